@@ -15,7 +15,6 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
@@ -39,6 +38,7 @@ from mjfim.information.null_space import NullSpace
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
+from mjfim.parallel.budget import Budget
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Recording
 

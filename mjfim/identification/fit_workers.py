@@ -19,7 +19,6 @@ from typing import Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 
-from mjfim.budget import Budget, StopToken
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
@@ -33,6 +32,7 @@ from mjfim.parallel import (
     pool_stop_token,
     results_or_here,
 )
+from mjfim.parallel.budget import Budget, StopToken
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import SharedValue, require_values
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.budget import Budget
 from mjfim.errors import RecordingError
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.parallel.budget import Budget
 from mjfim.plant.noise import Noise
 from mjfim.records.check import join_names
 from mjfim.records.trajectory import Recording

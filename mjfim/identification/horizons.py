@@ -16,13 +16,15 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.held_out_losses import BLOCKS, HeldOutLosses, losses_by_block
 from mjfim.identification.jackknife import jackknife_std, student_quantile
-from mjfim.identification.leave_out_fits import fit_to_others, leave_out_steps
-from mjfim.identification.left_out_parts import (
+from mjfim.identification.left_out import (
+    BLOCKS,
     MAX_FOLDS,
+    HeldOutLosses,
     LeftOutPart,
+    fit_without,
     left_out_parts,
+    losses_by_block,
     with_initial_states,
 )
 from mjfim.identification.report import FitResult
@@ -148,11 +150,11 @@ def _fitted(
     except SimulationDivergedError:
         return None
     without = []
-    for step in leave_out_steps(weighted, solution, parts):
-        others = fit_to_others(weighted, step, search.budget)
+    for part in parts:
+        others = fit_without(weighted, search.budget, solution=solution, part=part)
         if others is None:
             return None
-        without.append(weighted.theta(others.unknowns))
+        without.append(weighted.theta(others))
     return _LengthFit(
         length=length,
         problem=problem,

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
@@ -42,6 +41,7 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.parallel import ExecutorLike, one_blas_thread
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate, Restart
 from mjfim.records.events import FitEvent, begin_stage, shown_progress
 from mjfim.records.trajectory import Recording

@@ -12,14 +12,12 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget
 from mjfim.errors import first_ones, listed
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cad_prior import CadPrior
-from mjfim.identification.cross_validation import predict_unfitted
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality
 from mjfim.identification.flipped_signs import (
@@ -31,6 +29,7 @@ from mjfim.identification.flipped_signs import (
 from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.laws_in_loop import laws_in_loop
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
+from mjfim.identification.predictions import predict_unfitted
 from mjfim.identification.recording_comparison import compare_recordings
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
 from mjfim.identification.starts import values_of_start
@@ -39,6 +38,7 @@ from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.parallel.budget import Budget
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,

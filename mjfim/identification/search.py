@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from mjfim.arrays import Array, evenly_spread_indices
-from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
@@ -23,6 +22,7 @@ from mjfim.optimize.levenberg_marquardt import (
     UnknownValues,
     minimise,
 )
+from mjfim.parallel.budget import Budget
 from mjfim.plant.noise import Noise
 from mjfim.records.events import FitEvent, begin_stage
 

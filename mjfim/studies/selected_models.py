@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,21 +12,22 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
 from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.jackknife import student_quantile
+from mjfim.identification.left_out import HeldOutLosses
 from mjfim.identification.report import FitResult
 from mjfim.identification.terms import TermTests
-from mjfim.model.parameters import ParameterSet
+from mjfim.model.parameters import Parameter, ParameterSet
+from mjfim.model.paths import ParameterPath
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import (
-    Decision,
     PooledParameter,
     Selection,
-    SelectionStep,
     Term,
 )
-from mjfim.studies.simplification import simplified_experiment
+
+# Smallest number of parameters that are pooled.
+MIN_MEMBERS = 2
 
 # Probability that an interval holds the true value.
 CONFIDENCE = 0.95
@@ -36,6 +37,15 @@ MIN_PARTS = 2
 NOT_WIDENED = (
     "no interval contains that the terms were chosen with the same data, because fewer than two "
     "parts of the recordings could be predicted from the others; give further recordings"
+)
+
+
+# Losses of a model before data are predicted by it.
+NO_LOSSES = HeldOutLosses(
+    losses=np.zeros(0),
+    counts=np.zeros(0),
+    parts=np.zeros(0, dtype=np.intp),
+    estimates=np.zeros((0, 0)),
 )
 
 
@@ -54,9 +64,9 @@ class FittedModel:
     """
 
     result: FitResult
-    losses: HeldOutLosses
     cost: float
-    terms: tuple[Term, ...]
+    losses: HeldOutLosses = NO_LOSSES
+    terms: tuple[Term, ...] = ()
     pooled: tuple[PooledParameter, ...] = ()
     held: tuple[str, ...] = ()
     tests: TermTests | None = None
@@ -124,28 +134,6 @@ def poorly_known(model: FittedModel) -> tuple[str, ...]:
     return tuple(name for name, _ in model.result.accuracy.poorly_known if name not in excluded)
 
 
-def pooled_values(pooled: Sequence[PooledParameter], values: dict[str, float]) -> dict[str, float]:
-    """Values of pooled parameters where a search begins: the mean of what their members suggest.
-
-    Args:
-        pooled: The pooled parameters.
-        values: Values of other parameters by name [theta-unit].
-
-    Returns:
-        The values of those that have none yet, by name.
-    """
-    found = {}
-    for pool in pooled:
-        suggested = [
-            values[name] / scale
-            for name, scale in zip(pool.members, pool.scales, strict=True)
-            if name in values
-        ]
-        if suggested and pool.name not in values:
-            found[pool.name] = float(np.mean(suggested))
-    return found
-
-
 def different(
     estimate: Estimate, theta: Array, interval: Array, parameters: ParameterSet
 ) -> tuple[str, ...]:
@@ -172,56 +160,45 @@ def different(
     return tuple(name for name, flag in zip(estimate.parameters, apart, strict=True) if flag)
 
 
-def stated_values(model: FittedModel, first: FittedModel) -> dict[str, float]:
-    """Values of the parameters of the stated model in an extended one.
-
-    Args:
-        model: The extended model.
-        first: The stated model.
-
-    Returns:
-        The values by name, without parameters that are pooled [theta-unit].
-    """
+def values_of(model: FittedModel) -> dict[str, float]:
+    """Values of all parameters of a fitted model, by name [theta-unit]."""
     names = model.result.task.system.parameters.names
-    values = dict(zip(names, model.result.theta.tolist(), strict=True))
-    stated = first.result.task.system.parameters.names
-    return {name: values[name] for name in stated if name in values}
+    return dict(zip(names, model.result.theta.tolist(), strict=True))
 
 
-def tried_step(candidate: Term, model: FittedModel, reduction: Reduction) -> SelectionStep:
-    """Step of a term that was tried, before it is decided on.
+def start_of(
+    parameters: ParameterSet, model: FittedModel, added: Term | None = None, share: float = 1.0
+) -> Array:
+    """(p,) start of the fit of a changed model, beginning at its fit before the change.
 
-    Args:
-        candidate: The term.
-        model: The model with the term.
-        reduction: Reduction of the loss of left-out data by the term.
-    """
-    return replace(
-        unhelpful_step(candidate, len(model.terms) - 1),
-        decision=Decision.REJECTED,
-        error=model.losses.error,
-        reduction=reduction.mean,
-        standard_error=reduction.standard_error,
-    )
-
-
-def unhelpful_step(candidate: Term, count: int) -> SelectionStep:
-    """Step of a term with which the fit is no better, so that left-out data were not predicted.
+    Held parameters have their guess. A pooled parameter begins at the mean of what its members
+    suggest, and a number of a new term at its estimate: a field of a term at the estimate itself,
+    a number of the model that much beyond its value.
 
     Args:
-        candidate: The term.
-        count: Number of terms of the model without it.
+        parameters: The parameters of the changed model.
+        model: The changed model.
+        added: The new term.
+        share: Share of the estimated sizes of the term with which it begins.
     """
-    return SelectionStep(
-        decision=Decision.UNHELPFUL,
-        description=candidate.description,
-        path=candidate.path,
-        count=count,
-        error=np.nan,
-        sigmas=candidate.sigmas,
-        share=candidate.share,
-        joints=candidate.joints,
-    )
+    values = values_of(model)
+    for pool in model.pooled:
+        members = zip(pool.members, pool.scales, strict=True)
+        suggested = [values[name] / scale for name, scale in members if name in values]
+        if suggested and pool.name not in values:
+            values[pool.name] = float(np.mean(suggested))
+    changes = {
+        number.name: (share if number.is_size else 1.0) * number.value
+        for number in (() if added is None else added.numbers)
+    }
+    start = np.array(parameters.guess)
+    for i, parameter in enumerate(parameters.parameters):
+        if parameter.name in model.held:
+            continue
+        change = changes.get(parameter.name, 0.0)
+        is_field = parameter.name in changes and parameter.targets[0].term is not None
+        start[i] = change if is_field else values.get(parameter.name, start[i]) + change
+    return np.clip(start, parameters.lower, parameters.upper)
 
 
 def _name_of(path: str, taken: Iterable[str]) -> str:
@@ -275,3 +252,110 @@ def with_selection(
     lower, upper = system.parameters.lower, system.parameters.upper
     widened = replace(estimate, interval=np.clip(interval, lower[:, None], upper[:, None]))
     return with_honest_covariance(widened, system.parameters, without_parts=losses.estimates)
+
+
+# ---- simpler parameters
+
+
+def possible_pools(parameters: ParameterSet, names: Collection[str]) -> list[PooledParameter]:
+    """Groups of parameters that stand for the same field of different elements.
+
+    Args:
+        parameters: All parameters.
+        names: Names of the parameters that may be pooled.
+
+    Returns:
+        A pool for each group of two or more parameters with one target each and common bounds.
+    """
+    groups: dict[tuple[str, str, int | None, str], list[Parameter]] = {}
+    for parameter in parameters.parameters:
+        if parameter.name not in names or not _is_plain(parameter):
+            continue
+        path = ParameterPath.parse(parameter.targets[0].path)
+        key = (path.kind, path.field, path.index, parameter.unit)
+        groups.setdefault(key, []).append(parameter)
+
+    taken = set(parameters.names)
+    pools = []
+    for (kind, field, _, _), members in groups.items():
+        pool = None
+        if len(members) >= MIN_MEMBERS:
+            pool = _pool(f"{kind}_{field}", members, taken)
+        if pool is not None:
+            taken.add(pool.name)
+            pools.append(pool)
+    return pools
+
+
+def _is_plain(parameter: Parameter) -> bool:
+    """Whether a parameter sets one number of an element, and nothing else is stated about it."""
+    if len(parameter.targets) != 1 or parameter.function is not None or parameter.group:
+        return False
+    target = parameter.targets[0]
+    is_number = target.scale == 1.0 and target.offset == 0.0
+    return is_number and parameter.prior is None and not parameter.per_recording
+
+
+def _pool(
+    stem: str, members: Sequence[Parameter], taken: Collection[str]
+) -> PooledParameter | None:
+    """One parameter in place of several; None where no value lies within the bounds of all.
+
+    Where all guesses have one sign and differ, it is a factor on the guesses, because elements of
+    different size have different values.
+    """
+    name = stem
+    number = 2
+    while name in taken:
+        name = f"{stem}_{number}"
+        number += 1
+
+    guesses = np.array([member.guess for member in members])
+    is_factor = bool((guesses > 0.0).all() or (guesses < 0.0).all()) and np.ptp(guesses) > 0.0
+    scales = guesses if is_factor else np.ones(len(members))
+    guess = 1.0 if is_factor else float(guesses.mean())
+
+    # The pool keeps the bounds of all members.
+    low = max(min(bound / s for bound in m.bounds) for m, s in zip(members, scales, strict=True))
+    high = min(max(bound / s for bound in m.bounds) for m, s in zip(members, scales, strict=True))
+    if not low < high:
+        return None
+    guess = float(np.clip(guess, low, high))
+    sizes = [m.scale / abs(s) for m, s in zip(members, scales, strict=True)]
+    return PooledParameter(
+        name=name,
+        members=tuple(member.name for member in members),
+        paths=tuple(member.targets[0].path for member in members),
+        scales=tuple(float(scale) for scale in scales),
+        guess=guess,
+        unit="" if is_factor else members[0].unit,
+        scale=max(1.0, *sizes) if is_factor else max(sizes),
+        bounds=(float(low), float(high)),
+    )
+
+
+def simplified_experiment(
+    experiment: Experiment, pooled: Iterable[PooledParameter], held: Collection[str]
+) -> Experiment:
+    """An experiment with pooled and held parameters.
+
+    Args:
+        experiment: The experiment.
+        pooled: Pools, which take the places of their members.
+        held: Names of parameters that keep their guess.
+
+    Returns:
+        The experiment, checked again.
+    """
+    pools = list(pooled)
+    if not pools and not held:
+        return experiment
+
+    values = experiment.model_dump(exclude_unset=True)
+    members = {name for pool in pools for name in pool.members}
+    tables = {name: table for name, table in values["parameters"].items() if name not in members}
+    values["parameters"] = {**tables, **{pool.name: pool.table for pool in pools}}
+    if held:
+        fit = values.get("fit", {})
+        values["fit"] = {**fit, "hold": (*fit.get("hold", ()), *sorted(held))}
+    return experiment.restated(values)

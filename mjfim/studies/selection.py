@@ -15,20 +15,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
-from mjfim.identification.held_out_losses import HeldOutLosses, Reduction, held_out_losses
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
+from mjfim.identification.left_out import Reduction, held_out_losses
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask, with_length
-from mjfim.identification.terms import TermTests, find_missing_terms
-from mjfim.model.parameters import ParameterSet
-from mjfim.optimize.levenberg_marquardt import InterruptedPassError
+from mjfim.identification.terms import find_missing_terms
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate
@@ -45,16 +42,14 @@ from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import (
     FittedModel,
     different,
-    pooled_values,
     poorly_known,
+    possible_pools,
     selected_experiment,
     selected_term,
-    stated_values,
-    tried_step,
-    unhelpful_step,
+    start_of,
+    values_of,
     with_selection,
 )
-from mjfim.studies.simplification import possible_pools
 
 # Largest number of terms that are added.
 MAX_TERMS = 6
@@ -69,6 +64,9 @@ MAX_HELD_ATTEMPTS = 8
 # Ratio of the errors of left-out data, above which a simpler model predicts worse, even where the
 # data are too few for a clear difference.
 WORSE_ERROR_RATIO = 1.02
+
+# Largest number of final fits, each of which may show further terms.
+MAX_FINAL_FITS = 3
 
 # Difference of the costs of two fits (half of the sum of squared residuals in standard deviations)
 # below which both explain the data equally well: by one standard deviation at most.
@@ -170,8 +168,7 @@ def select_terms_system(
             workers=None if executor is None else FitWorkers(executor),
             max_terms=max_terms,
         )
-        task = FitTask.of(system, recordings, held_out=held_out)
-        estimate, selected = selector.selected(task)
+        estimate, selected = selector.selected(FitTask.of(system, recordings, held_out=held_out))
 
     estimate = replace(
         estimate,
@@ -181,101 +178,84 @@ def select_terms_system(
     return SelectedModel(estimate=estimate, system=selected)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Refit:
-    """A model with a new fit, of which left-out data are not predicted yet.
-
-    Attributes:
-        model: The terms of the model, with an earlier fit.
-        result: The new fit.
-        cost: Its cost with the noise of the fit of the stated model.
-    """
-
-    model: FittedModel
-    result: FitResult
-    cost: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Selector:
-    """Searches of one selection, which share a budget.
+    """One selection: its searches share a budget, and every attempt is kept as a step."""
 
-    Attributes:
-        held_out: Recordings that are only predicted at the end.
-        budget: Budget whose token ends the selection.
-        callback: Called with every iterate, or None.
-        workers: Workers that do parts of the work; None for this process.
-        max_terms: Largest number of added terms.
-    """
+    first: FittedModel
 
-    held_out: tuple[Recording, ...]
-    budget: Budget
-    callback: Callback | None
-    workers: FitWorkers | None
-    max_terms: int
+    def __init__(
+        self,
+        *,
+        held_out: tuple[Recording, ...],
+        budget: Budget,
+        callback: Callback | None,
+        workers: FitWorkers | None,
+        max_terms: int,
+    ) -> None:
+        self.held_out = held_out
+        self.budget = budget
+        self.callback = callback
+        self.workers = workers
+        self.max_terms = max_terms
+        self.steps: list[SelectionStep] = []
+        self.ending = ""
 
     def selected(self, task: FitTask) -> tuple[Estimate, System]:
         """Estimate of the extended model, and the extended model.
 
-        Where the length of the segments is not stated, terms are chosen by whole recordings, which
-        show them best. Where these do not explain the recordings, the length is chosen for the
-        extended model, and terms are chosen by predictions over this length as well.
+        Where the length of the segments is left to the fit, terms are chosen by whole recordings
+        first, and once more over the length that the final fit needs.
+
+        Args:
+            task: The fit of the stated model.
         """
         is_free = task.settings.segments is None
-        whole = with_length(task, "whole") if is_free else task
-        result = fit_task(self._search(whole), self.workers)
-        losses = self._losses(result, result)
-        if losses is None:
+        result = fit_task(
+            self._search(with_length(task, "whole") if is_free else task), self.workers
+        )
+        self.first = FittedModel(result=result, cost=result.solution.cost)
+        model = self._assessed(self.first)
+        if model is None:
             return self._unselected(result, is_free)
+        self.first = model
+        self._add(Decision.BEGUN, model)
 
-        first = FittedModel(result=result, losses=losses, cost=result.solution.cost, terms=())
-        steps = [SelectionStep(decision=Decision.BEGUN, error=losses.error)]
-        model, ending = self._chosen(first, first, steps)
-        result = self._final(model.result, is_free, is_changed=model.is_changed)
+        model, is_whole = self._chosen(model), is_free
+        for _ in range(MAX_FINAL_FITS):
+            final = self._final(model.result, is_whole, is_changed=model.is_changed)
+            if final is model.result:
+                break
+            model = self._at_final_fit(model, final, is_whole)
+            is_whole &= final.task.settings.segment_length is None
+            if model.result is final:
+                break
+        return self._selected(model, is_free)
 
-        # Over segments, the data may show other terms.
-        stated = first
-        if result.task.settings.segment_length is not None and is_free:
-            model, ending = self._over_length(model, first, result, steps, ending)
-            if model.result is not result:
-                result = self._final(model.result, is_free=False, is_changed=model.is_changed)
-            length = result.task.settings.segment_length
-            of_length = with_length(first.result.task, length)
-            stated = replace(first, result=replace(first.result, task=of_length))
-
-        # The final fit may show terms that were not significant before.
-        model, ending = self._completed(model, stated, result, steps, ending)
-        if model.result is not result:
-            is_whole = is_free and stated is first
-            result = self._final(model.result, is_whole, is_changed=model.is_changed)
-        result = _reported(result, is_free)
+    def _selected(self, model: FittedModel, is_free: bool) -> tuple[Estimate, System]:
+        """Estimate of the chosen model, and this model."""
+        result = _reported(model.result, is_free)
         selection = Selection(
             terms=model.terms,
-            steps=tuple(steps),
-            ending=ending,
+            steps=tuple(self.steps),
+            ending=self.ending,
             pooled=model.pooled,
             held=model.held,
         )
-        tests = self._tests_of(model, result, first)
+        tests = None if result.quality.unexplained or self._is_stopped() else model.tests
         estimate = estimate_from(result, self.budget, selection.refuted, tests)
         if selection.is_changed:
             settings = result.task.settings
             selection = replace(
                 selection,
-                refit=self._refit(result, estimate),
+                refit=self._refit_to_held_out(result, estimate),
                 hold=settings.hold,
                 segments=settings.segment_length if is_free else None,
             )
-        final_system = result.task.system
-        return with_selection(estimate, selection, model.losses, final_system), final_system
+        system = result.task.system
+        return with_selection(estimate, selection, model.losses, system), system
 
     def _unselected(self, result: FitResult, is_free: bool) -> tuple[Estimate, System]:
-        """Estimate of the stated model where no term could be tried, and this model.
-
-        Args:
-            result: The fit of the stated model.
-            is_free: Whether the length of the segments is left to the fit.
-        """
+        """Estimate of the stated model where no term could be tried, and this model."""
         ending = "The selection was interrupted before a term was tried."
         if not self._is_stopped():
             ending = (
@@ -289,16 +269,15 @@ class _Selector:
         estimate = estimate_from(result, self.budget)
         return replace(estimate, selection=selection), result.task.system
 
-    def _refit(self, result: FitResult, estimate: Estimate) -> HeldOutRefit | None:
+    def _refit_to_held_out(self, result: FitResult, estimate: Estimate) -> HeldOutRefit | None:
         """Fit the selected model to the held-out recordings; None without any, or after a stop."""
         if not self.held_out or self._is_stopped():
             return None
-
         begin_stage("fitting the selected model to the held-out recordings")
         task = FitTask.of(result.task.system, self.held_out, start=estimate.theta)
         try:
             found = fit_task(self._search(task), self.workers)
-        except (InterruptedPassError, SimulationDivergedError):
+        except SimulationDivergedError:
             return None
         interval = found.accuracy.interval
         return HeldOutRefit(
@@ -308,13 +287,7 @@ class _Selector:
         )
 
     def _final(self, result: FitResult, is_free: bool, *, is_changed: bool) -> FitResult:
-        """The fit of the chosen model, with all attempts against local minima.
-
-        Args:
-            result: The fit of the chosen model in the selection.
-            is_free: Whether the length of the segments is left to the fit.
-            is_changed: Whether the chosen model differs from the stated one.
-        """
+        """The fit of the chosen model, with all attempts against local minima."""
         is_settled = not is_changed and not (is_free and is_doubtful(result))
         if is_settled or self._is_stopped():
             return result
@@ -328,496 +301,312 @@ class _Selector:
         begins_at_guess = settings.starts == 1 and settings.start != "inverse_dynamics"
         if settings.segment_length is None or not begins_at_guess or is_free:
             return fit_task(self._search(final), self.workers)
-        try:
-            return refit_task(self._search(final), result, self.workers, is_rough=False)
-        except InterruptedPassError:
-            return result
+        return refit_task(self._search(final), result, self.workers, is_rough=False)
+
+    def _at_final_fit(self, model: FittedModel, result: FitResult, is_free: bool) -> FittedModel:
+        """The model at its final fit, with the terms that only this fit shows.
+
+        Left-out data are predicted from this fit anew: further terms are compared with it, and its
+        intervals are widened by the scatter between these fits.
+        """
+        final = replace(model, result=result, cost=self._cost(result))
+        length = result.task.settings.segment_length
+        if is_free and length is not None:
+            of_length = with_length(self.first.result.task, length)
+            self.first = replace(self.first, result=replace(self.first.result, task=of_length))
+            cut = self._assessed(final)
+            if cut is None:
+                return replace(final, tests=None)
+            self._add(Decision.SHORTENED, cut, f"segments of {length:.2g} s")
+            return self._chosen(cut)
+
+        counts = [len(each.problem.segments) for each in (result, model.result)]
+        if counts[0] == counts[1] and abs(final.cost - model.cost) <= EQUAL_COST:
+            return final
+        cut = self._assessed(final) if model.is_changed else None
+        return replace(final, tests=None) if cut is None else self._grown(cut, self._refuted)
 
     # ---- steps
 
-    def _completed(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        result: FitResult,
-        steps: list[SelectionStep],
-        ending: str,
-    ) -> tuple[FittedModel, str]:
-        """Try terms that only the final fit of a changed model shows to be significant.
+    def _add(
+        self, decision: Decision, model: FittedModel, description: str = "", **changes: object
+    ) -> None:
+        """Add a step whose model was decided on."""
+        step = SelectionStep(
+            decision=decision,
+            description=description,
+            count=len(model.terms),
+            error=model.losses.error,
+        )
+        self.steps.append(replace(step, **changes))  # type: ignore[arg-type]
 
-        Args:
-            model: The chosen model, with an earlier fit.
-            first: The stated model.
-            result: The final fit of the chosen model.
-            steps: Receives the steps.
-            ending: Why no more terms were added before.
+    @property
+    def _refuted(self) -> Collection[str]:
+        """Terms that the steps have refuted (`Selection.refuted`)."""
+        return Selection(terms=(), steps=tuple(self.steps), ending="").refuted
 
-        Returns:
-            The model with the final fit or with further terms, and why no more terms were added.
-        """
-        final = replace(model, result=result, tests=self._tests_of(model, result, first))
-        if self._is_stopped() or not model.is_changed or final.tests is not None:
-            return final, ending
-
-        # The final fit is another one. Left-out data are predicted from it anew: further terms are
-        # compared with it, and its intervals are widened by the scatter between these fits.
-        tests = self._term_tests(final)
-        final = replace(final, tests=tests)
-        if result is not model.result and not self._is_stopped():
-            assessed = self._assessed(self._costed(model, first, result), first)
-            if assessed is not None:
-                final = replace(assessed, tests=tests)
-        if self._is_stopped():
-            return final, INTERRUPTED
-        return self._grown(final, first, steps, _refuted(steps))
-
-    def _chosen(
-        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
-    ) -> tuple[FittedModel, str]:
-        """Add terms, remove needless ones, and simplify the parameters.
-
-        Args:
-            model: Where to begin.
-            first: The stated model.
-            steps: Receives the steps.
-
-        Returns:
-            The chosen model, and why no more terms were added.
-        """
-        model, ending = self._grown(model, first, steps)
-        model = self._pruned(model, first, steps)
-        simpler = self._simplified(model, first, steps)
-
+    def _chosen(self, model: FittedModel) -> FittedModel:
+        """Add terms, remove needless ones, and simplify the parameters."""
+        model = self._pruned(self._grown(model))
+        simpler = self._simplified(model)
         # Terms may have stood in for parameters that are held or pooled now. Without them, others
         # may be significant that were not tried before.
         if simpler is not model:
-            simpler = self._pruned(simpler, first, steps, tests_last=True)
-            simpler, ending = self._grown(simpler, first, steps, _refuted(steps))
-        return simpler, ending
+            simpler = self._grown(self._pruned(simpler, tests_last=True), self._refuted)
+        return simpler
 
-    def _over_length(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        result: FitResult,
-        steps: list[SelectionStep],
-        ending: str,
-    ) -> tuple[FittedModel, str]:
-        """Choose terms by predictions over segments instead of whole recordings.
+    def _grown(self, model: FittedModel, refuted: Collection[str] = ()) -> FittedModel:
+        """Add terms while they improve the prediction of left-out data, and say why it ended.
 
         Args:
-            model: The model that was chosen by whole recordings.
-            first: The stated model.
-            result: Fit of the chosen model over segments.
-            steps: Receives the steps.
-            ending: Why no more terms were added by whole recordings.
-
-        Returns:
-            The chosen model, and why no more terms were added.
-        """
-        length = result.task.settings.segment_length
-        cut = self._assessed(self._costed(model, first, result), first)
-        if cut is None or length is None:
-            return replace(model, result=result, tests=None), ending
-
-        steps.append(
-            SelectionStep(
-                decision=Decision.SHORTENED,
-                description=f"segments of {length:.2g} s",
-                count=len(model.terms),
-                error=cut.losses.error,
-            )
-        )
-        stated = replace(first.result, task=with_length(first.result.task, length))
-        return self._chosen(cut, replace(first, result=stated), steps)
-
-    def _grown(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        steps: list[SelectionStep],
-        refuted: Collection[str] = (),
-    ) -> tuple[FittedModel, str]:
-        """Add terms while they improve the prediction of left-out data.
-
-        Args:
-            model: Where to begin.
-            first: The stated model.
-            steps: Receives the steps.
-            refuted: Terms that are not tried again (`Selection.refuted`).
-
-        Returns:
-            The extended model, and why no more terms were added.
+            model: The model.
+            refuted: Terms that are not tried.
         """
         while len(model.terms) < self.max_terms:
+            if self._is_stopped():
+                self.ending = INTERRUPTED
+                return model
             begin_stage(f"looking for term {len(model.terms) + 1} that the model lacks")
-            tests = self._term_tests(model) if model.tests is None else model.tests
+            result = model.result
+            tests = model.tests or find_missing_terms(
+                result.problem, result.task.recordings, result.solution.unknowns
+            )
             model = replace(model, tests=tests)
             candidates = tests.without(refuted).terms
-            if self._is_stopped():
-                return model, INTERRUPTED
             if not candidates:
-                return model, f"No further term that was tested is significant.{tests.remark}"
+                self.ending = f"No further term that was tested is significant.{tests.remark}"
+                return model
 
             # The most promising terms are tried first, and the others if these do not help.
-            most = candidates[0].share
-            similar = [term for term in candidates if term.share >= SIMILAR_SHARE * most]
-            others = [term for term in candidates if term.share < SIMILAR_SHARE * most]
             better = None
-            for attempt in (similar, others):
-                better = better or self._best_extension(model, first, attempt, steps)
-            if self._is_stopped():
-                return model, INTERRUPTED
-            if better is None:
+            for is_similar in (True, False):
+                attempt = [
+                    term
+                    for term in candidates
+                    if (term.share >= SIMILAR_SHARE * candidates[0].share) == is_similar
+                ]
+                better = better or self._best_extension(model, attempt)
+            if better is None or self._is_stopped():
                 text = "No further term predicts left-out data clearly better."
-                return model, text + tests.remark
+                self.ending = INTERRUPTED if self._is_stopped() else text + tests.remark
+                return model
             model = better
-        return model, f"{self.max_terms} terms were added, the largest number."
+        self.ending = f"{self.max_terms} terms were added, the largest number."
+        return model
 
-    def _best_extension(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        candidates: Sequence[Term],
-        steps: list[SelectionStep],
-    ) -> FittedModel | None:
+    def _best_extension(self, model: FittedModel, candidates: Sequence[Term]) -> FittedModel | None:
         """The model with the one of some terms that predicts best; None where none is better."""
-        tried: list[tuple[FittedModel, SelectionStep]] = []
-        for candidate in candidates:
-            attempt = self._tried(model, first, candidate, steps)
-            if self._is_stopped():
-                return None
-            if attempt is not None:
-                tried.append(attempt)
+        tried = [self._tried(model, candidate) for candidate in candidates]
+        if self._is_stopped():
+            return None
+        extended = [pair for pair in tried if pair is not None]
 
         # Of the models that do not clearly predict worse than the best one, the one that fits the
         # data best is chosen: the fit uses all data, so that it tells similar terms apart better.
         # Where no data tell terms apart, the first one of the candidates is chosen, so that the
         # choice does not depend on rounding errors.
-        clear = [pair for pair in tried if model.losses.reduction(pair[0].losses).is_clear]
-        least = min(clear, key=lambda pair: pair[1].error, default=None)
-        best = None
-        if least is not None:
-            similar = [
-                pair for pair in clear if not pair[0].losses.reduction(least[0].losses).is_clear
-            ]
-            highest = min(pair[0].penalised_cost for pair in similar) + EQUAL_COST
-            best = next(pair for pair in similar if pair[0].penalised_cost <= highest)
-        steps.extend(step for found, step in tried if best is None or found is not best[0])
-        if best is None:
+        clear = [pair for pair in extended if model.losses.reduction(pair[0].losses).is_clear]
+        if not clear:
+            self.steps.extend(step for _, step in extended)
             return None
+        least = min(clear, key=lambda pair: pair[1].error)[0]
+        similar = [pair for pair in clear if not pair[0].losses.reduction(least.losses).is_clear]
+        highest = min(pair[0].penalised_cost for pair in similar) + EQUAL_COST
+        chosen, step = next(pair for pair in similar if pair[0].penalised_cost <= highest)
+        self.steps.extend(other for found, other in extended if found is not chosen)
 
         # What the data do not tell apart is said.
-        chosen, step = best
+        stated = self.first.result.task.system.parameters.names
         alternatives = tuple(
             AlternativeTerm(
-                description=other.description, path=other.path, values=stated_values(found, first)
+                description=other.description,
+                path=other.path,
+                values={n: v for n, v in values_of(found).items() if n in stated},
             )
             for found, other in clear
             if found is not chosen and not found.losses.reduction(chosen.losses).is_clear
         )
         count = len(chosen.terms)
-        steps.append(replace(step, decision=Decision.ADDED, count=count, alternatives=alternatives))
+        self.steps.append(
+            replace(step, decision=Decision.ADDED, count=count, alternatives=alternatives)
+        )
         return chosen
 
-    def _pruned(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        steps: list[SelectionStep],
-        *,
-        tests_last: bool = False,
-    ) -> FittedModel:
+    def _pruned(self, model: FittedModel, *, tests_last: bool = False) -> FittedModel:
         """Remove terms without which left-out data are predicted as well.
 
         Args:
-            model: Where to begin.
-            first: The stated model.
-            steps: Receives the steps.
-            tests_last: False where the last term has just been tested against the model without it.
+            model: The model.
+            tests_last: Whether the last term is tested too, which need not have been compared with
+                the same other parameters.
         """
-        while not self._is_stopped():
-            tested = model.terms if tests_last else model.terms[:-1]
-            if not tested:
-                break
+        while tested := model.terms if tests_last else model.terms[:-1]:
             begin_stage("testing whether all added terms are needed")
             needless: list[tuple[Reduction, Term, FittedModel]] = []
             for term in tested:
-                fewer = self._without(model, first, term)
-                if fewer is None:
-                    continue
-                reduction = fewer.losses.reduction(model.losses)
-                if not reduction.is_clear:
+                fewer = self._without(model, term)
+                reduction = None if fewer is None else fewer.losses.reduction(model.losses)
+                if fewer is not None and reduction is not None and not reduction.is_clear:
                     needless.append((reduction, term, fewer))
             if not needless:
                 break
-
             reduction, term, model = min(needless, key=lambda found: found[0].mean)
-            steps.append(
-                SelectionStep(
-                    decision=Decision.REMOVED,
-                    description=term.description,
-                    path=term.path,
-                    joints=term.joints,
-                    count=len(model.terms),
-                    error=model.losses.error,
-                    reduction=reduction.mean,
-                    standard_error=reduction.standard_error,
-                )
+            self._add(
+                Decision.REMOVED,
+                model,
+                term.description,
+                path=term.path,
+                joints=term.joints,
+                reduction=reduction.mean,
+                standard_error=reduction.standard_error,
             )
         return model
 
-    def _simplified(
-        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
-    ) -> FittedModel:
+    def _simplified(self, model: FittedModel) -> FittedModel:
         """Pool or hold poorly known parameters as long as the prediction stays as good."""
-        if self._is_stopped():
-            return model
         begin_stage("testing whether poorly known parameters are needed")
-        for pool in possible_pools(first.result.task.system.parameters, poorly_known(model)):
+        parameters = self.first.result.task.system.parameters
+        for pool in possible_pools(parameters, poorly_known(model)):
             words = f"one value of {pool.name} for {listed(pool.members)}"
             changed = replace(model, pooled=(*model.pooled, pool))
-            model = self._simpler(model, changed, first, (Decision.POOLED, words), steps)
+            model = self._simpler(model, changed, Decision.POOLED, words)
 
         # All of those that are still poorly known are held at once, or else one by one.
         names = poorly_known(model)
         attempts = [names] if len(names) > 1 else []
         attempts += [(name,) for name in names[:MAX_HELD_ATTEMPTS]]
         for attempt in attempts:
-            if self._is_stopped() or set(attempt) <= set(model.held):
-                continue
-
             # One parameter at least is left to the fit.
             task = model.result.task
-            if {*task.settings.hold, *attempt} >= set(task.system.parameters.names):
-                continue
-            changed = replace(model, held=(*model.held, *attempt))
-            model = self._simpler(model, changed, first, (Decision.HELD, listed(attempt)), steps)
+            is_all = {*task.settings.hold, *attempt} >= set(task.system.parameters.names)
+            if not is_all and not set(attempt) <= set(model.held):
+                changed = replace(model, held=(*model.held, *attempt))
+                model = self._simpler(model, changed, Decision.HELD, listed(attempt))
         return model
 
     def _simpler(
-        self,
-        model: FittedModel,
-        changed: FittedModel,
-        first: FittedModel,
-        named: tuple[Decision, str],
-        steps: list[SelectionStep],
+        self, model: FittedModel, changed: FittedModel, decision: Decision, words: str
     ) -> FittedModel:
-        """A simpler model, if it predicts left-out data as well; otherwise the model itself.
-
-        Args:
-            model: The model.
-            changed: It with the pooled and held parameters of the simpler one, not yet fitted.
-            first: The stated model.
-            named: The decision for the simpler model, and what it changes in words.
-            steps: Receives the step.
-        """
-        names = model.result.task.system.parameters.names
-        values = dict(zip(names, model.result.theta, strict=True))
-        simpler = self._assessed(self._refitted(changed, first, changed.terms, values, {}), first)
+        """A simpler model, if it predicts left-out data as well; otherwise the model itself."""
+        simpler = self._assessed(self._fitted(changed))
         if simpler is None:
             return model
-
-        decision, words = named
         reduction = simpler.losses.reduction(model.losses)
         is_worse = (
             reduction.is_clear or simpler.losses.error > WORSE_ERROR_RATIO * model.losses.error
         )
-        steps.append(
-            SelectionStep(
-                decision=Decision.KEPT if is_worse else decision,
-                description=words,
-                count=len(model.terms),
-                error=simpler.losses.error,
-                reduction=-reduction.mean,
-                standard_error=reduction.standard_error,
-            )
+        self._add(
+            Decision.KEPT if is_worse else decision,
+            simpler,
+            words,
+            reduction=-reduction.mean,
+            standard_error=reduction.standard_error,
         )
         return model if is_worse else simpler
 
     # ---- models
 
     def _tried(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        candidate: Term,
-        steps: list[SelectionStep],
+        self, model: FittedModel, candidate: Term
     ) -> tuple[FittedModel, SelectionStep] | None:
         """The model with one term more, and the step that tried it, before it is decided on.
 
-        None where it cannot be simulated, after a stop, and where it fits the data no better.
-
-        Args:
-            model: The model.
-            first: The stated model.
-            candidate: The term.
-            steps: Receives the step of a term with which the fit is no better.
+        None where the fit is no better, so that left-out data need not be predicted, where the
+        model cannot be simulated, and after a request to stop.
         """
-        names = model.result.task.system.parameters.names
-        term = selected_term(candidate, names)
-        values = dict(zip(names, model.result.theta, strict=True))
-        changes = {number.name: number.value for number in term.numbers}
-        terms = (*model.terms, term)
-        fit = self._refitted(model, first, terms, values, changes, sizes=_sizes_of(term))
-        if fit is None or self._is_stopped():
+        term = selected_term(candidate, model.result.task.system.parameters.names)
+        fit = self._fitted(replace(model, terms=(*model.terms, term)), term)
+        if fit is None:
             return None
-
-        # A term that does not even fit the data better need not predict left-out data.
-        is_equal = 0.0 <= fit.cost - model.cost <= EQUAL_COST
-        if is_equal and _is_comparable(fit, model):
-            steps.append(unhelpful_step(candidate, len(model.terms)))
+        step = SelectionStep(
+            decision=Decision.UNHELPFUL,
+            description=candidate.description,
+            path=candidate.path,
+            count=len(model.terms),
+            error=np.nan,
+            sigmas=candidate.sigmas,
+            share=candidate.share,
+            joints=candidate.joints,
+        )
+        found = fit.result
+        is_ended = found.solution.success and not found.solution.slow
+        is_comparable = have_same_initial_states(found.problem, model.result.problem)
+        is_comparable &= found.task.noise_is_stated and is_ended
+        if is_comparable and 0.0 <= fit.cost - model.cost <= EQUAL_COST:
+            self.steps.append(step)
             return None
-        extended = self._assessed(fit, first)
+        extended = self._assessed(fit)
         if extended is None:
             return None
         reduction = model.losses.reduction(extended.losses)
-        return extended, tried_step(candidate, extended, reduction)
+        return extended, replace(
+            step,
+            decision=Decision.REJECTED,
+            error=extended.losses.error,
+            reduction=reduction.mean,
+            standard_error=reduction.standard_error,
+        )
 
-    def _without(self, model: FittedModel, first: FittedModel, term: Term) -> FittedModel | None:
-        """The model without a term; None where it cannot be simulated, or after a stop.
-
-        There is none either where a pool replaces parameters of the term, and where all other
-        parameters are held.
-        """
+    def _without(self, model: FittedModel, term: Term) -> FittedModel | None:
+        """The model without a term; None where it cannot be fitted, or after a stop."""
         if any(not term.parameters.keys().isdisjoint(pool.members) for pool in model.pooled):
             return None
         task = model.result.task
-        names = task.system.parameters.names
-        if set(names) <= {*term.parameters, *task.settings.hold}:
+        if set(task.system.parameters.names) <= {*term.parameters, *task.settings.hold}:
             return None
-
         held = tuple(name for name in model.held if name not in term.parameters)
-        model = replace(model, held=held)
-        values = dict(zip(names, model.result.theta, strict=True))
         terms = tuple(each for each in model.terms if each is not term)
-        return self._assessed(self._refitted(model, first, terms, values, {}), first)
+        return self._assessed(self._fitted(replace(model, terms=terms, held=held)))
 
-    def _refitted(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        terms: tuple[Term, ...],
-        values: dict[str, float],
-        changes: dict[str, float],
-        sizes: Collection[str] = (),
-    ) -> _Refit | None:
-        """Fit the stated model with some terms, beginning at the fit of a similar model.
-
-        None where it cannot be simulated, or after a stop.
+    def _fitted(self, model: FittedModel, added: Term | None = None) -> FittedModel | None:
+        """Fit a model that was changed since its fit, beginning there.
 
         Args:
-            model: The similar model.
-            first: The stated model.
-            terms: The terms.
-            values: Values of the parameters where the search begins [theta-unit].
-            changes: Values of new parameters: what numbers of the model gain, and values of fields
-                of the library of terms [theta-unit].
-            sizes: Names of the parameters that are sizes of a new term, without which it has no
-                effect; none without a new term.
+            model: The changed model.
+            added: A new term.
+
+        Returns:
+            The model, whose losses are still those before the change; None where it cannot be
+            simulated, and after a request to stop.
         """
-        stated = first.result.task.system
+        stated = self.first.result.task.system
         selection = Selection(
-            terms=terms, steps=(), ending="", pooled=model.pooled, held=model.held
+            terms=model.terms, steps=(), ending="", pooled=model.pooled, held=model.held
         )
         system = System.resolve(
             selected_experiment(stated.experiment, selection),
             threads=stated.threads,
             source=stated.source,
         )
-        values = {**values, **pooled_values(model.pooled, values)}
-        start = _start_of(system.parameters, model.held, values, changes)
-
+        start = start_of(system.parameters, model, added)
         # A new term may have its size only together with other values of the other parameters.
         # With hardly any of it, the first step of the search moves all of them.
         other_start = None
-        if sizes:
-            fewer = {
-                name: SMALL_EFFECT * value if name in sizes else value
-                for name, value in changes.items()
-            }
-            other_start = _start_of(system.parameters, model.held, values, fewer)
-
-        task = FitTask.of(system, first.result.task.recordings, start=start)
+        if added is not None:
+            other_start = start_of(system.parameters, model, added, SMALL_EFFECT)
+        task = FitTask.of(system, self.first.result.task.recordings, start=start)
         try:
             result = refit_task(
                 self._search(task), model.result, self.workers, other_start=other_start
             )
-        except (InterruptedPassError, SimulationDivergedError):
+        except SimulationDivergedError:
             return None
-        return self._costed(replace(model, terms=terms), first, result)
-
-    def _costed(self, model: FittedModel, first: FittedModel, result: FitResult) -> _Refit | None:
-        """A model with a new fit and its cost; None after a request to stop.
-
-        Args:
-            model: The terms of the model, with an earlier fit.
-            first: The stated model, whose noise weights the cost.
-            result: The new fit.
-        """
-        weighted = result.problem.with_noise(first.result.problem.noise)
-        try:
-            cost = weighted.cost(result.solution.unknowns)
-        except InterruptedPassError:
+        if self._is_stopped():
             return None
-        return _Refit(model=model, result=result, cost=cost)
+        return replace(model, result=result, cost=self._cost(result))
 
-    def _assessed(self, fit: _Refit | None, first: FittedModel) -> FittedModel | None:
-        """A fitted model with its losses; None without a fit, and after a request to stop.
+    def _cost(self, result: FitResult) -> float:
+        """Cost of a fit with the noise of the stated model's fit, so that costs are comparable."""
+        weighted = result.problem.with_noise(self.first.result.problem.noise)
+        return weighted.cost(result.solution.unknowns)
 
-        Args:
-            fit: The fit, or None.
-            first: The stated model, whose noise weights the losses.
-        """
-        if fit is None:
+    def _assessed(self, model: FittedModel | None) -> FittedModel | None:
+        """A fitted model with its losses; None without a fit, and after a request to stop."""
+        if model is None:
             return None
-        losses = self._losses(fit.result, first.result)
-        if losses is None:
-            return None
-        return replace(fit.model, result=fit.result, losses=losses, cost=fit.cost, tests=None)
-
-    def _tests_of(
-        self, model: FittedModel, result: FitResult, first: FittedModel
-    ) -> TermTests | None:
-        """Tests of terms that the chosen model lacks, if they hold at its final fit; or None.
-
-        They do where the final fit explains the data as well as the fit at which they were made.
-
-        Args:
-            model: The chosen model.
-            result: Its final fit.
-            first: The stated model, whose noise weights the cost.
-        """
-        if model.tests is None or self._is_stopped() or result.quality.unexplained:
-            return None
-        if result.solution is model.result.solution:
-            return model.tests
-        if len(result.problem.segments) != len(model.result.problem.segments):
-            return None
-        try:
-            weighted = result.problem.with_noise(first.result.problem.noise)
-            change = weighted.cost(result.solution.unknowns) - model.cost
-        except InterruptedPassError:
-            return None
-        return model.tests if abs(change) <= EQUAL_COST else None
-
-    def _term_tests(self, model: FittedModel) -> TermTests:
-        """Significant terms that the model lacks, the most promising one first."""
-        result = model.result
-        try:
-            return find_missing_terms(
-                result.problem, result.task.recordings, result.solution.unknowns
-            )
-        except InterruptedPassError:
-            return TermTests()
-
-    def _losses(self, result: FitResult, first: FitResult) -> HeldOutLosses | None:
-        """Losses of the predictions of left-out data; None after a request to stop."""
-        sigma = first.problem.noise.sigma
-        try:
-            return held_out_losses(result.problem, result.solution, sigma, self.budget)
-        except InterruptedPassError:
-            return None
+        sigma, result = self.first.result.problem.noise.sigma, model.result
+        losses = held_out_losses(result.problem, result.solution, sigma, self.budget)
+        return None if losses is None else replace(model, losses=losses, tests=None)
 
     def _search(self, task: FitTask) -> FitSearch:
         """Searches of a task."""
@@ -828,68 +617,11 @@ class _Selector:
         return self.budget.stop.requested
 
 
-def _is_comparable(fit: _Refit, model: FittedModel) -> bool:
-    """Whether an equal cost of a fit with one term more shows that the term explains nothing.
-
-    It does where both fits minimise the same sum of squares with the same initial states, and where
-    the search ended near a minimum. A fit that costs clearly more has missed the one without the
-    term, and shows nothing.
-
-    Args:
-        fit: The fit with the term.
-        model: The model without it.
-    """
-    found = fit.result
-    is_ended = found.solution.success and not found.solution.slow
-    is_same_start = have_same_initial_states(found.problem, model.result.problem)
-    return is_same_start and found.task.noise_is_stated and is_ended
-
-
-def _refuted(steps: Sequence[SelectionStep]) -> Collection[str]:
-    """Terms that some steps have refuted (`Selection.refuted`)."""
-    return Selection(terms=(), steps=tuple(steps), ending="").refuted
-
-
-def _sizes_of(term: Term) -> set[str]:
-    """Names of the parameters of a term that its test has estimated, which are its sizes.
-
-    The others, such as a Stribeck speed, have no effect without them.
-    """
-    return {number.name for number in term.numbers if number.is_size}
-
-
-def _start_of(
-    parameters: ParameterSet,
-    held: Collection[str],
-    values: dict[str, float],
-    changes: dict[str, float],
-) -> Array:
-    """(p,) start of the fit of a model, beginning at the fit of a similar one [theta-unit].
-
-    Args:
-        parameters: The parameters of the model.
-        held: Names of those that keep their guess.
-        values: Values of those of the similar model.
-        changes: What numbers of the model gain, and values of fields of the library of terms.
-    """
-    start = np.array(parameters.guess)
-    for i, parameter in enumerate(parameters.parameters):
-        if parameter.name in held:
-            continue
-        change = changes.get(parameter.name, 0.0)
-        is_field = parameter.name in changes and parameter.targets[0].term is not None
-        start[i] = change if is_field else values.get(parameter.name, start[i]) + change
-    return np.clip(start, parameters.lower, parameters.upper)
-
-
 def _reported(result: FitResult, is_free: bool) -> FitResult:
     """A fit as it is reported.
 
-    It is compared with the guess, not with where the last search began. Its experiment has the
-    length of the segments that the user stated, unless another one was chosen.
-
     Args:
-        result: The fit.
+        result: The fit, whose task begins at a fit of the selection.
         is_free: Whether the length of the segments is left to the fit.
     """
     task = replace(result.task, start=result.task.system.parameters.guess)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import (
@@ -28,6 +27,7 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import least_squares
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
+from mjfim.parallel.budget import Budget, StopToken
 from tests.support.executors import LosingThreads, move_to, processes
 from tests.support.paths import MODELS
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.held_out_losses import HeldOutLosses, held_out_losses
 from mjfim.identification.identify import least_squares
+from mjfim.identification.left_out import HeldOutLosses, held_out_losses
+from mjfim.parallel.budget import Budget
 from tests.support.paths import ROOT
 
 

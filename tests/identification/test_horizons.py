@@ -13,9 +13,9 @@ import mjfim
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.held_out_losses import HeldOutLosses
 from mjfim.identification.horizons import _chosen
 from mjfim.identification.identify import DIVERGED
+from mjfim.identification.left_out import HeldOutLosses
 from mjfim.identification.search import FitSearch
 from mjfim.output.summaries.horizons import describe_horizons
 from mjfim.records.estimate import HorizonStudy

@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 import mjfim
-from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
@@ -26,6 +25,7 @@ from mjfim.identification.identify import identify, identify_system, least_squar
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.output.summaries.verdicts import verdict_of
+from mjfim.parallel.budget import StopToken
 from mjfim.records.events import FitEvent, stages_observed_by
 from mjfim.records.trajectory import Recording
 from mjfim.studies.campaign import identify_all

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
@@ -18,6 +17,7 @@ from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.identification.terms import TermTests
+from mjfim.parallel.budget import Budget
 from mjfim.records.events import FitEvent
 from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import segment_simulation
@@ -25,6 +24,7 @@ from mjfim.optimize.levenberg_marquardt import (
     UnknownValues,
     minimise,
 )
+from mjfim.parallel.budget import Budget
 from tests.support.numerics import Array
 from tests.support.paths import MODELS
 

@@ -11,11 +11,11 @@ import pytest
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_task
 from mjfim.identification.task import FitTask
+from mjfim.parallel.budget import StopToken
 from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS
 

@@ -26,8 +26,7 @@ from mjfim.records.terms import (
     Term,
     TermNumber,
 )
-from mjfim.studies.selected_models import selected_experiment
-from mjfim.studies.simplification import possible_pools
+from mjfim.studies.selected_models import possible_pools, selected_experiment
 from tests.support import results
 from tests.support.paths import ROOT
 from tests.support.results import SLIDE_FRICTION

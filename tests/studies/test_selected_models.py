@@ -11,7 +11,7 @@ import scipy
 import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
-from mjfim.identification.held_out_losses import HeldOutLosses
+from mjfim.identification.left_out import HeldOutLosses
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.terms import Decision, Selection, SelectionStep
 from mjfim.studies.selected_models import NOT_WIDENED, different, with_selection

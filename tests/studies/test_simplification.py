@@ -15,8 +15,7 @@ from mjfim.experiment.system import System
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.terms import Decision, PooledParameter
 from mjfim.records.trajectory import Recording
-from mjfim.studies.selected_models import selected_experiment
-from mjfim.studies.simplification import possible_pools, simplified_experiment
+from mjfim.studies.selected_models import possible_pools, selected_experiment, simplified_experiment
 from tests.support.paths import ROOT
 
 

@@ -9,34 +9,28 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.fit_problem import FitProblem, ProblemWork
-from mjfim.identification.leave_out_fits import (
-    LeaveOutStep,
-    fit_to_others,
-    leave_out_steps,
-    predicted_part,
-)
-from mjfim.identification.left_out_parts import (
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.left_out import (
+    LeftOutPart,
     affordable_part,
+    fit_without,
     left_out_parts,
     masks_of,
+    of_parts,
     with_initial_states,
 )
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.parallel import one_blas_thread
+from mjfim.parallel.budget import Budget
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.events import begin_stage
 from mjfim.records.trajectory import Recording
-
-T = TypeVar("T")
 
 
 @one_blas_thread()
@@ -131,57 +125,29 @@ def _cross_validate(
         for part in left_out_parts(problem)
         if any(segment.recording in part.recordings for segment in problem.segments)
     ]
-    steps = leave_out_steps(problem, solution, parts)
-    folds = [partial(_prediction_by_others, step=step) for step in steps]
-    for prediction in of_folds(problem, folds, budget):
+    works = [partial(_prediction_by_others, solution=solution, part=part) for part in parts]
+    for prediction in of_parts(problem, works, budget):
         if budget.exhausted is not None:
             return
         if prediction is not None:
             yield prediction
 
 
-def of_folds(problem: FitProblem, folds: Sequence[ProblemWork[T]], budget: Budget) -> Iterator[T]:
-    """Yield the results for all parts of the data, from one process or side by side from workers.
-
-    Args:
-        problem: Problem of all parts.
-        folds: Work on each part.
-        budget: Ends the work early.
-    """
-    begin_stage("predicting each part from the others", 0, len(folds))
-    for number, prediction in enumerate(problem.of_whole(folds, budget), start=1):
-        if number < len(folds):
-            begin_stage("predicting each part from the others", number, len(folds))
-        yield prediction
-
-
 def _prediction_by_others(
-    problem: FitProblem, budget: Budget, *, step: LeaveOutStep
+    problem: FitProblem, budget: Budget, *, solution: Solution, part: LeftOutPart
 ) -> Prediction | None:
-    """Prediction of one part of the data by a fit to the others.
+    """Prediction of one part of the data by a fit to the others; None without others.
 
     The fitted recordings are in the estimate anyway, so that only errors are kept.
-
-    Args:
-        problem: Problem of all parts.
-        budget: Ends the fit early.
-        step: Step of the fit to all data to the fit without the part.
-
-    Returns:
-        The prediction; None where there are no other data, where the simulation diverges, and after
-        a request to stop.
     """
-    others = fit_to_others(problem, step, budget)
+    others = fit_without(problem, budget, solution=solution, part=part)
     if others is None:
         return None
-
-    name, masks = step.part.name, step.part.masks(problem)
-    guess = problem.system.parameters.guess
-    predicted, at = predicted_part(problem, others, masks, budget)
+    guess, masks = problem.system.parameters.guess, part.masks(problem)
     return Prediction(
-        name=name,
-        identified=_errors_of(problem, predicted.masked(masks).errors_at(at), name),
-        nominal=_errors(problem, guess, masks, name, budget),
+        name=part.name,
+        identified=_errors(problem, others.theta, masks, part.name, budget),
+        nominal=_errors(problem, guess, masks, part.name, budget),
         held_out=False,
     )
 

@@ -1,0 +1,484 @@
+"""Parts of the data that are left out of a fit, and the losses of their prediction by it.
+
+A step of the fit to all data leads close to the fit without a part, because its linearisation
+contains the rows of every block (the infinitesimal jackknife, Giordano et al., A Swiss army
+infinitesimal jackknife, 2019). One simulation of the other data shows whether it does; otherwise a
+search follows. Models with different terms are compared by the losses of these predictions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+
+from mjfim.arrays import Array, evenly_spread_indices, freeze
+from mjfim.identification.fit_problem import FitProblem, ProblemWork
+from mjfim.identification.jackknife import jackknife_std
+from mjfim.optimize.levenberg_marquardt import (
+    WEAK_DAMPING,
+    SearchSettings,
+    Solution,
+    UnknownValues,
+    minimise,
+)
+from mjfim.parallel.budget import Budget
+from mjfim.records.events import begin_stage
+
+T = TypeVar("T")
+
+# Largest number of groups of recordings that are left out in turn.
+MAX_FOLDS = 5
+
+# Share of a single recording, at its end, that is predicted from the part before.
+PREDICTED_SHARE = 0.25
+
+# Largest number of samples in a cross-validation; of more data, a subset of the segments is used.
+MAX_SAMPLES = 200_000
+
+# Settings of the searches for theta without a part of the data, and for initial states. Few
+# iterations are enough, because these searches begin close to their result, and errors of
+# predictions hardly change with a step that lowers the cost by a ten-thousandth.
+SEARCH = SearchSettings(
+    max_iterations=8, tolerance=1e-2, relinearise_at_end=False, rough_share=1e-4
+)
+
+
+# Share of the predicted decrease of the cost that a step to the fit without a part may miss. The
+# errors of predictions hardly change with what is left of it.
+ALLOWED_SHARE = 0.1
+
+# Dampings of the steps that are tried in turn. A step without damping is long in directions that
+# the data hardly determine, in which the linearisation does not hold so far.
+DAMPINGS = (WEAK_DAMPING, 1e-4, 1e-3, 1e-2)
+
+# Share of the decrease by the step without damping that a damped one has to predict.
+ENOUGH_SHARE = 0.7
+
+
+# Number of blocks into which all data are divided. Errors of neighbouring samples are alike, those
+# of different blocks nearly independent.
+BLOCKS = 20
+
+# Fewest segments in each left-out part of a single recording, and fewest parts that consist of
+# segments.
+MIN_SEGMENTS_PER_PART = 2
+MIN_STRETCHES = 2
+
+# Share of the mean loss below which a difference between two models does not count, however small
+# its scatter is. Models that no data tell apart differ by where their searches ended.
+EQUAL_LOSS = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LeftOutPart:
+    """A part of the data that is left out of a fit.
+
+    Attributes:
+        name: Name of the part for the user. A worker does not know it: the problem there has only
+            the recordings that it needs, which may have other names.
+        recordings: Indices of the recordings that contain the part.
+        begin: Time at which the part begins in each of them [s].
+        end: Time before which it ends [s].
+    """
+
+    name: str
+    recordings: tuple[int, ...]
+    begin: float = -np.inf
+    end: float = np.inf
+
+    def masks(self, problem: FitProblem) -> list[np.ndarray]:
+        """(M, ny) for every recording, True for the values of the part.
+
+        Args:
+            problem: Problem of all parts.
+        """
+        masks = masks_of(problem.masks, self.recordings)
+        for i in self.recordings:
+            t = problem.recordings[i].t
+            masks[i] = masks[i] & ((t >= self.begin) & (t < self.end))[:, None]
+        return masks
+
+
+def masks_of(masks: Sequence[np.ndarray], recordings: Sequence[int]) -> list[np.ndarray]:
+    """The masks of some recordings; False for all values of the others."""
+    return [mask if i in recordings else np.zeros_like(mask) for i, mask in enumerate(masks)]
+
+
+def left_out_parts(problem: FitProblem) -> Iterator[LeftOutPart]:
+    """Parts of the data that are left out in turn.
+
+    They are groups of recordings, or the end of a single recording.
+    """
+    count = len(problem.recordings)
+    if count == 1:
+        recording = problem.recordings[0]
+        yield LeftOutPart(
+            name=f"last {100 * PREDICTED_SHARE:.0f} % of {recording.name}",
+            recordings=(0,),
+            begin=(1.0 - PREDICTED_SHARE) * float(recording.t[-1]),
+        )
+        return
+
+    for group in np.array_split(np.arange(count), min(count, MAX_FOLDS)):
+        indices = tuple(group.tolist())
+        name = ", ".join(problem.recordings[i].name for i in indices)
+        yield LeftOutPart(name=name, recordings=indices)
+
+
+def affordable_part(problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
+    """All segments of a problem; of much data, evenly spread ones, which are enough.
+
+    Args:
+        problem: Problem of all segments.
+        solution: Its solution.
+
+    Returns:
+        The problem of the segments, and the solution with their unknowns and their linearisation.
+    """
+    count = len(problem.segments)
+    if problem.sample_count <= MAX_SAMPLES or count == 1:
+        return problem, solution
+
+    wanted = max(MAX_SAMPLES * count // problem.sample_count, 2)
+    subset = evenly_spread_indices(count, wanted)
+    unknowns = solution.unknowns
+    part = replace(
+        solution,
+        unknowns=replace(unknowns, private=unknowns.private[subset]),
+        condensed=solution.condensed.of_segments(subset),
+    )
+    return problem.of_segments(subset), part
+
+
+def with_initial_states(
+    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], budget: Budget
+) -> tuple[FitProblem, UnknownValues]:
+    """The segments with values in some masks: (M, ny) for every recording, and their unknowns.
+
+    Unknown initial states are estimated from the other values of a segment, or from the predicted
+    ones where it has no others. theta: (p,).
+    """
+    problem = problem.of_segments(problem.masked(masks).segments_with_values)
+    at = problem.begin(theta)
+    if problem.unknown_count <= len(problem.layout.shared):
+        return problem, at
+
+    # Deviations of the initial state that were fitted belong to other recordings.
+    private = np.zeros_like(at.private)
+    if not problem.layout.free_starts:
+        guess = problem.system.parameters.guess[problem.layout.private]
+        private = np.tile(guess, (len(problem.segments), 1))
+
+    known = problem.masked(_masks_for_initial_states(problem, masks))
+    begin = replace(at, private=private)
+    found = minimise(known.with_shared_held(), begin, SEARCH, budget)
+    return problem, at if found is None else found.unknowns
+
+
+def _masks_for_initial_states(
+    problem: FitProblem, predicted: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """(M, ny) for every recording, True for the values from which initial states are estimated."""
+    masks = [np.zeros_like(mask) for mask in problem.masks]
+    for segment in problem.segments:
+        i = segment.recording
+        rows = segment.rows
+        counted = problem.masks[i][rows]
+
+        # The predicted values are used only where a segment has no others.
+        others = counted & ~predicted[i][rows]
+        masks[i][rows] = others if others.any() else counted
+    return masks
+
+
+def fit_without(
+    problem: FitProblem, budget: Budget, *, solution: Solution, part: LeftOutPart
+) -> UnknownValues | None:
+    """Fit theta to all data but one part.
+
+    Args:
+        problem: Problem of all parts.
+        budget: Ends the fit early.
+        solution: Its solution.
+        part: The part that is left out.
+
+    Returns:
+        The unknowns; None where there are no other data, where the simulation diverges, and after a
+        request to stop.
+    """
+    masks = part.masks(problem)
+    others = problem.masked([~mask for mask in masks])
+    segments = others.segments_with_values
+    if not len(segments):
+        return None
+    others = others.of_segments(segments)
+
+    def own(at: UnknownValues) -> UnknownValues:
+        """The unknowns of the segments with other data."""
+        return replace(at, private=at.private[segments])
+
+    # A step is the fit if it lowers the cost nearly as far as the linearisation predicts.
+    at, condensed = solution.unknowns, solution.condensed
+    cost = others.cost(own(at))
+    starts = [(cost, own(at))]
+    remaining = condensed.without_blocks(problem.blocks.containing(masks))
+    values = problem.common_values(at)
+    lower, upper = problem.lower - values, problem.upper - values
+    first = 0.0
+    for damping in DAMPINGS:
+        step = remaining.step(damping, condensed.column_norms, lower, upper)
+        first = max(first, step.predicted_decrease)
+        if step.predicted_decrease < ENOUGH_SHARE * first:
+            break
+        moved = problem.moved(at, step, 1.0)
+        cost_at_end = others.cost(own(moved))
+        missed = cost_at_end - (cost - step.predicted_decrease)
+        if missed <= max(ALLOWED_SHARE * step.predicted_decrease, SEARCH.rough_share * cost):
+            return None if budget.exhausted is not None else moved
+        starts.append((cost_at_end, own(moved)))
+
+    # The data that are left out may have led the estimate to a minimum that the others lack.
+    guess = others.begin(problem.system.parameters.guess)
+    starts.append((others.cost(guess), guess))
+    found = minimise(others, min(starts, key=lambda start: start[0])[1], SEARCH, budget)
+    return None if found is None or budget.exhausted is not None else found.unknowns
+
+
+def of_parts(problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget) -> Iterator[T]:
+    """Yield the results of a work on each left-out part, here or side by side on workers.
+
+    Args:
+        problem: Problem of all parts.
+        works: The works on it.
+        budget: Ends them early.
+    """
+    begin_stage("predicting each part from the others", 0, len(works))
+    for number, result in enumerate(problem.of_whole(works, budget), start=1):
+        if number < len(works):
+            begin_stage("predicting each part from the others", number, len(works))
+        yield result
+
+
+# ---- losses
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeldOutLosses:
+    """Losses of predictions of left-out data.
+
+    Attributes:
+        losses: (n,) sum of the loss in each block [squared standard deviations of the noise];
+            infinite where the simulation diverges.
+        counts: (n,) number of values in each block.
+        parts: (n,) index of the left-out part to which each block belongs.
+        estimates: (K, p) parameters from the data without each part [theta-unit].
+    """
+
+    losses: Array
+    counts: Array
+    parts: np.ndarray
+    estimates: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, "losses", "counts", "estimates")
+        self.parts.setflags(write=False)
+
+    @property
+    def error(self) -> float:
+        """Root mean loss of a value [standard deviations of the noise]."""
+        return float(np.sqrt(self.losses.sum() / self.counts.sum()))
+
+    def reduction(self, other: HeldOutLosses) -> Reduction:
+        """By how much another model predicts the same data better than this one.
+
+        Args:
+            other: The losses of the other model on the same blocks.
+        """
+        if not np.isfinite(other.losses).all():
+            return Reduction(mean=-np.inf, standard_error=np.inf)
+        if not np.isfinite(self.losses).all():
+            return Reduction(mean=np.inf, standard_error=0.0)
+
+        # Blocks of one recording are alike where something differs from recording to recording, so
+        # that the scatter between the parts counts as well.
+        difference = self.losses - other.losses
+        n_parts = int(self.parts.max()) + 1
+        by_part = np.bincount(self.parts, difference, n_parts).astype(float)
+        counts_by_part = np.bincount(self.parts, self.counts, n_parts).astype(float)
+        standard_error = max(
+            _standard_error(difference, self.counts), _standard_error(by_part, counts_by_part)
+        )
+        mean = float(difference.sum() / self.counts.sum())
+        least = EQUAL_LOSS * float(min(self.losses.sum(), other.losses.sum()) / self.counts.sum())
+        return Reduction(mean=mean, standard_error=standard_error, least=least)
+
+    @property
+    def jackknife(self) -> Array:
+        """(p,) standard errors of the estimates by leaving out each part [theta-unit].
+
+        NaN with fewer than two parts.
+        """
+        return jackknife_std(self.estimates)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reduction:
+    """Reduction of the mean loss of a value by another model.
+
+    Attributes:
+        mean: The reduction; negative where the other model predicts worse.
+        standard_error: Its standard error.
+        least: Reduction below which both models predict equally well.
+    """
+
+    mean: float
+    standard_error: float
+    least: float = 0.0
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the other model predicts better by more than one standard error."""
+        return self.mean > max(self.standard_error, self.least)
+
+
+def _standard_error(sums: Array, counts: Array) -> float:
+    """Standard error of the mean of values of which sums over independent groups are known.
+
+    The variance of the total is that of the sums around the common mean of a value; 0 with a single
+    group.
+
+    Args:
+        sums: (n,) sums of the values of each group.
+        counts: (n,) number of values in each group.
+    """
+    n = len(sums)
+    if n < 2:
+        return 0.0
+    scatter = sums - sums.sum() / counts.sum() * counts
+    variance = float(np.sum(scatter**2)) * n / (n - 1)
+    return float(np.sqrt(variance) / counts.sum())
+
+
+def held_out_losses(
+    problem: FitProblem, solution: Solution, sigma: Array, budget: Budget
+) -> HeldOutLosses | None:
+    """Predict every part of the data by a fit to the other parts.
+
+    Args:
+        problem: Problem of all data, with the noise by which the fits weight them.
+        solution: Its solution.
+        sigma: (ny,) noise by which errors are divided before they are compared [y-unit]. It has to
+            be the same for all models that are compared.
+        budget: Ends the work early.
+
+    Returns:
+        The losses; None after a request to stop, and where there are no parts that can be left out.
+    """
+    problem, solution = affordable_part(problem, solution)
+    parts = _parts(problem)
+    pieces = sum(len(part.recordings) for part in parts)
+    blocks = -(-BLOCKS // max(pieces, 1))
+    works = [
+        partial(_losses_of_part, solution=solution, part=part, blocks=blocks, sigma=sigma)
+        for part in parts
+    ]
+    found = [losses for losses in of_parts(problem, works, budget) if losses is not None]
+    if budget.exhausted is not None or not found:
+        return None
+    return HeldOutLosses(
+        losses=np.concatenate([each.losses for each in found]),
+        counts=np.concatenate([each.counts for each in found]),
+        parts=np.repeat(np.arange(len(found)), [len(each.losses) for each in found]),
+        estimates=np.concatenate([each.estimates for each in found]),
+    )
+
+
+def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
+    """Parts that are left out: groups of recordings, or stretches of a single recording."""
+    if len(problem.recordings) > 1:
+        return tuple(left_out_parts(problem))
+
+    # Stretches begin with a segment where there are enough of them, because a segment whose initial
+    # state is free is then predicted as a whole. Otherwise they have equal numbers of rows.
+    recording = problem.recordings[0]
+    rows = np.array([segment.rows.start for segment in problem.segments])
+    if len(rows) < MIN_SEGMENTS_PER_PART * MIN_STRETCHES:
+        rows = np.flatnonzero(problem.masks[0].any(axis=1))
+        groups = min(MAX_FOLDS, len(rows))
+    else:
+        groups = min(MAX_FOLDS, len(rows) // MIN_SEGMENTS_PER_PART)
+    times = [float(recording.t[group[0]]) for group in np.array_split(rows, groups)]
+    return tuple(
+        LeftOutPart(
+            name=f"{recording.name} from {begin:.3g} s", recordings=(0,), begin=begin, end=end
+        )
+        for begin, end in zip(times, [*times[1:], np.inf], strict=True)
+    )
+
+
+def _losses_of_part(
+    problem: FitProblem,
+    budget: Budget,
+    *,
+    solution: Solution,
+    part: LeftOutPart,
+    blocks: int,
+    sigma: Array,
+) -> HeldOutLosses | None:
+    """Losses of the prediction of one part by a fit to the others; None without others."""
+    others = fit_without(problem, budget, solution=solution, part=part)
+    if others is None:
+        return None
+    masks = part.masks(problem)
+    predicted, at = with_initial_states(problem, others.theta, masks, budget)
+    y = predicted.predict(at)
+    if budget.exhausted is not None:
+        return None
+    losses, counts = losses_by_block(problem, y, masks, part.recordings, blocks, sigma)
+    return HeldOutLosses(
+        losses=losses,
+        counts=counts,
+        parts=np.zeros(len(counts), dtype=np.intp),
+        estimates=problem.theta(others)[None],
+    )
+
+
+def losses_by_block(
+    problem: FitProblem,
+    predicted: Sequence[Array] | None,
+    masks: Sequence[np.ndarray],
+    recordings: Sequence[int],
+    blocks: int,
+    sigma: Array,
+) -> tuple[Array, Array]:
+    """Losses of predictions, summed over blocks of rows.
+
+    Args:
+        problem: Problem with the recordings.
+        predicted: (M, ny) predicted outputs of every recording [y-unit]; None where the simulation
+            diverges.
+        masks: (M, ny) for every recording, True for the predicted values.
+        recordings: Indices of the recordings.
+        blocks: Number of blocks into which each recording is divided.
+        sigma: (ny,) noise by which errors are divided [y-unit].
+
+    Returns:
+        (n,) sums of the loss, infinite where the simulation diverges, and (n,) numbers of values.
+    """
+    losses: list[float] = []
+    counts: list[float] = []
+    for i in recordings:
+        rows = np.flatnonzero(masks[i].any(axis=1))
+        for block in np.array_split(rows, min(blocks, len(rows)) or 1):
+            counted = masks[i][block]
+            counts.append(float(counted.sum()))
+            if predicted is None:
+                losses.append(np.inf)
+                continue
+            error = (predicted[i][block] - problem.recordings[i].y[block]) / sigma
+            losses.append(problem.loss.value(error[counted]))
+    return np.array(losses), np.array(counts)

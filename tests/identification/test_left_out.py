@@ -1,0 +1,80 @@
+"""Fits to all data but one part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.arrays import Array
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.identify import least_squares
+from mjfim.identification.left_out import LeftOutPart, fit_without, left_out_parts
+from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution
+from mjfim.parallel.budget import Budget
+from tests.support.paths import ROOT
+
+TIGHT = SearchSettings(tolerance=1e-6)
+
+
+def fitted(fit: dict[str, object]) -> tuple[FitProblem, Solution]:
+    """A fit to three recordings of the cart-pendulum."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    experiment = base.replace(horizon=2.0, fit={"bootstrap": 0, **fit})
+    task = DesignTask.resolve(experiment, threads=1)
+    problem = FitProblem.of(
+        task.system, [simulate_system(task.system, task.initial, i) for i in range(3)]
+    )
+    return problem, least_squares(problem, task.parameters.true, TIGHT)
+
+
+def exact_fit(problem: FitProblem, solution: Solution, part: LeftOutPart) -> Array:
+    """Parameters of the fit to the others."""
+    others = problem.masked([~mask for mask in part.masks(problem)])
+    others = others.of_segments(others.segments_with_values)
+    return least_squares(others, problem.theta(solution.unknowns), TIGHT).unknowns.theta
+
+
+def spoilt(problem: FitProblem, solution: Solution, factors: Array) -> Solution:
+    """The solution at other parameters, with the linearisation there."""
+    unknowns = replace(solution.unknowns, theta=solution.unknowns.theta * factors)
+    condensed = problem.condense(unknowns)
+    assert condensed is not None
+    return replace(solution, unknowns=unknowns, condensed=condensed)
+
+
+@pytest.mark.parametrize("fit", [{}, pytest.param({"segments": 0.5}, marks=pytest.mark.slow)])
+def test_it_is_the_fit_to_the_others(fit: dict[str, object]) -> None:
+    problem, solution = fitted(fit)
+    sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
+    for part in list(left_out_parts(problem))[:2]:
+        found = fit_without(problem, Budget(), solution=solution, part=part)
+        assert found is not None
+
+        # Theta moves by about a standard deviation, and misses a small share of it.
+        moved = found.theta - solution.unknowns.theta
+        missed = found.theta - exact_fit(problem, solution, part)
+        assert np.linalg.norm(moved / sigma) > 0.1
+        assert np.linalg.norm(missed / sigma) < 0.2 * np.linalg.norm(moved / sigma)
+
+
+def test_a_search_follows_where_the_linearisation_does_not_lead_there() -> None:
+    """Far from the fit, the search begins at the guess, where the others cost less."""
+    problem, solution = fitted({})
+    sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
+    part = next(left_out_parts(problem))
+    away = spoilt(problem, solution, np.array([3.0, 1.5, 0.2]))
+    found = fit_without(problem, Budget(), solution=away, part=part)
+    assert found is not None
+    missed = found.theta - exact_fit(problem, solution, part)
+    assert np.linalg.norm(missed / sigma) < 0.3
+
+
+def test_nothing_is_left_of_a_problem_with_one_part_only() -> None:
+    problem, solution = fitted({})
+    everything = replace(next(left_out_parts(problem)), recordings=(0, 1, 2))
+    assert fit_without(problem, Budget(), solution=solution, part=everything) is None
