@@ -54,7 +54,7 @@ def init(
 ) -> None:
     """Write a first experiment file for a model, with a comment for every choice."""
     from mjfim.cli.questions import ask as ask_for
-    from mjfim.model.urdf_sources import is_urdf
+    from mjfim.model.model_files import is_urdf
     from mjfim.studies.first_experiment.document import experiment_text
     from mjfim.studies.first_experiment.propose import propose_experiment
     from mjfim.studies.first_experiment.wishes import Wishes

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
-from mjfim.model.geom_distance import GeomDistances
+from mjfim.model.clearance.geom_distance import GeomDistances
 from mjfim.optimize.barrier import BarrierDerivatives, Bounds
 from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations

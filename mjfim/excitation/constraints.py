@@ -22,9 +22,9 @@ from mjfim.excitation.constraint_kinds import (
 from mjfim.excitation.limits import Limit, derivative_substeps_of, has_constant_forces
 from mjfim.excitation.observed_numbers import observed_numbers
 from mjfim.excitation.task import DesignTask
-from mjfim.model.geom_distance import GeomDistances
-from mjfim.model.geom_pairs import find_geom_pairs
-from mjfim.model.integrators import is_rk4
+from mjfim.model.clearance.geom_distance import GeomDistances
+from mjfim.model.clearance.pair_distance import find_geom_pairs
+from mjfim.model.elements import is_rk4
 from mjfim.model.sizes import model_length
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.plant.batch import SubstepObservations

@@ -6,7 +6,7 @@ at r = 0 as well:
     gradient   f'(r) / r * y
     Hessian    f'(r) / r * (I - e e') + f''(r) e e'      with e = y / r
 
-An angle a between 0 and pi has the norm r = sin(a/2), see `mjfim.model.orientation`.
+An angle a between 0 and pi has the norm r = sin(a/2), see `mjfim.model.limited_elements`.
 """
 
 from __future__ import annotations

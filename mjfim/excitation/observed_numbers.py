@@ -9,8 +9,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.excitation.limits import Limit
-from mjfim.model.limited_elements import actuators_of_tendon
-from mjfim.model.orientation import (
+from mjfim.model.limited_elements import (
+    actuators_of_tendon,
     quaternion_address,
     quaternion_joints,
     tilt_weights,

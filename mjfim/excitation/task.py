@@ -35,8 +35,7 @@ from mjfim.information.identifiability import IdentifiabilityTest
 from mjfim.model.coordinates import actuator_names, joint_names
 from mjfim.model.elements import unique_names
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.smooth_friction import has_dry_friction, smoothing_speeds_of
-from mjfim.model.variants import ModelVariant, Relaxation
+from mjfim.model.variants import ModelVariant, Relaxation, has_dry_friction, smoothing_speeds_of
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Trajectory

@@ -14,7 +14,7 @@ from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import Signal
 from mjfim.model.coordinates import joint_dofs, joint_names
-from mjfim.model.parameter_samples import sample_parameters
+from mjfim.model.parameter_ranges import sample_parameters
 from mjfim.recordings.control_table import read_control
 
 # Largest number of samples of a design, so that a mistyped horizon does not fill the memory.

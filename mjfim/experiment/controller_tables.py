@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from mjfim.quantities import WithUnit
-from mjfim.recordings.section import (
+from mjfim.recordings.spec import (
     Boolean,
     Bound,
     Finite,

@@ -23,8 +23,7 @@ from mjfim.model.control_laws import (
 )
 from mjfim.model.coordinates import ScalarJoint, actuator_names
 from mjfim.model.loading import ModelSource
-from mjfim.model.servos import AT_JOINT
-from mjfim.model.units import per_second
+from mjfim.model.units import AT_JOINT, per_second
 
 # Numbers of a law that give it an integral if they are parameters.
 INTEGRAL_NUMBERS = ("ki", "integral")

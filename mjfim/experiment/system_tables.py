@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SkipValidation, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from mjfim.recordings.section import (
+from mjfim.quantities import Quantity
+from mjfim.recordings.spec import (
     Boolean,
     Finite,
     FiniteWithUnit,
@@ -361,6 +362,14 @@ class ParameterSpec(Section):
         """Raise ValueError if the bounds are inverted, or exclude the guess or the true value."""
         if not low < high:
             raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
+
+        # Numbers with a unit are compared once the model has told whether the unit is right.
+        if any(isinstance(number, Quantity) for number in (low, high, self.guess, self.true)):
+            return
+
+        for key, value in (("guess", self.guess), ("true", self.true)):
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{key} {value} is outside bounds [{low}, {high}]")
 
     @property
     def all_targets(self) -> tuple[TargetSpec, ...]:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from mjfim.amounts import MAX_ITERATIONS, MAX_REPLICATES, MAX_SAMPLES, MAX_STARTS
-from mjfim.recordings.section import (
+from mjfim.recordings.spec import (
     Boolean,
     Finite,
     FiniteWithUnit,

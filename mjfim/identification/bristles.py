@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.servos import actuator_gear
 from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
+from mjfim.model.units import actuator_gear
 
 # Columns of the friction of a `dcmotor` in its bias: Coulomb, static, Stribeck speed.
 FRICTION_COLUMNS = slice(3, 6)

@@ -6,7 +6,7 @@ A body whose whole inertia is unknown has the rows
 
 with the pseudo-inertia C of the model, that of the estimate P, and the ten entries e of a symmetric
 matrix. Half of the sum of their squares is the distance d(C, P)² / sigma²
-(`mjfim/model/inertia_distance.py`). The prior is weak: it decides only what the recordings hardly
+(`mjfim/model/inertia.py`). The prior is weak: it decides only what the recordings hardly
 determine.
 """
 

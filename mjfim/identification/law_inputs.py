@@ -7,7 +7,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import MEASURED_SUMS, ControlLaw
-from mjfim.plant.law_commands import ON
+from mjfim.plant.laws.law_commands import ON
 from mjfim.plant.outputs import outputs_by_state
 
 

@@ -13,9 +13,10 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, BodyInertia
-from mjfim.model.inertia_distance import (
+from mjfim.model.inertia import (
     BARYCENTRIC_DERIVATIVES,
+    INERTIA_PARAMETRISATIONS,
+    BodyInertia,
     InertiaDifference,
     barycentric_of,
     inertia_difference,

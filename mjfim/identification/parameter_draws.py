@@ -27,7 +27,7 @@ from mjfim.identification.honest_covariance import (
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.identification.prior_share import InertiaCombinations
 from mjfim.identification.truncated_normal import MatrixBound, draw_truncated_normal
-from mjfim.model.inertia_distance import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
+from mjfim.model.inertia import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import ModelField
 from mjfim.records.estimate import Estimate, ParameterDraws

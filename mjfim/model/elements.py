@@ -115,3 +115,12 @@ def element_name(model: Any, kind: str, number: int) -> str:
         The name; empty where the element has none.
     """
     return mujoco.mj_id2name(model, OBJECT_TYPES[kind], number) or ""
+
+
+def is_rk4(model: Any) -> bool:
+    """Whether a model is integrated with RK4, which computes forces at four stages of a step.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)

@@ -2,58 +2,44 @@
 
 from __future__ import annotations
 
-import os
-import threading
-from collections.abc import Callable, Sequence
+import multiprocessing
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
+from threading import Lock, RLock
 from typing import Any
 from weakref import WeakValueDictionary
 
 import mujoco
 
-from mjfim.errors import ModelError
+from mjfim.errors import ModelError, ModelWarning
 from mjfim.model.coordinates import ModelCoordinates
-from mjfim.model.model_files import files_of_model
-from mjfim.model.mujoco_log import collected_warnings, tell_once
+from mjfim.model.model_files import PackedFiles, files_of_model, name_of
 from mjfim.model.terms.extension import StateLayout, extended_spec
 from mjfim.model.terms.term import Term
+from mjfim.parallel.kept import Kept
 
 
-def load_spec(path: Path) -> Any:
+def load_spec(path: Path, files: Any = None) -> Any:
     """MjSpec of an MJCF or URDF file. What MuJoCo warns of is told once.
 
     Args:
         path: The file.
+        files: Virtual file system (`mujoco.MjVfs`) that holds it; None for the disk.
 
     Raises:
         ModelError: The file is absent or no model, or MuJoCo cannot read it.
     """
-    if not path.is_file():
+    if files is None and not path.is_file():
         raise ModelError(f"{path}: no such model file")
     if path.suffix.lower() == ".toml":
         raise ModelError(
             f"{path}: an experiment file, but a model (MJCF or URDF) is needed, such as the one "
             "that this file states"
         )
-    return _parsed_spec(path, _engine_path(path), None)
-
-
-def load_packed_spec(path: Path, files: Any) -> Any:
-    """MjSpec of an MJCF or URDF file that is not on the disk.
-
-    Args:
-        path: The file.
-        files: Virtual file system (`mujoco.MjVfs`) that holds it.
-
-    Raises:
-        ModelError: MuJoCo cannot read it.
-    """
-    return _parsed_spec(path, path.as_posix(), files)
-
-
-def _parsed_spec(path: Path, name: str, files: Any) -> Any:
-    """MjSpec of a file by its name for MuJoCo, on the disk or in a virtual file system."""
+    name = str(path) if files is None else path.as_posix()
     try:
         with collected_warnings(of_reader=True) as found:
             spec = mujoco.MjSpec.from_file(name, vfs=files)
@@ -65,24 +51,6 @@ def _parsed_spec(path: Path, name: str, files: Any) -> Any:
         raise ModelError(f"{path}: the model contains NaN; every number must be finite")
     tell_once(path, found)
     return spec
-
-
-def _engine_path(path: Path) -> str:
-    """Return a path as MuJoCo needs it, in UTF-8 whatever the locale is.
-
-    Raises ModelError if the path is not UTF-8, or if it has a backslash that is no separator.
-    """
-    if os.sep == "/" and "\\" in str(path):
-        raise ModelError(
-            f"{path}: MuJoCo takes a backslash for the separator of folders; rename the file or "
-            "its folders"
-        )
-    try:
-        return os.fsencode(path).decode("utf-8")
-    except UnicodeDecodeError:
-        raise ModelError(
-            f"{path}: MuJoCo reads only files whose path is UTF-8; rename the file or its folders"
-        ) from None
 
 
 def compile_spec(spec: Any, path: Path, *, tells: bool = False, files: Any = None) -> Any:
@@ -142,7 +110,7 @@ class ModelSource:
                 finite.
         """
         self.path = path
-        self.spec = self._loaded(path, files) if spec is None else spec
+        self.spec = load_spec(path, files) if spec is None else spec
         self.model = compile_spec(self.spec, path, tells=True, files=files)
         self.terms: dict[str, Term] = {}
         self.layout: StateLayout | None = None
@@ -151,17 +119,12 @@ class ModelSource:
         # The model without terms where this one has some, and its extensions that are in use. An
         # extension refers to the stated model, which must not refer to it in turn.
         self._stated: ModelSource | None = None
-        self._extended: WeakValueDictionary[tuple[Term, ...], ModelSource] = WeakValueDictionary()
-
-        # Copies of this model with custom numbers that are in use.
-        self._numbered: WeakValueDictionary[
-            tuple[tuple[str, tuple[float, ...]], ...], ModelSource
-        ] = WeakValueDictionary()
+        # Copies of this model with custom numbers are kept as well.
+        self._derived: WeakValueDictionary[tuple[Any, ...], ModelSource] = WeakValueDictionary()
 
         # Several threads of a worker process may use the same model. The edit of a spec may ask for
         # another compiled model.
-        self._lock = threading.RLock()
-        self._compiled: dict[frozenset[str] | None, Any] = {}
+        self._lock = RLock()
         self._edited: dict[tuple[frozenset[str] | None, bytes], Any] = {}
 
     @property
@@ -186,10 +149,10 @@ class ModelSource:
             return stated
 
         with stated._lock:
-            found = stated._extended.get(key)
+            found = stated._derived.get(key)
             if found is None:
                 found = stated._with_terms(key)
-                stated._extended[key] = found
+                stated._derived[key] = found
             return found
 
     def _with_terms(self, terms: tuple[Term, ...]) -> ModelSource:
@@ -206,11 +169,6 @@ class ModelSource:
         source._stated = self
         return source
 
-    @staticmethod
-    def _loaded(path: Path, files: Any) -> Any:
-        """The parsed model from the disk, or from a virtual file system."""
-        return load_spec(path) if files is None else load_packed_spec(path, files)
-
     def with_numbers(self, numbers: tuple[tuple[str, tuple[float, ...]], ...]) -> ModelSource:
         """This model with custom numbers, compiled once as long as it is in use.
 
@@ -222,7 +180,7 @@ class ModelSource:
             The model; it has the terms of this one, and the same model of the file.
         """
         with self._lock:
-            found = self._numbered.get(numbers)
+            found = self._derived.get(numbers)
             if found is None:
                 spec = self.spec.copy()
                 for name, data in numbers:
@@ -230,7 +188,7 @@ class ModelSource:
                 found = ModelSource(self.path, spec, self._files)
                 found.terms, found.layout = self.terms, self.layout
                 found._stated = self.stated
-                self._numbered[numbers] = found
+                self._derived[numbers] = found
             return found
 
     @cached_property
@@ -259,14 +217,14 @@ class ModelSource:
         Returns:
             MjModel that callers copy and never change.
         """
-        if not self._has_simple(moved_bodies):
+        # Where MuJoCo treats none of them as simple, another compile would give the same model. A
+        # body without a number was merged with its parent.
+        model = self.model
+        simple = {model.body(i).name: bool(model.body_simple[i]) for i in range(1, model.nbody)}
+        moved = simple if moved_bodies is None else moved_bodies
+        if not any(simple.get(name, True) for name in moved):
             return self.model
-
-        with self._lock:
-            if moved_bodies not in self._compiled:
-                spec = self._editable_spec(moved_bodies)
-                self._compiled[moved_bodies] = compile_spec(spec, self.path, files=self._files)
-            return self._compiled[moved_bodies]
+        return self.edited(moved_bodies, b"", lambda spec: None)
 
     def edited(
         self, moved_bodies: frozenset[str] | None, key: bytes, edit: Callable[[Any], None]
@@ -289,32 +247,13 @@ class ModelSource:
             if place not in self._edited:
                 if len(self._edited) >= MAX_EDITED_MODELS:
                     self._edited.clear()
-                spec = self._editable_spec(moved_bodies)
+                spec = self.spec.copy()
+                for body in spec.bodies[1:]:
+                    if moved_bodies is None or body.name in moved_bodies:
+                        body.simple = 0
                 edit(spec)
                 self._edited[place] = compile_spec(spec, self.path, files=self._files)
             return self._edited[place]
-
-    def _has_simple(self, moved_bodies: frozenset[str] | None) -> bool:
-        """Whether the user's compiled model treats a moved body as "simple".
-
-        If it does not, another compile would give the same model.
-        """
-        simple = self.model.body_simple
-        if moved_bodies is None:
-            return bool(simple[1:].any())
-        kind = mujoco.mjtObj.mjOBJ_BODY
-        numbers = [mujoco.mj_name2id(self.model, kind, name) for name in sorted(moved_bodies)]
-
-        # A body without a number was merged with its parent.
-        return any(number < 0 or simple[number] for number in numbers)
-
-    def _editable_spec(self, moved_bodies: frozenset[str] | None) -> Any:
-        """A copy of the spec in which the moved bodies are not compiled as "simple"."""
-        spec = self.spec.copy()
-        for body in spec.bodies[1:]:
-            if moved_bodies is None or body.name in moved_bodies:
-                body.simple = 0
-        return spec
 
 
 def decoration(spec: Any, model: Any) -> frozenset[str]:
@@ -334,3 +273,129 @@ def decoration(spec: Any, model: Any) -> frozenset[str]:
         and (geom.mass == 0.0 or (geom.parent.explicitinertial and not forced))
         and not geom.meshname
     )
+
+
+# Guards the settings of MuJoCo's log, which all threads share.
+_lock = Lock()
+
+# Parts of warnings about nothing that concerns a user: attached models keep the names of their
+# elements, and what a later version of MuJoCo will not read still holds in the present one.
+MEANINGLESS = ("Attaching a spec with an empty prefix", "is deprecated and will be removed")
+
+# Warnings that were told, each with its file.
+_told: set[tuple[Path, str]] = set()
+
+# One entry for each block that is open in any thread: the settings before the first of them.
+_open_blocks: list[Any] = []
+
+
+@contextmanager
+def silence_mujoco_log() -> Iterator[None]:
+    """Suppress MuJoCo's messages inside the block.
+
+    The previous settings are restored when the last open block of all threads ends.
+
+    Yields:
+        Nothing.
+    """
+    with _lock:
+        current = mujoco.MjLogConfig.get()
+        _open_blocks.append(_open_blocks[0] if _open_blocks else current)
+
+        silent = mujoco.MjLogConfig.get()
+        silent.logto_console = False
+        silent.logto_file = False
+        mujoco.MjLogConfig.set(silent)
+
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _open_blocks.pop()
+            if not _open_blocks:
+                mujoco.MjLogConfig.set(before)
+
+
+@contextmanager
+def collected_warnings(*, of_reader: bool = False) -> Iterator[list[str]]:
+    """Collect the warnings of MuJoCo's reader or compiler instead of showing them.
+
+    Args:
+        of_reader: Whether the block reads a file. The reader warns by a callback, the compiler
+            through Python. The callback is left alone for a compile, which may use threads.
+
+    Yields:
+        The warnings with a meaning for the user, complete when the block has ended.
+    """
+    found: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    with silence_mujoco_log(), warnings.catch_warnings(record=True) as recorded:
+        warnings.simplefilter("always")
+        if of_reader:
+            mujoco.set_mju_user_warning(found.append)
+        try:
+            yield found
+        finally:
+            if of_reader:
+                mujoco.set_mju_user_warning(before)
+
+    found += [str(each.message) for each in recorded]
+    found[:] = [text for text in found if not any(part in text for part in MEANINGLESS)]
+
+
+def tell_once(path: Path, messages: Iterable[str]) -> None:
+    """Warn about what MuJoCo says about a file, unless it was told before.
+
+    Worker processes read the files again and stay silent.
+
+    Args:
+        path: The file.
+        messages: MuJoCo's warnings.
+    """
+    if multiprocessing.parent_process() is not None:
+        return
+
+    for message in messages:
+        text = " ".join(message.split())
+        if (path, text) not in _told:
+            _told.add((path, text))
+            warnings.warn(f"{path}: MuJoCo warns: {text}", ModelWarning, stacklevel=3)
+
+
+# Number of packed models that a process keeps ready for use. A worker seldom serves more studies
+# than these in turn, and each model takes the memory of its meshes several times.
+KEPT_MODELS = 4
+
+
+def packed_model(files: PackedFiles, path: Path) -> ModelSource:
+    """Return the model of a packed file.
+
+    It is parsed and compiled once in each process, as long as it is among the latest models.
+
+    Args:
+        files: Files with the model, what it includes, and its assets.
+        path: The MJCF or URDF file.
+
+    Returns:
+        The model, which all callers share.
+
+    Raises:
+        ModelError: MuJoCo cannot read or compile the model.
+    """
+    # A second thread that asks for the same model waits until the first one has compiled it.
+    key = files.digest, name_of(path)
+    with _packed_lock:
+        return _models.get(key, lambda: ModelSource(path, files=_file_system(files)))
+
+
+def _file_system(files: PackedFiles) -> Any:
+    """Packed files as a virtual file system of MuJoCo (MjVfs)."""
+    system = mujoco.MjVfs()
+    for name, content in files.contents.items():
+        system[name] = content
+    return system
+
+
+# The latest packed models of this process, by the hash of their files and their name.
+_models = Kept[ModelSource](KEPT_MODELS)
+_packed_lock = Lock()

@@ -1,11 +1,17 @@
-"""List of the files that a model needs: the MJCF or URDF file, what it includes, and its assets."""
+"""The files of a model: its MJCF or URDF, what it includes and attaches, and its assets."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
-from mjfim.model.included_files import read_elements, read_with_included_files
+from mjfim.errors import ExperimentError
+from mjfim.parallel.shared_value import SharedValue
 
 # Attributes of <compiler> that state the folder of meshes or images.
 FOLDERS = ("assetdir", "meshdir", "texturedir")
@@ -14,85 +20,222 @@ FOLDERS = ("assetdir", "meshdir", "texturedir")
 # URDF.
 FILE_ATTRIBUTE = "file"
 
-# Elements whose file is a model of its own, with folders of its own.
-MODEL_ELEMENT = "model"
-
 # Separates the kind of a URI from its path, as in package://meshes/arm.stl.
 URI_SEPARATOR = "://"
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfSource:
+    """A URDF whose links and joints are bodies and joints of a model.
+
+    Attributes:
+        path: The URDF file.
+        prefixes: What stands before the names of its links and joints in the model, one for each
+            time it is attached.
+    """
+
+    path: Path
+    prefixes: tuple[str, ...]
+
+
+def included_file(main: Path, including: Path, name: str) -> Path | None:
+    """Find the file that an `<include>` names.
+
+    Args:
+        main: The main file of the model.
+        including: The file that contains the `<include>`.
+        name: The name that it states.
+
+    Returns:
+        The file, beside the main file or beside the including one; None where there is none.
+    """
+    places = (main.parent / name, including.parent / name)
+    return next((place for place in places if place.is_file()), None)
+
+
+def elements_of(main: Path) -> Iterator[tuple[Path, Any]]:
+    """Yield all XML elements of a model file and of the files that it includes, with their file.
+
+    Files that are no XML have no elements. A file that is included several times is read once.
+    """
+    waiting = [main]
+    known = {main.resolve()}
+    # The list grows while it is read.
+    for path in waiting:
+        root = _root(path)
+        for element in () if root is None else root.iter():
+            yield path, element
+            if element.tag == "include" and "file" in element.attrib:
+                other = included_file(main, path, element.attrib["file"])
+                if other is not None and other.resolve() not in known:
+                    known.add(other.resolve())
+                    waiting.append(other)
 
 
 def files_of_model(path: Path) -> tuple[Path, ...]:
     """List the files of a model.
 
-    A name is looked for in every folder in which MuJoCo may look for it, and all files that are
-    found there are listed. So the list may hold a file too many, but lacks none.
-
     Args:
         path: The MJCF or URDF file.
 
     Returns:
-        The file itself, then the files that it includes, models that it attaches, and assets. Only
-        existing files are listed.
+        Existing files that MuJoCo may read for the model, the model first. Where a name fits
+        several files, all of them are listed.
     """
     found = dict.fromkeys([path])
     mains = [path]
-
     # The list of models grows while it is read.
     for main in mains:
-        names = _FileNames(main)
-        for file in names.files():
-            found.setdefault(Path(os.path.normpath(file)))
-        mains += [model for model in names.models() if model not in mains]
+        places, folders = {main.parent}, {Path()}
+        names: dict[str, bool] = {}
+        for file, element in elements_of(main):
+            places.add(file.parent)
+            for key, value in element.attrib.items():
+                if key.startswith(FILE_ATTRIBUTE):
+                    names[value] = names.get(value, False) or element.tag == "model"
+                elif element.tag == "compiler" and key in FOLDERS:
+                    folders.add(Path(value))
+        for name, is_model in names.items():
+            files = _existing(name, places, folders)
+            found.update(dict.fromkeys(files))
+            mains += [file for file in files if is_model and file not in mains]
     return tuple(found)
 
 
-class _FileNames:
-    """Names of files in an MJCF file and in the files that it includes.
+def is_urdf(path: Path) -> bool:
+    """Whether a model file is a URDF."""
+    root = _root(path)
+    return root is not None and root.tag == "robot"
+
+
+def urdf_sources(path: Path) -> tuple[UrdfSource, ...]:
+    """Find the URDFs from which a model comes.
 
     Args:
-        main: The file of the model.
+        path: The model file.
+
+    Returns:
+        The model itself where it is a URDF; otherwise those that an MJCF attaches.
+    """
+    if is_urdf(path):
+        return (UrdfSource(path=path, prefixes=("",)),)
+
+    files: dict[str, Path] = {}
+    attachments = []
+    for including, element in elements_of(path):
+        if element.tag == "model" and "file" in element.attrib:
+            file = included_file(path, including, element.attrib["file"])
+            root = None if file is None else _root(file)
+            if file is not None and root is not None:
+                # Without a stated name, a model has the one in its file.
+                files[element.get("name", root.get("name", ""))] = file
+        elif element.tag == "attach" and "model" in element.attrib:
+            attachments.append((element.attrib["model"], element.get("prefix", "")))
+
+    found: dict[Path, list[str]] = {}
+    for name, prefix in attachments:
+        if name in files and is_urdf(files[name]):
+            found.setdefault(files[name], []).append(prefix)
+    return tuple(UrdfSource(path=file, prefixes=tuple(each)) for file, each in found.items())
+
+
+def _root(path: Path) -> Any:
+    """The main element of an XML file; None where it is none."""
+    try:
+        return ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError):
+        return None
+
+
+def _existing(name: str, places: set[Path], folders: set[Path]) -> list[Path]:
+    """Existing files with a name: as it is stated, and without its folders."""
+    path = Path(name.split(URI_SEPARATOR)[-1])
+    candidates = [
+        place / folder / stated
+        for place in sorted(places)
+        for folder in sorted(folders)
+        for stated in dict.fromkeys((path, Path(path.name)))
+    ]
+    return [Path(os.path.normpath(file)) for file in candidates if file.is_file()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackedFiles:
+    """Files by their paths, as bytes. They can be pickled.
+
+    Attributes:
+        digest: Hash of all paths and contents; equal for equal files only.
+        held: Bytes of each file by its path, with slashes; or a reference to them, under which they
+            are pickled as their hash.
     """
 
-    def __init__(self, main: Path) -> None:
-        self._places = {main.parent}
-        self._folders = {Path()}
-        self._names: dict[str, None] = {}
-        self._models: dict[str, None] = {}
-        read_with_included_files(main, None, self._read)
+    digest: str
+    held: Mapping[str, bytes] | SharedValue[Mapping[str, bytes]] = field(repr=False, compare=False)
 
-    def files(self) -> list[Path]:
-        """Existing files with the names, in all folders in which they may be."""
-        return [file for name in self._names for file in self._found(name)]
+    @classmethod
+    def of(cls, contents: Mapping[Path, bytes]) -> PackedFiles:
+        """Pack files.
 
-    def models(self) -> list[Path]:
-        """Existing files of models that are attached."""
-        return [Path(os.path.normpath(file)) for name in self._models for file in self._found(name)]
+        Args:
+            contents: Bytes of each file by its path.
+        """
+        named = {name_of(path): content for path, content in contents.items()}
+        ordered = dict(sorted(named.items()))
 
-    def _found(self, name: str) -> list[Path]:
-        """Existing files with a name: as it is stated, and without its folders."""
-        path = Path(name.split(URI_SEPARATOR)[-1])
-        candidates = [
-            place / folder / stated
-            for place in sorted(self._places)
-            for folder in sorted(self._folders)
-            for stated in dict.fromkeys((path, Path(path.name)))
-        ]
-        return [file for file in candidates if file.is_file()]
+        # The length of each part tells where it ends, so that other files have another hash.
+        hashed = hashlib.sha256()
+        for name, content in ordered.items():
+            for part in (name.encode(), content):
+                hashed.update(len(part).to_bytes(8, "big"))
+                hashed.update(part)
+        return cls(digest=hashed.hexdigest(), held=ordered)
 
-    def _read(self, path: Path, context: None) -> list[tuple[str, None]]:
-        """Read the names in one file; returns the files that it includes."""
-        included: list[tuple[str, None]] = []
-        self._places.add(path.parent)
+    @classmethod
+    def read(cls, paths: Iterable[Path], packed: PackedFiles) -> PackedFiles:
+        """Pack files from the disk.
 
-        def start(tag: str, attributes: dict[str, str]) -> None:
-            """Keep the names of files and folders of an element."""
-            named = [value for key, value in attributes.items() if key.startswith(FILE_ATTRIBUTE)]
-            self._names.update(dict.fromkeys(named))
-            if tag == "include":
-                included.extend((name, None) for name in named)
-            if tag == MODEL_ELEMENT:
-                self._models.update(dict.fromkeys(named))
-            if tag == "compiler":
-                self._folders.update(Path(attributes[key]) for key in FOLDERS if key in attributes)
+        Args:
+            paths: The files.
+            packed: Files that are packed already, which are not read again.
 
-        return included if read_elements(path, start) else []
+        Raises:
+            ExperimentError: A file cannot be read.
+        """
+        contents = {}
+        for path in paths:
+            kept = packed.content(path)
+            contents[path] = _read(path) if kept is None else kept
+        return cls.of(contents)
+
+    @property
+    def contents(self) -> Mapping[str, bytes]:
+        """Bytes of each file by its path, with slashes.
+
+        Raises:
+            AbsentValueError: This process has received the hash only.
+        """
+        return self.held.value if isinstance(self.held, SharedValue) else self.held
+
+    def shared(self) -> PackedFiles:
+        """Return these files for tasks, each of which is sent with their hash alone."""
+        if isinstance(self.held, SharedValue):
+            return self
+        size = sum(map(len, self.held.values()))
+        return PackedFiles(digest=self.digest, held=SharedValue.of(self.digest, self.held, size))
+
+    def content(self, path: Path) -> bytes | None:
+        """Return the bytes of a file; None if it is not among the packed files."""
+        return self.contents.get(name_of(path))
+
+
+def name_of(path: Path) -> str:
+    """Return the normalised path of a file with slashes."""
+    return Path(os.path.normpath(path)).as_posix()
+
+
+def _read(path: Path) -> bytes:
+    """Return the content of a file."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ExperimentError(f"{path}: cannot read the file: {error.strerror}") from None

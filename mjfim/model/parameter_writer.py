@@ -18,8 +18,8 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, listed
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
-from mjfim.model.mujoco_log import silence_mujoco_log
-from mjfim.model.spec_writer import write_element
+from mjfim.model.loading import silence_mujoco_log
+from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TermField
 from mjfim.model.variants import PlantModel
 
@@ -284,3 +284,118 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> st
             "positive semidefinite)"
         )
     return f"principal moments of inertia {listed} kg m²; {wanted}"
+
+
+# Fields of a body that need its inertia to be stated in the spec.
+INERTIA_FIELDS = ("mass", "ipos", "inertia", *INERTIAL_FIELDS)
+
+
+def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float) -> None:
+    """Write the number that a path names into an MjSpec, in place.
+
+    Args:
+        spec: The spec (`mujoco.MjSpec`), a private copy of the caller.
+        compiled: The model of this spec. Where the inertia of a body comes from geoms, it is stated
+            explicitly before it is changed.
+        wanted: The model at the values, from which inertias and orientations are taken as a whole.
+        text: The parameter path. Paths of control laws, of the initial state and of the
+            measurement write nothing.
+        value: The value of the number.
+
+    Raises:
+        ExperimentError: The element cannot be moved in the spec.
+    """
+    path = ParameterPath.parse(text)
+    if path.kind in ("controller", "initial", "output"):
+        return
+
+    element = spec.option if path.kind == "option" else getattr(spec, path.kind)(path.name)
+    if path.field in ("pos", "rot") and element.frame is not None:
+        leave_frame(element, getattr(compiled, path.kind)(path.name), text)
+
+    if path.field in INERTIAL_FIELDS:
+        state_inertia(element, wanted)
+    elif path.field == "rot":
+        element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        element.quat = getattr(wanted, path.kind)(path.name).quat
+    elif path.kind == "actuator" and path.field in SERVO_FIELDS:
+        element.gainprm = wanted.actuator_gainprm[element.id]
+        element.biasprm = wanted.actuator_biasprm[element.id]
+    elif path.field == "springlength":
+        # One rest length may set both ends of the range.
+        element.springlength = wanted.tendon_lengthspring[element.id]
+    else:
+        _write_number(spec, compiled, element, path, value)
+
+
+def _write_number(
+    spec: Any, compiled: Any, element: Any, path: ParameterPath, value: float
+) -> None:
+    """Write a number that the spec holds under the name of the path's field."""
+    if path.kind == "body" and path.field in INERTIA_FIELDS and not element.explicitinertial:
+        state_inertia(element, compiled)
+
+    if path.kind == "geom" and np.isfinite(element.fromto[0]):
+        state_geom(element, compiled)
+
+    # The compiler adds the offset of a mesh to the position.
+    if path.kind == "geom" and path.field == "pos" and element.meshname:
+        index = path.component
+        value += float(element.pos[index] - compiled.geom(path.name).pos[index])
+
+    in_degrees = spec.compiler.degree and path.field == "springref"
+    if in_degrees and element.type == mujoco.mjtJoint.mjJNT_HINGE:
+        value = float(np.rad2deg(value))
+
+    _assign(element, path.field, path.component, value)
+
+
+def _assign(element: Any, field: str, index: int, value: float) -> None:
+    """Set a field of an element of a spec: the scalar, or one entry of the array."""
+    old = np.array(getattr(element, field), dtype=np.float64)
+    if old.ndim:
+        old[index] = value
+        setattr(element, field, old)
+    else:
+        setattr(element, field, value)
+
+
+def leave_frame(element: Any, found: Any, text: str) -> None:
+    """State the pose of an element in the coordinates of its body instead of those of a `<frame>`.
+
+    Args:
+        element: The element of the spec, changed in place.
+        found: The element in the compiled model.
+        text: The parameter path, for the message.
+
+    Raises:
+        ExperimentError: The element is a mesh geom.
+    """
+    if getattr(element, "meshname", ""):
+        raise ExperimentError(
+            f"{text!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame"
+        )
+    element.set_frame(element.parent.add_frame())
+    element.pos = found.pos
+    element.quat = found.quat
+    element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+
+
+def state_inertia(body: Any, compiled: Any) -> None:
+    """State in a body of a spec the inertia that it has in a model."""
+    found = compiled.body(body.id)
+    body.mass = float(found.mass[0])
+    body.ipos = found.ipos
+    body.iquat = found.iquat
+    body.inertia = found.inertia
+    body.fullinertia = np.full(6, np.nan)
+    body.explicitinertial = True
+
+
+def state_geom(geom: Any, compiled: Any) -> None:
+    """Replace the end points of a geom of a spec by the place and size that they compile to."""
+    found = compiled.geom(geom.id)
+    geom.fromto = np.full(6, np.nan)
+    geom.pos = found.pos
+    geom.quat = found.quat
+    geom.size = found.size

@@ -25,7 +25,6 @@ from mjfim.model.coordinates import (
 )
 from mjfim.model.elements import identifier, names_of, unnamed_count
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
-from mjfim.model.servos import servo_kind
 from mjfim.model.targets import (
     InertiaField,
     InitialStateField,
@@ -39,7 +38,7 @@ from mjfim.model.targets import (
     TermField,
 )
 from mjfim.model.terms.term import Term, TermQuantity
-from mjfim.model.units import ANGLE, FIELD_UNITS, LENGTH, gain_unit, joint_field_unit
+from mjfim.model.units import ANGLE, FIELD_UNITS, LENGTH, gain_unit, joint_field_unit, servo_kind
 
 # A parameter path: the kind, the name (absent for options and the delay), the field, and
 # optionally an index or the part of a joint.

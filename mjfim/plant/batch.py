@@ -16,12 +16,12 @@ import numpy as np
 from mujoco.batch import Batch
 
 from mjfim.arrays import Array
-from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.model.loading import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
 
 if TYPE_CHECKING:
-    from mjfim.plant.running_law import InputContext, LoopTrace
+    from mjfim.plant.laws.running_law import InputContext, LoopTrace
 
 # Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,
 # qvel and act.

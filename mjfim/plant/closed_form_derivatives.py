@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
-from mjfim.plant.closed_form import (
+from mjfim.plant.closed_form.affine_forces import ParameterChange, acts_on_joints, is_inertial
+from mjfim.plant.closed_form.samples import (
     MODEL_STEP,
     ClosedForm,
     SampleJacobians,
     closed_form_tree,
+    observation_jacobian,
 )
-from mjfim.plant.closed_form_observations import observation_jacobian
-from mjfim.plant.difference_steps import DifferenceSteps
-from mjfim.plant.parameter_change import ParameterChange, acts_on_joints, is_inertial
 from mjfim.records.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from mjfim.plant.plant import Plant
 
 # Largest number of parameter values for which the change of the model is kept.
 MAX_KEPT_CHANGES = 64
@@ -26,6 +29,10 @@ MAX_KEPT_CHANGES = 64
 # Step along (psi w, w) between two derivatives in closed form. It can be short, because they have
 # little round-off.
 CLOSED_FORM_STEP = 1e-6
+
+
+# Smallest divisor; it prevents a division by zero.
+TINY = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,8 +114,59 @@ class ClosedFormMemory:
         self.changes: dict[bytes, ParameterChange] = {}
 
 
-class ClosedFormDerivatives(DifferenceSteps):
-    """Derivatives in closed form; None wherever the plant has no closed form."""
+class ClosedFormDerivatives:
+    """Derivatives in closed form; None wherever the plant has no closed form.
+
+    Attributes:
+        plant: The plant.
+    """
+
+    def __init__(self, plant: Plant, step_factors: Array | None = None) -> None:
+        """Set the plant and the factors of its difference steps.
+
+        Args:
+            plant: The plant.
+            step_factors: (p,) factors by which the difference steps of the parameters are
+                lengthened; None takes 1.
+        """
+        self.plant = plant
+        self._step_factors = (
+            np.ones(len(plant.parameters)) if step_factors is None else step_factors
+        )
+
+    @property
+    def parameter_scale(self) -> Array:
+        """(p,) magnitude of each parameter, to which its steps are relative [theta-unit]."""
+        return np.asarray(self.plant.parameters.magnitude * self._step_factors)
+
+    def difference_sizes(self, trajectory: Trajectory) -> Array:
+        """Magnitudes of state and control along a trajectory, to which steps are relative.
+
+        They are the largest values along the trajectory, or the natural sizes of the model where it
+        hardly moves. A rotation has the magnitude 1.
+
+        Args:
+            trajectory: The trajectory.
+
+        Returns:
+            (nx+nu,) magnitudes [x-unit, u-unit].
+        """
+        return self.plant.sizes.along(trajectory)
+
+    def direction_step(self, relative_step: float, relative_direction: Array, w: Array) -> float:
+        """Step along (psi w, w).
+
+        It is relative to the larger of the two parts.
+
+        Args:
+            relative_step: The step where the larger part is 1.
+            relative_direction: (..., nx) direction psi w, divided by the sizes of the state.
+            w: (p,) direction of the parameters [theta-unit].
+        """
+        in_model = self.plant.parameters.changes_model
+        relative = np.where(in_model, np.abs(w / self.parameter_scale), 0.0).max(initial=0.0)
+        largest = max(np.abs(relative_direction).max(initial=0.0), relative, TINY)
+        return float(relative_step / largest)
 
     def closed_form_sensitivity(
         self, theta: Array, trajectory: Trajectory, directions: Array

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.model.loading import silence_mujoco_log
 from mjfim.plant.batch import MAX_CONTROL, state_space
 
 # Names of MuJoCo's warnings about numbers that are not finite or huge.

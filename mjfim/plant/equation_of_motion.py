@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.plant.affine_forces import MOMENT_FIELDS
 from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.closed_form.affine_forces import MOMENT_FIELDS
 
 # Integrators that take the damping of all forces at the end of the step.
 IMPLICIT = (

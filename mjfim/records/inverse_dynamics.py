@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import field
+
+import numpy as np
+
 from mjfim.arrays import Array
-from mjfim.records.base import Record, ShownRecord, no_array, record
+from mjfim.records.base import Record, ShownRecord, record
 
 
 @record
@@ -102,7 +106,7 @@ class InverseDynamicsFit(ShownRecord):
     recording: str = ""
     seconds: float = 0.0
     steps: int = 0
-    sizes: Array = no_array()
+    sizes: Array = field(default_factory=lambda: np.zeros(0))
 
     file_stem = "inverse_dynamics"
     made_by = "`InverseDynamicsFit.save`"

@@ -59,8 +59,7 @@ from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.identification.residual_tests import misfit_reasons
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
-from mjfim.model.inertia_distance import barycentric_of, logcholesky_factor
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
 from mjfim.parallel.budget import Budget
 from mjfim.records.estimate import Estimate, Whiteness

@@ -17,7 +17,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.robust import ParameterSamples
 from mjfim.excitation.task import DesignTask
-from mjfim.model.parameter_samples import sample_parameters
+from mjfim.model.parameter_ranges import sample_parameters
 from mjfim.model.parameters import Parameter, ParameterSet
 from tests.support.numerics import CART_PARAMETERS, Array, body_task, cart_task
 

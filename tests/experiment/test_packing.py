@@ -17,7 +17,7 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.model import packed_models
+from mjfim.model import loading
 from mjfim.parallel.kept import Kept
 from tests.support.mesh_model import write_mesh_model
 from tests.support.paths import MODELS, SHARED_MODELS
@@ -111,15 +111,15 @@ def test_a_process_parses_a_packed_model_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parsed = []
-    original = packed_models.ModelSource
+    original = loading.ModelSource
 
     def counted(path: Path, **options: Any) -> Any:
         """A model, the parsing of which is counted."""
         parsed.append(path)
         return original(path, **options)
 
-    monkeypatch.setattr(packed_models, "ModelSource", counted)
-    monkeypatch.setattr(packed_models, "_models", Kept(packed_models.KEPT_MODELS))
+    monkeypatch.setattr(loading, "ModelSource", counted)
+    monkeypatch.setattr(loading, "_models", Kept(loading.KEPT_MODELS))
     experiment = stated(tmp_path)
 
     for _ in range(3):
@@ -130,9 +130,9 @@ def test_a_process_parses_a_packed_model_once(
 
 
 def test_only_the_latest_models_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = Kept(packed_models.KEPT_MODELS)
-    monkeypatch.setattr(packed_models, "_models", kept)
-    for number in range(packed_models.KEPT_MODELS + 2):
+    kept = Kept(loading.KEPT_MODELS)
+    monkeypatch.setattr(loading, "_models", kept)
+    for number in range(loading.KEPT_MODELS + 2):
         (tmp_path / "m.xml").write_text(
             '<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>'
             f"<!-- {number} --></mujoco>"
@@ -146,7 +146,7 @@ def test_only_the_latest_models_are_kept(tmp_path: Path, monkeypatch: pytest.Mon
         )
         System.resolve(experiment.packed(), threads=1)
 
-    assert len(kept) == packed_models.KEPT_MODELS
+    assert len(kept) == loading.KEPT_MODELS
 
 
 def test_messages_of_packed_files_name_the_file_of_the_user(tmp_path: Path) -> None:

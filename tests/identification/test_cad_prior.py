@@ -20,7 +20,7 @@ from mjfim.identification.parameter_draws import draw_parameters_system
 from mjfim.identification.prior_share import prior_directions
 from mjfim.identification.report import _implausible_estimates
 from mjfim.identification.task import FitTask
-from mjfim.model.inertia_distance import logcholesky_factor
+from mjfim.model.inertia import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.records.trajectory import Recording
 from tests.support.hinged_arm import arm_experiment, arm_log

@@ -23,7 +23,7 @@ from mjfim.identification.parameter_draws import (
     draw_parameters,
     draw_parameters_system,
 )
-from mjfim.model.inertia_distance import barycentric_of, logcholesky_derivatives
+from mjfim.model.inertia import barycentric_of, logcholesky_derivatives
 from mjfim.records.events import stages_observed_by
 from tests.support.hinged_arm import arm_experiment
 from tests.support.numerics import Array

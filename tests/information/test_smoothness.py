@@ -19,7 +19,7 @@ from mjfim.information.smoothness import (
     roughness,
 )
 from mjfim.output.condensed import condensed
-from mjfim.plant.rollout_derivatives import RolloutDerivatives
+from mjfim.plant.derivatives import RolloutDerivatives
 from mjfim.records.check import Roughness
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
 

@@ -8,10 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-import mjfim
-from mjfim.excitation.task import DesignTask
 from mjfim.model.loading import ModelSource
-from tests.support.cli import MODELS
 
 # A free box is "simple" for MuJoCo; the arm beside it is not.
 BOX_AND_ARM = """
@@ -51,7 +48,7 @@ def test_the_users_model_serves_where_no_moved_body_is_simple(
     assert source.compiled(moved) is source.model
 
     # Another compile gives the same model.
-    again = source._editable_spec(moved).compile()
+    again = source.edited(moved, b"", lambda spec: None)
     assert model_bytes(again) == model_bytes(source.model)
 
 
@@ -63,21 +60,3 @@ def test_a_simple_body_that_moves_needs_another_model(
     assert source.model.body("box").simple[0] != 0
     assert found.body("box").simple[0] == 0
     assert source.compiled(moved) is found
-
-
-def test_a_design_parses_and_compiles_its_model_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[str] = []
-    for name in ("compile", "from_file"):
-        stated = getattr(mujoco.MjSpec, name)
-
-        def counted(*args, name=name, stated=stated, **kwargs):
-            calls.append(name)
-            return stated(*args, **kwargs)
-
-        wrapped = staticmethod(counted) if name == "from_file" else counted
-        monkeypatch.setattr(mujoco.MjSpec, name, wrapped)
-
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    task = DesignTask.resolve(experiment, threads=1)
-    task.plant.derivatives.sensitivity(task.theta, task.initial)
-    assert calls == ["from_file", "compile"]

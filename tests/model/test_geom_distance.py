@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.model.geom_distance import GeomDistances, SignedDistances
-from mjfim.model.geom_pairs import find_geom_pairs
-from mjfim.model.pair_distance import BOX, CAPSULE
+from mjfim.model.clearance.geom_distance import GeomDistances, SignedDistances
+from mjfim.model.clearance.pair_distance import BOX, CAPSULE, find_geom_pairs
 from tests.support.numerics import Array, directional_check
 
 ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))
@@ -185,28 +184,6 @@ def test_pairs_agree_with_mujocos_collisions(flag: str) -> None:
     assert ("plate - two" in names) == ("disable" in flag)
 
 
-def test_pairs_are_found_where_contacts_are_off() -> None:
-    """The flag decides what is simulated, not which geoms may touch."""
-    off, on = (
-        mujoco.MjModel.from_xml_string(CROWD.format(flag=f'contact="{x}"'))
-        for x in ("disable", "enable")
-    )
-    assert find_geom_pairs(off, ()) == find_geom_pairs(on, ())
-
-
-def test_fixed_geoms_have_no_pairs_with_each_other() -> None:
-    """Mocap bodies and the world stay where they are."""
-    model = mujoco.MjModel.from_xml_string(
-        """
-        <mujoco><worldbody><geom name="wall" size="1"/>
-          <body name="m" mocap="true"><geom size="1"/></body>
-          <body name="r"><freejoint/><geom name="r" size="1"/></body>
-        </worldbody></mujoco>
-        """
-    )
-    assert [p.name for p in find_geom_pairs(model, ())] == ["r - wall", "r - m geom 1"]
-
-
 def test_ignored_bodies_are_left_out() -> None:
     """All pairs of geoms of the two bodies are ignored, in either order, also with the world."""
     model = mujoco.MjModel.from_xml_string(ARMS)
@@ -224,23 +201,6 @@ def test_ignored_bodies_are_left_out() -> None:
         "wrist geom 4 - hand geom 6",
     }
     assert left < every
-
-
-@pytest.mark.parametrize(
-    ("ignored", "message"),
-    [
-        (
-            ("wirst", "hand"),
-            r"unknown body 'wirst' \(did you mean 'wrist'\?\); "
-            r"valid: elbow, hand, left, right, stone, w",
-        ),
-        (("hand",), r"\['hand'\] is no pair of bodies; needs two different names"),
-    ],
-)
-def test_misuse_of_ignored(ignored: tuple[str, ...], message: str) -> None:
-    """The message names the fault and the valid values."""
-    with pytest.raises(ExperimentError, match=message):
-        find_geom_pairs(mujoco.MjModel.from_xml_string(ARMS), {frozenset(ignored)})
 
 
 def test_height_fields_are_refused_unless_ignored() -> None:
@@ -285,23 +245,6 @@ def test_all_distances_within_reach_are_found(reach: float) -> None:
     assert d.max() <= reach
     assert (
         (d < 0.0).any() and ((d > 0.0) & (d < reach)).any() and (reach > 1.0 or (d == reach).any())
-    )
-
-
-def test_blocks_of_configurations_give_equal_results() -> None:
-    """Many configurations are computed in blocks; no configurations give empty arrays."""
-    model = mujoco.MjModel.from_xml_string(ARMS)
-    chosen, qpos = between(model, 0.3), scattered(model, 11, 0.4)
-    whole = chosen(qpos, True)
-    pairs = find_geom_pairs(model, ())
-    blocks = GeomDistances(model, pairs, 0.3, grouped=False, max_bounds=3 * len(pairs))
-    cut, none = blocks(qpos, True), blocks(qpos[:0], True)
-    np.testing.assert_array_equal(cut.d, whole.d)
-    np.testing.assert_array_equal(cut.slope, whole.slope)
-    assert none.d.shape == (0, len(chosen.columns)) and none.slope.shape == (
-        0,
-        len(chosen.columns),
-        model.nv,
     )
 
 
@@ -354,20 +297,6 @@ def test_planes_agree_with_contacts(kind: str) -> None:
     np.testing.assert_allclose(d, deepest, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("eighths", range(8))
-def test_a_box_on_its_edge_has_the_right_distance(eighths: int) -> None:
-    """`mj_geomDistance` misses the lowest corners of a cube that is turned by 225 degrees."""
-    model = mujoco.MjModel.from_xml_string(
-        """
-        <mujoco><worldbody><geom type="plane" size="1 1 1"/>
-          <body pos="0 0 0.3"><joint axis="1 0 0"/><geom type="box" size="0.1 0.1 0.1"/></body>
-        </worldbody></mujoco>
-        """
-    )
-    found = between(model, 1.0)(np.array([[eighths * np.pi / 4]]), False).d[0, 0]
-    assert found == pytest.approx(0.3 - 0.1 * (2**0.5 if eighths % 2 else 1.0), abs=1e-12)
-
-
 def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
     """It agrees with that of the box as a mesh, for which MuJoCo uses another collider."""
     corners = " ".join(
@@ -412,24 +341,6 @@ def test_slopes_agree_with_differences(first: str, second: str) -> None:
     errors = slope_errors(model, lambda q: chosen(q, True), qpos)
     assert np.quantile(errors, 0.75) < 1e-6
     assert errors.max() < 1e-4  # the surface bends where another edge or face becomes the nearest
-
-
-def test_the_check_of_slopes_can_fail() -> None:
-    """A slope with the wrong sign, one of another configuration and one with a dof left out."""
-    model = two(KINDS["capsule"], KINDS["box"])
-    chosen, qpos = between(model, 2.0), scattered(model, 2, 0.4)
-
-    def wrong(change: Callable[[Array], Array]) -> float:
-        return slope_errors(
-            model,
-            lambda q: SignedDistances(d=chosen(q, True).d, slope=change(chosen(q, True).slope)),
-            qpos,
-        ).min()
-
-    assert wrong(lambda s: s) < 1e-6
-    assert wrong(lambda s: -s) > 1.0
-    assert wrong(lambda s: s[::-1]) > 0.1
-    assert wrong(lambda s: s * (np.arange(model.nv) != 4)) > 1e-3
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -479,18 +390,6 @@ def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
     assert slope_errors(model, lambda q: chosen(q, True), qpos[None]).max() < 2e-4
 
 
-def test_slopes_are_zero_beyond_reach() -> None:
-    """They are zero exactly if the distance is the reach; slopes not requested are None."""
-    model = mujoco.MjModel.from_xml_string(ARMS)
-    chosen, qpos = between(model, 0.2, grouped=True), scattered(model, 100, 0.4)
-    found = chosen(qpos, True)
-    assert ((found.slope != 0.0).any(axis=2) == (found.d < 0.2)).all()
-    assert found.slope.shape == (100, len(chosen.columns), model.nv)
-    plain = chosen(qpos, False)
-    np.testing.assert_array_equal(plain.d, found.d)
-    assert plain.slope is None
-
-
 def test_columns_are_pairs_of_bodies() -> None:
     """Their smallest distance, with the slope that belongs to it."""
     model = mujoco.MjModel.from_xml_string(ARMS)
@@ -531,14 +430,6 @@ def test_nearest_is_the_smallest_of_all(spread: float) -> None:
     assert (distance > 0.01) == (spread > 1.0)
 
 
-def test_nearest_may_be_the_floor() -> None:
-    """Planes need no call of MuJoCo."""
-    model = on_floor(KINDS["cylinder"])
-    chosen, qpos = between(model, 0.1), scattered(model, 20, 1.0)
-    d = between(model, 50.0)(qpos, False).d[:, 0]
-    assert chosen.nearest(qpos) == (d.min(), d.argmin(), chosen.pairs[0])
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_diverged_configurations_have_no_distance(value: float) -> None:
     """Their distances are NaN, and their smallest distance is refused."""
@@ -549,22 +440,3 @@ def test_diverged_configurations_have_no_distance(value: float) -> None:
     assert np.isnan(found.d[3]).all() and np.isfinite(np.delete(found.d, 3, axis=0)).all()
     with pytest.raises(SimulationDivergedError, match="configuration 3 is not finite"):
         chosen.nearest(qpos)
-
-
-def test_the_model_is_not_changed() -> None:
-    """Options of the collider are set on a copy, and later changes of the model have no effect."""
-    model = mujoco.MjModel.from_xml_string(ARMS)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
-    sizes, kinds, options = model.geom_size.copy(), model.geom_type.copy(), str(model.opt)
-    chosen, qpos = between(model, 0.5), scattered(model, 20, 0.4)
-    before = chosen(qpos, False).d
-    np.testing.assert_array_equal(
-        before, between(mujoco.MjModel.from_xml_string(ARMS), 0.5)(qpos, False).d
-    )
-    assert (
-        (model.geom_size == sizes).all()
-        and (model.geom_type == kinds).all()
-        and str(model.opt) == options
-    )
-    model.geom_size *= 2.0
-    np.testing.assert_array_equal(chosen(qpos, False).d, before)

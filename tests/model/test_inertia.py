@@ -15,7 +15,6 @@ from mjfim.model.inertia import (
     INERTIA_ENTRIES,
     INERTIA_PARAMETRISATIONS,
     BodyInertia,
-    from_barycentric,
     from_logcholesky,
     to_barycentric,
     to_logcholesky,
@@ -107,22 +106,6 @@ def test_every_parametrisation_has_an_inverse(chart: str) -> None:
         )
 
 
-def test_principal_axes_agree_with_mujoco() -> None:
-    """Descending moments in a right-handed frame, as the compiler writes them; and back."""
-    for body in solids(20, 1):
-        found = compiled(body).body("tip")
-        moments, quaternion = body.principal_axes()
-        np.testing.assert_allclose(moments, found.inertia, rtol=1e-10)
-        assert moments[0] >= moments[1] >= moments[2] > 0.0
-        R = np.zeros(9)
-        mujoco.mju_quat2Mat(R, quaternion)
-        R = R.reshape(3, 3)
-        assert np.linalg.det(R) == pytest.approx(1.0)
-        np.testing.assert_allclose(R @ np.diag(moments) @ R.T, body.inertia, rtol=1e-9, atol=1e-12)
-        again = BodyInertia.from_principal(found.mass[0], found.ipos, found.inertia, found.iquat)
-        np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
-
-
 def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
     """They agree with sums over points, by their definition."""
     rng = np.random.default_rng(2)
@@ -154,15 +137,6 @@ def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
         errors[name] = np.abs(mixed - (0.4 * ends[0] + 0.6 * ends[1])).max() / np.abs(mixed).max()
     assert errors["barycentric"] < 1e-12
     assert errors["logcholesky"] > 1e-3 and errors["central"] > 1e-3, "a weak test"
-
-
-def test_the_barycentric_regressor_predicts_the_dynamics() -> None:
-    """Eleven bodies determine the regressor; it predicts a twelfth to round-off."""
-    bodies = solids(12, 4)
-    V = np.array([np.append(to_barycentric(b), 1.0) for b in bodies])
-    Y = np.array([dynamics(b) for b in bodies])
-    regressor = np.linalg.solve(V[:11], Y[:11])
-    np.testing.assert_allclose(V[11] @ regressor, Y[11], rtol=0, atol=1e-9 * np.abs(Y).max())
 
 
 def test_log_cholesky_is_physical_for_every_vector() -> None:
@@ -246,25 +220,3 @@ def test_magnitudes_follow_the_units() -> None:
             rtol=1e-12,
         )
         assert (chart.magnitudes(body) > 0.0).all()
-
-
-def test_radius_of_gyration_is_about_the_bodys_origin() -> None:
-    """The root of the mean square distance of points."""
-    points = np.random.default_rng(10).standard_normal((7, 3))
-    com, about = points.mean(axis=0), points - points.mean(axis=0)
-    body = BodyInertia(
-        mass=7.0, com=com, inertia=sum(r @ r * np.eye(3) - np.outer(r, r) for r in about)
-    )
-    assert body.gyration_radius == pytest.approx(
-        np.sqrt(np.mean(np.sum(points**2, axis=1))), rel=1e-12
-    )
-
-
-def test_first_moments_at_the_origin_do_not_move_with_the_mass() -> None:
-    """The mass alone changes the centre of mass and the inertia about it, not the inertia about the
-    origin.
-    """
-    v = to_barycentric(solids(1, 11)[0])
-    heavier = from_barycentric(np.append(2.0 * v[0], v[1:]))
-    np.testing.assert_allclose(heavier.com, 0.5 * v[1:4] / v[0], rtol=1e-13)
-    np.testing.assert_allclose(to_barycentric(heavier), np.append(2.0 * v[0], v[1:]), rtol=1e-12)

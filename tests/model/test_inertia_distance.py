@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 import scipy
 
-from mjfim.model.inertia import from_logcholesky, to_barycentric
-from mjfim.model.inertia_distance import (
+from mjfim.model.inertia import (
     BARYCENTRIC_DERIVATIVES,
-    barycentric_of,
     inertia_difference,
     is_positive_definite,
     logcholesky_derivatives,
     logcholesky_factor,
-    pseudo_inertia_of,
 )
 from tests.support.numerics import Array
 
@@ -28,13 +25,6 @@ def pseudo_inertia(values: Array) -> Array:
     """(4, 4) pseudo-inertia of (10,) log-Cholesky coordinates."""
     factor = logcholesky_factor(values)
     return factor @ factor.T
-
-
-def test_barycentric_coordinates_are_those_of_the_body() -> None:
-    values = coordinates(1)
-    found = barycentric_of(pseudo_inertia(values))
-    np.testing.assert_allclose(found, to_barycentric(from_logcholesky(values)), rtol=1e-12)
-    np.testing.assert_allclose(pseudo_inertia_of(found), pseudo_inertia(values), rtol=1e-12)
 
 
 def test_derivatives_are_those_of_differences() -> None:
@@ -82,14 +72,6 @@ def test_distance_is_that_of_the_metric_in_any_frame_and_unit() -> None:
     change *= np.sqrt(1e-3)
     moved = scipy.linalg.eigh(change @ P @ change.T, change @ C @ change.T, eigvals_only=True)
     assert np.sum(np.log(moved) ** 2) == pytest.approx(squares, rel=1e-9)
-
-
-def test_a_heavier_body_has_the_logarithm_of_its_mass_on_the_diagonal() -> None:
-    reference = coordinates(7)
-    heavier = 3.0 * pseudo_inertia(reference)
-    found = inertia_difference(heavier, BARYCENTRIC_DERIVATIVES, reference).residual
-    assert np.sort(found)[-4:] == pytest.approx(np.log(3.0))
-    assert found @ found == pytest.approx(4.0 * np.log(3.0) ** 2)
 
 
 def test_bodies_without_volume_are_not_positive_definite() -> None:

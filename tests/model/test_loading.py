@@ -4,8 +4,6 @@ included.
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +11,8 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.errors import ModelError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.model.loading import load_spec
 from mjfim.output import folders as results
 from tests.support.cli import DESIGN, MODELS, names, read, run
 from tests.support.examples import design_file
@@ -89,13 +85,3 @@ def test_a_short_design_improves_and_writes_all_files(
     assert len(told["final"]["std"]) == len(told["parameters"])
     assert [c["words"] for c in told["combined"]] == [c.expression for c in design.combined]
     assert bool(design.combined) == (name in TOGETHER)
-
-
-@pytest.mark.skipif(os.sep != "/", reason="a backslash separates folders here")
-def test_a_backslash_in_a_name_is_refused(tmp_path: Path) -> None:
-    """MuJoCo would look for the file in a folder that does not exist."""
-    folder = tmp_path / "back\\slash"
-    folder.mkdir()
-    model = shutil.copy(MODELS / "cart_pendulum.xml", folder)
-    with pytest.raises(ModelError, match="takes a backslash for the separator of folders"):
-        load_spec(Path(model))

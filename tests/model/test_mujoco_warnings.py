@@ -11,7 +11,6 @@ import pytest
 
 from mjfim.errors import ModelWarning
 from mjfim.model.loading import ModelSource
-from tests.support.cli import run
 
 # MuJoCo says of both attributes that a later version will not have them.
 DEPRECATED = """
@@ -74,12 +73,3 @@ def test_what_mujoco_ignores_is_told_once_for_each_file(tmp_path: Path, capfd: A
 def test_worker_processes_do_not_repeat_warnings(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(multiprocessing, "parent_process", lambda: "the process that warned")
     assert told(file(tmp_path, "robot.urdf", EQUAL_LIMITS)) == []
-
-
-def test_the_command_line_prints_the_warning_as_a_sentence(tmp_path: Path) -> None:
-    path = file(tmp_path, "robot.urdf", EQUAL_LIMITS)
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
-        result = run("list", path, "--kind", "limits")
-    assert result.exit_code == 0, result.output
-    assert result.stderr.splitlines() == [f"warning: {path}: MuJoCo warns: {SENTENCE}"]

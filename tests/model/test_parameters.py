@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError
-from mjfim.model.elements import names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource, decoration
 from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
@@ -21,7 +19,7 @@ from mjfim.model.paths import KINDS, ParameterPath, fields_of, resolve
 from mjfim.model.targets import ModelField, RotationField, SpecField
 from mjfim.model.variants import PlantModel
 from mjfim.output.models.mjcf import write_identified
-from tests.support.numerics import Loop, make_task
+from tests.support.numerics import make_task
 from tests.support.specs import write_spec
 
 # Two links with inertia from skewed geoms; a position servo; sensors that see sites and geoms.
@@ -466,25 +464,6 @@ def test_inertia_of_a_tendon_couples_simple_bodies_as_a_compile_would() -> None:
     assert np.abs(rollout(own, 50) - rollout(base, 50)).max() > 1e-3
 
 
-def test_inertias_of_simple_bodies_are_written_with_the_right_dynamics() -> None:
-    """Bodies that MuJoCo would compile with a diagonal mass matrix."""
-    for path in (
-        "body/flyer:fullinertia[3]",
-        "body/flyer:firstmoment[1]",
-        "body/slider:logcholesky[9]",
-    ):
-        spec, base = compiled(SIMPLE, [one(path)])
-        resolved = parameter_set([one(path)], base)
-        field, other = resolved.parameters[0].targets[0].field, spec.copy()
-        change = 0.05 * field.magnitude(base)
-        written_by_hand(other, base, path, change)
-        own = resolved.writer.model(base, np.array([field.read(base) + change]))
-        np.testing.assert_allclose(
-            rollout(own, 100), rollout(other.compile(), 100), rtol=1e-9, atol=1e-9
-        )
-        assert np.abs(rollout(own, 100) - rollout(base, 100)).max() > 1e-4
-
-
 @pytest.mark.parametrize(
     ("xml", "path", "value", "derived"), COMPILES, ids=[e[1] for e in COMPILES]
 )
@@ -664,25 +643,6 @@ def test_a_mesh_moves_from_its_compiled_place() -> None:
         resolve(base, "geom/h:size")
 
 
-def test_mass_and_density_of_geoms_are_not_in_the_compiled_model() -> None:
-    _, base = compiled(ARM, [])
-    for field in ("mass", "density"):
-        with pytest.raises(ExperimentError, match=rf"{field} of geom 'h' .* state `guess`"):
-            resolve(base, f"geom/h:{field}").read(base)
-
-
-def test_one_rest_length_stands_for_both_ends_of_the_range() -> None:
-    """Otherwise the lower end would exceed the upper one, which MuJoCo refuses."""
-    _, base = compiled(TENDON, [])
-    own = parameter_set([one("tendon/t:springlength")], base).writer.model(base, np.array([0.5]))
-    assert own.tendon_lengthspring.tolist() == [[0.5, 0.5]]
-    _, ranged = compiled(TENDON.replace('springlength=".3"', 'springlength=".3 .4"'), [])
-    own = parameter_set([one("tendon/t:springlength")], ranged).writer.model(
-        ranged, np.array([0.1])
-    )
-    assert own.tendon_lengthspring.tolist() == [[0.1, 0.4]]
-
-
 @pytest.mark.parametrize(
     ("kind", "written", "path"),
     [
@@ -757,26 +717,6 @@ def test_servos_with_several_controls_have_gains_too(written: str, path: str) ->
     assert resolved.parameters[0].targets[0].field.read(base) == 2.0
     mine, theirs = arrays(resolved.writer.model(base, np.array([3.5]))), arrays(again)
     assert [n for n in theirs if not np.array_equal(mine[n], theirs[n])] == []
-
-
-def test_gears_are_counted_by_force_outputs() -> None:
-    base = mujoco.MjModel.from_xml_string(BALL.format('<orientation name="s" joint="j" kp="2"/>'))
-    resolved = parameter_set([one("actuator/m:gear")], base)
-    assert resolved.parameters[0].targets[0].field.read(base) == 1.5
-    np.testing.assert_array_equal(
-        resolved.writer.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0]
-    )
-
-
-def test_the_damping_of_a_servo_does_not_follow_its_gain() -> None:
-    parameters = [
-        one("actuator/p:kp"),
-        Parameter(name="kv", targets=(target_at("actuator/p:kv"),), guess=1.0),
-    ]
-    _, base = compiled(ARM, [])
-    own = parameter_set(parameters, base).writer.model(base, np.array([20.0, 3.0]))
-    assert own.actuator("p").gainprm[0] == 20.0
-    assert own.actuator("p").biasprm[:3].tolist() == [0.0, -20.0, -3.0]
 
 
 @pytest.mark.parametrize("thing", ["body/b", "site/t"])
@@ -903,28 +843,6 @@ def test_measurement_and_initial_state_are_outside_the_model() -> None:
     np.testing.assert_array_equal(rollout(own, 20), rollout(base, 20))
 
 
-def test_comparison_would_notice_a_write_without_mj_setConst() -> None:
-    _, base = compiled(ARM, [one("body/b:mass")])
-    own, field = copy.copy(base), resolve(base, "body/b:mass")
-    field.write(own, 2.0)
-    _, _, again = both_ways(ARM, "body/b:mass", 2.0)
-    assert not np.array_equal(own.dof_M0, again.dof_M0)
-
-
-def test_bodies_whose_inertial_frame_moves_are_found() -> None:
-    paths = [
-        "body/a:pos",
-        "body/b:ipos[1]",
-        "body/c:inertia[2]",
-        "body/d:mass",
-        "geom/e:pos",
-        "site/f:pos",
-        "joint/g:damping",
-    ]
-    # A body stays simple with another mass and with other principal inertias.
-    assert moved_bodies([one(p) for p in paths]) == {"a", "b"}
-
-
 # A ball that can only slide: MuJoCo gives such a body another constraint weight than others.
 SLIDING_BALL = """
 <mujoco>
@@ -953,120 +871,12 @@ def test_a_body_that_only_slides_touches_the_floor_as_in_the_users_model(tmp_pat
         np.testing.assert_allclose(rollout(model), plain, rtol=1e-7, atol=1e-7)
 
 
-def test_the_model_at_theta_has_the_right_dynamics_for_simple_bodies(tmp_path) -> None:
-    target = {"com": {"target": "body/flyer:ipos[0]", "guess": 0.1}}
-    task = make_task(SIMPLE, tmp_path, rate=500.0, parameters=target, noise={"state": 0.1})
-    _, _, again = both_ways(SIMPLE, "body/flyer:ipos[0]", 0.1)
-    plain = mujoco.MjModel.from_xml_string(SIMPLE)
-    assert np.abs(rollout(plain) - rollout(again)).max() > 1e-3
-    np.testing.assert_array_equal(
-        rollout(task.plant.model(np.array([0.1])))[:, :17], rollout(again)[:, :17]
-    )
-    np.testing.assert_array_equal(rollout(task.system.model_at(np.array([0.1]))), rollout(again))
-
-
-def test_several_targets_follow_one_parameter_by_scale_and_offset() -> None:
-    targets = (
-        target_at("body/a:mass"),
-        target_at("body/b:mass", 2.0, 0.5),
-        target_at("joint/j:damping", -1.0, 3.0),
-    )
-    parameters = [Parameter(name="m", targets=targets, guess=1.0), one("option:gravity[1]")]
-    spec, base = compiled(ARM, parameters)
-    resolved = parameter_set(parameters, base)
-    own = resolved.writer.model(base, np.array([1.25, -0.5]))
-    assert (own.body("a").mass[0], own.body("b").mass[0], own.joint("j").damping[0]) == (
-        1.25,
-        3.0,
-        1.75,
-    )
-    assert own.opt.gravity[1] == -0.5
-    other = spec.copy()
-    write_spec(other, base, base, resolved, np.array([1.25, -0.5]))
-    np.testing.assert_array_equal(rollout(own), rollout(other.compile()))
-
-
-def test_one_number_takes_one_parameter() -> None:
-    parameters = [one("body/a:mass"), one("body/a:mass")]
-    _, base = compiled(ARM, [])
-    with pytest.raises(ExperimentError, match=r"body/a:mass.*already belongs"):
-        parameter_set(parameters, base)
-
-
-def test_stating_the_inertia_of_geoms_changes_only_the_target() -> None:
-    spec, base = compiled(ARM, [])
-    assert not spec.body("b").explicitinertial
-    resolved = parameter_set([one("body/b:mass")], base)
-    write_spec(spec, base, base, resolved, np.array([base.body("b").mass[0]]))
-    assert spec.body("b").explicitinertial
-    np.testing.assert_array_equal(rollout(spec.compile()), rollout(base))
-
-
-def test_values_are_written_into_private_copies() -> None:
-    parameters = [one("body/b:ipos[1]"), one("body/b:mass")]
-    _, base = compiled(ARM, parameters)
-    before, resolved = arrays(base), parameter_set(parameters, base)
-    first = resolved.writer.model(base, np.array([0.2, 3.0]))
-    kept = arrays(first)
-    second = resolved.writer.model(base, np.array([0.3, 4.0]))
-    assert second.body("b").mass[0] == 4.0
-    for name, value in arrays(base).items():
-        np.testing.assert_array_equal(value, before[name], err_msg=name)
-    for name, value in arrays(first).items():
-        np.testing.assert_array_equal(value, kept[name], err_msg=name)
-
-
-def test_writing_twice_leaves_no_trace_of_the_first_value() -> None:
-    parameters = [one("body/b:ipos[1]"), one("body/b:mass")]
-    _, base = compiled(ARM, parameters)
-    resolved = parameter_set(parameters, base)
-    own, fresh = (
-        resolved.writer.model(base, np.array([0.4, 9.0])),
-        resolved.writer.model(base, np.array([0.1, 2.0])),
-    )
-    resolved.writer.write(own, np.array([0.1, 2.0]))
-    for name, value in arrays(own).items():
-        np.testing.assert_array_equal(value, arrays(fresh)[name], err_msg=name)
-
-
-@pytest.mark.parametrize(
-    ("path", "rows"), [("joint/f:damping", range(2, 8)), ("joint/h:damping", [1])]
-)
-def test_joint_fields_reach_every_degree_of_freedom_of_the_joint_and_no_other(
-    path: str, rows
-) -> None:
-    _, base = compiled(SIMPLE, [])
-    own = parameter_set([one(path)], base).writer.model(base, np.array([0.7]))
-    assert list(np.flatnonzero(own.dof_damping)) == list(rows)
-
-
-def test_an_index_left_out_means_zero() -> None:
-    _, base = compiled(ARM, [])
-    assert (
-        resolve(base, "body/b:pos")
-        == resolve(base, "body/b:pos[0]")
-        != resolve(base, "body/b:pos[1]")
-    )
-
-
-def test_names_may_hold_slashes_and_spaces() -> None:
-    _, base = compiled(ARM.replace('"b"', '"left arm/b"'), [])
-    field = resolve(base, "body/left arm/b:pos[2]")
-    assert field.read(base) == 0.5
-    assert moved_bodies([one("body/left arm/b:pos[2]")]) == {"left arm/b"}
-
-
 @pytest.mark.parametrize(
     ("path", "said"),
     [
         ("body/bb:mass", ["unknown body 'bb'", "valid: a, b, world"]),
-        ("body/B:mass", ["unknown body 'B'", "valid: a, b, world"]),
         ("joint/q:damping", ["unknown joint 'q'", "valid: j, k"]),
-        ("actuator/q:gear", ["unknown actuator 'q'", "valid: m, p"]),
-        ("geom/q:size", ["unknown geom 'q'", "valid: g, h"]),
-        ("site/q:pos", ["unknown site 'q'", "valid: s, t"]),
         ("tendon/q:damping", ["unknown tendon 'q'", "valid: none"]),
-        ("body:mass", ["unknown body ''", "valid: a, b, world"]),
         (
             "bodies/a:mass",
             [
@@ -1088,29 +898,16 @@ def test_names_may_hold_slashes_and_spaces() -> None:
         ),
         ("body/world:fullinertia", ["body 'world' has no mass"]),
         ("body/a:rot[3]", ["index 3 is out of range", "valid: 0 to 2"]),
-        ("body/a:logcholesky[10]", ["index 10 is out of range", "valid: 0 to 9"]),
-        ("body/a:firstmoment[3]", ["index 3 is out of range", "valid: 0 to 2"]),
-        ("body/a:origininertia[6]", ["index 6 is out of range", "valid: 0 to 5"]),
-        ("joint/j:rot", ["unknown joint field 'rot'"]),
         ("actuator/m:kp", ["no position servo", "gainprm[i] and biasprm[i]"]),
         ("actuator/m:kv", ["no position or velocity servo"]),
-        ("geom/h:mass[1]", ["index 1 is out of range", "valid: 0 to 0"]),
-        ("geom/h:size[3]", ["index 3 is out of range", "valid: 0 to 2"]),
-        ("option:density[1]", ["index 1 is out of range", "valid: 0 to 0"]),
         ("initial/q:qpos", ["unknown joint 'q'", "valid: j, k"]),
         ("initial/j:qpos.rx", ["has no parts", "write 'initial/j:qpos'"]),
         ("body/a:pos.x", ["has parts such as '.rx'", "write pos[index]"]),
         ("initial/j:qpos[1]", ["index 1 is out of range", "valid: 0 to 0"]),
         ("initial/p:act", ["unknown actuator with a state 'p'", "valid: none"]),
-        ("initial/j:pos", ["unknown initial field 'pos'", "valid: act, qpos, qvel"]),
         ("output/y:bias", ["unknown output 'y'", "valid: none"]),
         ("output/y:delay", ["one delay lags all outputs", "output:delay"]),
-        ("body/a:pos[3]", ["index 3 is out of range", "valid: 0 to 2"]),
-        ("body/a:mass[1]", ["index 1 is out of range", "valid: 0 to 0"]),
-        ("actuator/m:gear[6]", ["index 6 is out of range", "valid: 0 to 5"]),
-        ("option:gravity[3]", ["index 3 is out of range", "valid: 0 to 2"]),
         ("body/a:pos[-1]", ["not of the form kind/name:field[index]"]),
-        ("body/a.mass", ["not of the form kind/name:field[index]"]),
         ("", ["not of the form kind/name:field[index]"]),
     ],
 )
@@ -1122,26 +919,6 @@ def test_the_message_about_a_wrong_path_names_valid_values(path: str, said: list
     assert repr(path) in message
     for part in said:
         assert part in message
-
-
-def test_springref_of_a_ball_joint_is_refused() -> None:
-    _, base = compiled(TENDON, [])
-    with pytest.raises(ExperimentError, match="slide and hinge joints only"):
-        resolve(base, "joint/j:springref")
-
-
-def test_names_are_listed_without_the_unnamed() -> None:
-    _, base = compiled(CONTACT, [])
-    assert names_of(base, "body") == ["world", "ball"]
-    assert names_of(base, "joint") == []
-    assert names_of(base, "geom") == ["floor", "ball"]
-
-
-def test_theta_of_the_wrong_length_is_refused() -> None:
-    _, base = compiled(ARM, [])
-    resolved = parameter_set([one("body/a:mass")], base)
-    with pytest.raises(ValueError, match=r"shorter|longer"):
-        resolved.writer.model(base, np.array([1.0, 2.0]))
 
 
 def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
@@ -1199,68 +976,6 @@ AWKWARD = {
 }
 
 
-@pytest.mark.parametrize("case", AWKWARD)
-def test_the_identified_model_file_has_the_identified_dynamics_or_is_refused(
-    case: str, tmp_path
-) -> None:
-    xml, path, value = AWKWARD[case]
-    table = {"theta": {"target": path, "guess": value}}
-    try:
-        task = make_task(xml, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
-        write_identified(tmp_path / "identified.xml", task.system, np.array([value]))
-    except MjfimError:
-        return  # refused with a message: also right
-    own, again = (
-        task.plant.model(np.array([value])),
-        mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
-    )
-    states = own.nq + own.nv
-    # MuJoCo writes seven digits into XML
-    np.testing.assert_allclose(
-        rollout(again, 100)[:, :states], rollout(own, 100)[:, :states], rtol=0, atol=1e-4
-    )
-
-
-def test_an_unphysical_inertia_is_refused_with_a_clear_message(tmp_path) -> None:
-    table = {"theta": {"target": "body/a:inertia[0]", "guess": 0.01}}
-    task = make_task(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
-    with pytest.raises(MjfimError, match="inertia"):
-        write_identified(tmp_path / "identified.xml", task.system, np.array([5.0]))
-
-
-@pytest.mark.parametrize(
-    ("path", "guess"), [("geom/box:pos[0]", 0.1), ("geom/box:size[0]", 0.1), ("geom/box:mass", 1.0)]
-)
-def test_geoms_that_make_a_simple_bodys_inertia_are_followed(
-    path: str, guess: float, tmp_path
-) -> None:
-    """The parameter keeps the body from being 'simple'; psi is that of separate compiles."""
-    task = make_task(
-        SIMPLE,
-        tmp_path,
-        parameters={"g": {"target": path, "guess": guess}},
-        noise={"state": 0.01},
-        horizon=0.2,
-    )
-    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
-    assert found is not None
-    h, ends = 1e-4 * guess, []
-    for sign in (1.0, -1.0):
-        loop = Loop(
-            task.parameters.writer.model(task.plant.source, np.array([guess + sign * h])), 1
-        )
-        state = task.initial.state[0]
-        for u in task.initial.ctrl:
-            for _ in range(task.system.grid.substeps):
-                state = loop.F(state, u)
-        ends.append(state)
-    reference = loop.minus(ends[0], ends[1]) / (2.0 * h)
-    assert np.abs(reference).max() > 1e-6
-    np.testing.assert_allclose(
-        found.psi[-1, :, 0], reference, rtol=1e-5, atol=1e-7 * np.abs(reference).max()
-    )
-
-
 def in_arm(folder: Path, tables: dict) -> Any:
     """DesignTask of an experiment on ARM."""
     return make_task(ARM, folder, rate=500.0, horizon=0.1, parameters=tables, noise={"state": 0.1})
@@ -1291,18 +1006,6 @@ def test_unphysical_bodies_are_refused_before_a_simulation(
         in_arm(tmp_path, table)
 
 
-def test_both_parameters_of_a_barycentric_inertia_are_named(tmp_path: Path) -> None:
-    table = {
-        "m": {"target": "body/a:mass", "guess": -2.0},
-        "h": {"target": "body/a:firstmoment[2]"},
-    }
-    with pytest.raises(
-        ExperimentError,
-        match=r"parameters\.m\.guess, parameters\.h\.guess: body 'a' has mass -2 kg",
-    ):
-        in_arm(tmp_path, table)
-
-
 @pytest.mark.parametrize("field", ["origininertia[0]", "fullinertia[0]", "mass"])
 def test_plates_and_fixed_loads_without_mass_are_physical(field: str, tmp_path: Path) -> None:
     """These are a plate with few digits, and a load without mass that is fixed to a link."""
@@ -1316,16 +1019,3 @@ def test_plates_and_fixed_loads_without_mass_are_physical(field: str, tmp_path: 
         "theta": {"target": path, "guess": 0.0 if field == "mass" else 0.00999999999, "scale": 1.0}
     }
     make_task(xml, tmp_path, rate=100.0, horizon=0.1, parameters=table, noise={"state": 0.1})
-
-
-def test_a_function_that_changes_the_timestep_is_refused(tmp_path: Path) -> None:
-    """Also if it does not change the timestep at the guess."""
-
-    def edit(spec: Any, value: float) -> None:
-        spec.option.timestep = value
-
-    for guess in (0.001, 0.002):  # ARM's is the second
-        with pytest.raises(
-            ExperimentError, match=r"changes option\.timestep of .*model\.xml from 0\.002 s to"
-        ):
-            in_arm(tmp_path, {"dt": {"function": edit, "guess": guess}})

@@ -54,11 +54,6 @@ def test_scale_and_offset_move_and_turn_the_bound() -> None:
     assert found.upper.tolist() == [np.inf, 3.0]
 
 
-def test_stated_bounds_replace_those_of_physics() -> None:
-    found = parameters(damping={"target": "joint/hinge:damping", "bounds": [-1.0, 5.0]})
-    assert (found.lower[0], found.upper[0]) == (-1.0, 5.0)
-
-
 @pytest.mark.parametrize("key", ["guess", "true"])
 def test_a_value_outside_is_an_error_unless_bounds_contain_it(key: str) -> None:
     spec = {"target": "joint/hinge:damping", key: -0.5}

@@ -6,8 +6,7 @@ import mujoco
 import pytest
 
 from mjfim.model.paths import unit_of
-from mjfim.model.servos import commanded_joint, servo_kind
-from mjfim.model.units import control_unit
+from mjfim.model.units import commanded_joint, control_unit, servo_kind
 
 MODEL = """
 <mujoco>

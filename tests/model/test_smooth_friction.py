@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.model.smooth_friction import has_dry_friction, smooth_dry_friction, smoothing_speeds_of
+from mjfim.model.variants import smooth_dry_friction, smoothing_speeds_of
 
 SLIDER = """
 <mujoco>
@@ -48,17 +48,6 @@ def test_smoothed_friction_is_viscous_up_to_its_speed_and_constant_beyond(push: 
         np.testing.assert_allclose(found, wanted, atol=0.02 if push else 0.002)
 
 
-def test_smoothed_friction_scales_with_the_friction_loss() -> None:
-    """The derivative by the loss is clip(v / s), not zero below s."""
-    forces = []
-    for loss in (0.5, 0.6):
-        model = model_of(0.5)
-        model.dof_frictionloss[0] = loss
-        smooth_dry_friction(model, (0.05, 0.0, 0.0))
-        forces.append(friction(model, 0.02)[0])
-    assert (forces[1] - forces[0]) / 0.1 == pytest.approx(-0.4, rel=0.02)
-
-
 def test_joints_without_friction_or_speed_are_not_changed() -> None:
     model, plain = model_of(0.5), model_of(0.5)
     smooth_dry_friction(model, (0.0, 0.05, 0.05))
@@ -84,9 +73,3 @@ def test_smoothing_speeds_are_a_fraction_of_the_fastest_and_above_sticking() -> 
     data.qvel[0] = 0.5 * slow[0]
     mujoco.mj_forward(sticks, data)
     assert -0.5 < data.qfrc_constraint[0] < -0.2  # within: less than the loss
-
-
-def test_dry_friction_of_joints_and_tendons_is_found() -> None:
-    assert has_dry_friction(model_of(0.1))
-    assert has_dry_friction(model_of(0.0, 0.1))
-    assert not has_dry_friction(model_of(0.0))

@@ -387,21 +387,3 @@ def test_a_wrong_table_is_one_clear_message(
         System.resolve(experiment.restated(tables))
     assert "terms.extra" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_paths_into_terms_are_checked(tmp_path: Path) -> None:
-    experiment = experiment_of(tmp_path, "stribeck")
-    for path, message in (
-        ("term/other:excess", "extra"),
-        ("term/extra:static", "excess, speed"),
-        ("term/extra:excess[0]", "single number"),
-    ):
-        with pytest.raises(ExperimentError, match=message):
-            System.resolve(experiment.replace(parameters={"excess": {"target": path}}))
-
-
-def test_a_bristle_refuses_rk4(tmp_path: Path) -> None:
-    experiment = experiment_of(tmp_path, "stribeck")
-    write_pendulum(tmp_path, integrator="RK4")
-    with pytest.raises(ExperimentError, match="lugre"):
-        System.resolve(experiment)

@@ -14,8 +14,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.design import design_task
 from mjfim.excitation.levels import DescentLevel, first_point
 from mjfim.excitation.task import DesignTask
-from mjfim.model.smooth_friction import SMOOTHING_SPEED_FRACTION
-from mjfim.model.variants import RELAXED, STATED
+from mjfim.model.variants import RELAXED, SMOOTHING_SPEED_FRACTION, STATED
 from mjfim.plant.active_constraints import nothing_acts_along
 from mjfim.plant.mixed_derivatives import SHARED_ORIGIN, SHARED_ORIGIN_SHORT
 from mjfim.records.design import Status
@@ -115,61 +114,6 @@ def test_a_longer_timestep_keeps_the_samples_and_gives_nearly_equal_states(tmp_p
         task.stretched(3)
 
 
-def test_difference_steps_are_calibrated_again_only_where_the_motion_changes(
-    tmp_path: Path,
-) -> None:
-    """A servo without its clamp moves as before unless the clamp cuts off its force."""
-    (tmp_path / "free").mkdir()
-    for folder, largest, is_same in ((tmp_path / "free", 100.0, True), (tmp_path, 5.0, False)):
-        names = ("shoulder", "elbow")
-        limits = {
-            "control": dict.fromkeys(names, (-1.0, 1.0)),
-            "force": dict.fromkeys(names, (-largest, largest)),
-        }
-        text = ARM.replace('-1 1"/>', f'-1 1" forcerange="-{largest} {largest}"/>')
-        task = make_task(
-            text.format(friction=0.0),
-            folder,
-            rate=100.0,
-            parameters={"mass": DRY["mass"]},
-            noise={"state": 0.01},
-            initial={"control": {"kind": "sine", "amplitude": 0.9, "frequency": 2.0}},
-            limits=limits,
-        )
-        free = task.relaxed()
-        assert free.initial.moves_as(task.initial) is is_same
-        assert (free.plant.step_factors is task.plant.step_factors) is is_same
-
-        # These are the steps of a calibration of its own.
-        own = free.plant.derivatives.calibrated_step_factors(free.theta, free.initial)
-        np.testing.assert_allclose(free.plant.step_factors, own)
-
-        # A longer timestep changes the motion as well.
-        long = task.stretched(5)
-        assert long.plant.step_factors is not task.plant.step_factors
-
-
-def test_the_initial_control_is_evaluated_again_only_where_it_moves_differently(
-    tmp_path: Path,
-) -> None:
-    task = arm(tmp_path, 0.0, parameters={"mass": DRY["mass"]})
-    stated = DescentLevel(task, None)
-    first = stated.problem.point(task.initial)
-
-    # Without the clamps, which do not act, nothing is simulated.
-    free = DescentLevel(task.relaxed(), None)
-    steps = free.task.plant.engine_steps
-    assert first_point(free, first) is first
-    assert free.task.plant.engine_steps == steps
-
-    # A longer timestep gives another motion, and another cost.
-    long = DescentLevel(free.task.stretched(5), None)
-    point = first_point(long, first)
-    assert point is not None
-    assert point.cost != first.cost
-    assert long.task.plant.engine_steps > 0
-
-
 def test_clamps_may_act_at_the_samples_of_a_robust_design_only(tmp_path: Path) -> None:
     """The clamp of a servo just lets the expected arm move freely, but not a heavier one."""
     mass = {"mass": {**DRY["mass"], "bounds": (0.1, 2.0)}}
@@ -231,20 +175,6 @@ def test_a_design_with_dry_friction_improves_and_keeps_its_limits(tmp_path: Path
     assert min(design.limits.values()) >= 0.0
     assert design.final.cost < 0.5 * design.initial.cost
     assert design.parameters == ("mass", "drag", "dry")
-
-
-def test_steps_of_the_smoothed_plant_are_counted(tmp_path: Path) -> None:
-    task = arm(tmp_path).relaxed()
-    plant, psi = task.plant, np.zeros((task.samples + 1, task.space.nx, 3))
-    begun, own = plant.engine_steps, plant.simulator.steps
-    plant.derivatives.bilinear(
-        task.theta, task.initial, psi, np.eye(3)[:2], plant.derivatives.quickest_accuracy
-    )
-    batch = (
-        (task.samples + 1) * task.system.grid.substeps * (task.space.nx + len(task.controls) + 1)
-    )
-    assert plant.simulator.steps - own == batch  # A and B
-    assert plant.engine_steps - begun == 4 * batch  # and on the copy the origin and two directions
 
 
 def test_with_sensors_only_mixed_differences_are_taken_on_the_smoothed_plant(

@@ -12,7 +12,7 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.model.urdf_sources import urdf_sources
+from mjfim.model.model_files import urdf_sources
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.models.mjcf import identified_files, same_dynamics, write_identified
 from tests.output.test_mjcf import changes

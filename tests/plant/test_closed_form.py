@@ -12,7 +12,7 @@ import pytest
 
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.closed_form import closed_form_tree
+from mjfim.plant.closed_form.samples import closed_form_tree
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
 from mjfim.records.trajectory import Trajectory
 from tests.support.numerics import make_task
@@ -178,20 +178,6 @@ def test_mixed_derivatives_agree_with_differences(tmp_path) -> None:
     assert_close(found.F_mixed, expected.F_mixed, 1e-5)
 
 
-def test_numbers_that_are_shown_come_from_differences(tmp_path) -> None:
-    task = tree_task(tmp_path)
-    trajectory = curve(task)
-    shown = task.problem.point(trajectory, CENTRAL_DIFFERENCES)
-    quick = task.problem.point(trajectory)
-    expected = with_differences(task).problem.point(trajectory, CENTRAL_DIFFERENCES)
-    assert shown.information is not None and quick.information is not None
-    assert expected.information is not None
-
-    np.testing.assert_array_equal(shown.information, expected.information)
-    assert not np.array_equal(quick.information, expected.information)
-    assert_close(quick.information, expected.information, 1e-5)
-
-
 def test_a_force_that_reaches_its_limit_is_no_derivative(tmp_path) -> None:
     task = tree_task(tmp_path)
     trajectory, derivatives = curve(task), task.plant.derivatives
@@ -217,19 +203,6 @@ def test_a_force_that_reaches_its_limit_is_no_derivative(tmp_path) -> None:
     assert found is not None
     assert not found.F_mixed[0, 3].any()
     assert found.F_mixed[0, 5].any()
-
-
-def test_the_steps_of_differences_are_calibrated_in_closed_form(tmp_path) -> None:
-    task = tree_task(tmp_path)
-    trajectory = curve(task)
-    before = task.plant.engine_steps
-    found = task.plant.derivatives.calibrated_step_factors(task.theta, trajectory)
-    assert task.plant.engine_steps - before < 4 * task.samples * task.plant.simulator.substeps
-
-    differences = with_differences(task).plant.derivatives
-    expected = differences.calibrated_step_factors(task.theta, trajectory)
-    assert found is not None and expected is not None
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_derivatives_of_observations_agree_with_differences(tmp_path) -> None:
@@ -258,24 +231,6 @@ def test_derivatives_of_observations_agree_with_differences(tmp_path) -> None:
         assert_close(found[:, :, number], expected[2][:, :, number], 1e-5)
 
 
-def test_the_gradient_does_not_compute_known_derivatives_again(tmp_path) -> None:
-    task = tree_task(tmp_path)
-    point = task.problem.point(curve(task))
-    before = task.plant.engine_steps
-    known = task.problem.expand(point)
-    steps = task.plant.engine_steps - before
-
-    # The engine moves along one direction only, since the point has the derivatives along itself.
-    engine_steps = task.samples * task.plant.simulator.substeps
-    assert engine_steps <= steps < 2 * engine_steps
-
-    # What was computed anew is the same to the last digit.
-    task.plant.closed_form_memory.latest = None
-    again = task.problem.expand(point)
-    np.testing.assert_array_equal(again.A, known.A)
-    np.testing.assert_array_equal(again.b, known.b)
-
-
 # Actuators whose force or moment arm is another function of the state, and other elements.
 OTHERS = (
     '<general joint="elbow" gaintype="affine" gainprm="0 0 -1"/>',
@@ -295,13 +250,6 @@ def test_other_actuators_have_no_closed_form(other: str) -> None:
     text = text.replace('<body name="base"', '<site name="wall" pos="1 0 1"/><body name="base"')
     cable = '<spatial name="cable"><site site="wall"/><site site="tip"/></spatial>'
     text = text.replace("<actuator>", f"<tendon>{cable}</tendon><actuator>")
-    assert closed_form_tree(mujoco.MjModel.from_xml_string(text)) is None
-
-
-@pytest.mark.parametrize("spring", ['stiffness="1 2"', 'damping="1 2"'])
-def test_springs_and_dampers_of_higher_order_have_no_closed_form(spring: str) -> None:
-    text = TREE.format(option="", joint="", load="")
-    text = text.replace('stiffness="30" damping="1"', spring)
     assert closed_form_tree(mujoco.MjModel.from_xml_string(text)) is None
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mjfim.experiment.system import System
-from mjfim.model.mujoco_log import silence_mujoco_log
-from mjfim.plant.running_law import InputContext
+from mjfim.model.loading import silence_mujoco_log
+from mjfim.plant.laws.running_law import InputContext
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
 
 # The arm with a sensor of the torque of the shoulder's motor.
@@ -166,30 +166,6 @@ def test_a_law_on_the_voltage_of_a_motor_with_a_current(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.states[0], states, atol=1e-11)
 
 
-def test_parameters_that_need_a_compile_keep_the_law(tmp_path: Path) -> None:
-    """The numbers of the law are in the model that is compiled anew."""
-    geom = '<geom name="rod" type="box" size="0.02 0.02 0.1" pos="0 0 -0.1" mass="1.2"/>'
-    text = ARM.read_text()
-    first = text.index('<inertial pos="0 0 -0.15"')
-    text = text[:first] + geom + text[text.index('<joint name="elbow"') :]
-    path = tmp_path / "rod.xml"
-    path.write_text(text)
-    parameters = {
-        "size": {"target": "geom/rod:size[2]"},
-        "kp": {"target": "controller/shoulder:kp"},
-    }
-    experiment = arm_experiment({"shoulder": LAWS["pd"]}, parameters=parameters, model=str(path))
-    plant = System.resolve(experiment).plant
-    models = plant.models(np.array([[0.1, 60.0], [0.12, 40.0]]))
-    inputs = signals(System.resolve(experiment))
-    found = plant.simulator.rollout(models, np.stack([START] * 2), np.stack([inputs] * 2))
-    for i, kp in enumerate((60.0, 40.0)):
-        columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
-        laws = {0: plain({**LAWS["pd"], "kp": kp}, "shoulder")}
-        states, _ = simulate(models[i], laws, columns, plant.dt, SAMPLES, START)
-        np.testing.assert_allclose(found.states[i], states, atol=1e-11)
-
-
 def test_measured_forces_are_those_of_the_law(tmp_path: Path) -> None:
     """A force sensor shows the control that the law has computed at the same instant."""
     path = tmp_path / "sensed.xml"
@@ -271,11 +247,3 @@ def test_a_diverging_loop_is_found() -> None:
     with silence_mujoco_log():
         found = stable.plant.simulator.rollout(models, starts, inputs)
     assert found.finite.tolist() == [False, True]
-
-
-def test_single_samples_are_refused() -> None:
-    """A law remembers what happened before a sample."""
-    system = System.resolve(arm_experiment({"shoulder": LAWS["pd"]}))
-    model = system.plant.model(system.parameters.guess)
-    with pytest.raises(NotImplementedError, match="memory"):
-        system.plant.simulator.step([model], START[None], np.zeros((1, 2)))

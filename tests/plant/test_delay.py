@@ -43,15 +43,6 @@ def test_a_cubic_is_shifted_exactly_and_a_quartic_is_not() -> None:
         assert (error < 1e-8) == (degree <= 3)
 
 
-def test_whole_samples_are_exact() -> None:
-    """A delay of whole samples needs no interpolation; without a delay no bit changes."""
-    y = curve(T)
-    np.testing.assert_array_equal(OutputDelay.on_grid(len(T), 0.0, DT).apply(y), y)
-    np.testing.assert_allclose(
-        OutputDelay.on_grid(len(T), 3 * DT, DT).apply(y)[3:], y[:-3], rtol=0, atol=1e-12
-    )
-
-
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 2.6])
 def test_nothing_depends_on_samples_after_the_delayed_time(delay: float) -> None:
     """Later samples contain the feedback of a controller on the noise of this measurement."""
@@ -101,16 +92,6 @@ def test_the_derivative_by_the_delay(delay: float) -> None:
     np.testing.assert_allclose(rate[inside], -slope[inside], rtol=0, atol=2e-2)
 
 
-def test_the_derivative_at_zero_delay_is_one_sided() -> None:
-    """The guess of a delay may be zero: its derivative there is the one towards positive delays."""
-    y = curve(T)
-    h = 1e-7
-    quotient = (OutputDelay.on_grid(len(T), h, DT).apply(y) - y) / h
-    np.testing.assert_allclose(
-        OutputDelay.on_grid(len(T), 0.0, DT).derivative(y)[1:], quotient[1:], rtol=0, atol=2e-2
-    )
-
-
 def test_adjoints_by_dot_products() -> None:
     """`<v, L y> = <L' v, y>` for arrays of any rank; shapes are kept."""
     rng = np.random.default_rng(0)
@@ -127,20 +108,6 @@ def test_adjoints_by_dot_products() -> None:
             assert np.sum(v * backward(y)) != pytest.approx(left, rel=1e-3), (
                 "not its own adjoint: a weak test"
             )
-
-
-@pytest.mark.parametrize("samples", [2, 3])
-def test_short_recordings_are_interpolated_by_a_polynomial_through_all_samples(
-    samples: int,
-) -> None:
-    """Two samples give a line, three a parabola."""
-    t = np.arange(float(samples))
-    y = 2.0 + (t**2 if samples == 3 else t)
-    delayed = OutputDelay.on_grid(samples, 0.4, 1.0).apply(y)
-    wanted = np.maximum(t - 0.4, 0.0)
-    np.testing.assert_allclose(
-        delayed, 2.0 + (wanted**2 if samples == 3 else wanted), rtol=0, atol=1e-12
-    )
 
 
 def test_the_sensitivity_to_a_delay_is_the_derivative_of_delayed_outputs(tmp_path: Path) -> None:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mjfim.excitation.levels import DescentLevel
-from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.lumped_parameters import LumpedParameters
-from tests.support.numerics import body_task, cart_task
+from tests.support.numerics import cart_task
 
 # The force of the cart is the product of the gain and the gear of its motor.
 PRODUCT = {
@@ -76,54 +73,6 @@ def test_a_level_moves_only_the_parameters_that_are_not_lumped(tmp_path) -> None
     assert rollouts in (3, 6)
     assert np.isfinite(point.cost)
     assert level.problem.lumped is not None and point.lumps
-
-
-def test_a_search_that_goes_on_elsewhere_still_moves_all_parameters(tmp_path) -> None:
-    task = cart_task(tmp_path, parameters=PRODUCT)
-    lumped = LumpedParameters.of(WITH_EFFECT, task.parameters.magnitude)
-    point = replace(task.problem, lumped=lumped).point(task.initial)
-    assert not point.lumps
-    assert point.cost == task.problem.point(task.initial).cost
-
-    # A later part of a search has a problem of its own, which does not simulate the probe again.
-    N, nu = task.initial.ctrl.shape
-    zeta = TangentCurve(z=np.zeros((N + 1, task.space.nx)), v=np.full((N, nu), 0.01))
-    K = np.zeros((N, nu, task.space.nx))
-    steps, costs = [], []
-    for problem in (replace(task.problem, lumped=lumped), task.problem):
-        before = task.plant.engine_steps
-        moved = problem.project(point, zeta, 1.0, K)
-        steps.append(task.plant.engine_steps - before)
-        costs.append(moved.cost)
-        assert not moved.lumps
-    assert steps[0] == steps[1] and costs[0] == costs[1]
-
-
-def test_an_output_that_shows_round_off_only_does_not_prevent_lumping(tmp_path) -> None:
-    task = body_task(tmp_path)
-    p, ny = len(task.parameters), len(task.plant.outputs)
-    direction = np.eye(p)[:, :1] - np.eye(p)[:, 1:2]
-    lumped = LumpedParameters.of(direction * task.parameters.magnitude[:, None], np.ones(p))
-    assert lumped is not None
-
-    # The effects cancel in every output but the last, whose values of 1 have an effect of 1e-11.
-    psi = np.ones((5, task.space.nx, p)) / task.parameters.magnitude
-    G = np.ones((5, ny, p)) / task.parameters.magnitude
-    G[:, -1] *= 1e-11
-    dx = np.zeros((5, task.space.nx))
-    dy = np.zeros((5, ny))
-    dy[:, -1] = 1e-11
-    explained = task.plant.derivatives._is_explained
-    assert explained(lumped, psi, G, np.ones(ny), dx, dy)
-
-    # An effect that is no round-off counts.
-    dy[:, 0] = 1.0
-    assert not explained(lumped, psi, G, np.ones(ny), dx, dy)
-
-
-def test_round_off_in_a_direction_takes_no_parameter_into_the_lumping() -> None:
-    lumped = LumpedParameters.of(np.array([[1.0], [-1.0], [1e-16]]), np.ones(3))
-    assert lumped is not None and lumped.probe[2] == 0.0
 
 
 def test_nearly_dependent_directions_are_not_lumped() -> None:

@@ -44,19 +44,6 @@ def test_whitened_residuals_are_the_normal_density() -> None:
     )
 
 
-def test_independent_outputs_are_the_special_case() -> None:
-    """Division by sigma and the triangular solve agree on a diagonal covariance."""
-    sigma, values = np.array([0.5, 2.0, 0.1]), np.random.default_rng(1).standard_normal((7, 3, 2))
-    plain = Noise.independent(sigma, stride=2)
-    assert not plain.correlated
-    np.testing.assert_allclose(plain.whiten(values), values / sigma[:, None], rtol=1e-15)
-    np.testing.assert_allclose(plain.factor, np.diag(sigma), rtol=1e-15)
-    faint = Noise(covariance=plain.covariance + 1e-300 * (1 - np.eye(3)), strides=plain.strides)
-    assert faint.correlated
-    np.testing.assert_allclose(faint.whiten(values), plain.whiten(values), rtol=1e-14)
-    assert plain.strides.tolist() == [2, 2, 2]
-
-
 def test_jacobians_are_whitened_like_residuals() -> None:
     """With any trailing axes; products of whitened rows are the Fisher information by the precision
     matrix.
@@ -115,21 +102,6 @@ def test_missing_values_are_marginalised() -> None:
     # taking rows of the joint whitening instead would condition on zeros
     conditioned = noise.whiten(np.where(present, values, 0.0))[present]
     assert np.abs(conditioned - white).max() > 0.1
-
-
-def test_missing_values_of_jacobians_go_with_those_of_residuals() -> None:
-    """Their orders agree, for correlated and for independent outputs."""
-    rng = np.random.default_rng(5)
-    y, G, present = (
-        rng.standard_normal((9, 4)),
-        rng.standard_normal((9, 4, 3)),
-        rng.random((9, 4)) < 0.5,
-    )
-    for noise in (correlated(), Noise.independent([1.0, 2.0, 3.0, 4.0])):
-        theta = np.array([0.3, -1.0, 2.0])
-        together = noise.whiten_present(y + G @ theta, present)
-        apart = noise.whiten_present(y, present) + noise.whiten_present(G, present) @ theta
-        np.testing.assert_allclose(together, apart, rtol=1e-12, atol=1e-12)
 
 
 def test_samples_have_the_stated_covariance() -> None:

@@ -129,52 +129,6 @@ def test_observations_agree_with_plain_steps_at_every_engine_step(
     assert (np.abs(torques).max() == 0.9) is not lifted
 
 
-def test_single_samples_and_the_whole_curve_give_equal_observations(tmp_path: Path) -> None:
-    task = floating_task(tmp_path)
-    observations, plant = observations_of(task), task.plant
-    watched = plant.observe(task.theta, task.control, observations)
-    assert watched is not None
-    trajectory, observed = watched
-    for order in (slice(None), slice(None, None, -1), slice(4, 9)):
-        stepped = plant.simulator.step(
-            [plant.model(task.theta)],
-            trajectory.state[:-1][order],
-            task.control[order],
-            observations,
-        )
-        np.testing.assert_allclose(
-            stepped.observed,
-            observed[order][:, list(observations.derivative_rows)],
-            rtol=0,
-            atol=1e-9,
-        )
-        np.testing.assert_allclose(stepped.states, trajectory.state[1:][order], rtol=0, atol=1e-12)
-    assert (
-        plant.simulator.step(
-            [plant.model(task.theta)], trajectory.state[:1], task.control[:1]
-        ).observed
-        is None
-    )
-
-
-def test_a_diverging_control_has_no_observations(tmp_path: Path) -> None:
-    task = floating_task(tmp_path)
-    assert task.plant.observe(task.theta, 1e12 * task.control, observations_of(task)) is None
-
-
-def test_observations_cost_no_further_steps(tmp_path: Path) -> None:
-    task = floating_task(tmp_path)
-    observations, plant = observations_of(task), task.plant
-    counts = []
-    for own in (None, observations):
-        begun = plant.simulator.steps
-        plant.simulator.step(
-            [plant.model(task.theta)], task.initial.state[:7], task.control[:7], own
-        )
-        counts.append(plant.simulator.steps - begun)
-    assert counts == [35, 35]
-
-
 def rows_of_sample(
     model: Any, state: Array, ctrl: Array, observations: SubstepObservations, substeps: int
 ) -> Array:

@@ -18,7 +18,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.files import as_json
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.fisher import FisherInformation
-from mjfim.plant.rollout_derivatives import RolloutDerivatives
+from mjfim.plant.derivatives import RolloutDerivatives
 from mjfim.records.trajectory import Recording
 from mjfim.studies.check import check, check_recordings, check_task
 from tests.support.dense_residuals import dense_residuals

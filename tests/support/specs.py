@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from mjfim.model.parameter_writer import write_element
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import resolve
-from mjfim.model.spec_writer import write_element
 from tests.support.numerics import Array
 
 

@@ -13,7 +13,7 @@ from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.inverse_dynamics.motion import FEWEST_READINGS
 from mjfim.model.coordinates import actuator_names
 from mjfim.model.elements import element_name
-from mjfim.model.servos import acts_at_joint
+from mjfim.model.units import acts_at_joint
 
 # Sensors of forces of single actuators, and of all actuators on a joint.
 ACTUATOR_FORCE = int(mujoco.mjtSensor.mjSENS_ACTUATORFRC)

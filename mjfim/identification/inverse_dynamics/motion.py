@@ -19,7 +19,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.inverse_dynamics.spline import Readings, RegressionSpline, fit_spline
 from mjfim.model.coordinates import dof_names
-from mjfim.model.integrators import is_rk4
+from mjfim.model.elements import is_rk4
 from mjfim.plant.outputs import outputs_by_state
 
 # Number of points of the motion for each interval between the knots of the finest spline.

@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
-from mjfim.model.integrators import is_rk4
-from mjfim.model.servos import actuator_gear
+from mjfim.model.elements import is_rk4
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, control_sizes, model_length
 from mjfim.model.terms.term import (
     FieldDescription,
@@ -21,7 +20,7 @@ from mjfim.model.terms.term import (
     named_element,
     stated_quantities,
 )
-from mjfim.model.units import FORCE_UNITS, LENGTH, force_unit
+from mjfim.model.units import FORCE_UNITS, LENGTH, actuator_gear, force_unit
 
 # Types of gain for which an activation may take the place of the control.
 PLAIN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)

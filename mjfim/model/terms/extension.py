@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.servos import actuator_gear, commanded_joint
 from mjfim.model.terms.term import Term
+from mjfim.model.units import actuator_gear, commanded_joint
 
 # Types of dynamics whose activation follows the control, so that it equals the control at rest.
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))

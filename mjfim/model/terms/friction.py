@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
-from mjfim.model.integrators import is_rk4
+from mjfim.model.elements import is_rk4
 from mjfim.model.terms.term import (
     FieldDescription,
     JointSizes,

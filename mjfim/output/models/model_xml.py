@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.files import replacing
-from mjfim.model.included_files import included_file
 from mjfim.model.inertia import BodyInertia
-from mjfim.model.mujoco_log import collected_warnings
+from mjfim.model.loading import collected_warnings
+from mjfim.model.model_files import included_file
 
 # Where the element that defines an object stands; other objects are elements of <worldbody>.
 PLACES = {

@@ -23,7 +23,7 @@ from mjfim.errors import ExperimentError, MjfimError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align
-from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.model.loading import silence_mujoco_log
 from mjfim.records.trajectory import Recording
 
 # Distance from the guess to a bound that is not stated, in sizes of the parameter; sysid takes

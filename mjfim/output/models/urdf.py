@@ -25,6 +25,7 @@ from mjfim.model.inertia import (
     from_barycentric,
     to_barycentric,
 )
+from mjfim.model.model_files import UrdfSource, urdf_sources
 from mjfim.model.parameters import Parameter
 from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath
 from mjfim.model.targets import (
@@ -33,7 +34,6 @@ from mjfim.model.targets import (
     OutputDelayField,
     OutputScaleField,
 )
-from mjfim.model.urdf_sources import UrdfSource, urdf_sources
 from mjfim.output.models.model_xml import (
     ROUNDING,
     ModelXml,

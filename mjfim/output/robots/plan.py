@@ -13,7 +13,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.limits import limits_of
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint
-from mjfim.model.servos import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
+from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
 from mjfim.output.archive import check_fits
 from mjfim.output.playback import reference_columns, simulate_playback
 from mjfim.records.design import Design

@@ -13,7 +13,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.model.coordinates import joint_names
 from mjfim.model.elements import element_count, element_name, identifier, names_of
 from mjfim.model.inertia import body_inertia
-from mjfim.model.servos import servo_kind
+from mjfim.model.units import servo_kind
 from mjfim.studies.first_experiment.wishes import GROUPS, Group
 
 # Bodies at the end of the chain whose mass and centre of mass are proposed.

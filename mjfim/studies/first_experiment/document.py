@@ -9,7 +9,7 @@ import tomlkit
 from tomlkit.items import InlineTable, Table
 
 from mjfim.excitation.limits import limits_of_model
-from mjfim.model.orientation import QUATERNION_PLACE
+from mjfim.model.limited_elements import QUATERNION_PLACE
 from mjfim.model.paths import unit_of
 from mjfim.studies.first_experiment.candidates import Candidate
 from mjfim.studies.first_experiment.propose import Proposal

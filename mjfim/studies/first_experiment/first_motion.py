@@ -11,8 +11,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs, tangent_components
-from mjfim.model.servos import actuator_gear, commanded_joint
 from mjfim.model.sizes import control_sizes, translations
+from mjfim.model.units import actuator_gear, commanded_joint
 from mjfim.studies.first_experiment.start import MARGIN, Start
 
 # Share of the range of a control that the first trial uses to each side of the resting control.

@@ -12,8 +12,8 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs
-from mjfim.model.servos import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.model.sizes import control_sizes, translations
+from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.studies.first_experiment.time_scale import free_time, pendulum_time, reach
 from mjfim.studies.first_experiment.wishes import require_keyframe, resting_keyframes
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.integrators import is_rk4
+from mjfim.model.elements import is_rk4
 
 # Samples in one characteristic period of the motion.
 SAMPLES_PER_PERIOD = 100

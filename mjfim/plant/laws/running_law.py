@@ -20,7 +20,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.control_laws import ControlLaw
-from mjfim.plant.law_commands import LawCommands, LawNumbers, Ticks, filter_shares
+from mjfim.plant.laws.law_commands import LawCommands, LawNumbers, Ticks, filter_shares
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,22 +15,22 @@ from mujoco.batch import Batch
 
 from mjfim.arrays import Array
 from mjfim.model.control_laws import MEASURED_SUMS, ControlLaw, ControlLaws
-from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.model.loading import silence_mujoco_log
 from mjfim.plant.batch import (
     BatchSimulator,
     Rollouts,
     SubstepObservations,
     is_accepted,
 )
-from mjfim.plant.law_commands import LawCommands, LawNumbers, Ticks, lead_time
-from mjfim.plant.running_law import (
+from mjfim.plant.laws.law_commands import LawCommands, LawNumbers, Ticks, lead_time
+from mjfim.plant.laws.running_law import (
     InputContext,
     LawMemory,
     LoopTrace,
     RunningLaws,
     memory_at_begin,
 )
-from mjfim.plant.state_sizes import StateSizes
+from mjfim.plant.state_space import StateSizes
 
 # Number of batches that are kept, one for each of the latest numbers of simulations.
 KEPT_BATCHES = 6

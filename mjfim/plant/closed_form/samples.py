@@ -21,11 +21,19 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.plant.affine_forces import FORCE_FIELDS, AffineForces, ForceSlopes
-from mjfim.plant.batch import BatchSimulator
-from mjfim.plant.joint_tree import JointTree
-from mjfim.plant.parameter_change import ParameterChange
-from mjfim.plant.rigid_body_motion import MOTION_FIELDS, RigidBodyMotion, barycentric_inertias
+from mjfim.plant.batch import BatchSimulator, SubstepObservations
+from mjfim.plant.closed_form.affine_forces import (
+    FORCE_FIELDS,
+    AffineForces,
+    ForceSlopes,
+    ParameterChange,
+)
+from mjfim.plant.closed_form.rigid_body_motion import (
+    MOTION_FIELDS,
+    JointTree,
+    RigidBodyMotion,
+    barycentric_inertias,
+)
 
 # Smallest number of joints for which derivatives have a closed form. With four hinges, a gradient
 # takes half of the time that steps of the engine take, with seven a third.
@@ -399,3 +407,85 @@ def advance(derivative: Array, acceleration: Array, timestep: float) -> None:
 def _flat(values: Array) -> Array:
     """(N * s, ...) values of all engine steps from (N, s, ...)."""
     return values.reshape(-1, *values.shape[2:])
+
+
+def observation_jacobian(
+    found: SampleJacobians, ctrl: Array, observations: SubstepObservations
+) -> Array | None:
+    """Derivatives of observations by state and control.
+
+    Args:
+        found: Derivatives of N samples.
+        ctrl: (N, nu) controls of the samples.
+        observations: The w observed quantities.
+
+    Returns:
+        (N, S, w, nx+nu) derivatives at the S rows of `SubstepObservations.derivative_rows`; None
+        for quantities that have none here.
+    """
+    if observations.has_stages or len(observations.turns) or len(observations.tendon_lengths):
+        return None
+
+    samples = _ObservedSamples(found, ctrl, observations)
+    AB = unmoved(found.accelerations)
+    rows = []
+    for i in range(found.accelerations.shape[1]):
+        acceleration = by_state_and_control(found.accelerations[:, i], AB)
+        forces = samples.forces(i, AB)
+        advance(AB, acceleration, observations.timestep)
+        if i + 1 in observations.derivative_substeps:
+            rows.append(np.concatenate([samples.motion(AB, acceleration), forces], axis=1))
+
+    # The further row has the forces at the end of the sample.
+    if observations.force_rows:
+        forces = samples.forces(found.accelerations.shape[1], AB)
+        motion = rows[-1][:, : rows[-1].shape[1] - forces.shape[1]]
+        rows.append(np.concatenate([motion, forces], axis=1))
+    return np.stack(rows, axis=1)
+
+
+class _ObservedSamples:
+    """Derivatives of the observations at single engine steps of samples."""
+
+    def __init__(
+        self, found: SampleJacobians, ctrl: Array, observations: SubstepObservations
+    ) -> None:
+        """Set the samples, their controls and the observations."""
+        self.found, self.ctrl, self.observations = found, ctrl, observations
+
+    def motion(self, AB: Array, acceleration: Array) -> Array:
+        """(N, m, nx+nu) derivatives of positions, speeds and accelerations.
+
+        Args:
+            AB: (N, 2 nv, nx+nu) derivatives of the state after an engine step.
+            acceleration: (N, nv, nx+nu) derivatives of the mean acceleration of the step.
+        """
+        wanted, nv = self.observations, acceleration.shape[1]
+        return np.concatenate(
+            [
+                AB[:, wanted.positions],
+                AB[:, nv + wanted.velocities],
+                acceleration[:, wanted.accelerations],
+            ],
+            axis=1,
+        )
+
+    def forces(self, step: int, AB: Array) -> Array:
+        """(N, f, nx+nu) derivatives of the forces that belong to the state before an engine step.
+
+        Args:
+            step: Number of the engine step, from 0.
+            AB: (N, 2 nv, nx+nu) derivatives of the state before it.
+        """
+        wanted = self.observations
+        if not wanted.fields:
+            return np.zeros((len(AB), 0, AB.shape[2]))
+
+        slopes = self.found.forces.actuator_slopes(self.found.states[:, step], self.ctrl)
+        actuators = by_state_and_control(slopes, AB)
+        joints = self.found.forces.moments.T @ actuators
+        tendons = [actuators[:, list(pulling)].sum(axis=1) for pulling in wanted.tendon_forces]
+        parts = [actuators[:, wanted.actuator_forces], joints[:, wanted.joint_forces]]
+        if tendons:
+            parts.append(np.stack(tendons, axis=1))
+        return np.concatenate(parts, axis=1)

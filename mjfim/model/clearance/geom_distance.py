@@ -16,8 +16,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.model.geom_pairs import GeomPair
-from mjfim.model.pair_distance import Indices, PairDistances
+from mjfim.model.clearance.pair_distance import GeomPair, Indices, PairDistances
 
 # Largest number of lower bounds of distances that are held in memory at once. Where there are
 # more, the configurations are processed in blocks.

@@ -1,0 +1,1 @@
+"""Distances of a robot to itself and to the world."""

@@ -1,0 +1,1 @@
+"""Control laws in the loop: simulations in which they compute the controls."""
