@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,11 +18,7 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     COARSER_STEP_FACTOR,
-    COLUMN_ERROR_FACTOR,
-    ERROR_FACTOR,
     LEAST_EFFECT,
-    LEAST_RELATIVE_EFFECT,
-    ZERO_SINGULAR_VALUES,
     NullSpace,
     find_null_space,
     parameter_groups,
@@ -44,16 +40,12 @@ ROW_ROUND_OFF = 1e-7
 # An effect below this fraction of the strongest one in earlier experiments is round-off.
 NEGLIGIBLE_EFFECT = 1e-6
 
-# Number of samples of a trajectory whose single steps are tested first; if they leave a doubt, all
-# samples are tested.
-FEW_SAMPLES = 60
+# Largest number of samples of a trajectory whose single steps are tested.
+MOST_SAMPLES = 200
 
 # Difference steps of the parameters for single engine steps, relative to the size of each
 # parameter.
 SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
-
-# Smallest divisor; it prevents a division by zero.
-TINY = 1e-300
 
 # An effect on a whole motion is certain if it exceeds this multiple of the derivatives' error.
 CLEAR_EFFECT = 1e3
@@ -183,15 +175,15 @@ class IdentifiabilityTest:
             The null spaces.
         """
         J = self.rows(sensitivity)
-        single_steps = _single_step_null_space(self, [trajectory])
+        steps = _step_rows(self, trajectory)
 
         # One difference step is enough if all singular values are far larger than round-off.
-        quick = _null_space(self, [J], None, single_steps.directions)
+        quick = _null_space(self, [J], None, _hidden_from_steps(self, [steps]))
         if quick.smallest > CLEAR_SINGULAR_VALUE and not quick.count:
             return _with_groups(self, quick, quick)
 
         J, error = _rows_and_error(self, trajectory, sensitivity)
-        return _identifiability(self, trajectory, J, error, single_steps, stop)
+        return _identifiability(self, J, error, steps, stop)
 
     def of_rows(
         self,
@@ -213,8 +205,8 @@ class IdentifiabilityTest:
         Returns:
             The null spaces.
         """
-        single_steps = _single_step_null_space(self, [trajectory])
-        return _identifiability(self, trajectory, J, error, single_steps, stop)
+        steps = _step_rows(self, trajectory)
+        return _identifiability(self, J, error, steps, stop)
 
 
 def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
@@ -242,174 +234,85 @@ def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
 
 def _identifiability(
     test: IdentifiabilityTest,
-    trajectory: Trajectory,
     J: Array,
     error: Array,
-    single_steps: _SingleSteps,
+    steps: RowsAndError | None,
     stop: Callable[[], bool],
 ) -> Identifiability:
-    """Null space of given rows, and the part of it that remains with random trajectories.
+    """Null space of the rows of a motion, and the part of it that remains with random motions.
+
+    Whole motions show small effects that add up, but are inaccurate where the motion is chaotic;
+    single steps are accurate, but do not see every contact. A combination counts as hidden if
+    neither shows it.
 
     Args:
-        test: The plant and its parameters.
-        trajectory: One of the trajectories to which the rows belong.
-        J: (n, p) whitened rows of G.
-        error: (n, p) their change with a longer difference step.
-        single_steps: What single steps of the trajectory show.
-        stop: Asked before every random trajectory; true leaves out the rest of them.
+        test: The test.
+        J: (n, p) whitened rows of G of the motion.
+        error: (n, p) change of J with a longer difference step.
+        steps: What single steps of the motion show.
+        stop: Asked before each random motion.
     """
-    directions = _hidden_from_rows(test, single_steps.directions, J, error)
-    along_trajectory = _null_space(test, [J], [error], directions)
+    hidden = _hidden_from_rows(test, _hidden_from_steps(test, [steps]), J, error)
+    along_trajectory = _null_space(test, [J], [error], hidden)
     if not along_trajectory.count or stop():
         return _with_groups(test, along_trajectory, along_trajectory)
 
     tried = list(itertools.takewhile(lambda _: not stop(), test.probes(PROBES)))
-    shown = replace(single_steps, directions=directions)
-    known = _single_step_null_space(test, [trajectory, *tried], shown).directions
-    known = _hidden_from_rows(test, known, J, error)
+    of_probes = [_step_rows(test, probe) for probe in tried]
+    hidden = _hidden_from_rows(test, _hidden_from_steps(test, [steps, *of_probes]), J, error)
     stack, errors = [J], [error]
 
     # Whole motions are differentiated only if single steps do not explain the null space.
-    if known is None or along_trajectory.count > known.shape[1]:
+    if hidden is None or along_trajectory.count > hidden.shape[1]:
         differentiated = test.differentiated or (lambda probes: map(test.rows_along, probes))
         for found in differentiated(itertools.takewhile(lambda _: not stop(), tried)):
             if found is not None:
                 stack.append(found[0])
                 errors.append(found[1])
 
-    along_all = _null_space(test, stack, errors, known)
+    along_all = _null_space(test, stack, errors, hidden)
     return _with_groups(test, along_trajectory, along_all)
 
 
-def _single_step_null_space(
-    test: IdentifiabilityTest,
-    trajectories: Sequence[Trajectory],
-    known: _SingleSteps | None = None,
-) -> _SingleSteps:
-    """Directions without effect on single steps and their outputs.
-
-    Such a direction changes no motion and no output. Single steps show this accurately, even if
-    motions are chaotic.
-
-    Args:
-        test: The plant and its parameters.
-        trajectories: Trajectories whose samples are tested.
-        known: What single steps of the first trajectory show, or None where it is not known.
+def _step_rows(test: IdentifiabilityTest, trajectory: Trajectory) -> RowsAndError | None:
+    """Effects on single steps of a trajectory and their outputs, and the error of these effects.
 
     Returns:
-        The directions, none if no wanted parameter changes the model or if all steps diverge.
+        (n, p) rows, and their change with a longer difference step; None where no parameter of the
+        model is wanted, or where a step diverges. Control laws remember what happened before a
+        sample, so that only whole motions are tested with them.
     """
-    parameters = test.parameters
-    inside = parameters.interest[parameters.changes_model[parameters.interest]]
-
-    # Control laws remember what happened before a sample, so that only whole motions are tested.
-    if not len(inside) or test.plant.laws is not None:
-        return _SingleSteps(few=None, directions=None)
-
-    # A few samples are tested first. Another sample may show an effect of the directions that have
-    # none there, such as a contact that depends on them. One combination of them is tested at all
-    # samples, and every parameter only where that combination has an effect.
-    few = _step_effects(test, trajectories[:1], FEW_SAMPLES) if known is None else known.few
-    if few is not None:
-        others = trajectories[1:]
-        directions = None if known is None else known.directions
-        if directions is None:
-            others = trajectories
-            directions = _without_effect(test, few, inside)
-
-        if not _has_effect(test, others, few, directions):
-            return _SingleSteps(few=few, directions=_hidden_from_earlier(test, directions))
-
-    longest = max(trajectory.samples for trajectory in trajectories)
-    found = _step_effects(test, trajectories, longest)
-    if found is None:
-        return _SingleSteps(few=few, directions=None)
-
-    directions = _without_effect(test, found, inside)
-    return _SingleSteps(few=few, directions=_hidden_from_earlier(test, directions))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _StepEffects:
-    """Effects of directions of theta on single steps of trajectories.
-
-    Attributes:
-        J: (n, m) effects, see `mjfim.plant.step_derivatives.StepEffects`.
-        error: (n, m) their change with a longer difference step.
-        output_sizes: (ny,) sizes of the outputs, or None where there are no sensors.
-    """
-
-    J: Array
-    error: Array
-    output_sizes: Array | None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SingleSteps:
-    """Effects of the parameters on single steps of trajectories.
-
-    Attributes:
-        few: Effects of each parameter at a few samples of the first trajectory; None where no
-            parameter changes the model or all of these steps diverge.
-        directions: (t, k) directions without effect on the steps, or None where there are no
-            such parameters or steps.
-    """
-
-    few: _StepEffects | None
-    directions: Array | None
-
-
-def _step_effects(
-    test: IdentifiabilityTest,
-    trajectories: Sequence[Trajectory],
-    most: int,
-    *,
-    directions: Array | None = None,
-    output_sizes: Array | None = None,
-) -> _StepEffects | None:
-    """Effects on single steps; None if all trajectories diverge.
-
-    Args:
-        test: The plant and its parameters.
-        trajectories: Trajectories whose samples are tested.
-        most: Largest number of samples of each trajectory.
-        directions: (m, p) directions of theta; None for each parameter alone.
-        output_sizes: (ny,) sizes of the outputs; None for the largest effects of each trajectory.
-    """
-    stack, errors = [], []
-    sizes = output_sizes
-    for trajectory in trajectories:
-        count = min(most, trajectory.samples)
-        picked = np.unique(np.linspace(0, trajectory.samples - 1, count).astype(int))
-        try:
-            first, second = (
-                test.plant.derivatives.one_step(
-                    test.theta,
-                    trajectory,
-                    picked,
-                    step,
-                    directions=directions,
-                    output_sizes=output_sizes,
-                )
-                for step in SINGLE_STEP_DIFFERENCES
-            )
-        except SimulationDivergedError:
-            continue
-        stack.append(first.rows)
-        errors.append(second.rows - first.rows)
-        sizes = first.output_sizes
-
-    if not stack:
+    if not len(_inside(test)) or test.plant.laws is not None:
         return None
-    return _StepEffects(J=np.concatenate(stack), error=np.concatenate(errors), output_sizes=sizes)
+    count = min(MOST_SAMPLES, trajectory.samples)
+    picked = np.unique(np.linspace(0, trajectory.samples - 1, count).astype(int))
+    try:
+        first, second = (
+            test.plant.derivatives.one_step(test.theta, trajectory, picked, step)
+            for step in SINGLE_STEP_DIFFERENCES
+        )
+    except SimulationDivergedError:
+        return None
+    return first, second - first
 
 
-def _without_effect(test: IdentifiabilityTest, effects: _StepEffects, inside: np.ndarray) -> Array:
-    """(t, k) directions of the parameters inside the model without effect on single steps."""
-    parameters = test.parameters
+def _inside(test: IdentifiabilityTest) -> np.ndarray:
+    """Indices of the wanted parameters that change the model."""
+    interest = test.parameters.interest
+    return np.asarray(interest[test.parameters.changes_model[interest]])
+
+
+def _hidden_from_steps(
+    test: IdentifiabilityTest, steps: Sequence[RowsAndError | None]
+) -> Array | None:
+    """(t, k) directions without effect on single steps; None where no step is known."""
+    known = [each for each in steps if each is not None]
+    if not known:
+        return None
+    parameters, inside = test.parameters, _inside(test)
     null = find_null_space(
-        effects.J[:, inside],
-        effects.error[:, inside],
+        np.concatenate([J for J, _ in known])[:, inside],
+        np.concatenate([error for _, error in known])[:, inside],
         parameters.magnitude[inside],
         parameters.scale[inside],
         np.arange(len(inside)),
@@ -417,65 +320,44 @@ def _without_effect(test: IdentifiabilityTest, effects: _StepEffects, inside: np
     )
     directions = np.zeros((len(parameters.interest), null.count))
     directions[np.searchsorted(parameters.interest, inside)] = null.directions
-    return directions
+    if not test.earlier.any() or not null.count:
+        return directions
+
+    # Combinations that earlier experiments have shown are not hidden.
+    before = _rows_of_information(test.earlier)
+    strongest = np.linalg.norm(before * parameters.magnitude, 2)
+    return _without_effect(test, directions, before, NEGLIGIBLE_EFFECT * float(strongest))
 
 
-def _has_effect(
-    test: IdentifiabilityTest,
-    trajectories: Sequence[Trajectory],
-    few: _StepEffects,
-    directions: Array,
-) -> bool:
-    """Check whether directions have an effect on any single step.
+def _hidden_from_rows(
+    test: IdentifiabilityTest, directions: Array | None, J: Array, error: Array
+) -> Array | None:
+    """Directions without effect on single steps that have none on a whole motion either.
 
-    A random combination of them has an effect, almost surely, where one of them has.
-
-    Args:
-        test: The plant and its parameters.
-        trajectories: Trajectories, all of whose samples are tested.
-        few: Effects of each parameter at a few samples, to which an effect is compared.
-        directions: (t, k) directions.
-
-    Returns:
-        True also where no step can be simulated.
+    Small effects add up over a motion; a contact may be shorter than a sample.
     """
-    k = directions.shape[1]
-    if not k or not trajectories:
-        return False
+    if directions is None or not directions.shape[1]:
+        return directions
 
-    interest = test.parameters.interest
-    relative = directions / test.parameters.magnitude[interest][:, None]
-    share = np.random.default_rng(0).standard_normal(k) / np.linalg.norm(relative, axis=0)
-    combination = np.zeros((1, len(test.theta)))
-    combination[0, interest] = directions @ share
-
-    longest = max(trajectory.samples for trajectory in trajectories)
-    found = _step_effects(
-        test, trajectories, longest, directions=combination, output_sizes=few.output_sizes
-    )
-    if found is None:
-        return True
-
-    # The directions are as inaccurate as the effects from which they follow.
-    effect = float(_root_mean_square(found.J)[0])
-    error = float(_root_mean_square(found.error)[0])
-    error += float(np.linalg.norm(combination[0] * _root_mean_square(few.error)))
-
-    # A weak effect that is no larger than its error is round-off.
-    sizes = test.parameters.magnitude
-    strongest = float((sizes * _root_mean_square(few.J)).max(initial=0.0))
-    weak = LEAST_RELATIVE_EFFECT * strongest * float(np.linalg.norm(combination[0] / sizes))
-    if effect <= min(weak, COLUMN_ERROR_FACTOR * error):
-        return False
-
-    # Other effects are compared with those of the parameters that cancel in the combination.
-    parts = max(float(np.linalg.norm(combination[0] * _root_mean_square(few.J))), TINY)
-    return effect / parts > float(np.clip(ERROR_FACTOR * error / parts, *ZERO_SINGULAR_VALUES))
+    # Motions that cannot be differentiated accurately, as chaotic ones, are no evidence.
+    unit = _in_units_of_size(test, directions)
+    rounding = CLEAR_EFFECT * float(np.linalg.norm(error[:, test.parameters.interest] @ unit, 2))
+    return _without_effect(test, directions, J, rounding)
 
 
-def _root_mean_square(rows: Array) -> Array:
-    """(m,) root mean square of each column of rows: (n, m)."""
-    return np.asarray(np.sqrt(np.mean(rows**2, axis=0)))
+def _without_effect(test: IdentifiabilityTest, directions: Array, J: Array, least: float) -> Array:
+    """Combinations of (t, k) directions whose effect on rows J is below a bound."""
+    unit = _in_units_of_size(test, directions)
+    square = np.zeros((unit.shape[1], unit.shape[1]))
+    effect = np.concatenate([J[:, test.parameters.interest] @ unit, square])
+    _, values, V = np.linalg.svd(effect, full_matrices=False)
+    return np.asarray(unit @ V[values <= max(LEAST_EFFECT, least)].T)
+
+
+def _in_units_of_size(test: IdentifiabilityTest, directions: Array) -> Array:
+    """Directions of length 1, where each parameter is measured by its size."""
+    sizes = test.parameters.magnitude[test.parameters.interest][:, None]
+    return np.asarray(directions / np.linalg.norm(directions / sizes, axis=0))
 
 
 def _with_groups(
@@ -536,57 +418,6 @@ def _rows_of_information(information: Array) -> Array:
 
     lengths = np.sqrt(values[kept])
     return np.asarray(lengths[:, None] * vectors.T[kept])
-
-
-def _hidden_from_rows(
-    test: IdentifiabilityTest, directions: Array | None, J: Array, error: Array
-) -> Array | None:
-    """Directions without effect on single steps that have none on a whole motion either.
-
-    An effect that is negligible in one step may add up over the motion.
-
-    Args:
-        test: The plant and its parameters.
-        directions: (t, k) directions without effect on single steps, or None.
-        J: (n, p) whitened rows of G along the motion.
-        error: (n, p) their change with a longer difference step.
-
-    Returns:
-        (t, j) combinations of the directions; None if there are no directions.
-    """
-    if directions is None or not directions.shape[1]:
-        return directions
-
-    interest = test.parameters.interest
-    sizes = test.parameters.magnitude[interest][:, None]
-    unit = directions / np.linalg.norm(directions / sizes, axis=0)
-
-    # Motions that cannot be differentiated accurately, as chaotic ones, are no evidence.
-    rounding = CLEAR_EFFECT * np.linalg.norm(error[:, interest] @ unit, 2)
-    square = np.zeros((unit.shape[1], unit.shape[1]))
-    effect = np.concatenate([J[:, interest] @ unit, square])
-    _, values, V = np.linalg.svd(effect, full_matrices=False)
-    return np.asarray(unit @ V[values <= max(LEAST_EFFECT, rounding)].T)
-
-
-def _hidden_from_earlier(test: IdentifiabilityTest, directions: Array) -> Array:
-    """Combinations of (t, k) directions without effect on earlier experiments."""
-    if not test.earlier.any() or not directions.shape[1]:
-        return directions
-
-    parameters = test.parameters
-    interest = parameters.interest
-    sizes = parameters.magnitude[interest][:, None]
-    unit = directions / np.linalg.norm(directions / sizes, axis=0)
-
-    before = _rows_of_information(test.earlier)
-    effect = before[:, interest] @ unit
-    square = np.zeros((unit.shape[1], unit.shape[1]))
-    _, values, V = np.linalg.svd(np.concatenate([effect, square]), full_matrices=False)
-
-    strongest = np.linalg.norm(before * parameters.magnitude, 2)
-    unseen = values <= max(LEAST_EFFECT, NEGLIGIBLE_EFFECT * strongest)
-    return np.asarray(unit @ V[unseen].T)
 
 
 def _rows_and_error(

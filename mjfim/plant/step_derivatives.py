@@ -70,20 +70,6 @@ class MovedSamples:
         return np.moveaxis(quotient, 0, 3)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StepEffects:
-    """Effects of directions of theta on single steps.
-
-    Attributes:
-        rows: (n, m) effects per unit of each direction. A row is relative to the size of a state
-            component [1/s], or to the size of an output.
-        output_sizes: (ny,) sizes of the outputs [y-unit], or None where there are no sensors.
-    """
-
-    rows: Array
-    output_sizes: Array | None
-
-
 class StepDerivatives(ClosedFormDerivatives):
     """First derivatives of F and h by state, control and parameters."""
 
@@ -203,50 +189,34 @@ class StepDerivatives(ClosedFormDerivatives):
         trajectory: Trajectory,
         samples: np.ndarray,
         step: float,
-        *,
-        directions: Array | None = None,
-        output_sizes: Array | None = None,
-    ) -> StepEffects:
-        """Effect of parameters on the next state and on the sensors at given samples.
+    ) -> Array:
+        """Effect of each parameter on the next state and on the sensors at given samples.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: The trajectory.
             samples: Indices of the samples.
             step: Difference step relative to `parameter_scale`.
-            directions: (m, p) directions of theta; None for each parameter alone.
-            output_sizes: (ny,) sizes of the outputs, see `StepEffects`; None for the largest effect
-                of these directions, each parameter changed by its size.
 
         Returns:
-            The effects.
+            (n, p) effects. A row is relative to the size of a state component [1/s], or to the
+            largest effect on an output, each parameter changed by its size.
 
         Raises:
             SimulationDivergedError: A perturbed step diverges.
         """
         plant = self.plant
-        magnitudes = plant.parameters.magnitude
-        moves = np.diag(step * self.parameter_scale)
-        widths = np.diag(moves)
-        if directions is not None:
-            widths = step / np.abs(directions / self.parameter_scale).max(axis=1)
-            moves = directions * widths[:, None]
-            magnitudes = 1.0 / np.abs(directions / magnitudes).max(axis=1)
-
         states = trajectory.state[samples]
-        dx, ds = self._one_step_along(theta, moves, widths, states, trajectory.ctrl[samples])
+        dx, ds = self._one_step_by_theta(theta, states, trajectory.ctrl[samples], step)
         state_sizes = self.difference_sizes(trajectory)[: plant.space.nx]
         effects = [_require_finite(dx) / (plant.dt * state_sizes)]
 
         if ds is not None:
             dy = plant.outputs.tangent(states, np.zeros_like(dx), ds)
-            if output_sizes is None:
-                largest = np.abs(dy * magnitudes[:, None, None]).max(axis=(0, 1))
-                output_sizes = np.where(largest > 0.0, largest, 1.0)
-            effects.append(dy / output_sizes)
-
-        rows = np.concatenate([effect.reshape(len(moves), -1) for effect in effects], axis=1).T
-        return StepEffects(rows=rows, output_sizes=output_sizes)
+            magnitudes = plant.parameters.magnitude[:, None, None]
+            largest = np.abs(dy * magnitudes).max(axis=(0, 1))
+            effects.append(dy / np.where(largest > 0.0, largest, 1.0))
+        return np.concatenate([effect.reshape(len(theta), -1) for effect in effects], axis=1).T
 
     def _one_step_by_theta(
         self, theta: Array, states: Array, ctrl: Array, step: float
@@ -264,28 +234,11 @@ class StepDerivatives(ClosedFormDerivatives):
             without sensors.
         """
         h = step * self.parameter_scale
-        return self._one_step_along(theta, np.diag(h), h, states, ctrl)
-
-    def _one_step_along(
-        self, theta: Array, moves: Array, widths: Array, states: Array, ctrl: Array
-    ) -> tuple[Array, Array | None]:
-        """Derivatives of single steps along directions of theta, by two-sided differences.
-
-        Args:
-            theta: (p,) parameters [theta-unit].
-            moves: (m, p) forward moves of theta, whose opposites are the backward moves.
-            widths: (m,) lengths of the forward moves.
-            states: (n, ns) states.
-            ctrl: (n, nu) controls.
-
-        Returns:
-            (m, n, nx) derivative of the next state, and (m, n, nsensordata) of the sensors, or None
-            without sensors.
-        """
+        moves = np.diag(h)
         models = self.plant.models(np.concatenate([theta + moves, theta - moves]))
         every_state = tiled(states, len(models))
         every_ctrl = tiled(ctrl, len(models))
-        return self._central_quotients(models, every_state, every_ctrl, 2.0 * widths[:, None, None])
+        return self._central_quotients(models, every_state, every_ctrl, 2.0 * h[:, None, None])
 
     def _central_quotients(
         self, models: list[Any], states: Array, ctrl: Array, widths: Array

@@ -15,10 +15,8 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.designable import require_designable
 from mjfim.excitation.task import DesignTask
 from mjfim.information.identifiability import (
-    FEW_SAMPLES,
     PROBES,
     Identifiability,
-    _single_step_null_space,
     require_visible,
 )
 from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task
@@ -109,9 +107,6 @@ def test_a_small_effect_that_adds_up_over_the_motion_counts(tmp_path) -> None:
     faint = {"kind": "sine", "amplitude": {"left": 5e-9, "right": 0.0}, "frequency": 0.5}
     task = two_task(tmp_path, parameters=drag, initial={"control": faint}, horizon=4.0)
 
-    test = task.identifiability_test
-    single_steps = _single_step_null_space(test, [task.initial]).directions
-    assert single_steps is not None and single_steps.shape == (1, 1)
     assert look(task).along_trajectory.count == 0
 
 
@@ -310,35 +305,3 @@ def test_a_design_is_refused_before_any_optimisation(tmp_path) -> None:
     start = np.stack([np.sin(5.0 * task.t), np.cos(4.0 * task.t)], axis=1)
     result = design_task(two_task(tmp_path, descent={"max_iterations": 1}), initial_control=start)
     assert np.isfinite(result.final.std).all()
-
-
-def test_directions_without_effect_at_a_few_samples_are_tested_at_all_of_them(
-    tmp_path, monkeypatch
-) -> None:
-    """Both sliders rest at the first sample, which alone is tested first, and are pushed later."""
-    monkeypatch.setattr("mjfim.information.identifiability.FEW_SAMPLES", 1)
-    task = two_task(tmp_path)
-    control = np.zeros_like(task.control)
-    control[task.samples // 2 :] = 0.5
-    pushed = task.plant.simulate(task.theta, control)
-
-    found = _single_step_null_space(task.identifiability_test, [pushed]).directions
-    assert found is not None and not found.shape[1]
-
-
-def test_the_common_null_space_needs_few_single_steps(tmp_path) -> None:
-    task = cart_task(tmp_path, parameters=PRODUCT)
-    before = task.plant.engine_steps
-    shown = _single_step_null_space(task.identifiability_test, [task.initial])
-    assert shown.directions is not None and shown.directions.shape[1] == 1
-
-    # Two differences of each of three parameters at 60 samples, and of one combination at all.
-    spent = task.plant.engine_steps - before
-    samples = task.samples * task.plant.simulator.substeps
-    few = FEW_SAMPLES * task.plant.simulator.substeps
-    assert spent <= 4 * (len(task.theta) * few + samples)
-
-    # Another trajectory needs the combination alone.
-    before = task.plant.engine_steps
-    _single_step_null_space(task.identifiability_test, [task.initial, task.initial], shown)
-    assert 0 < task.plant.engine_steps - before <= 4 * samples

@@ -753,7 +753,7 @@ def test_parameters_of_little_effect_get_longer_difference_steps_and_others_keep
 def test_one_step_effects_are_E_and_H_in_natural_units(tmp_path) -> None:
     task = body_task(tmp_path)
     picked, L = np.array([3, 20, 41]), linear(task)
-    found = task.plant.derivatives.one_step(task.theta, task.initial, picked, 1e-5).rows
+    found = task.plant.derivatives.one_step(task.theta, task.initial, picked, 1e-5)
     nx, ny, p = task.space.nx, len(task.system.outputs), len(task.theta)
     states = (
         found[: 3 * nx].reshape(3, nx, p)
