@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import os
-import platform
-import re
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -25,10 +24,10 @@ if TYPE_CHECKING:
 # Permissions of a new file, from which the umask of the process removes some.
 DEFAULT_PERMISSIONS = 0o666
 
-# Begin of the names of temporary files. The computer is named, because the number of a process says
-# nothing on another one that shares the folder.
-COMPUTER = re.sub(r"[^A-Za-z0-9]", "", platform.node()) or "local"
-PREFIX = f".mjfim-{COMPUTER}-"
+# Begin of the names of temporary files, and the age from which on such a file was left by a process
+# that was killed [s].
+PREFIX = ".mjfim-"
+LEFT_OVER_SECONDS = 3600.0
 
 # Temporary files that this process is writing, and folders in which it has looked for left-over
 # ones.
@@ -121,7 +120,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
 
-    _remove_left_over_files(path.parent)
+    _remove_left_over_files(path.parent.resolve())
 
     prefix = f"{PREFIX}{os.getpid()}-"
     handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
@@ -158,27 +157,13 @@ def remove_temporary_files() -> None:
 
 
 def _remove_left_over_files(folder: Path) -> None:
-    """Remove temporary files of processes of this computer that have ended, once per folder."""
-    place = folder.resolve()
-    if place in _tidied_folders:
-        return
-
-    _tidied_folders.add(place)
-    for left_over in folder.glob(f"{PREFIX}*"):
-        owner = re.match(r"(\d+)-", left_over.name.removeprefix(PREFIX))
-        if owner is not None and left_over.is_file() and not _is_running(int(owner[1])):
-            left_over.unlink(missing_ok=True)
-
-
-def _is_running(process: int) -> bool:
-    """Check whether a process exists, by its number."""
-    import psutil  # slow, and needed only where a process has left a file
-
-    # `os.kill(process, 0)` would end the process on Windows.
-    try:
-        return bool(psutil.pid_exists(process))
-    except OverflowError:
-        return False
+    """Remove temporary files of processes that have ended long ago, once per folder."""
+    if folder not in _tidied_folders:
+        _tidied_folders.add(folder)
+        for left_over in folder.glob(f"{PREFIX}*-*"):
+            with suppress(OSError):
+                if time.time() - left_over.stat().st_mtime > LEFT_OVER_SECONDS:
+                    left_over.unlink()
 
 
 def _umask() -> int:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 
-import psutil
 import pytest
 
-from mjfim import files
 from mjfim.parallel import threads
 from tests.support.paths import ROOT
 
@@ -24,26 +20,6 @@ def test_windows_waits_for_at_most_61_processes(monkeypatch: pytest.MonkeyPatch)
     assert threads.process_count(None) == 61
     assert threads.process_count(100) == 61
     assert threads.process_count(3) == 3
-
-
-def test_left_over_files_are_removed_on_windows_without_a_signal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """There, a signal with the number 0 would end the process that is asked for."""
-
-    def no_signal(process: int, number: int) -> None:
-        raise AssertionError(f"signal {number} to process {process}")
-
-    monkeypatch.setattr(os, "kill", no_signal)
-    monkeypatch.setattr(psutil, "pid_exists", lambda process: process == 17)
-    ended, running = (tmp_path / f"{files.PREFIX}{process}-x.csv" for process in (4_000_000, 17))
-    ended.touch()
-    running.touch()
-
-    with files.replacing(tmp_path / "file.csv") as temporary:
-        temporary.write_text("t\n", encoding="utf-8")
-    assert not ended.exists()
-    assert running.exists()
 
 
 @pytest.mark.slow
