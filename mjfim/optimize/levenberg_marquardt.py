@@ -80,10 +80,6 @@ ASSUMED_LENGTH = 1.0
 # A step is complete if the predicted step is shorter than this multiple of it.
 COMPLETE_STEP = 1.1
 
-# Relative change of every unknown of a step up to which it counts as the same step. Where that step
-# was rejected, it is not tried again.
-SAME_STEP = 0.01
-
 # Ratio of the actual to the predicted decrease above which a step is lengthened, and the largest
 # factor by which it is.
 MIN_RATIO_TO_LENGTHEN = 1.2
@@ -516,22 +512,12 @@ class _Search:
             if small or self.damping > MAX_DAMPING or not self.settings.damped:
                 return self._without_progress(self._predicted_step())
 
-            step = self._shorter_step(step)
-
-            if (reason := self.budget.exhausted) is not None:
-                return self._stopped(reason)
-
-    def _shorter_step(self, rejected: Step) -> Step:
-        """Raise the damping until the step differs from a rejected one, and return this step.
-
-        Weak damping hardly changes a step, so that the simulation at its end would tell nothing.
-        """
-        step = rejected
-        while self.damping <= MAX_DAMPING and not _differ(step, rejected):
             self.damping = max(self.damping, MIN_RAISED_DAMPING) * self.damping_growth
             self.damping_growth *= 2.0
             step = self._step(self.damping)
-        return step
+
+            if (reason := self.budget.exhausted) is not None:
+                return self._stopped(reason)
 
     def _trial(self, step: Step) -> _Trial:
         """Evaluate a step with the current damping.
@@ -780,17 +766,3 @@ class _Search:
             interrupted=interrupted,
             iterates=tuple(self.iterates),
         )
-
-
-def _differ(step: Step, other: Step) -> bool:
-    """Whether two steps are not the same, by `SAME_STEP`.
-
-    Common unknowns are compared one by one, because the length of a step is hardly that of its weak
-    directions. Private unknowns are compared by kind, over all segments.
-    """
-    private = np.linalg.norm(step.private - other.private, axis=0)
-    of_other = np.linalg.norm(other.private, axis=0)
-    common = np.abs(step.common - other.common)
-    return bool(
-        (common > SAME_STEP * np.abs(other.common)).any() or (private > SAME_STEP * of_other).any()
-    )

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
-from mjfim.parallel.budget import Budget, StopToken
 
 LAWS: dict[str, Callable[[int], float]] = {
     "square root": lambda n: (173 / n) ** 0.5,
@@ -65,18 +64,11 @@ def test_the_grid_rounds_to_multiples_from_its_first_multiple_on() -> None:
 
 
 def test_a_stopped_search_returns_the_bracket_so_far() -> None:
-    """The budget stops it between two evaluations, or an evaluation gives no ratio."""
+    """An evaluation gives no ratio where the user stops it."""
     grid = SampleGrid(unit=1, first_multiple=0)
-    stop = StopToken()
-
-    def requested(n: int) -> float:
-        stop.request()
-        return LAWS["square root"](n)
 
     def given_up(n: int) -> float | None:
         return LAWS["square root"](n) if n == 400 else None
 
-    found = smallest_feasible(requested, 400, 700, grid, lambda n: 1, Budget(stop=stop))
-    assert found == (400, None)
     assert smallest_feasible(given_up, 400, 700, grid, lambda n: 1) == (400, None)
     assert smallest_feasible(given_up, 300, 700, grid, lambda n: 1) == (None, None)
