@@ -1,22 +1,12 @@
-from .dispatch import (
-    Dispatch,
-    LostWorkError,
-    NumberedOrder,
-    Outcome,
-    carry_out,
-    results,
-    results_or_here,
-)
+from .dispatch import LostWorkError, Outcome, carry_out, results, results_or_here
 from .pool import LOST_SENTENCE, Pool, offer_result, pool_stop_token
 from .threads import cores, one_blas_thread, process_count, require_threads
 from .workers import ExecutorLike, Workers
 
 __all__ = [
     "LOST_SENTENCE",
-    "Dispatch",
     "ExecutorLike",
     "LostWorkError",
-    "NumberedOrder",
     "Outcome",
     "Pool",
     "Workers",

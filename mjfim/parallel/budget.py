@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
-from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -214,17 +213,6 @@ class Budget:
         other.stop = stop
         return other
 
-    def paused(self) -> PausedBudget:
-        """Freeze what is used and left now, for a computation that goes on later or elsewhere."""
-        return PausedBudget(
-            seconds_used=self.seconds_used,
-            seconds_left=self.seconds_left,
-            max_steps=self.max_steps,
-            max_iterations=self.max_iterations,
-            steps=self.steps,
-            iterations=self.iterations,
-        )
-
     def __getstate__(self) -> dict[str, Any]:
         """State for another process, in which the stop token and the clock differ."""
         state = dict(self.__dict__)
@@ -244,39 +232,6 @@ class Budget:
         self.begun += shift
         self.deadline += shift
         self.stop = StopToken()
-
-
-@dataclass(frozen=True, kw_only=True)
-class PausedBudget:
-    """A budget whose time does not pass, because its computation is interrupted.
-
-    Attributes:
-        seconds_used: Time that was used before [s].
-        seconds_left: Time that is left [s]; infinite without a limit.
-        max_steps: Limit of the engine steps; infinite without one.
-        max_iterations: Limit of the iterations; infinite without one.
-        steps: Engine steps that were used.
-        iterations: Iterations that were used.
-    """
-
-    seconds_used: float
-    seconds_left: float
-    max_steps: float
-    max_iterations: float
-    steps: float
-    iterations: int
-
-    def resumed(self, stop: StopToken) -> Budget:
-        """Let the time pass again.
-
-        Args:
-            stop: Token that ends the computation early.
-        """
-        budget = Budget(seconds=self.seconds_left, stop=stop)
-        budget.begun -= self.seconds_used
-        budget.max_steps, budget.steps = self.max_steps, self.steps
-        budget.max_iterations, budget.iterations = self.max_iterations, self.iterations
-        return budget
 
 
 class Interruption:

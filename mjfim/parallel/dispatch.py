@@ -68,14 +68,6 @@ class Outcome(Generic[T]):
         return self.found[0]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NumberedOrder(Generic[Order]):
-    """An order with its number."""
-
-    index: int
-    order: Order
-
-
 @dataclass(kw_only=True, eq=False)
 class _Work(Generic[Order]):
     """An order that has no result yet, the losses so far, and values that its worker lacked."""
@@ -86,37 +78,22 @@ class _Work(Generic[Order]):
     values: dict[str, SentValue] = field(default_factory=dict)
 
 
-class Dispatch(Generic[Order, T]):
-    """Orders under way on workers; an order can be added at any time.
-
-    Args:
-        workers: The workers.
-        function: Carries out an order; both can be pickled, and the result depends on the order
-            alone. An order whose worker was killed is carried out again.
-        budget: Its token ends the work early; see `arrivals` for its time.
-        source: Asked for a further order whenever there is a worker for it and none waits. It
-            returns None where there is none at present.
-    """
+class _Dispatch(Generic[Order, T]):
+    """Orders under way on workers. An order whose worker was killed is carried out again."""
 
     def __init__(
         self,
         workers: Workers,
         function: Callable[[Order], T],
+        orders: Iterable[Order],
         budget: Budget,
-        source: Callable[[], NumberedOrder[Order] | None] = lambda: None,
     ) -> None:
-        self._source = source
         self._workers = workers
         self._function = function
         self._budget = budget
-        self._waiting: deque[_Work[Order]] = deque()
+        self._waiting = deque(_Work(index=i, order=order) for i, order in enumerate(orders))
         self._running: dict[Future[Any], _Work[Order]] = {}
         self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
-
-    def add(self, index: int, order: Order, *, next_one: bool = False) -> None:
-        """Add an order under a number; `next_one`: before all others that are not begun."""
-        add = self._waiting.appendleft if next_one else self._waiting.append
-        add(_Work(index=index, order=order))
 
     def withdraw(self) -> None:
         """Forget the orders that have not begun."""
@@ -129,20 +106,14 @@ class Dispatch(Generic[Order, T]):
                 del self._running[future]
 
     def arrivals(self) -> Iterator[Outcome[T]]:
-        """Carry out all orders, also those that are added meanwhile.
+        """Carry out all orders, and yield outcomes in the order in which they arrive.
 
         After a request to stop, what the running tasks have found by then follows. The same holds
         long after the end of the budget's time, where a task may hang.
-
-        Yields:
-            Outcomes in the order in which they arrive.
-
-        Raises:
-            ExperimentError: An order cannot be sent, or a cluster had no workers at all.
         """
         try:
             while not self._budget.stop.requested and not self._is_overdue():
-                while len(self._running) < self._workers.window and self._has_waiting():
+                while self._waiting and len(self._running) < self._workers.window:
                     self._submit(self._waiting.popleft())
                 if not self._running:
                     return
@@ -156,13 +127,6 @@ class Dispatch(Generic[Order, T]):
             # If the caller ended the iteration or an order failed, the others are stopped.
             if self._running:
                 self._collected()
-
-    def _has_waiting(self) -> bool:
-        """Check whether an order waits, and ask the source for one where none does."""
-        further = None if self._waiting else self._source()
-        if further is not None:
-            self.add(further.index, further.order)
-        return bool(self._waiting)
 
     def _submit(self, work: _Work[Order]) -> None:
         """Submit an order with the values that a worker did not have."""
@@ -268,7 +232,7 @@ class Dispatch(Generic[Order, T]):
 def carry_out(
     executor: ExecutorLike,
     function: Callable[[Order], T],
-    orders: Sequence[Order],
+    orders: Iterable[Order],
     budget: Budget,
 ) -> Iterator[Outcome[T]]:
     """Carry out independent orders on the workers of an executor.
@@ -282,10 +246,7 @@ def carry_out(
     Raises:
         ExperimentError: An order cannot be sent, or a cluster had no workers at all.
     """
-    dispatch = Dispatch[Order, T](Workers.of(executor), function, budget)
-    for index, order in enumerate(orders):
-        dispatch.add(index, order)
-
+    dispatch = _Dispatch(Workers.of(executor), function, orders, budget)
     early: dict[int, Outcome[T]] = {}
     following = 0
     for outcome in dispatch.arrivals():

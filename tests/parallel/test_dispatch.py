@@ -19,7 +19,6 @@ import pytest
 
 from mjfim.errors import ExperimentError
 from mjfim.parallel import (
-    Dispatch,
     LostWorkError,
     Outcome,
     Pool,
@@ -127,18 +126,6 @@ def test_without_workers_each_order_is_asked_for_after_the_one_before_is_done() 
     assert list(results(lambda order: done.append(order), orders, None, Budget())) == [None] * 3
     assert done == [0, 1, 2]
     assert list(results(square, range(9), None, Budget(seconds=0.0))) == [0]
-
-
-def test_orders_may_be_added_while_others_are_carried_out() -> None:
-    with ThreadPoolExecutor(2) as executor:
-        work = Dispatch[int, int](Workers(executor), square, Budget())
-        work.add(0, 3)
-        found = []
-        for outcome in work.arrivals():
-            found.append(outcome.result)
-            if len(found) < 3:
-                work.add(len(found), found[-1])
-    assert found == [9, 81, 6561]
 
 
 def test_ctrl_c_that_reaches_the_workers_as_well_keeps_the_results_so_far() -> None:
