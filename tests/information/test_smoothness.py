@@ -19,7 +19,7 @@ from mjfim.information.smoothness import (
     roughness,
 )
 from mjfim.output.condensed import condensed
-from mjfim.plant.derivatives import RolloutDerivatives
+from mjfim.plant.derivatives import Derivatives
 from mjfim.records.check import Roughness
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
 
@@ -233,14 +233,14 @@ def test_a_model_that_diverges_under_the_longer_step_is_infinitely_rough(
     tmp_path, monkeypatch
 ) -> None:
     task = slider(tmp_path, 'frictionloss="1.5"')
-    whole = RolloutDerivatives.sensitivity
+    whole = Derivatives.sensitivity
 
     def sensitivity(
-        derivatives: RolloutDerivatives, theta: Array, curve: object, step: object = None
+        derivatives: Derivatives, theta: Array, curve: object, step: object = None
     ) -> object:
         return whole(derivatives, theta, curve) if step is None else None
 
-    monkeypatch.setattr(RolloutDerivatives, "sensitivity", sensitivity)
+    monkeypatch.setattr(Derivatives, "sensitivity", sensitivity)
     found = along(task)
     assert found.error == np.inf
     assert found.parameter == "mass, drag"

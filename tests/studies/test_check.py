@@ -18,7 +18,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.files import as_json
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.fisher import FisherInformation
-from mjfim.plant.derivatives import RolloutDerivatives
+from mjfim.plant.derivatives import Derivatives
 from mjfim.records.trajectory import Recording
 from mjfim.studies.check import check, check_recordings, check_task
 from tests.support.dense_residuals import dense_residuals
@@ -177,13 +177,13 @@ def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
 
 def test_a_wrong_sensitivity_is_caught_by_the_recursion(tmp_path, monkeypatch) -> None:
     task = cart_task(tmp_path)
-    right = RolloutDerivatives.sensitivity
+    right = Derivatives.sensitivity
 
     def wrong(*arguments, **options):
         found = right(*arguments, **options)
         return replace(found, psi=found.psi * 1.01)
 
-    monkeypatch.setattr(RolloutDerivatives, "sensitivity", wrong)
+    monkeypatch.setattr(Derivatives, "sensitivity", wrong)
     tested = check_task(task).self_test
     assert tested.recursion == pytest.approx(0.01, rel=0.05)
     assert not tested.passed
