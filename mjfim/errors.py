@@ -14,6 +14,21 @@ SHOWN_TEXT = 40
 # Longest list of names in a message [characters].
 LISTED_TEXT = 240
 
+# Largest numbers that a user may ask for, in an experiment file or on the command line. Larger ones
+# are mistyped: the work would not end, would only use memory, or would mean nothing. They stand
+# here, so that the help of the command line states them without importing a room.
+MAX_THREADS = 1024
+
+# Repeated work of a design.
+MAX_STARTS = 10_000
+MAX_ITERATIONS = 1_000_000
+MAX_REPLICATES = 100_000
+MAX_SAMPLES = 10_000
+
+# Largest relative error of a guess, and largest ratio of the noise to the stated one. Robots beyond
+# them have nothing in common with the model, and their numbers overflow in the end.
+MAX_WRONG, MAX_NOISE = 10.0, 1e6
+
 
 class MjfimError(Exception):
     """Base class of all errors that mjfim raises for misuse; the command line exits with code 2."""

@@ -19,9 +19,9 @@ import typer
 from typer.core import TyperCommand
 
 import mjfim
-from mjfim.amounts import MAX_THREADS
 from mjfim.cli.progress import out, progress, say, say_from_program
 from mjfim.errors import (
+    MAX_THREADS,
     InterruptedByUserError,
     MjfimError,
     ModelWarning,

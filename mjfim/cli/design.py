@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import mjfim
-from mjfim.amounts import MAX_STARTS
 from mjfim.cli.common import (
     ExperimentFile,
     LiveView,
@@ -20,7 +19,7 @@ from mjfim.cli.common import (
     write_wanted_video,
 )
 from mjfim.cli.progress import progress, say, say_from_program, watched
-from mjfim.errors import first_ones
+from mjfim.errors import MAX_STARTS, first_ones
 
 if TYPE_CHECKING:
     from mjfim.excitation.shortest_horizon import ShortestExperiment

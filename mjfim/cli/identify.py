@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 import mjfim
-from mjfim.amounts import MAX_SAMPLES
 from mjfim.cli.common import (
     ExperimentFile,
     LiveView,
@@ -21,7 +20,7 @@ from mjfim.cli.common import (
     write_wanted_video,
 )
 from mjfim.cli.progress import progress, say, watched
-from mjfim.errors import ExperimentError
+from mjfim.errors import MAX_SAMPLES, ExperimentError
 
 if TYPE_CHECKING:
     from mjfim.experiment.system import System

@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.amounts import MAX_WRONG
 from mjfim.cli.common import ExperimentFile, Run, verb
 from mjfim.cli.progress import progress, say_from_program
+from mjfim.errors import MAX_WRONG
 
 # Largest number of robots; more would take days.
 MAX_RUNS = 100_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
-from mjfim.signals import spline_basis
+from mjfim.experiment.signals import spline_basis
 
 
 def bandwidth_basis(task: DesignTask, t: Array) -> Array | None:

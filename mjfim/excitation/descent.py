@@ -25,13 +25,13 @@ from mjfim.excitation.interior_problem import InteriorPoint, InteriorProblem, va
 from mjfim.excitation.levels import DescentLevel, regulator_for
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.signals import independent_curves
 from mjfim.information.criteria import Criterion
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status
-from mjfim.signals import independent_curves
 
 # Smallest tolerance on a coarse level. It is coarse, because the stated level refines the minimum.
 COARSE_TOLERANCE = 1e-5

@@ -12,8 +12,8 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import opened
+from mjfim.experiment.signals import fourier_basis
 from mjfim.recordings.control_table import read_control
-from mjfim.signals import fourier_basis
 
 # Largest number of harmonics of a Fourier series.
 MAX_SERIES_HARMONICS = 15

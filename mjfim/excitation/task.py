@@ -29,6 +29,7 @@ from mjfim.excitation.task_parts import (
 from mjfim.experiment.initial_state import keyframe
 from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment, by_name
+from mjfim.experiment.signals import multisine
 from mjfim.experiment.system import System
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import IdentifiabilityTest
@@ -39,7 +40,6 @@ from mjfim.model.variants import ModelVariant, Relaxation, has_dry_friction, smo
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Trajectory
-from mjfim.signals import multisine
 
 # Harmonics of a random multisine.
 RANDOM_HARMONICS = 10

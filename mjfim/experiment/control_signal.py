@@ -7,8 +7,8 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.experiment.schema import by_name
+from mjfim.experiment.signals import multisine
 from mjfim.experiment.system_tables import Signal
-from mjfim.signals import multisine
 
 # Frequencies of successive actuators differ by this fraction of the first actuator's frequency.
 FREQUENCY_SPREAD = 0.17

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from mjfim.quantities import WithUnit
+from mjfim.recordings.quantities import WithUnit
 from mjfim.recordings.spec import (
     Boolean,
     Bound,

@@ -21,7 +21,7 @@ from mjfim.model.limited_elements import limited_elements
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import unit_of
 from mjfim.model.units import ANGLE, control_unit, per_second, sensor_unit
-from mjfim.quantities import Quantity, Unit, wrong_unit
+from mjfim.recordings.quantities import Quantity, Unit, wrong_unit
 
 # Angles beyond this number of turns look like degrees if they are round in degrees.
 TURNS = 2.0

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SkipValidation, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from mjfim.quantities import Quantity
+from mjfim.recordings.quantities import Quantity
 from mjfim.recordings.spec import (
     Boolean,
     Finite,

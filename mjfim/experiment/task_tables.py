@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from mjfim.amounts import MAX_ITERATIONS, MAX_REPLICATES, MAX_SAMPLES, MAX_STARTS
+from mjfim.errors import MAX_ITERATIONS, MAX_REPLICATES, MAX_SAMPLES, MAX_STARTS
 from mjfim.recordings.spec import (
     Boolean,
     Finite,

@@ -23,7 +23,6 @@ from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
-from mjfim.interruption import hurried
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
@@ -32,7 +31,7 @@ from mjfim.parallel import (
     pool_stop_token,
     results_or_here,
 )
-from mjfim.parallel.budget import Budget, StopToken
+from mjfim.parallel.budget import Budget, StopToken, hurried
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import SharedValue, require_values
 

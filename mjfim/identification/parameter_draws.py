@@ -15,9 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjfim.amounts import MAX_SAMPLES
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, first_ones, listed
+from mjfim.errors import MAX_SAMPLES, ExperimentError, first_ones, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.honest_covariance import (

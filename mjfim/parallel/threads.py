@@ -10,8 +10,7 @@ from contextlib import contextmanager
 
 from threadpoolctl import threadpool_limits
 
-from mjfim.amounts import MAX_THREADS
-from mjfim.errors import ExperimentError
+from mjfim.errors import MAX_THREADS, ExperimentError
 
 # Largest number of processes of a pool on Windows, beyond which Python refuses it.
 MAX_WINDOWS_PROCESSES = 61

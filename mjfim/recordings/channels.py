@@ -20,7 +20,7 @@ from mjfim.model.coordinates import (
 )
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.units import sensor_unit
-from mjfim.quantities import Unit, units_like
+from mjfim.recordings.quantities import Unit, units_like
 from mjfim.recordings.spec import LAW_PREFIXES, LogUnit, RecordingSpec
 
 # Factor that converts each unit of a log to the model's unit.

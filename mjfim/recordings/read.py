@@ -21,7 +21,6 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, closest, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
-from mjfim.quantities import TURN
 from mjfim.recordings import formats
 from mjfim.recordings.channels import (
     UNIT_FACTORS,
@@ -39,6 +38,7 @@ from mjfim.recordings.checks import (
     check_measured,
 )
 from mjfim.recordings.formats.table import Table
+from mjfim.recordings.quantities import TURN
 from mjfim.recordings.spec import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
 from mjfim.recordings.summary import LogSummary, summarize
 from mjfim.records.trajectory import Recording

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from mjfim.quantities import WithUnit
+from mjfim.recordings.quantities import WithUnit
 
 # Sizes between which the squares and quotients of numbers neither vanish nor overflow. No physical
 # quantity in any unit is outside.
@@ -50,7 +50,7 @@ Metres = Annotated[Positive, WithUnit("m")]
 Period = tuple[Annotated[Bound, WithUnit("s")], Annotated[Bound, WithUnit("s")]]
 
 
-# Units that a column of a log may have; their factors are in `mjfim.quantities`.
+# Units that a column of a log may have; their factors are in `mjfim.recordings.quantities`.
 LogUnit = Literal[
     "rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "m", "cm", "mm", "m/s", "mm/s"
 ]

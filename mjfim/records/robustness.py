@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.amounts import MAX_NOISE, MAX_WRONG
 from mjfim.arrays import NORMAL_95, Array
-from mjfim.errors import ExperimentError
+from mjfim.errors import MAX_NOISE, MAX_WRONG, ExperimentError
 from mjfim.records.base import Record, ShownRecord, record
 
 # Probability with which the intervals and joint regions should hold the true values.

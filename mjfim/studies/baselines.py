@@ -22,18 +22,11 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.search import Search
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.signals import fourier_basis, independent_curves
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.events import DesignEvent
-from mjfim.signals import (
-    Chirp,
-    Excitation,
-    ExcitationSettings,
-    Multisine,
-    RandomSteps,
-    fourier_basis,
-    independent_curves,
-)
+from mjfim.studies.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
 
 # Base frequencies of the first Fourier series, and bandwidths of the first B-splines [Hz].
 FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)

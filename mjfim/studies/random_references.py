@@ -14,9 +14,9 @@ from mjfim.excitation.task import (
     RANDOM_HARMONICS,
     DesignTask,
 )
+from mjfim.experiment.signals import multisine
 from mjfim.model.control_laws import ControlLaws
 from mjfim.records.trajectory import Trajectory
-from mjfim.signals import multisine
 
 # Columns of a log that are no signals, but say which law acts.
 SWITCHES = ("gain:", "enable:")

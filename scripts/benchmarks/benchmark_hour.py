@@ -30,12 +30,12 @@ from rich.table import Table
 
 import mjfim
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.signals import multisine
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
 from mjfim.parallel import cores
 from mjfim.records.trajectory import Recording
-from mjfim.signals import multisine
 from scripts.benchmarks.child import ROOT, CommandRun, run_command
 
 # Experiment of the two joints.

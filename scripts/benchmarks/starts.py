@@ -38,6 +38,7 @@ from rich.table import Table
 import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError
+from mjfim.experiment.signals import multisine
 from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.identification.fit_problem import FitProblem
@@ -45,7 +46,6 @@ from mjfim.identification.identify import identify_system, least_squares
 from mjfim.output.models.sysid import silenced, sysid_problem
 from mjfim.parallel import cores
 from mjfim.records.trajectory import Recording
-from mjfim.signals import multisine
 
 # Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]

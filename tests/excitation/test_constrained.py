@@ -17,12 +17,12 @@ from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.signals import spline_basis
 from mjfim.output.summaries.design import describe_design
 from mjfim.output.summary_parts import Paragraph
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Design, HistoryRow, Status
 from mjfim.records.events import DesignEvent
-from mjfim.signals import spline_basis
 from tests.support.limits import ARM, HARD, cart_inside
 from tests.support.numerics import (
     CART_PARAMETERS,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.experiment.signals import multisine
 from mjfim.experiment.system import System
 from mjfim.identification.terms.candidates import Candidate, candidates_of
-from mjfim.signals import multisine
 from tests.support.closed_loop import ARM
 
 DAMPINGS: dict[str, Any] = {

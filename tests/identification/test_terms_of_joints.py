@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.experiment.signals import multisine
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.terms.candidates import Candidate, Effect
@@ -23,7 +24,6 @@ from mjfim.identification.terms.score_tests import (
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
-from mjfim.signals import multisine
 from mjfim.studies.selected_models import selected_term
 from tests.support.numerics import Array
 

@@ -13,16 +13,16 @@ import pytest
 
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.verification import verify
+from mjfim.experiment.signals import fourier_basis
 from mjfim.parallel.budget import StopToken, measured_by
-from mjfim.signals import (
+from mjfim.studies.baselines import METHODS, BaselineSearch, reflected, run_baseline
+from mjfim.studies.signals import (
     Chirp,
     ExcitationSettings,
     Multisine,
     RandomSteps,
-    fourier_basis,
     schroeder_phases,
 )
-from mjfim.studies.baselines import METHODS, BaselineSearch, reflected, run_baseline
 from tests.support.limits import cart_inside
 
 FRAME = ExcitationSettings(

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.signals import multisine
 from mjfim.records.trajectory import Recording
-from mjfim.signals import multisine
 from tests.support.numerics import Array
 
 # Axes of the hinges, lengths to the next one [m], masses [kg], sizes of torques, and the mean pose.

@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 from pydantic_core import PydanticCustomError
 
-from mjfim.quantities import USUAL_UNITS, Quantity, Unit, units_like
+from mjfim.recordings.quantities import USUAL_UNITS, Quantity, Unit, units_like
 from mjfim.recordings.spec import LogUnit
 
 
