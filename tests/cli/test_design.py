@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import Result
 
-import mjfim
 from mjfim.cli import design as design_verb
-from mjfim.excitation.design import design_task
-from mjfim.excitation.task import DesignTask
 from mjfim.output.manifest import MANIFEST
 from tests.support.cli import (
     DESIGN,
@@ -45,26 +40,6 @@ def test_design_json_is_the_file(home: Path, designed: Result) -> None:
     assert (home / "out" / data["experiment"]).resolve() == home / "study.toml"
     assert (home / "out" / data["model"]).resolve() == home / "cart_pendulum.xml"
     assert "wrote" in designed.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("empty_figures")
-def test_second_run_into_the_same_folder(
-    home: Path, study: Path, archived: Path, tmp_path: Path
-) -> None:
-    """A second run replaces the files of the first and leaves other files alone."""
-    out = tmp_path / "out"
-    shutil.copytree(home / "out", out)
-    (out / "notes.txt").write_text("mine", encoding="utf-8")
-    first = read(out / "design.json")
-
-    result = run("design", study, "-o", out, "--threads", 1)
-    assert result.exit_code == 0
-    assert names(out) == DESIGN | {"notes.txt", MANIFEST}
-
-    second = read(out / "design.json")
-    assert second["seconds"] != first["seconds"]
-    assert second["final"]["cost"] == pytest.approx(first["final"]["cost"], rel=1e-6)
 
 
 @pytest.mark.usefixtures("no_files")
@@ -204,18 +179,6 @@ def test_unwritable_folder(study: Path, tmp_path: Path, monkeypatch: pytest.Monk
     assert names(tmp_path) == set()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_really_unwritable_folder(study: Path, tmp_path: Path) -> None:
-    """A folder that the operating system protects is refused before the work."""
-    tmp_path.chmod(0o500)
-    try:
-        misused(
-            run("design", study, "-o", tmp_path / "out"), f"{tmp_path}: no permission to write here"
-        )
-    finally:
-        tmp_path.chmod(0o700)
-
-
 def test_disk_full(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One message with the words of the operating system."""
 
@@ -251,19 +214,6 @@ def test_parameter_that_does_nothing(tmp_path: Path) -> None:
     )
 
 
-def test_start_that_excites_next_to_nothing(tmp_path: Path) -> None:
-    """Hanging at rest without control: a motion by round-off is not information."""
-    path = write_experiment(
-        tmp_path, start='{ kind = "constant", amplitude = 0.0 }', max_iterations="1"
-    )
-    misused(
-        run("design", path, "-o", tmp_path / "out"),
-        "the initial control does not excite: ",
-        "m, l and c",
-        "Other controls do",
-    )
-
-
 def test_start_that_diverges(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -273,34 +223,6 @@ def test_start_that_diverges(
     misused(run("design", path, "-o", tmp_path / "out"), "diverges under this control")
     assert capfd.readouterr() == ("", "")
     assert names(tmp_path) == {"study.toml", "cart_pendulum.xml", "cart_pendulum.csv"}
-
-
-def test_trials_that_diverge(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A step that diverges is too long: the descent shortens it without a message."""
-    monkeypatch.chdir(tmp_path)
-    diverged = []
-    experiment = mjfim.Experiment.from_file(
-        write_experiment(tmp_path, horizon="0.5", tolerance="1e-7")
-    )
-    for amplitude in np.geomspace(1.2e4, 4.8e4, 7):
-        wave = {"kind": "sine", "frequency": 2.0, "amplitude": float(amplitude)}
-        descent = {"max_iterations": 4, "coarse": 1}
-        task = DesignTask.resolve(experiment.replace(initial={"control": wave}, descent=descent))
-        project = task.plant.project
-
-        def spy(*words: Any, project: Any = project) -> Any:
-            trial = project(*words)
-            diverged.append(trial is None)
-            return trial
-
-        monkeypatch.setattr(task.plant, "project", spy)
-        result = design_task(task)
-        assert result.final.cost < result.initial.cost
-    assert any(diverged), "no trial diverged: this test has lost its object"
-    assert capfd.readouterr() == ("", "")
-    assert "MUJOCO_LOG.TXT" not in names(tmp_path)
 
 
 @pytest.mark.parametrize(

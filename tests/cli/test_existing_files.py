@@ -95,19 +95,6 @@ def test_an_edited_result_is_kept(study: Path, archived: Path, tmp_path: Path) -
         assert file.read_bytes() == first
 
 
-@pytest.mark.parametrize("verb", ["design", "identify", "montecarlo", "check"])
-def test_a_folder_of_an_older_version_is_kept(
-    verb: str, study: Path, archived: Path, recorded: Path, tmp_path: Path
-) -> None:
-    """There is no manifest in it. The message comes before the work, and names --force."""
-    file = {"design": "limits.png", "identify": "fit.png"}.get(verb, f"{verb}.npz")
-    inputs = {"identify": [recorded], "montecarlo": [archived]}.get(verb, [])
-    (tmp_path / file).write_text("old", encoding="utf-8")
-    result = run(verb, study, *inputs, "-o", tmp_path)
-    misused(result, f"{tmp_path / file}: not listed", "older version", "--force")
-    assert contents(tmp_path) == {file: b"old"}
-
-
 def test_a_second_run_does_not_enter_the_folder_of_the_first(study: Path, tmp_path: Path) -> None:
     """Exit code 2; the message names the folder and the process."""
     with locked(tmp_path / FOLDER_LOCK):

@@ -99,21 +99,6 @@ def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:
     assert names(tmp_path) == set(cases)
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("empty_figures")
-def test_stale_pictures_of_an_older_estimate_are_removed(
-    study: Path, archived: Path, recorded: Path, tmp_path: Path
-) -> None:
-    """An estimate from one recording follows an estimate from two in one folder."""
-    second = tmp_path / "second.csv"
-    run("simulate", study, archived, "-o", second, "--seed", "6")
-    run("identify", study, recorded, second, "-o", tmp_path / "e")
-    (tmp_path / "e" / "fitness.png").touch()  # a file of the user
-    assert {"fit_1.png", "fit_2.png"} <= names(tmp_path / "e")
-    run("identify", study, recorded, "-o", tmp_path / "e")
-    assert {n for n in names(tmp_path / "e") if n.startswith("fit")} == {"fit.png", "fitness.png"}
-
-
 @pytest.mark.usefixtures("empty_figures")
 @pytest.mark.slow
 def test_drawn_robots(study: Path, recorded: Path, tmp_path: Path) -> None:
@@ -163,13 +148,3 @@ def test_no_robots_are_drawn_from_undetermined_parameters(
     assert "--samples: no robots were drawn: the recordings do not determine extra" in said
     assert {"samples", "samples.csv", "samples.png"}.isdisjoint(names(out))
     assert read(out / "estimate.json")["draws"] is None
-
-
-@pytest.mark.parametrize("count", ["0", "-1", "10001", "many"])
-def test_impossible_numbers_of_robots(
-    study: Path, recorded: Path, tmp_path: Path, count: str
-) -> None:
-    result = run("identify", study, recorded, "-o", tmp_path / "fit", "--samples", count)
-    assert result.exit_code == 2
-    assert "--samples" in result.stderr
-    assert not (tmp_path / "fit").exists()

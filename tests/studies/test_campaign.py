@@ -24,7 +24,6 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.files import write_json
 from mjfim.identification.identify import identify_system
-from mjfim.identification.residual_tests import is_larger_than_noise
 from mjfim.output.campaign_folder import (
     SETTINGS_FILE,
     campaign_settings,
@@ -94,25 +93,6 @@ def test_a_campaign_ends_at_the_targets_and_at_the_true_values(
     assert not campaign.warnings and not campaign.short
 
 
-def test_a_round_holds_its_design_recording_and_estimate(campaign: Campaign) -> None:
-    """All recordings so far count, once; the first design is at the guess, the next at the
-    estimate; promises are kept.
-    """
-    task = DesignTask.resolve(STUDY)
-    recordings = [r for each in campaign.rounds for r in each.recordings]
-    alone = identify_system(task.system, recordings)
-    last = campaign.rounds[-1]
-    np.testing.assert_allclose(last.estimate.theta, alone.theta, atol=1e-4 * alone.std.min())
-    np.testing.assert_allclose(last.attained, alone.std, rtol=1e-4)
-    np.testing.assert_array_equal(campaign.rounds[0].theta, task.parameters.guess)
-    np.testing.assert_array_equal(last.theta, campaign.rounds[-2].estimate.theta)
-    np.testing.assert_allclose(last.predicted, last.attained, rtol=0.05)
-    assert (np.abs(campaign.rounds[0].predicted / campaign.rounds[0].attained - 1.0) > 0.1).any(), (
-        "the guess was right"
-    )
-    assert len(campaign.designs) == len(campaign.estimates) == len(recordings)
-
-
 def smallest_eigenvalue(controls: Sequence[Array], truth: DesignTask) -> float:
     """Smallest eigenvalue of what the controls tell together at the truth."""
     told = [
@@ -138,24 +118,6 @@ def test_a_redesign_gains_more_information_than_repeating_the_first_design(
     assert gained([r.control for r in campaign.rounds], truth) > 1.03
     efforts = [float((r.control**2).sum()) for r in campaign.rounds]
     assert 0.8 * efforts[0] < min(efforts) and max(efforts) < 1.25 * efforts[0]
-
-
-def test_a_redesign_is_at_the_estimate_on_the_same_scales(tmp_path: Path) -> None:
-    """Relative scales stay those of the stated guess; guesses keep inside bounds; true values are
-    not told.
-    """
-    tables = {
-        "m": {"target": "body/bob:mass", "true": 1.4, "bounds": (0.5, 2.0)},
-        "c": {"target": "joint/hinge:damping"},
-    }
-    base = cart_task(tmp_path, parameters=tables, cost={"linearize_at": "true"})
-    moved = DesignTask.resolve(restate_experiment(base, np.array([2.0, 0.1])))
-    np.testing.assert_array_equal(moved.parameters.scale, base.parameters.scale)
-    assert moved.theta[0] == pytest.approx(2.0 - 1e-3 * 1.5) and moved.theta[1] == 0.1
-    assert moved.experiment.parameters["m"].true is None
-    np.testing.assert_array_equal(
-        DesignTask.resolve(restate_experiment(base)).theta, base.parameters.guess
-    )
 
 
 def test_the_guess_of_an_inertia_moves_where_the_recordings_determine_it(tmp_path: Path) -> None:
@@ -211,19 +173,6 @@ def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path)
     assert any("misfit" in sentence for sentence in found.warnings)
 
 
-@pytest.mark.slow
-def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_path: Path) -> None:
-    rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" damping="0.5"/>')
-    easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
-    found = mjfim.run_campaign(
-        easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=1
-    )
-    assert found.estimate is not None and found.estimate.misfit
-    assert not is_larger_than_noise(found.estimate.chi2, found.estimate.dof)
-    assert found.status is CampaignStatus.DOUBTFUL
-    assert any("autocorrelated" in sentence for sentence in found.warnings)
-
-
 def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
     """Three rows of a recording are no progress; the rounds are used up, and it says what is
     missing.
@@ -267,24 +216,6 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     ]
     found = mjfim.run_campaign(STUDY, never, rounds=2, done=done)
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
-
-
-@pytest.mark.slow
-def test_recorded_rounds_are_not_repeated(campaign: Campaign) -> None:
-    """The next design of a continued campaign is that of an uninterrupted one."""
-    first = campaign.rounds[0]
-    done = [
-        EarlierRound(
-            recordings=first.recordings,
-            theta=first.theta,
-            predicted=first.predicted,
-            control=first.control,
-        )
-    ]
-    found = mjfim.run_campaign(STUDY, lambda design, number: None, done=done)
-    assert found.status is CampaignStatus.WAITING and found.pending is not None
-    np.testing.assert_allclose(found.pending.trajectory.ctrl, campaign.rounds[1].control, atol=1e-6)
-    np.testing.assert_allclose(found.pending.theta, campaign.rounds[1].theta, rtol=1e-9)
 
 
 @pytest.mark.slow

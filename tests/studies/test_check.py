@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import gzip
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ import mjfim
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.files import as_json
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.fisher import FisherInformation
 from mjfim.plant.derivatives import Derivatives
@@ -247,33 +245,3 @@ def test_recordings_of_the_real_double_pendulum_give_the_same_combinations() -> 
     combinations = double_pendulum_groups(check_recordings(task.system, [recording]))
     assert combinations["m1r1"]["m2"] == pytest.approx(0.3, rel=1e-3)
     assert combinations["I1"]["m2"] == pytest.approx(0.09, rel=1e-3)
-
-
-def test_the_summary_is_strict_json(tmp_path) -> None:
-    parameters = {**CART_PARAMETERS, **PRODUCT}
-    text = as_json(check_task(cart_task(tmp_path, parameters=parameters)).summary())
-    assert "NaN" not in text
-    assert "Infinity" not in text
-    assert '"identifiable"' in text
-
-
-@pytest.mark.parametrize(
-    "file",
-    [
-        pytest.param(
-            file,
-            id=file.stem,
-            marks=[] if file.stem == "cart_pendulum_limits" else pytest.mark.slow,
-        )
-        for file in sorted(MODELS.glob("cart_pendulum*.toml"))
-    ],
-)
-def test_a_cart_pendulum_can_be_checked_with_any_weights(file: Path) -> None:
-    """A cost without control weights has no metric of its own; the slope is tested along a
-    unit-weight direction. The other examples are checked by the tests of models.
-    """
-    found = check(mjfim.Experiment.from_file(file))
-    assert found.verdict
-    assert np.isfinite(found.self_test.slope)
-    if found.self_test.roughness is None:
-        assert found.self_test.passed

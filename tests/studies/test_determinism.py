@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -21,7 +18,6 @@ from mjfim.records.events import Event
 from tests.support.contents import contents
 from tests.support.limits import ARM, cart_inside, floating_task
 from tests.support.numerics import filtered_task, make_task
-from tests.support.paths import ROOT
 
 
 def study(
@@ -127,23 +123,3 @@ def test_other_problems_give_the_same_files_with_any_threads(make: Any, tmp_path
     experiment = make(tmp_path)
     first = study(experiment, tmp_path / "first", threads=1)
     assert study(experiment, tmp_path / "second", threads=2) == first
-
-
-@pytest.mark.slow
-def test_the_order_of_sets_in_python_does_not_change_the_files(tmp_path: Path) -> None:
-    """Python orders sets of words differently in every process."""
-    code = (
-        "import pathlib, sys; from tests.studies.test_determinism import robust, study; "
-        "home = pathlib.Path(sys.argv[1]); study(robust(home), home / 'out', threads=1)"
-    )
-    found = []
-
-    for seed in ("1", "2"):
-        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(ROOT)}
-        home = tmp_path / seed
-        home.mkdir()
-        subprocess.run([sys.executable, "-c", code, str(home)], env=environment, check=True)
-        found.append(contents(home / "out"))
-
-    assert "design.json" in found[0]
-    assert found[0] == found[1]

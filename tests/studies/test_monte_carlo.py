@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, kstest, norm
 
 import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.identify import identify, identify_system
+from mjfim.identification.identify import identify
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import Event, StudyEvent
 from mjfim.records.trajectory import Recording, Trajectory
@@ -65,31 +64,6 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Desig
     np.testing.assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
 
 
-@pytest.mark.slow
-def test_each_trial_is_a_least_squares_estimate(
-    experiment: Experiment, design: mjfim.Design
-) -> None:
-    study = monte_carlo(
-        experiment, {"initial": design.initial.trajectory}, trials=20, seed=5, measure_rate=25.0
-    )
-    task = DesignTask.resolve(experiment.replace(measure_rate=25.0))
-    rng = np.random.default_rng(5).spawn(1)[0]
-    ctrl, rows = design.initial.trajectory.ctrl, np.arange(4, 401, 4)
-    exact, _ = task.plant.measure(task.parameters.true[None], ctrl)
-    noise = rng.standard_normal((20, 400)).reshape(20, 100, 4)
-    std = np.sqrt(np.diag(study.sets["initial"].crlb))
-    for i in range(5):
-        y = np.full((401, 4), np.nan)
-        y[rows] = exact[0, rows] + 0.05 * noise[i]
-        alone = identify_system(
-            task.system,
-            [Recording(t=np.arange(401) * 0.01, ctrl=ctrl, y=y, outputs=task.system.outputs.names)],
-        )
-        np.testing.assert_array_less(
-            np.abs(study.sets["initial"].estimates[i] - alone.theta), 0.01 * std
-        )
-
-
 def test_the_seed_determines_the_result(short: Experiment, motion: Trajectory) -> None:
     runs = [
         monte_carlo(short, motion, trials=3, seed=seed).sets["final"].estimates
@@ -124,16 +98,6 @@ def test_failed_trials_are_counted_not_averaged() -> None:
     s = _statistics(estimates, np.eye(2), 0.0)
     assert (s.failed, s.trials) == (1, 100)
     assert np.isfinite(s.covariance).all()
-
-
-def test_simulated_noise_is_white_gaussian_of_the_stated_size(
-    experiment: Experiment, curve: Trajectory
-) -> None:
-    task = DesignTask.resolve(experiment)
-    exact, _ = task.plant.measure(task.parameters.true[None], curve.ctrl)
-    residual = ((simulate_system(task.system, curve, seed=9).y - exact[0]) / 0.05).ravel()
-    assert 0.001 < chi2.cdf(residual @ residual, residual.size) < 0.999
-    assert kstest(residual, norm.cdf).pvalue > 1e-3
 
 
 PAIR = ((0.05**2, 0.8 * 0.05**2), (0.8 * 0.05**2, 0.05**2))
@@ -200,14 +164,6 @@ def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estim
             np.abs(study.sets["final"].estimates[i] - alone.theta), 0.01 * std
         )
         np.testing.assert_allclose(alone.std, std, rtol=0.2)
-
-
-def test_simulation_measures_at_the_measurement_rate(
-    experiment: Experiment, curve: Trajectory
-) -> None:
-    y = mjfim.simulate(experiment.replace(measure_rate=25.0), curve, seed=0).y
-    measured = np.isfinite(y).all(axis=1)
-    assert np.array_equal(np.flatnonzero(measured), np.arange(0, 401, 4))
 
 
 def test_too_few_trials_are_refused(experiment: Experiment, curve: Trajectory) -> None:

@@ -19,11 +19,8 @@ from mjfim.errors import (
     RecordingError,
     SimulationDivergedError,
 )
-from mjfim.excitation.design import design_task
-from mjfim.excitation.initial_controls import control_of_earlier_design
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
-from mjfim.model.coordinates import tangent_names
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
@@ -34,10 +31,9 @@ from mjfim.records.trajectory import Playback, Recording
 from mjfim.studies import robot_bench
 from mjfim.studies.robot_bench import RobotBench
 from mjfim.studies.robustness import summarize_runs
-from tests.support.cli import misused, run, run_script
+from tests.support.cli import misused, run
 from tests.support.numerics import Array, body_task, cart_task, filtered_task
 
-FILTERED_FINE = {"rate": 50.0, "playback_rate": 100.0}  # of an engine at 200 Hz
 COARSE = {"rate": 25.0, "horizon": 0.8}  # of engines at 100 Hz
 BUILD: dict[str, Any] = {
     "cart": lambda folder, **tables: cart_task(folder, **{**COARSE, **tables}),
@@ -97,19 +93,6 @@ def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(data.qpos, qpos[-1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(rows["t"], np.arange(len(qpos)) / FINE[kind], rtol=0, atol=1e-12)
     assert np.isnan(ctrl[-1]).all() and np.isnan(starting(rows, "gain:")[-1]).all()
-
-
-@pytest.mark.parametrize("kind", BUILD)
-def test_rows_at_samples_are_the_design(kind: str, tmp_path: Path) -> None:
-    """Every sample of the design is in the file to the last bit, at any rate of the controller."""
-    task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    stride = round(FINE[kind] / task.experiment.rate)
-    played = simulate_playback(task.system, task.initial, gains(task))
-    assert stride > 1
-    np.testing.assert_array_equal(played.state[::stride], task.initial.state)
-    for first in range(stride):
-        np.testing.assert_array_equal(played.ctrl[first::stride], task.initial.ctrl)
-        np.testing.assert_array_equal(played.gain[first::stride], gains(task))
 
 
 def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Array]:
@@ -173,37 +156,6 @@ def engine_loop(task: DesignTask, model: Any, start: Array, reference: Array, K:
     return np.array(states)
 
 
-def test_gains_of_the_samples_serve_a_faster_controller(tmp_path: Path) -> None:
-    """A displaced cart returns to the plan with feedback, and does not return without."""
-    task = BUILD["cart"](tmp_path, playback_rate=100.0, horizon=4.0)
-    path, _ = written(task, tmp_path)
-    push = np.array([0.3, 0.0, 0.0, 0.0])
-    states, _, plan = closed_loop(path, tmp_path, push)
-    model, start = task.plant.model(task.theta), task.space.plus(task.initial.state[:1], push)
-    alone = task.plant.simulator.rollout([model], start, task.initial.ctrl[None]).states[0]
-    assert abs(alone[-1, 0] - plan[-1, 0]) == pytest.approx(0.3, rel=1e-6)
-    assert abs(states[-1, 0] - plan[-1, 0]) < 0.1
-
-
-def test_gain_columns_name_the_components_on_which_they_act(tmp_path: Path) -> None:
-    """Free and ball joints by tangent components, rotations as vectors; activations too."""
-    body = BUILD["body"](tmp_path)
-    parts = ["x", "y", "z", "rx", "ry", "rz"]
-    wanted = [f"float.{p}" for p in parts] + [f"ball.{p}" for p in parts[3:]]
-    assert list(tangent_names(body.system.model)) == [
-        f"{kind}:{name}" for kind in ("qpos", "qvel") for name in wanted
-    ]
-    rows = table(written(body, tmp_path)[0])
-    names = [name for name in rows if name.startswith("gain:")]
-    assert names[0] == "gain:push:qpos:float.x"
-    assert names[-1] == "gain:twist:qvel:ball.rz"
-    filtered = BUILD["filtered"](tmp_path)
-    *header, note = table(written(filtered, tmp_path)[0])
-    assert note.startswith("note: gains are for")
-    state = ["qpos:hinge", "qvel:hinge", "act:servo"]
-    assert header == ["t", *state, "ctrl:servo", *(f"gain:servo:{name}" for name in state)]
-
-
 def assert_last_acceleration(qacc: Array, played: Playback, data: Any) -> None:
     """The last row has the acceleration of the last engine step, (nv,)."""
     model = data.model
@@ -247,32 +199,6 @@ def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : task.space.nq])
 
 
-def test_a_design_leaves_both_tables(tmp_path: Path) -> None:
-    """At the controller's rate; design.csv is a control to start from and an earlier design, gains
-    and all.
-    """
-    task = BUILD["filtered"](
-        tmp_path, **FILTERED_FINE, descent={"max_iterations": 1}, cost={"control": 0.1}
-    )
-    design = design_task(task)
-    archive.write_design(tmp_path / "out", design, task.system)
-    rows, motion = table(tmp_path / "out" / "design.csv"), table(tmp_path / "out" / "reference.csv")
-    assert len(rows["t"]) == len(motion["t"]) == 2 * task.samples + 1
-    np.testing.assert_array_equal(rows["qpos:hinge"], motion["qpos:hinge"])
-    np.testing.assert_array_equal(rows["qpos:hinge"][::2], design.trajectory.qpos[:, 0])
-    np.testing.assert_array_equal(
-        starting(rows, "gain:")[:-1:2], design.final.gain.reshape(task.samples, -1)
-    )
-    again = DesignTask.resolve(
-        task.experiment.replace(initial={"control": str(tmp_path / "out" / "design.csv")})
-    )
-    np.testing.assert_array_equal(again.control, design.trajectory.ctrl)
-    np.testing.assert_array_equal(
-        control_of_earlier_design(task, str(tmp_path / "out" / "design.csv")),
-        design.trajectory.ctrl,
-    )
-
-
 @pytest.mark.parametrize("rate", [37.0, 75.0, 12.5, 400.0, 150.0])
 def test_playback_rate_must_fit(rate: float, tmp_path: Path) -> None:
     """A multiple of rate that divides the engine's; the message lists all of them."""
@@ -280,12 +206,6 @@ def test_playback_rate_must_fit(rate: float, tmp_path: Path) -> None:
         ExperimentError,
         match=r"playback_rate: .* multiple of rate \(50 Hz\).*200 Hz.*valid: 50, 100, 200",
     ):
-        filtered_task(tmp_path, rate=50.0, playback_rate=rate)
-
-
-@pytest.mark.parametrize("rate", [0.0, -50.0, "fast", float("nan")])
-def test_playback_rate_is_a_rate(rate: Any, tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match="playback_rate"):
         filtered_task(tmp_path, rate=50.0, playback_rate=rate)
 
 
@@ -484,32 +404,6 @@ def test_margins_of_servo_forces_hold_at_every_engine_step(
     assert margins[kinds.index("force")] == pytest.approx(1.0 - largest / 400.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("latency", "feedback"),
-    [
-        (0.0, False),
-        (0.005, True),
-        *(
-            pytest.param(latency, feedback, marks=pytest.mark.slow)
-            for latency, feedback in ((0.0, True), (0.005, False), (0.02, False), (0.02, True))
-        ),
-    ],
-)
-@pytest.mark.slow
-def test_without_noise_the_true_values_are_found(
-    cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
-) -> None:
-    """A late control is exactly equivalent to a late measurement, also with feedback."""
-    bench = bench_of(cart, feedback=feedback, latency=latency, loudness=0.0)
-    for number in range(3):
-        run = bench.run(number)
-        off = run.theta[:3] / bench.task.parameters.guess[:3]
-        np.testing.assert_allclose(np.abs(off - 1.0), 0.2, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(
-            run.estimate, run.theta, rtol=0, atol=float((1e-4 * run.std).max())
-        )
-
-
 RUNS, FEW = 30, 6
 
 
@@ -696,23 +590,6 @@ def test_a_stopped_study_keeps_the_robots_that_are_done(
     assert result.runs == 1
     with pytest.raises(NoResultError):
         mjfim.assess_robustness(*cart, stop=stop, **options)
-
-
-def test_the_player_script_walks_through_the_plan(
-    cart: tuple[mjfim.Experiment, Path], tmp_path: Path
-) -> None:
-    """Its log of the simulated robot holds the planned states and controls, and can be read as a
-    recording.
-    """
-    _, path = cart
-    log = tmp_path / "recording.csv"
-    done = run_script("play_design.py", path, "--model", path.parent / "cart.xml", "-o", log)
-    assert done.returncode == 0, done.stderr
-
-    planned, recorded = table(path), table(log)
-    for name in ("t", "qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"):
-        np.testing.assert_allclose(recorded[name], planned[name], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(recorded["ctrl:force"][:-1], planned["ctrl:force"][:-1])
 
 
 @pytest.mark.parametrize(
