@@ -36,7 +36,7 @@ def validate(
     read = mjfim.Experiment.from_file(experiment)
 
     from mjfim.output.summaries.stated_experiment import describe_experiment
-    from mjfim.studies.stated_experiment import stated_experiment
+    from mjfim.studies.inventory import stated_experiment
 
     stated = stated_experiment(read)
     print_result(as_json, stated.summary(), describe_experiment(stated), verbose=verbose)

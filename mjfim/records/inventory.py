@@ -79,7 +79,7 @@ class ListedKeyframe(Record):
 
 @record
 class ListedLimit(Record):
-    """A range of the MJCF, which a design keeps.
+    """A range of the MJCF or a stated limit, which a design keeps.
 
     Attributes:
         quantity: What is limited: `position`, `control`, `force` or `joint_force`.
@@ -214,25 +214,6 @@ class StatedOutput(Record):
 
 
 @record
-class StatedLimit(Record):
-    """One limit that a design keeps.
-
-    Attributes:
-        quantity: What is limited, as the key of the table `limits`.
-        name: Name of the joint, the actuator or the tendon.
-        lower: Lower bound [unit of the quantity].
-        upper: Upper bound [unit of the quantity].
-        unit: Unit of the quantity; empty where the model does not determine it.
-    """
-
-    quantity: str
-    name: str
-    lower: float
-    upper: float
-    unit: str = ""
-
-
-@record
 class StatedExperiment(Record):
     """Contents of a correct experiment file.
 
@@ -257,7 +238,7 @@ class StatedExperiment(Record):
     parameters: tuple[StatedParameter, ...]
     outputs: tuple[StatedOutput, ...]
     controls: tuple[str, ...]
-    limits: tuple[StatedLimit, ...]
+    limits: tuple[ListedLimit, ...]
     controllers: tuple[ControlLawInLoop, ...]
     missing: tuple[str, ...]
     warnings: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""`mjfim.list_model`: everything that an experiment file can name in a model."""
+"""What an experiment file can name in a model (`list`), and what a file states (`validate`)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, listed
-from mjfim.excitation.limits import limits_of_model, unsupported_ranges
+from mjfim.excitation.limits import Limit, limits_of, limits_of_model, unsupported_ranges
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.stated_units import probable_degrees
+from mjfim.experiment.system import System
+from mjfim.identification.laws_in_loop import laws_in_loop
 from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import INERTIAL_FIELDS, MODEL_ARRAYS, fields_of, resolve, unit_of
@@ -26,6 +31,9 @@ from mjfim.records.inventory import (
     ListedOutput,
     ListedParameter,
     ListedTerm,
+    StatedExperiment,
+    StatedOutput,
+    StatedParameter,
 )
 
 # Name of the body that does not move and has no parameters.
@@ -78,7 +86,7 @@ def list_model(path: str | Path) -> Inventory:
         outputs=tuple(_outputs(source)),
         actuators=tuple(_actuators(source)),
         keyframes=tuple(_keyframes(model)),
-        limits=tuple(_limits(source)),
+        limits=tuple(map(_listed, limits_of_model(model))),
         terms=tuple(_terms(model)),
         remarks=tuple(_remarks(model)),
     )
@@ -187,16 +195,15 @@ def _keyframes(model: Any) -> Iterator[ListedKeyframe]:
         )
 
 
-def _limits(source: ModelSource) -> Iterator[ListedLimit]:
-    """Ranges of the MJCF that a design keeps."""
-    for limit in limits_of_model(source.model):
-        yield ListedLimit(
-            quantity=limit.kind,
-            name=limit.name,
-            lower=limit.lower,
-            upper=limit.upper,
-            unit=limit.unit,
-        )
+def _listed(limit: Limit) -> ListedLimit:
+    """A limit for the user."""
+    return ListedLimit(
+        quantity=limit.kind,
+        name=limit.name,
+        lower=limit.lower,
+        upper=limit.upper,
+        unit=limit.unit,
+    )
 
 
 def _terms(model: Any) -> Iterator[ListedTerm]:
@@ -236,3 +243,56 @@ def _remarks(model: Any) -> Iterator[str]:
     ranges = unsupported_ranges(model)
     if ranges:
         yield f"ranges of the MJCF that a design does not keep: {listed(ranges)}"
+
+
+def stated_experiment(experiment: Experiment) -> StatedExperiment:
+    """Check an experiment against its model, and say what it states.
+
+    Args:
+        experiment: The experiment.
+
+    Raises:
+        ExperimentError: A name, a file or a number in the experiment is wrong; the message names
+            the key.
+        ModelError: The model cannot be used.
+    """
+    system = System.resolve(experiment)
+
+    missing = []
+    if experiment.horizon is None:
+        missing.append("horizon")
+    if experiment.initial.control is None and system.controls:
+        missing.append("initial.control")
+
+    # A file for recordings alone needs no task of a design.
+    if missing or system.laws is not None:
+        limits = limits_of(system.model, system.controls, experiment.limits, system.dt)
+    else:
+        limits = DesignTask.of(system).limits
+
+    return StatedExperiment(
+        source=experiment.source,
+        model=str(system.model_path),
+        rate=experiment.rate,
+        horizon=experiment.horizon,
+        parameters=tuple(
+            StatedParameter(
+                name=parameter.name,
+                unit=parameter.unit,
+                guess=parameter.guess,
+                lower=parameter.bounds[0],
+                upper=parameter.bounds[1],
+                nuisance=parameter.nuisance,
+            )
+            for parameter in system.parameters.parameters
+        ),
+        outputs=tuple(
+            StatedOutput(name=output.name, unit=output.unit, sigma=output.sigma)
+            for output in system.outputs.outputs
+        ),
+        controls=system.controls,
+        limits=tuple(map(_listed, limits)),
+        controllers=laws_in_loop(system, system.parameters.guess, {}),
+        missing=tuple(missing),
+        warnings=probable_degrees(experiment, system.source),
+    )

@@ -26,7 +26,7 @@ from mjfim.output import plots
 from mjfim.output.labels import complete_labels
 from mjfim.output.summaries.stated_experiment import describe_experiment
 from mjfim.output.summary_parts import SummaryTable
-from mjfim.studies.stated_experiment import stated_experiment
+from mjfim.studies.inventory import stated_experiment
 from tests.support.limits import barrier_check
 from tests.support.numerics import Array, make_task
 

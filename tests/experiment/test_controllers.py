@@ -15,7 +15,7 @@ from mjfim.experiment.system import System
 from mjfim.model.control_laws import Quantity
 from mjfim.recordings.read import read_recording
 from mjfim.recordings.spec import LAW_PREFIXES
-from mjfim.studies.stated_experiment import stated_experiment
+from mjfim.studies.inventory import stated_experiment
 from tests.support.closed_loop import arm_experiment
 from tests.support.paths import MODELS
 

@@ -15,7 +15,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
-from mjfim.studies.stated_experiment import stated_experiment
+from mjfim.studies.inventory import stated_experiment
 
 MODEL = """
 <mujoco>
