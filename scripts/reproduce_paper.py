@@ -23,9 +23,9 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.labels import labels_of_system
 from mjfim.files import write_json
-from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
+from mjfim.output.plots.pictures import draw
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
@@ -213,18 +213,18 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
         study: Monte-Carlo study at 25 Hz.
     """
     names = labels_of_system(task.system)
-    figures = {
-        "figure_2": plots.trajectories(design, names),
-        "figure_3": plots.sensitivity_phase(design, names),
-        "convergence": plots.convergence(design),
+    drawn = {
+        "figure_2": (design, "trajectories"),
+        "figure_3": (design, "sensitivity_phase"),
+        "convergence": (design, "convergence"),
+        **{
+            f"figure_{number}": (study, f"histogram_{parameter}")
+            for number, parameter in ((4, "c"), (5, "m"), (6, "l"))
+        },
     }
 
-    for number, parameter in ((4, "c"), (5, "m"), (6, "l")):
-        index = study.parameters.index(parameter)
-        figures[f"figure_{number}"] = plots.histogram(study, index, names)
-
-    for name, figure in figures.items():
-        plots.save(figure, folder / f"{name}.png")
+    for name, (record, picture) in drawn.items():
+        draw(record, picture, folder / f"{name}.png")
     rerun_log.log_design(folder / "design.rrd", task.system.model_at(task.theta), design, names)
 
 

@@ -60,6 +60,6 @@ def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
             return path
 
     # Imported here, because most tests draw nothing and matplotlib takes a while to import.
-    from mjfim.output import plots
+    from mjfim.output.plots import draw
 
-    monkeypatch.setattr(plots, "save", touch)
+    monkeypatch.setattr(draw, "save", touch)

@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import as_json, read_json, replacing, write_json
-from mjfim.output import plots
 from mjfim.output.archive import check_fits, origin_of
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.folders import (
@@ -35,15 +34,15 @@ from mjfim.output.manifest import fingerprint
 from mjfim.output.models.mjcf import write_identified
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
+from mjfim.output.plots import studies
+from mjfim.output.plots.pictures import Pictures
+from mjfim.output.plots.words import format_with_uncertainty
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import write_report
 from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-
-if TYPE_CHECKING:
-    from mjfim.output.plots.pictures import Pictures
 
 # The settings with which a simulated campaign began; the call that continues it needs the same.
 SETTINGS_FILE = "settings.json"
@@ -228,7 +227,7 @@ class CampaignFolder:
             return []
 
         drawn = CampaignParameters.stated(parameters, simulated=simulated)
-        pictures: Pictures = {"campaign": partial(plots.campaign_figure, campaign, drawn)}
+        pictures: Pictures = {"campaign": partial(studies.campaign, campaign, drawn)}
         write_pictures(self.path, pictures, self.picture_format)
         try:
             return write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
@@ -243,10 +242,6 @@ def accuracy_sentence(estimate: Estimate, wanted: Array) -> str:
         estimate: The estimate.
         wanted: (p,) standard deviations aimed at [theta-unit]; infinite where none is.
     """
-    from mjfim.output.plots.style import (
-        format_with_uncertainty,
-    )  # imports matplotlib, which is slow
-
     parts = []
     for j, name in enumerate(estimate.parameters):
         if np.isfinite(wanted[j]):

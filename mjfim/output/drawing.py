@@ -154,7 +154,7 @@ def picture_contents(record: ShownRecord) -> dict[str, bytes]:
 
 def _import_what_draws() -> None:
     """Import all modules that draw pictures, before there is anything to draw."""
-    from mjfim.output.plots import pictures, style  # noqa: F401
+    from mjfim.output.plots import draw, pictures  # noqa: F401
 
 
 def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
@@ -162,7 +162,7 @@ def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, b
 
     A fault is raised, so that the program that waits for the pictures knows its reason.
     """
+    from mjfim.output.plots.draw import content
     from mjfim.output.plots.pictures import pictures_of
-    from mjfim.output.plots.style import content
 
-    return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}
+    return {name: content(make(), picture_format) for name, make in pictures_of(record).items()}

@@ -8,20 +8,26 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.identification.aligned_recording import measured_trajectory
-from mjfim.output import archive, plots
+from mjfim.output import archive
 from mjfim.output import rerun as rerun_log
 from mjfim.output.drawing import begin_pictures, picture_contents
 from mjfim.output.models.mjcf import identified_files, write_identified
 from mjfim.output.optional_files import write_optional
+from mjfim.output.panels import Picture
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
+from mjfim.output.plots.pictures import (
+    Pictures,
+    fit_names,
+    held_out_names,
+    histogram_name,
+    pictures_of,
+)
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import records_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
@@ -32,9 +38,6 @@ from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import begin_stage
-
-if TYPE_CHECKING:
-    from mjfim.output.plots.pictures import DrawPicture, Pictures
 
 # The identified model.
 IDENTIFIED = "identified.xml"
@@ -317,15 +320,8 @@ def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFor
 
     # Matplotlib takes seconds to import, which nobody waits for who has pressed Ctrl-C twice.
     pictures: Pictures = {}
-    write_optional("the pictures", lambda: pictures.update(_pictures_of(record)))
+    write_optional("the pictures", lambda: pictures.update(pictures_of(record)))
     write_pictures(folder, pictures, picture_format)
-
-
-def _pictures_of(record: ShownRecord) -> Pictures:
-    """Functions that draw the pictures of a record, by name."""
-    from mjfim.output.plots.pictures import pictures_of  # imports matplotlib, which is slow
-
-    return pictures_of(record)
 
 
 def missing_pictures(folder: Path) -> Pictures:
@@ -352,9 +348,9 @@ def missing_pictures(folder: Path) -> Pictures:
         ((folder / f"{record.file_stem}.npz").stat().st_mtime_ns, record)
         for record in records_in(folder).values()
     ]
-    wanted: dict[str, tuple[int, DrawPicture]] = {}
+    wanted: dict[str, tuple[int, Callable[[], Picture]]] = {}
     for written, record in sorted(records, key=lambda each: each[0]):
-        wanted.update({name: (written, draw) for name, draw in _pictures_of(record).items()})
+        wanted.update({name: (written, draw) for name, draw in pictures_of(record).items()})
     return {name: draw for name, (written, draw) in wanted.items() if drawn.get(name, 0) < written}
 
 
@@ -396,9 +392,11 @@ def _write_content(content: bytes, file: Path) -> None:
         temporary.write_bytes(content)
 
 
-def _write_picture(draw: DrawPicture, file: Path) -> None:
+def _write_picture(make: Callable[[], Picture], file: Path) -> None:
     """Draw a picture and write it."""
-    plots.save(draw(), file)
+    from mjfim.output.plots.draw import save  # imports matplotlib, which is slow
+
+    save(make(), file)
 
 
 def clear(folder: Path, names: str) -> None:

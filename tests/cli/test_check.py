@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 import mjfim
 from mjfim.output.manifest import MANIFEST
-from mjfim.output.plots.check import check_figure
+from mjfim.output.plots.studies import check
 from tests.support.cli import MODELS, loads, misused, names, read, run, write_experiment
 
 
@@ -102,16 +102,15 @@ def test_misuse(study: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_picture_shows_parameters_that_are_not_known_alone() -> None:
     found = mjfim.check(mjfim.Experiment.from_file(MODELS / "double_pendulum.toml"))
-    figure = check_figure(found)
-    bars, heat = figure.axes[0], figure.axes[1]
-    named = [label.get_text() for label in bars.get_yticklabels()]
-    assert named[:7] == list(found.wanted)
-    assert len(named) == 7 + len(found.combined)
-    hatched = [patch for patch in bars.patches if patch.get_hatch()]
-    assert len(hatched) == 3
-    shown = heat.images[0].get_array()
-    assert shown.shape == (7, 7)
-    assert np.ma.getmaskarray(shown)[:3].all()
+    bars, heat = check(found).panels
+    assert bars.y.names is not None
+    assert list(bars.y.names[:7]) == list(found.wanted)
+    assert len(bars.y.names) == 7 + len(found.combined)
+    (hatched,) = (mark for mark in bars.marks if mark.hollow)
+    assert len(hatched.x) == 3
+    assert heat.cells is not None
+    assert heat.cells.values.shape == (7, 7)
+    assert np.isnan(heat.cells.values[:3]).all()
 
 
 def test_a_wrong_horizon_is_refused_with_its_file(tmp_path: Path) -> None:

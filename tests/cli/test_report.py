@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from mjfim.output import plots
+from mjfim.output.plots import draw
 from mjfim.output.plots.pictures import picture_names
 from mjfim.output.report import REPORT
 from mjfim.parallel.budget import NOTHING_SENTENCE
@@ -67,7 +67,7 @@ def test_a_press_while_pictures_are_drawn_keeps_those_that_are_written(
     """After the first press, the others are drawn; after the second one, they are left out."""
     folder = tmp_path / "a design"
     results.design().save(folder)
-    write = plots.save
+    write = draw.save
     written: list[Path] = []
 
     def press(figure: Figure, path: Path) -> None:
@@ -76,7 +76,7 @@ def test_a_press_while_pictures_are_drawn_keeps_those_that_are_written(
         for _ in range(presses if len(written) == 1 else 0):
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(plots, "save", press)
+    monkeypatch.setattr(draw, "save", press)
     result = run("report", folder, "--pictures")
     assert result.exit_code == 1
     assert NOTHING_SENTENCE not in result.stderr

@@ -22,8 +22,8 @@ from mjfim.excitation.verification import require_feasible_start, verify
 from mjfim.excitation.violations import violations_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
-from mjfim.output import plots
 from mjfim.output.labels import complete_labels
+from mjfim.output.plots.design import limits as limits_picture
 from mjfim.output.summaries.stated_experiment import describe_experiment
 from mjfim.output.summary_parts import SummaryTable
 from mjfim.studies.inventory import stated_experiment
@@ -566,9 +566,8 @@ def test_a_quadrotor_flies_inside_its_box_speeds_and_tilt(tmp_path: Path) -> Non
     said = [str(violation) for violation in design.initial_violations]
     assert any(text.startswith("tilt of float is 0.3") for text in said)
 
-    titles = [
-        axes.get_title(loc="left") for axes in plots.limits(design, complete_labels(design)).axes
-    ]
+    picture = limits_picture(design, complete_labels(design))
+    titles = [panel.title for panel in picture.panels]
     assert any(title.startswith("tilt: smallest margin") for title in titles)
     assert any(title.startswith("angular velocity: smallest margin") for title in titles)
 

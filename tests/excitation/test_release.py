@@ -18,8 +18,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import tangent_components
-from mjfim.output.plots.convergence import convergence
-from mjfim.output.plots.design import trajectories
+from mjfim.output.plots.design import convergence, trajectories
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
 from mjfim.studies.monte_carlo import monte_carlo
@@ -243,10 +242,10 @@ def test_estimates_of_a_designed_release_reach_the_cramer_rao_bound(tmp_path: Pa
 def test_figures_of_a_release_have_no_empty_panel(tmp_path: Path) -> None:
     design = mjfim.design(short(tmp_path, horizon=0.4))
     assert design.trajectory.ctrl.shape == (20, 0)
-    for figure in (convergence(design), trajectories(design, design.labels)):
-        for axes in figure.axes:
-            assert axes.lines
-    assert len(convergence(design).axes) == 2
+    assert design.labels is not None
+    for picture in (convergence(design), trajectories(design, design.labels)):
+        assert all(panel.marks for panel in picture.panels)
+    assert len(convergence(design).panels) == 2
 
 
 FILE = """

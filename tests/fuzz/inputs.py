@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mjfim.files import replacing
-from mjfim.output import plots
+from mjfim.output.plots import draw
 from tests.fuzz.bad_inputs import Call, bad_input
 from tests.fuzz.faults import fault
 from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
@@ -97,15 +97,15 @@ def _save_pixel(figure: object, path: Path, dpi: float = 0.0) -> Path:
 
 def in_this_process(call: Call, folder: Path) -> Ending:
     """Call the command line in this process, with figures of one pixel."""
-    home, save = Path.cwd(), plots.save
+    home, save = Path.cwd(), draw.save
     os.chdir(folder)
-    plots.save = _save_pixel
+    draw.save = _save_pixel
     try:
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             result = run_here(*call.words)
     finally:
-        plots.save = save
+        draw.save = save
         os.chdir(home)
 
     fault = "; ".join(

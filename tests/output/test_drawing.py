@@ -17,8 +17,8 @@ from mjfim.errors import MjfimError
 from mjfim.output import drawing
 from mjfim.output.drawing import begin_pictures, drawing_elsewhere, picture_contents
 from mjfim.output.picture_format import PictureFormat
+from mjfim.output.plots.draw import content
 from mjfim.output.plots.pictures import pictures_of
-from mjfim.output.plots.style import content
 from tests.support import results
 
 

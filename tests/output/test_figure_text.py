@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mjfim.output import plots
-from mjfim.output.campaign_parameters import CampaignParameters
+from mjfim.output.plots.draw import figure_of
+from mjfim.output.plots.pictures import pictures_of
+from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.check import Check, ParameterCheck, SelfTest
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome
@@ -29,6 +30,7 @@ from mjfim.records.estimate import (
 )
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
 from mjfim.records.labels import Labels
+from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from mjfim.records.terms import Decision, Selection, SelectionStep
@@ -91,6 +93,7 @@ def design(size: Size) -> Design:
     return dataclasses.replace(
         found,
         parameters=size.labels.parameters,
+        labels=size.labels,
         usage=tuple(usage),
         limits=margins,
         combined=combined,
@@ -131,6 +134,8 @@ def estimate(size: Size) -> Estimate:
     return dataclasses.replace(
         made,
         parameters=labels.parameters,
+        units=labels.parameter_units,
+        labels=labels,
         at_bound=labels.parameters[:1],
         recordings=(recording,),
         sigma=dict.fromkeys(outputs, 0.05),
@@ -248,8 +253,9 @@ def robustness(size: Size) -> Robustness:
     )
 
 
-def campaign_figure(size: Size) -> Figure:
-    """Draw a campaign of three rounds."""
+@cache
+def campaign(size: Size) -> Campaign:
+    """A campaign of three rounds."""
     found = estimate(size)
     rounds = tuple(
         Round(
@@ -262,24 +268,16 @@ def campaign_figure(size: Size) -> Figure:
         )
         for k in (1, 2, 3)
     )
-    campaign = Campaign(
+    return Campaign(
         parameters=size.labels.parameters,
         wanted=0.01 * found.theta,
         rounds=rounds,
         status=CampaignStatus.EXHAUSTED,
     )
-    parameters = CampaignParameters(
-        names=size.labels.parameters,
-        units=size.labels.parameter_units,
-        guess=found.initial_theta,
-        interest=tuple(range(size.parameters)),
-        true=found.theta,
-    )
-    return plots.campaign_figure(campaign, parameters)
 
 
-def selection_figure(size: Size) -> Figure:
-    """Figure of a selection with as many terms as joints, and as many rejected ones."""
+def selection(size: Size) -> Selection:
+    """A selection with as many terms as joints, and as many rejected ones."""
     steps = [SelectionStep(decision=Decision.BEGUN, error=2.0)]
     for i in range(size.joints):
         term = f"viscous damping of joint number {i + 1}"
@@ -302,45 +300,16 @@ def selection_figure(size: Size) -> Figure:
     )
     steps += [cut, last]
     ending = "No further term that was tested is significant."
-    selection = Selection(terms=(), steps=tuple(steps), ending=ending)
-    assert selection.errors == (0.6, 0.5)
-    assert "over segments of 0.5 s 0.6" in str(selection)
-    return plots.selection_figure(dataclasses.replace(estimate(size), selection=selection))
+    return Selection(terms=(), steps=tuple(steps), ending=ending)
 
 
-def test_every_term_that_was_tried_has_its_name_unless_there_are_very_many() -> None:
-    """A term that predicts far worse than all others is an arrow at the right end."""
-    for count, is_named in ((3, True), (30, False)):
-        steps = [
-            SelectionStep(decision=Decision.REJECTED, description=f"term {i}", error=1.5 + i)
-            for i in range(count)
-        ]
-        begun = SelectionStep(decision=Decision.BEGUN, error=2.0)
-        added = SelectionStep(decision=Decision.ADDED, description="friction", count=1, error=1.0)
-
-        # A term with which the fit is no better has no error to draw.
-        no_better = SelectionStep(decision=Decision.UNHELPFUL, description="a spring", error=np.nan)
-        selection = Selection(terms=(), steps=(begun, *steps, no_better, added), ending="")
-        drawn = dataclasses.replace(estimate(SMALL), selection=selection)
-        axes = plots.selection_figure(drawn).axes[0]
-        names = [label.get_text() for label in axes.get_yticklabels()]
-        middle = [f"term {i}" for i in range(count)] if is_named else []
-        assert names == ["the stated model", *middle, "+ friction"]
-
-        line, *marks = axes.get_lines()
-        np.testing.assert_allclose(line.get_ydata(), [0, len(names) - 1])
-        assert [mark.get_marker() for mark in marks] == ["x", "x", *[">"] * (count - 2)]
-        rows = [float(np.ravel(mark.get_ydata())[0]) for mark in marks]
-        assert rows == ([1.0, 2.0, 3.0] if is_named else [1.0] * count)
-
-
-def horizons_figure(size: Size) -> Figure:
-    """Figure of four lengths of segments, on which some parameters depend."""
+def horizons(size: Size) -> HorizonStudy:
+    """Four lengths of segments, on which some parameters depend."""
     found = estimate(size)
     scales = np.array([1.2, 1.1, 1.0, 0.9])[:, None]
     apart = np.zeros((4, size.parameters), dtype=bool)
     apart[0, ::2] = True
-    study = HorizonStudy(
+    return HorizonStudy(
         lengths=np.array([0.12, 0.48, 1.9, 4.0]),
         errors=np.array([[1.0, 1.2, 2.0, 9.0], [1.1, 1.2, 1.8, 5.0], [1.1, 1.2, 1.5, 3.0]] * 2)[:4],
         chosen=2,
@@ -351,26 +320,16 @@ def horizons_figure(size: Size) -> Figure:
         half_widths=np.abs(0.05 * scales * found.theta),
         is_apart=apart,
     )
-    return plots.horizons_figure(dataclasses.replace(found, horizons=study))
 
 
-def recording_forest(size: Size) -> Figure:
-    """Figure of as many recordings as joints, at least two."""
-    labels = size.labels
-    names = tuple(f"{'n' * size.width}run_{k}.csv" for k in range(max(size.joints, 2)))
-    made = make_recording_comparison(labels.parameters, labels.parameter_units, names)
-    return plots.recording_forest(
-        dataclasses.replace(estimate(size), recording_comparison=made, misfit=True)
-    )
-
-
-def robot_figure(size: Size) -> Figure:
-    """Figure of two robots, the first parameter of which differs."""
+@cache
+def robots(size: Size) -> RobotComparison:
+    """Two robots, the first parameter of which differs."""
     labels = size.labels
     count = size.parameters
     values = np.linspace(1.0, 2.0, count)
     other = values + np.append(0.8, np.zeros(count - 1))
-    comparison = RobotComparison(
+    return RobotComparison(
         names=("n" * 30, "m" * 30),
         recordings=(1, 2),
         parameters=labels.parameters,
@@ -385,25 +344,23 @@ def robot_figure(size: Size) -> Figure:
         level=0.05,
         is_reliable=False,
     )
-    return plots.robot_figure(comparison)
 
 
-def drawn_robots(size: Size, share: float = 1.0) -> Figure:
-    """Figure of 50 drawn robots, whose scatter is a share of the standard deviation."""
+def draws(size: Size, share: float = 1.0) -> ParameterDraws:
+    """50 drawn robots, whose scatter is a share of the standard deviation."""
     found = estimate(size)
     noise = np.random.default_rng(0).normal(size=(50, size.parameters))
-    draws = ParameterDraws(
+    return ParameterDraws(
         parameters=size.labels.parameters,
         units=size.labels.parameter_units,
         values=found.theta + share * found.std * noise,
         centre=found.theta,
         std=found.std,
     )
-    return plots.drawn_robots(dataclasses.replace(found, draws=draws))
 
 
-def inverse_dynamics_figure(size: Size) -> Figure:
-    """Figure of the equations of as many joints, with a gap in the measured force."""
+def inverse_dynamics(size: Size) -> InverseDynamicsFit:
+    """The equations of as many joints, with a gap in the measured force."""
     count = size.parameters
     t = np.delete(np.linspace(0.0, 6.0, 60), slice(20, 30))
     equations = tuple(
@@ -422,7 +379,7 @@ def inverse_dynamics_figure(size: Size) -> Figure:
         )
         for k in range(size.joints)
     )
-    fit = InverseDynamicsFit(
+    return InverseDynamicsFit(
         parameters=size.labels.parameters,
         units=size.labels.parameter_units,
         theta=np.ones(count),
@@ -441,74 +398,65 @@ def inverse_dynamics_figure(size: Size) -> Figure:
         seconds=1.0,
         steps=1000,
     )
-    return plots.inverse_dynamics_figure(fit)
 
 
-FIGURES: dict[str, Callable[[Size], Figure]] = {
-    "inverse_dynamics_figure": inverse_dynamics_figure,
-    "campaign_figure": campaign_figure,
-    "check_figure": lambda size: plots.check_figure(check(size)),
-    "check_pairs": lambda size: plots.check_pairs(check(size)),
-    "compare_figure": lambda size: plots.compare_figure(comparison(size)),
-    "convergence": lambda size: plots.convergence(design(size)),
-    "drawn_robots": drawn_robots,
-    "estimate_pairs": lambda size: plots.estimate_pairs(estimate(size), size.labels),
-    "fit": lambda size: plots.fit(estimate(size), 0, size.labels, np.full(size.joints, 0.05)),
-    "held_out": lambda size: plots.held_out(estimate(size), 0, size.labels),
-    "histogram": lambda size: plots.histogram(make_study(size.parameters), 0, size.labels),
-    "horizons_figure": horizons_figure,
-    "limits": lambda size: plots.limits(design(size), size.labels),
-    "parameter_intervals": lambda size: plots.parameter_intervals(estimate(size), size.labels),
-    "parameter_trace": lambda size: plots.parameter_trace(estimate(size), size.labels),
-    "predictions": lambda size: plots.predictions(estimate(size), size.labels),
-    "recording_forest": recording_forest,
-    "residual_spectra": lambda size: plots.residual_spectra(estimate(size), size.labels),
-    "robot_figure": robot_figure,
-    "robustness_figure": lambda size: plots.robustness_figure(robustness(size)),
-    "selection_figure": selection_figure,
-    "sensitivity_phase": lambda size: plots.sensitivity_phase(design(size), size.labels),
-    "std_bars": lambda size: plots.std_bars(design(size), size.labels),
-    "study_overview": lambda size: plots.study_overview(make_study(size.parameters), size.labels),
-    "trajectories": lambda size: plots.trajectories(design(size), size.labels),
+@cache
+def studied(size: Size) -> Estimate:
+    """An estimate with all studies."""
+    labels = size.labels
+    names = tuple(f"{'n' * size.width}run_{k}.csv" for k in range(max(size.joints, 2)))
+    return dataclasses.replace(
+        estimate(size),
+        selection=selection(size),
+        horizons=horizons(size),
+        recording_comparison=make_recording_comparison(
+            labels.parameters, labels.parameter_units, names
+        ),
+        draws=draws(size),
+        inverse_dynamics=inverse_dynamics(size),
+        misfit=True,
+    )
+
+
+def study(size: Size) -> MonteCarloStudy:
+    """A Monte Carlo study."""
+    return dataclasses.replace(make_study(size.parameters), labels=size.labels)
+
+
+RECORDS: dict[str, Callable[[Size], ShownRecord]] = {
+    "design": design,
+    "estimate": studied,
+    "check": check,
+    "comparison": comparison,
+    "robots": robots,
+    "robustness": robustness,
+    "study": study,
+    "campaign": campaign,
 }
 
-# Figures that are drawn quickly, in the fast tests.
-QUICK = ("check_figure", "limits", "predictions")
+# Pictures that are drawn in the fast tests.
+QUICK = (("check", "check"), ("design", "limits"), ("estimate", "predictions"))
 
 
-def drawn(name: str, size: Size) -> Figure:
-    """Draw a figure with few dots per inch, which changes no place of a text."""
-    figure = FIGURES[name](size)
+def misplaced(record: str, picture: str, size: Size) -> list[str]:
+    """Texts of a picture that overlap or leave it; few dots per inch change no place of a text."""
+    figure = figure_of(pictures_of(RECORDS[record](size))[picture]())
     figure.set_dpi(50.0)
-    return figure
+    return misplaced_texts(figure)
 
 
-def test_every_figure_is_tested() -> None:
-    assert {*FIGURES, "save"} == set(plots.__all__)
-
-
-@pytest.mark.parametrize("name", QUICK)
-def test_texts_of_quick_figures_do_not_overlap(name: str) -> None:
-    assert misplaced_texts(drawn(name, WIDE)) == []
+@pytest.mark.parametrize(("record", "picture"), QUICK)
+def test_texts_of_quick_figures_do_not_overlap(record: str, picture: str) -> None:
+    assert misplaced(record, picture, WIDE) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [SMALL, USUAL, WIDE, LARGE], ids=str)
-@pytest.mark.parametrize("name", FIGURES)
-def test_texts_do_not_overlap_and_stay_inside(name: str, size: Size) -> None:
-    if name.endswith("_pairs") and size.parameters < 2:
-        pytest.skip("a pair needs two parameters")
-    assert misplaced_texts(drawn(name, size)) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [SMALL, USUAL, WIDE, LARGE], ids=str)
-def test_texts_of_robots_with_well_known_parameters_do_not_overlap(size: Size) -> None:
-    """The ticks are differences from a number above each histogram."""
-    figure = drawn_robots(size, 1e-6)
-    figure.set_dpi(50.0)
-    assert misplaced_texts(figure) == []
-    assert any("+ Δ" in axes.get_title() for axes in figure.axes)
+@pytest.mark.parametrize("record", RECORDS)
+def test_texts_do_not_overlap_and_stay_inside(record: str, size: Size) -> None:
+    pictures = [name for name in pictures_of(RECORDS[record](size)) if "histogram" not in name]
+    found = {name: misplaced(record, name, size) for name in pictures}
+    assert {name: faults for name, faults in found.items() if faults} == {}
 
 
 def test_overlapping_and_escaping_texts_are_found() -> None:

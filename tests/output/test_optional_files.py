@@ -12,7 +12,6 @@ from mjfim.errors import OutputError, UndrawnWarning
 from mjfim.output import folders
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.plots import pictures as picture_module
 from tests.support import results
 
 
@@ -54,7 +53,7 @@ def test_one_bad_picture_does_not_keep_the_others_away(
         pictures: Any = {"first": fail, "second": lambda: None}
         folders.write_pictures(tmp_path, pictures, PictureFormat.PNG)
         monkeypatch.setattr(folders, "write_report", lambda *_, **__: fail())
-        monkeypatch.setattr(picture_module, "pictures_of", lambda _: {"check": lambda: None})
+        monkeypatch.setattr(folders, "pictures_of", lambda _: {"check": lambda: None})
         folders.write_result(tmp_path, results.check())
 
     drawn = {path.name for path in tmp_path.iterdir()}

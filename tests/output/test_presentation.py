@@ -18,9 +18,9 @@ from mjfim.errors import MjfimError
 from mjfim.output.folders import DESIGN_FILES, estimate_files, study_files, write_pictures
 from mjfim.output.html import render
 from mjfim.output.manifest import OutputGuard, claimed
+from mjfim.output.panels import Picture
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import Pictures
-from mjfim.output.plots.style import new_figure
 from mjfim.output.presentation import describe
 from mjfim.output.summary_parts import (
     Emphasis,
@@ -304,7 +304,7 @@ def test_an_unknown_format_is_an_error_that_lists_the_formats(
 
 def test_pictures_of_an_earlier_run_in_another_format_are_removed(tmp_path: Path) -> None:
     """A file of the user with such a name remains."""
-    pictures: Pictures = {"limits": partial(new_figure, 0.5)}
+    pictures: Pictures = {"limits": partial(Picture, title="", panels=())}
     for chosen in (PictureFormat.PNG, PictureFormat.SVG):
         (tmp_path / "limits.pdf").write_text("of the user", encoding="utf-8")
         guard = OutputGuard([], force=False)

@@ -22,7 +22,8 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import verify
 from mjfim.output.manifest import MANIFEST
-from mjfim.output.plots.compare import compare_figure
+from mjfim.output.plots.draw import save
+from mjfim.output.plots.studies import compare
 from mjfim.parallel.budget import StopToken
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design
@@ -203,16 +204,15 @@ def test_budgets_must_be_positive(budget: dict[str, float]) -> None:
 
 def test_the_picture_has_a_row_per_method() -> None:
     """The best method is on top."""
-    figure = compare_figure(small())
-    cells, bars = figure.axes[:2]
+    cells, bars = compare(small()).panels
     best_first = sorted(small().rows, key=lambda r: r.cost)
-    assert [label.get_text() for label in cells.get_yticklabels()] == [r.title for r in best_first]
-    assert [label.get_text() for label in cells.get_xticklabels()] == ["m", "l", "c"]
-    shown = np.exp(np.asarray(cells.images[0].get_array()))
+    assert cells.y.names == [r.title for r in best_first]
+    assert cells.x.names == ["m", "l", "c"]
+    assert cells.cells is not None
     design = small().rows[2]
-    for values, r in zip(shown, best_first, strict=True):
+    for values, r in zip(np.exp(cells.cells.values), best_first, strict=True):
         np.testing.assert_allclose(values, r.std / design.std)
-    assert [bar.get_width() for bar in bars.patches] == pytest.approx(
+    assert [float(mark.x[0]) for mark in bars.marks if mark.kind == "bars"] == pytest.approx(
         [r.worst_relative_std for r in best_first]
     )
 
@@ -234,7 +234,7 @@ def test_the_picture_has_a_row_per_method() -> None:
     ],
 )
 def test_the_picture_of_any_result_is_drawn(rows: tuple[MethodResult, ...], tmp_path: Path) -> None:
-    compare_figure(made(*rows)).savefig(tmp_path / "x.png")
+    save(compare(made(*rows)), tmp_path / "x.png")
     assert imread(tmp_path / "x.png").std() > 0.0
 
 

@@ -1,409 +1,484 @@
-"""Figures of a design: trajectories, sensitivities of the motion."""
+"""Pictures of a design: motion and information, sensitivities, search, accuracy, limits."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from mjfim.arrays import Array
+from mjfim.excitation.constraints import SUBSTEP_KINDS
 from mjfim.model.coordinates import split_unit
-from mjfim.model.units import per_second
-from mjfim.output.plots.style import (
-    DESIGNED_COLOUR,
-    INITIAL_COLOUR,
-    SMALL_FONT,
-    TEXT_COLOUR,
-    add_title,
-    fit_label,
-    format_axes,
-    format_number,
-    new_figure,
-    own_style,
-    panel_width,
-    quotient_unit,
-    scale_axis,
-    shorten,
-    text_width,
-    trajectory_handles,
-    write_message,
+from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
+from mjfim.output.limit_curves import (
+    closest_to_bounds,
+    envelope,
+    largest_share,
+    whole_percent,
+    would_be_solid,
 )
+from mjfim.output.panels import (
+    SERIES,
+    Axis,
+    Kind,
+    Mark,
+    Panel,
+    Picture,
+    area,
+    around,
+    bars,
+    dots,
+    hline,
+    hspan,
+    in_grid,
+    line,
+    mark,
+    row_axis,
+    vline,
+    words,
+)
+from mjfim.output.plots.words import as_sentence, format_number, quotient_unit, shorten
 from mjfim.output.positions import shown_positions
-from mjfim.records.design import Design
+from mjfim.output.summaries.accuracy import BEST_CASE, improvement, relative, size_sentence
+from mjfim.output.vocabulary import DESIGNED, INITIAL
+from mjfim.records.design import Design, LimitUsage
 from mjfim.records.labels import Labels
 
-# Number of panels of the trajectories side by side.
-PANEL_COLUMNS = 4
-
-# Largest number of intervals between the ticks of a panel.
-MAX_TIME_TICKS, MAX_PANEL_TICKS = 5, 4
+# Number of panels of the trajectories, and of phase plots, side by side, and largest number of
+# phase plots.
+PANEL_COLUMNS, PHASE_COLUMNS, MAX_PHASE_PLOTS = 4, 3, 6
 
 # Widths of the lines of the initial and of the designed trajectory [points].
 LINE_WIDTHS = (1.1, 1.6)
 
-# Background of the panels of controls.
-CONTROL_BACKGROUND = "#f1f2f3"
+# Largest number of rows of bars that have numbers.
+MAX_HIGH_ROWS = 12
 
-# Largest number of phase plots, and of those side by side.
-MAX_PHASE_PLOTS, PHASE_COLUMNS = 6, 3
+# Kinds of limits in the order of their panels.
+LIMIT_KINDS = (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
 
-# Largest number of intervals between the ticks of a phase plot, which has one tick more at most.
-MAX_PHASE_TICKS = 3
+# Unit of the force of an actuator or joint, by the unit of its control or of its position.
+FORCE_OF_CONTROL = {
+    coordinate: force
+    for unit, force in FORCE_UNITS.items()
+    for coordinate in (unit, per_second(unit), force)
+}
 
-# Width that the label of an axis of a phase plot may have [inch].
-PHASE_LABEL_WIDTH = 2.2
+# Largest number of panels of limits that are as wide as the figure, and of curves of a panel that
+# are named with their shares, those closest to a bound.
+MAX_WIDE_PANELS, NAMED_CURVES = 3, 3
 
-# Share of the largest sensitivity below which a sensitivity is a rounding error.
-NEGLIGIBLE_SENSITIVITY = 1e-6
-
-# Ratio of the designed to the initial loop of sensitivities above which the initial one is drawn
-# enlarged.
-ENLARGING_RATIO = 4.0
-
-# Height that a panel gains for the enlarged loop, as a share of the height without it.
-ENLARGED_LOOP_HEIGHT = 0.62
+# Number of envelopes of a panel above which each curve has a row of its own, and largest number of
+# these rows; height of a share of 100 % over the height of a row.
+MAX_ENVELOPES, MAX_ROWS, FULL_ROW = 2, 12, 0.86
 
 
 # ---- trajectories
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Group:
-    """Panels of one kind of quantity; they stand in rows of their own.
-
-    Attributes:
-        name: Name of the kind.
-        labels: Label `name [unit]` of every column.
-        initial: (n, columns) values along the initial trajectory.
-        designed: (n, columns) values along the designed trajectory.
-        held: True for values that are held from each sample to the next.
-    """
-
-    name: str
-    labels: tuple[str, ...]
-    initial: Array
-    designed: Array
-    held: bool = False
-
-    def rows(self, columns: int) -> int:
-        """Return the number of rows of panels, for a number of columns."""
-        return -(-len(self.labels) // columns)
-
-
-@own_style
-def trajectories(design: Design, labels: Labels) -> Figure:
-    """Draw states, controls and the information gathered up to each time (the paper's figure 2).
-
-    The information is the square root of the smallest eigenvalue of the Fisher information.
-
-    Args:
-        design: The design.
-        labels: Labels of the model's columns.
-
-    Raises:
-        MjfimError: The labels do not fit the design.
-    """
-    trajectory = design.trajectory
+def trajectories(design: Design, labels: Labels) -> Picture:
+    """Show states, controls and the information gathered up to each time (the paper's figure 2)."""
+    initial, designed = design.initial.trajectory, design.final.trajectory
     labels.check(
-        qpos=trajectory.qpos.shape[1],
-        velocities=trajectory.qvel.shape[1],
-        controls=trajectory.ctrl.shape[1],
+        qpos=initial.qpos.shape[1], velocities=initial.qvel.shape[1], controls=initial.ctrl.shape[1]
     )
-    groups = [group for group in _groups(design, labels) if group.labels]
-    columns = panel_columns([len(group.labels) for group in groups])
-    rows = sum(group.rows(columns) for group in groups) + 1
-    figure = new_figure(1.15 * rows + 1.7)
-    grid = figure.add_gridspec(rows, columns, height_ratios=[1.0] * (rows - 1) + [1.6])
-
+    positions, qpos = shown_positions(labels, initial.qpos, designed.qpos)
+    velocities = [label.replace(" velocity [", " [") for label in labels.velocities]
+    controls = [label.replace(" (control)", " [model unit]") for label in labels.controls]
+    groups = (
+        ("positions", positions, qpos),
+        ("velocities", velocities, (initial.qvel, designed.qvel)),
+        ("controls", controls, (initial.ctrl, designed.ctrl)),
+    )
+    columns = min(PANEL_COLUMNS, max(len(names) for _, names, _ in groups))
+    panels: list[Panel] = []
     row = 0
-    for group in groups:
-        for k in range(len(group.labels)):
-            down, column = divmod(k, columns)
-            axes = figure.add_subplot(grid[row + down, column])
-            _draw_panel(axes, design, group, k, columns)
-            format_axes(axes, ylabel=group.name if column == 0 else "")
-            axes.yaxis.label.set_fontweight("bold")
-        row += group.rows(columns)
+    for group, names, values in groups:
+        shown = [
+            Panel(
+                title=name,
+                marks=_both(design, [each[:, k] for each in values]),
+                x=Axis(most=5),
+                y=Axis(label=group if k % columns == 0 else "", most=4),
+                is_shaded=group == "controls",
+            )
+            for k, name in enumerate(names)
+        ]
+        panels += in_grid(shown, columns, row)
+        row += -(-len(names) // columns)
 
-    # The information has the last row.
-    axes = figure.add_subplot(grid[rows - 1, :])
-    _draw_information(axes, design)
-    format_axes(axes, "time [s]", "information")
-    axes.yaxis.label.set_fontweight("bold")
-    root = r"$\sqrt{\lambda_{\min}}$ up to each time"
-    axes.set_title(root + r"  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]", loc="left")
-
+    roots = [np.sqrt(np.maximum(e.min_eigenvalue, 0.0)) for e in (design.initial, design.final)]
+    ends = [
+        words([trajectory.t[-1]], [root[-1]], [format_number(float(root[-1]))], term.word)
+        for trajectory, root, term in zip(
+            (initial, designed), roots, (INITIAL, DESIGNED), strict=True
+        )
+    ]
+    information = Panel(
+        title=r"$\sqrt{\lambda_{\min}}$ up to each time  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]",
+        marks=[*_both(design, roots), *ends],
+        x=Axis(label="time [s]"),
+        y=Axis(label="information", most=4),
+        place=(row, 0),
+        is_wide=True,
+    )
     note = (
         "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the "
         "measurement rate. All horizontal axes: time [s]."
     )
-    if any(group.held for group in groups):
+    if controls:
         note += " Grey background: controls."
-    title = "Trajectories and the information that they gather"
-    add_title(figure, title, trajectory_handles(), note)
-    return figure
+    return Picture(
+        title="Trajectories and the information that they gather",
+        panels=[*panels, information],
+        note=note,
+        heights=[1.15] * row + [1.85],
+        widths=[1.0] * columns,
+    )
 
 
-def _groups(design: Design, labels: Labels) -> list[_Group]:
-    """Return the panels of positions, velocities and controls."""
-    initial, designed = design.initial.trajectory, design.final.trajectory
-    names, both = shown_positions(labels, initial.qpos, designed.qpos)
-    velocities = tuple(label.replace(" velocity [", " [") for label in labels.velocities)
-    controls = tuple(label.replace(" (control)", " [model unit]") for label in labels.controls)
-    return [
-        _Group(name="positions", labels=names, initial=both[0], designed=both[1]),
-        _Group(name="velocities", labels=velocities, initial=initial.qvel, designed=designed.qvel),
-        _Group(
-            name="controls",
-            labels=controls,
-            initial=initial.ctrl,
-            designed=designed.ctrl,
-            held=True,
-        ),
-    ]
-
-
-def panel_columns(counts: Sequence[int]) -> int:
-    """Return the number of panels side by side that leaves the fewest places empty.
-
-    Args:
-        counts: Number of panels of each group; every group begins in a row of its own.
-    """
-    widest = min(PANEL_COLUMNS, max(counts))
-    narrowest = min(PANEL_COLUMNS - 1, widest)
-    empty = {
-        columns: sum(-count % columns for count in counts)
-        for columns in range(widest, narrowest - 1, -1)
-    }
-    return min(empty, key=lambda columns: (empty[columns], -columns))
-
-
-def _draw_panel(axes: Axes, design: Design, group: _Group, k: int, columns: int) -> None:
-    """Draw quantity k of a group along both trajectories, as one of several panels in a row."""
-    times = design.initial.trajectory.t, design.final.trajectory.t
-    both = group.initial, group.designed
-    colours = (INITIAL_COLOUR, DESIGNED_COLOUR)
-    for t, values, colour, width in zip(times, both, colours, LINE_WIDTHS, strict=True):
-        if group.held:
-            axes.stairs(values[:, k], t, baseline=None, color=colour, linewidth=width, snap=False)
-        else:
-            axes.plot(t, values[:, k], color=colour, linewidth=width)
-
-    label = fit_label(group.labels[k], panel_width(columns), SMALL_FONT)
-    axes.set_title(label, loc="left", fontsize=SMALL_FONT, pad=3)
-    axes.locator_params(axis="x", nbins=MAX_TIME_TICKS)
-    axes.locator_params(axis="y", nbins=MAX_PANEL_TICKS)
-    if group.held:
-        axes.set_facecolor(CONTROL_BACKGROUND)
-
-
-def _draw_information(axes: Axes, design: Design) -> None:
-    """Draw the root of the smallest eigenvalue up to each time, with its last value."""
+def _both(design: Design, values: Sequence[Array]) -> list[Mark]:
+    """Return the curves of one quantity along both trajectories; controls are held."""
+    marks = []
     evaluations = (design.initial, design.final)
-    colours = (INITIAL_COLOUR, DESIGNED_COLOUR)
-    for evaluation, colour, width in zip(evaluations, colours, LINE_WIDTHS, strict=True):
+    for evaluation, y, term, width in zip(
+        evaluations, values, (INITIAL, DESIGNED), LINE_WIDTHS, strict=True
+    ):
         t = evaluation.trajectory.t
-        root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-        axes.plot(t, root, color=colour, linewidth=width)
-        axes.annotate(
-            format_number(float(root[-1])),
-            (float(t[-1]), float(root[-1])),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=SMALL_FONT,
-            color=colour,
-            annotation_clip=False,
-        )
+        kind: Kind = "line" if len(y) == len(t) else "steps"
+        marks.append(mark(kind, t, y, term.word, width=width, label=term.word))
+    return marks
 
 
 # ---- sensitivities
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Loop:
-    """A phase plot: the sensitivity of one degree of freedom to one parameter.
-
-    Attributes:
-        dof: Number of the degree of freedom.
-        parameter: Number of the parameter.
-    """
-
-    dof: int
-    parameter: int
-
-
-@own_style
-def sensitivity_phase(design: Design, labels: Labels) -> Figure:
-    """Draw phase plots of the largest sensitivities psi (the paper's figure 3).
-
-    Args:
-        design: The design.
-        labels: Labels of the model's columns and of the parameters.
-
-    Raises:
-        MjfimError: The labels do not fit the design.
-    """
+def sensitivity_phase(design: Design, labels: Labels) -> Picture:
+    """Show what moves most with each parameter, as phase plots of ψ (the paper's figure 3)."""
     nv = design.trajectory.qvel.shape[1]
-    count = len(design.theta)
-    labels.check(positions=nv, velocities=nv, parameters=count)
-    relative = _relative_sensitivities(design)
-    loops = _shown_loops(design, relative)
-
-    columns = min(max(len(loops), 1), PHASE_COLUMNS)
-    rows = max(-(-len(loops) // columns), 1)
-    figure = new_figure(2.75 * rows + 1.0)
-    grid = figure.add_gridspec(rows, columns)
-    for k, loop in enumerate(loops):
-        axes = figure.add_subplot(grid[divmod(k, columns)])
-        curves = _curves(design, loop)
-        _draw_loops(axes, curves)
-        _label_phase_axes(axes, labels, loop, curves)
-        _enlarge_initial_loop(axes, curves)
-    if not loops:
-        write_message(figure.add_subplot(grid[0, 0]), "the motion depends on no parameter")
-
-    total = int(np.count_nonzero(relative > NEGLIGIBLE_SENSITIVITY * relative.max(initial=0.0)))
-    note = "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative."
-    if any(axes.child_axes for axes in figure.axes):
-        note += " A blue box shows the initial curve enlarged."
-    if len(loops) < total:
-        note += (
-            f" Shown: {len(loops)} of {total} pairs of a degree of freedom and a parameter: the "
-            "parameters with the largest predicted relative standard deviations, and what moves "
-            "most with them."
-        )
-    start = Line2D(
-        [], [], color=TEXT_COLOUR, marker="o", markersize=3.5, linestyle="", label="start"
-    )
-    handles = [*trajectory_handles(), start]
-    add_title(figure, "Sensitivity of the motion to each parameter", handles, note)
-    return figure
-
-
-def _relative_sensitivities(design: Design) -> Array:
-    """Return how much each degree of freedom reacts to relative changes of each parameter.
-
-    Changes of velocities are relative to the largest velocity, so that units do not matter.
-
-    Returns:
-        (nv, p) largest changes over time [1].
-    """
-    nv = design.trajectory.qvel.shape[1]
-    change = np.abs(design.final.sensitivity[:, nv : 2 * nv] * design.sizes).max(axis=0)
+    labels.check(positions=nv, velocities=nv, parameters=len(design.theta))
+    psi = design.final.sensitivity
+    change = np.abs(psi[:, nv : 2 * nv]).max(axis=0)
     speed = np.abs(design.trajectory.qvel).max(axis=0)
-    relative = change / np.where(speed > 0.0, speed, np.inf)[:, None]
-    return np.asarray(relative, dtype=np.float64)
+    change /= np.where(speed > 0.0, speed, np.inf)[:, None]
 
+    # The wanted parameters with the largest relative standard deviations; one that the motion does
+    # not determine comes last.
+    moving = [j for j in design.wanted if change[:, j].any()]
+    std = np.where(np.isfinite(design.final.std), design.final.std, 0.0)
+    relative_std = std / np.where(design.sizes > 0.0, design.sizes, np.inf)
+    shown = sorted(sorted(moving, key=lambda j: -relative_std[j])[:MAX_PHASE_PLOTS])
 
-def _shown_loops(design: Design, relative: Array) -> list[_Loop]:
-    """Return the phase plots to draw, by parameter; those of rounding errors are left out.
-
-    Args:
-        design: The design.
-        relative: (nv, p) relative sensitivities.
-    """
-    parameters = [int(j) for j in _least_known_parameters(design)]
-    negligible = NEGLIGIBLE_SENSITIVITY * relative.max(initial=0.0)
-    most_sensitive = {j: np.argsort(-relative[:, j], kind="stable") for j in parameters}
-
-    # The most sensitive degree of freedom of each parameter, then the second one, and so on.
-    chosen = []
-    for rank in range(len(relative)):
-        for j in parameters:
-            dof = int(most_sensitive[j][rank])
-            if relative[dof, j] > negligible:
-                chosen.append(_Loop(dof=dof, parameter=j))
-    return sorted(chosen[:MAX_PHASE_PLOTS], key=lambda loop: (loop.parameter, loop.dof))
-
-
-def _least_known_parameters(design: Design) -> NDArray[np.intp]:
-    """Return the wanted parameters with the largest predicted relative standard deviations.
-
-    Their numbers are in ascending order.
-    """
-    wanted = np.array(design.wanted, dtype=np.intp)
-
-    # A parameter that the design does not determine has nothing to show.
-    std = design.final.std
-    sizes = np.where(design.sizes > 0.0, design.sizes, np.inf)
-    relative_std = np.where(np.isfinite(std), std, 0.0) / sizes
-
-    descending = np.argsort(-relative_std[wanted], kind="stable")
-    return np.sort(wanted[descending][:MAX_PHASE_PLOTS])
-
-
-def _curves(design: Design, loop: _Loop) -> tuple[Array, Array]:
-    """Return the sensitivities of position and velocity along both trajectories.
-
-    Returns:
-        (N+1, 2) of the initial and of the designed trajectory [x-unit / theta-unit].
-    """
-    nv = design.trajectory.qvel.shape[1]
-    columns = [loop.dof, nv + loop.dof]
-    initial, designed = design.initial.sensitivity, design.final.sensitivity
-    return initial[:, columns, loop.parameter], designed[:, columns, loop.parameter]
-
-
-def _draw_loops(axes: Axes, curves: tuple[Array, Array]) -> None:
-    """Draw both loops; the initial one lies on top, because it is the smaller one."""
-    initial, designed = curves
-    axes.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.5, zorder=3)
-    axes.plot(*designed.T, color=DESIGNED_COLOUR, linewidth=1.7, zorder=2)
-    axes.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=3.5, zorder=4)
-    axes.locator_params(nbins=MAX_PHASE_TICKS)
-
-
-def _enlarge_initial_loop(axes: Axes, curves: tuple[Array, Array]) -> None:
-    """Draw a tiny initial loop once more, enlarged, in a box above the other one."""
-    initial, designed = curves
-    initial_extent = np.ptp(initial, axis=0)
-    designed_extent = np.ptp(designed, axis=0)
-    tiny = (ENLARGING_RATIO * initial_extent < designed_extent).all()
-    if not tiny or not (initial_extent > 0.0).all():
-        return
-
-    # The axes grow upwards, but keep their ticks.
-    low, high = axes.get_ylim()
-    axes.set_yticks([tick for tick in axes.get_yticks() if low <= tick <= high])
-    axes.set_ylim(low, high + ENLARGED_LOOP_HEIGHT * (high - low))
-
-    box = axes.inset_axes((0.2, 0.72, 0.6, 0.27))
-    box.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.2)
-    box.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=2.5)
-    box.set(xticks=[], yticks=[])
-    box.spines[:].set(visible=True, color=INITIAL_COLOUR, linewidth=0.7)
-    times = format_number(float((designed_extent / initial_extent).min()), 2)
-    box.set_title(
-        f"initial: 1/{times} of the size", fontsize=SMALL_FONT - 1.5, color=INITIAL_COLOUR, pad=2
+    panels = [_phase_plot(design, labels, int(np.argmax(change[:, j])), j) for j in shown]
+    if not panels:
+        panels = [Panel(message="the motion depends on no parameter")]
+    columns = min(len(panels), PHASE_COLUMNS)
+    note = "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative."
+    if len(shown) < len(moving):
+        note += (
+            f" Shown: {len(shown)} of {len(moving)} parameters, those with the largest predicted "
+            "relative standard deviations."
+        )
+    return Picture(
+        title="Sensitivity of the motion to each parameter",
+        panels=in_grid(panels, columns),
+        note=note,
+        heights=[2.75] * -(-len(panels) // columns),
+        widths=[1.0] * columns,
     )
 
 
-def _fitting_names(name: str, parameter: str) -> tuple[str, str]:
-    """Shorten the names of a coordinate and a parameter until their derivative fits."""
-    width = max(len(name), len(parameter))
-    while text_width(f"∂{shorten(name, width)}′/∂{shorten(parameter, width)}") > PHASE_LABEL_WIDTH:
-        width -= 1
-    return shorten(name, width), shorten(parameter, width)
+def _phase_plot(design: Design, labels: Labels, dof: int, j: int) -> Panel:
+    """Return the sensitivity of one degree of freedom to one parameter."""
+    nv = design.trajectory.qvel.shape[1]
+    marks = []
+    for evaluation, term, front in ((design.initial, INITIAL, 3.0), (design.final, DESIGNED, 2.0)):
+        position, velocity = evaluation.sensitivity[:, [dof, nv + dof], j].T
+        marks.append(line(position, velocity, term.word, label=term.word, width=1.6, front=front))
+    name, unit = split_unit(labels.positions[dof])
+    divisor, parameter = labels.parameter_units[j], shorten(labels.parameters[j], 14)
+    axes = [
+        Axis(
+            label=f"∂{shorten(name, 14)}{prime}/∂{parameter}\n[{quotient_unit(of, divisor)}]",
+            most=3,
+        )
+        for prime, of in (("", unit), ("′", per_second(unit)))
+    ]
+    start = dots([0.0], [0.0], "text", size=3.5, label="start", front=4.0)
+    return Panel(marks=[*marks, start], x=axes[0], y=axes[1])
 
 
-def _label_phase_axes(axes: Axes, labels: Labels, loop: _Loop, curves: tuple[Array, Array]) -> None:
-    """Label the axes with the derivatives of position and velocity; units have a power of ten."""
-    name, unit = split_unit(labels.positions[loop.dof])
-    divisor = labels.parameter_units[loop.parameter]
-    name, parameter = _fitting_names(name, labels.parameters[loop.parameter])
-    units = quotient_unit(unit, divisor), quotient_unit(per_second(unit), divisor)
+# ---- search
 
-    texts = []
-    for axis, mark, quotient, column in zip(
-        (axes.xaxis, axes.yaxis), ("", "′"), units, (0, 1), strict=True
+
+def convergence(design: Design) -> Picture:
+    """Show cost, slope and smallest eigenvalue over the iterations."""
+    history = design.history
+    iterations = np.array([row.iteration for row in history], dtype=np.float64)
+    values = {
+        "cost J [–]": np.array([row.cost for row in history], dtype=np.float64),
+        "slope |DJ·ζ| [–]": np.abs([row.slope for row in history]),
+        r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]": np.array(
+            [row.min_eigenvalue for row in history], dtype=np.float64
+        ),
+    }
+    # The search for a release has no slope.
+    shown = {name: each for name, each in values.items() if np.isfinite(each).any() or not history}
+    stages = [(row.rate, row.mu) for row in history]
+    changes = [k for k in range(1, len(stages)) if stages[k] != stages[k - 1]]
+
+    begin = INITIAL.word
+    if history and not np.isclose(history[0].cost, design.initial.cost, rtol=1e-9, atol=0.0):
+        begin = f"start: {design.found_by}"
+    panels = []
+    for k, (name, each) in enumerate(shown.items()):
+        found = _history_marks(iterations, each, begin)
+        stage = [vline(iterations[c], "band", width=1.5, front=0.0) for c in changes]
+        usable = each[np.isfinite(each)]
+        ends = [format_number(float(value)) for value in (*usable[:1], *usable[-1:])]
+        panels.append(
+            Panel(
+                marks=[*stage, *found],
+                x=Axis(label="iteration [–]", whole=True),
+                y=Axis(label=name, log=bool((each > 0.0).any())),
+                title=" → ".join(ends),
+                role="muted",
+                message="" if found else "no iterations recorded",
+                place=(0, k),
+            )
+        )
+    note = as_sentence(design.outcome)
+    if changes:
+        note += " Thick lines: the time grid becomes finer, or a new stage of the barrier begins."
+    if any(row.mu for row in history):
+        note += " With limits, the slope is that of log J plus the barrier."
+    return Picture(
+        title="Convergence",
+        panels=panels,
+        note=note,
+        heights=[2.4],
+        widths=[1.0] * len(panels),
+    )
+
+
+def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
+    """Return the curve of one quantity, with dots at its ends."""
+    usable = np.isfinite(values) & ((values > 0.0) | ~(values > 0.0).any())
+    if not usable.any():
+        return []
+    x, y = iterations[usable], values[usable]
+    curve = line(x, y, "muted", symbol=".", size=3.0)
+    ends = [dots(x[-1:], y[-1:], DESIGNED.word, size=6.0, label=DESIGNED.word)]
+    if usable[0]:
+        ends.insert(0, dots(x[:1], y[:1], INITIAL.word, size=6.0, label=begin))
+    return [curve, *ends]
+
+
+# ---- accuracy
+
+
+def standard_deviations(design: Design, labels: Labels) -> Picture:
+    """Show the predicted standard deviations along both trajectories."""
+    labels.check(parameters=len(design.theta))
+    wanted, combined = list(design.wanted), design.combined
+    names = [labels.parameter(j) for j in wanted] + [each.expression for each in combined]
+    sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
+    stds = np.array(
+        [
+            [*design.initial.std[wanted], *(each.std_initial for each in combined)],
+            [*design.final.std[wanted], *(each.std_final for each in combined)],
+        ]
+    )
+    # Infinite bars reach beyond all others.
+    is_known = np.isfinite(stds)
+    low, high = around(stds, factor=3.0)
+    high *= 1.0 if is_known.all() else 10.0
+
+    rows = np.arange(float(len(names)))
+    marks, beside = [], []
+    for std, known, term, offset in zip(
+        stds, is_known, (INITIAL, DESIGNED), (-0.19, 0.19), strict=True
     ):
-        largest = max(float(np.abs(curve[:, column]).max(initial=0.0)) for curve in curves)
-        power = scale_axis(axis, largest)
-        texts.append(f"∂{name}{mark}/∂{parameter}\n[{power}{quotient}]")
-    format_axes(axes, *texts)
+        at, left = rows + offset, np.full(len(rows), low)
+        texts = [format_number(float(value)) for value in std[known]]
+        ends, places = std[known], at[known]
+        marks.append(bars(ends, places, term.word, left=left[known], size=0.36, label=term.word))
+        if len(names) <= MAX_HIGH_ROWS:
+            marks.append(words(ends, places, texts, term.word))
+        if not known.all():
+            beyond = np.full(len(at), high)[~known]
+            marks.append(
+                bars(beyond, at[~known], term.word, left=left[~known], size=0.36, hollow=True)
+            )
+        shares = [str(relative(*pair)) for pair in zip(std.tolist(), sizes, strict=True)]
+        beside.append(("relative σ", term.word, shares))
+    changes = [improvement(*pair) for pair in stds.T.tolist()]
+
+    note = BEST_CASE
+    if not is_known.all():
+        note += " Hatched: the parameter is not identifiable alone from this trajectory."
+    if of_size := size_sentence(design.theta, design.sizes):
+        note += f" {of_size}"
+    panel = Panel(
+        marks=marks,
+        x=Axis(label="predicted σ [unit of the parameter]", log=True, limits=(low, high)),
+        y=row_axis(names),
+        beside=[*beside, ("change", "text", changes)],
+    )
+    height = 0.7 + (0.5 if len(names) <= MAX_HIGH_ROWS else 0.3) * len(names)
+    return Picture(
+        title="Predicted accuracy (Cramér–Rao)", panels=[panel], note=note, heights=[height]
+    )
+
+
+# ---- limits
+
+
+def limits(design: Design, labels: Labels) -> Picture:
+    """Show the used share of each limit; a joint has the same colour in all panels."""
+    by_kind = {
+        kind: curves
+        for kind in LIMIT_KINDS
+        if (curves := [usage for usage in design.usage if usage.kind == kind])
+    }
+    columns = 2 if len(by_kind) > MAX_WIDE_PANELS else 1
+    closest = closest_to_bounds(design.usage)[: len(SERIES)]
+    names = [name for name in dict.fromkeys(u.name for u in design.usage) if name in closest]
+    roles = {name: f"series{i}" for i, name in enumerate(names)}
+    panels = [
+        _limit_panel(curves, roles, _margin_in_words(design, kind, labels))
+        for kind, curves in by_kind.items()
+    ]
+    heights = [
+        2.0 if panel.y.names is None else 0.7 + 0.27 * len(panel.y.names) for panel in panels
+    ]
+
+    note = (
+        "All engine steps of the stated model. ±100 %: at the upper and at the lower bound; grey: "
+        "beyond a bound."
+    )
+    if "clearance" in by_kind:
+        note += " Of a clearance: required over actual distance."
+    if any(panel.y.names for panel in panels):
+        note += (
+            " In rows: the largest share of each interval of time, whichever bound; the line at "
+            "the top of a row is the bound."
+        )
+    elif any(map(would_be_solid, design.usage)):
+        note += " Filled: smallest and largest value of a curve that changes too fast to be seen."
+    ends = [
+        f"{_words(kind)} {_kept(margin)}"
+        for kind, margin in design.limits.items()
+        if kind.startswith("end_")
+    ]
+    if ends:
+        note += f" At the end: {', '.join(ends)}."
+    return Picture(
+        title="How much of each limit the design uses",
+        panels=in_grid(panels, columns),
+        note=note,
+        heights=[max(heights[i : i + columns]) for i in range(0, len(heights), columns)],
+        widths=[1.0] * columns,
+        keys=[
+            line([], [], role, width=2.0, label=shorten(name, 24)) for name, role in roles.items()
+        ],
+    )
+
+
+def _limit_panel(curves: Sequence[LimitUsage], roles: dict[str, str], margin: str) -> Panel:
+    """Return the panel of one kind of limit; the curves closest to a bound are strong."""
+    closest = sorted(curves, key=lambda usage: -largest_share(usage))
+    shares = [
+        f"{shorten(usage.name, 18)} {whole_percent(largest_share(usage))}"
+        for usage in closest[:NAMED_CURVES]
+    ]
+    solid = [usage for usage in curves if would_be_solid(usage)]
+    in_rows = len(solid) > MAX_ENVELOPES
+    axis = Axis(label="share of the limit [%]")
+    if in_rows:
+        shown = [usage for usage in curves if usage in closest[:MAX_ROWS]]
+        axis = row_axis([usage.name for usage in shown])
+        marks = [
+            each
+            for row, usage in enumerate(shown)
+            for each in _row_marks(usage, row, roles.get(usage.name, "muted"))
+        ]
+    else:
+        marks = [
+            each
+            for rank, usage in enumerate(closest)
+            for each in _curve_marks(usage, rank, roles.get(usage.name, "muted"))
+        ]
+        one_sided = curves[0].kind == "clearance"
+        reach = max(112.0, 105.0 * largest_share(closest[0]))
+        axis = Axis(label=axis.label, limits=(0.0 if one_sided else -reach, reach))
+        for side in (1.0,) if one_sided else (1.0, -1.0):
+            marks += [hspan(100.0 * side, reach * side), hline(100.0 * side, width=0.8)]
+    return Panel(
+        marks=marks,
+        x=Axis(label="time [s]"),
+        y=axis,
+        title=margin,
+        role=DESIGNED.word if largest_share(closest[0]) > 1.0 else "text",
+        remark=f"largest: {', '.join(shares)}",
+    )
+
+
+def _curve_marks(usage: LimitUsage, rank: int, role: str) -> list[Mark]:
+    """Return the curve of one limit, or the envelope of one that changes too fast to be seen."""
+    strong, front = rank < NAMED_CURVES, 3.0 - 0.01 * rank
+    if not would_be_solid(usage):
+        width = 1.4 if strong else 0.7
+        return [line(usage.t, 100.0 * usage.share, role, width=width, front=front)]
+    t, low, high = envelope(usage)
+    return [
+        area(t, low, high, role, opacity=0.25 if strong else 0.08, front=front),
+        *(line(t, end, role, width=0.9 if strong else 0.4, front=front) for end in (low, high)),
+    ]
+
+
+def _row_marks(usage: LimitUsage, row: int, role: str) -> list[Mark]:
+    """Return a row that is filled up to the largest share of each interval of time."""
+    t, low, high = envelope(usage)
+    base = row + 0.5 * FULL_ROW
+    top = base - FULL_ROW * np.maximum(np.abs(low), np.abs(high)) / 100.0
+    return [
+        area(t, np.full(len(t), base), top, role, opacity=0.45),
+        line(t, top, role, width=0.9),
+        hline(base - FULL_ROW, width=0.6),
+    ]
+
+
+def _words(kind: str) -> str:
+    """Return the name of a kind of limit in words."""
+    return kind.replace("_", " ")
+
+
+def _kept(margin: float, unit: str = "") -> str:
+    """Say whether a limit holds, and by which margin."""
+    size = f"{format_number(abs(margin), 2)} {unit}".rstrip()
+    return f"VIOLATED by {size}" if margin < 0.0 else f"smallest margin {size}"
+
+
+def _margin_in_words(design: Design, kind: str, labels: Labels) -> str:
+    """Say whether a kind of limit holds, and by which margin in its unit, if that is known."""
+    is_of_actuator = kind in ("control", "control_rate", "force")
+    label_units = dict(map(split_unit, labels.controls if is_of_actuator else labels.positions))
+    found = {
+        label_units.get(usage.name, "")
+        for usage in design.usage
+        if usage.kind == kind and np.isfinite(usage.share).any()
+    }
+    base = found.pop() if len(found) == 1 else ""
+    unit = LENGTH if kind in ("clearance", "tendon_length") else ""
+    if base and base != "model unit":
+        unit = {
+            "position": base,
+            "velocity": per_second(base),
+            "acceleration": f"{base}/s²",
+            "control": base,
+            "control_rate": per_second(base),
+            "force": FORCE_OF_CONTROL.get(base, ""),
+            "joint_force": FORCE_OF_CONTROL.get(base, ""),
+        }.get(kind, unit)
+    return f"{_words(kind)}: {_kept(design.limits.get(kind, float('nan')), unit)}"

@@ -1,20 +1,25 @@
-"""The figures of every kind of result, by the names of their files without the ending."""
+"""The pictures of every kind of result, by the names of their files without the ending.
+
+Nothing here imports matplotlib: a picture is data until `mjfim.output.plots.draw` draws it.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from functools import partial, singledispatch
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mjfim.errors import MjfimError, unknown
-from mjfim.output import plots
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.labels import complete_labels
-from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
-from mjfim.output.plots.pairs import has_pairs
+from mjfim.output.panels import Picture
+from mjfim.output.plots import design as of_design
+from mjfim.output.plots import estimate as of_estimate
+from mjfim.output.plots import estimate_studies, studies
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -26,169 +31,195 @@ from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
 
-# A function that draws a figure.
-DrawPicture = Callable[[], Figure]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-# Functions that draw the figures of a record, by the name of the figure.
-Pictures = dict[str, DrawPicture]
+# Functions that make the pictures of a record, by their names.
+Pictures = dict[str, Callable[[], Picture]]
+
+
+def fit_names(count: int) -> tuple[str, ...]:
+    """Return the names of the pictures of the fits of `count` recordings."""
+    return _numbered("fit", count)
+
+
+def held_out_names(count: int) -> tuple[str, ...]:
+    """Return the names of the pictures of the predictions of `count` held-out recordings."""
+    return _numbered("held_out", count)
+
+
+def histogram_name(parameter: str) -> str:
+    """Return the name of the histogram of a parameter."""
+    safe_name = re.sub(r"[^\w.-]", "_", parameter)
+    return f"histogram_{safe_name}"
+
+
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    """Return names with numbers; a single one has none."""
+    return (name,) if count == 1 else tuple(f"{name}_{i + 1}" for i in range(count))
 
 
 def picture_names(record: ShownRecord) -> tuple[str, ...]:
-    """Return the names of the figures of a record, the usual one first.
-
-    Args:
-        record: The record.
-    """
+    """Return the names of the pictures of a record, the usual one first."""
     return tuple(pictures_of(record))
 
 
 def draw(
     record: ShownRecord, picture: str | None = None, file: str | os.PathLike[str] = ""
 ) -> Figure:
-    """Draw a figure of a record.
+    """Draw a picture of a record.
 
     Args:
         record: The record.
-        picture: Name of the figure; default: the first one.
-        file: File to which the figure is written; empty: none.
+        picture: Name of the picture; default: the usual one.
+        file: File into which it is written, too; its ending states the format.
+
+    Returns:
+        The figure.
 
     Raises:
-        MjfimError: The record has no such figure, or the ending of the file is not that of a
-            picture.
+        MjfimError: The record has no such picture, or the format is unknown.
     """
+    from mjfim.output.plots.draw import figure_of, save  # imports matplotlib, which is slow
+
     pictures = pictures_of(record)
     if not pictures:
         raise MjfimError(f"this {type(record).__name__} has no results yet that can be drawn")
-
     name = next(iter(pictures)) if picture is None else picture
     if name not in pictures:
         raise MjfimError(unknown(f"picture of a {type(record).__name__}", name, pictures))
-    figure = pictures[name]()
+    figure = figure_of(pictures[name]())
     if os.fspath(file):
-        plots.save(figure, file)
+        save(figure, file)
     return figure
 
 
 @singledispatch
 def pictures_of(record: ShownRecord) -> Pictures:
-    """Return the figures of a record, the usual one first.
-
-    Args:
-        record: The record.
+    """Return functions that make the pictures of a record, the usual one first.
 
     Raises:
-        MjfimError: This kind of record has no figures.
+        MjfimError: Records of this kind have no pictures.
     """
     raise MjfimError(f"a {type(record).__name__} has no figures")
 
 
 @pictures_of.register
 def _(design: Design) -> Pictures:
-    """The figures of a design."""
+    """The pictures of a design."""
     labels = complete_labels(design)
     pictures: Pictures = {
-        "trajectories": partial(plots.trajectories, design, labels),
-        "sensitivity_phase": partial(plots.sensitivity_phase, design, labels),
-        "convergence": partial(plots.convergence, design),
-        "standard_deviations": partial(plots.std_bars, design, labels),
+        "trajectories": partial(of_design.trajectories, design, labels),
+        "sensitivity_phase": partial(of_design.sensitivity_phase, design, labels),
+        "convergence": partial(of_design.convergence, design),
+        "standard_deviations": partial(of_design.standard_deviations, design, labels),
     }
     if design.usage:
-        pictures["limits"] = partial(plots.limits, design, labels)
+        pictures["limits"] = partial(of_design.limits, design, labels)
     return pictures
 
 
 @pictures_of.register
 def _(estimate: Estimate) -> Pictures:
-    """The figures of an estimate."""
+    """The pictures of an estimate; those of studies only where it has them."""
     labels = complete_labels(estimate)
-    pictures: Pictures = {
-        "parameters": partial(plots.parameter_intervals, estimate, labels),
-        "spectra": partial(plots.residual_spectra, estimate, labels),
+    held = sum(prediction.recording is not None for prediction in estimate.predictions)
+    fits = {
+        name: partial(of_estimate.fit, estimate, i, labels)
+        for i, name in enumerate(fit_names(len(estimate.recordings)))
     }
-    pictures |= _studies(estimate)
-    if len(estimate.trace) > 1:
-        pictures["trace"] = partial(plots.parameter_trace, estimate, labels)
-    if has_pairs(estimate.std):
-        pictures["pairs"] = partial(plots.estimate_pairs, estimate, labels)
-    if estimate.predictions:
-        pictures["predictions"] = partial(plots.predictions, estimate, labels)
-
-    sigma = list(estimate.sigma.values())
-    for i, name in enumerate(fit_names(len(estimate.recordings))):
-        pictures[name] = partial(plots.fit, estimate, i, labels, sigma)
-    kept = sum(prediction.recording is not None for prediction in estimate.predictions)
-    for i, name in enumerate(held_out_names(kept)):
-        pictures[name] = partial(plots.held_out, estimate, i, labels)
-    return pictures
-
-
-def _studies(estimate: Estimate) -> Pictures:
-    """The figures of studies that only some estimates have."""
-    pictures: Pictures = {}
-    if estimate.selection is not None:
-        pictures["selection"] = partial(plots.selection_figure, estimate)
-    if estimate.horizons is not None:
-        pictures["horizons"] = partial(plots.horizons_figure, estimate)
-    if estimate.inverse_dynamics is not None:
-        pictures["inverse_dynamics"] = partial(
-            plots.inverse_dynamics_figure, estimate.inverse_dynamics
-        )
-    if estimate.recording_comparison is not None:
-        pictures["recordings"] = partial(plots.recording_forest, estimate)
-    if estimate.draws is not None:
-        pictures["samples"] = partial(plots.drawn_robots, estimate)
-    return pictures
+    held_out = {
+        name: partial(of_estimate.held_out, estimate, i, labels)
+        for i, name in enumerate(held_out_names(held))
+    }
+    forces = estimate.inverse_dynamics
+    optional: dict[str, tuple[bool, Callable[[], Picture]]] = {
+        "selection": (
+            estimate.selection is not None,
+            partial(estimate_studies.selection, estimate),
+        ),
+        "horizons": (estimate.horizons is not None, partial(estimate_studies.horizons, estimate)),
+        "inverse_dynamics": (
+            forces is not None,
+            partial(of_estimate.inverse_dynamics, forces),  # type: ignore[arg-type]
+        ),
+        "recordings": (
+            estimate.recording_comparison is not None,
+            partial(estimate_studies.recordings, estimate),
+        ),
+        "samples": (estimate.draws is not None, partial(estimate_studies.samples, estimate)),
+        "trace": (
+            len(estimate.trace) > 1,
+            partial(of_estimate.parameter_trace, estimate, labels),
+        ),
+        "pairs": (
+            estimate_studies.has_pairs(estimate.std),
+            partial(estimate_studies.estimate_pairs, estimate),
+        ),
+        "predictions": (
+            bool(estimate.predictions),
+            partial(of_estimate.predictions, estimate, labels),
+        ),
+    }
+    return {
+        "parameters": partial(of_estimate.parameter_intervals, estimate, labels),
+        "spectra": partial(of_estimate.residual_spectra, estimate, labels),
+        **{name: make for name, (has_it, make) in optional.items() if has_it},
+        **fits,
+        **held_out,
+    }
 
 
 @pictures_of.register
 def _(result: InverseDynamicsFit) -> Pictures:
-    """The figure of a fit to the equation of motion."""
-    return {"inverse_dynamics": partial(plots.inverse_dynamics_figure, result)}
+    """The picture of a fit to the equation of motion."""
+    return {"inverse_dynamics": partial(of_estimate.inverse_dynamics, result)}
 
 
 @pictures_of.register
 def _(study: MonteCarloStudy) -> Pictures:
-    """The figures of a Monte Carlo study."""
+    """The pictures of a Monte Carlo study."""
     labels = complete_labels(study)
-    pictures: Pictures = {"overview": partial(plots.study_overview, study, labels)}
-    for i, name in enumerate(study.parameters):
-        pictures[histogram_name(name)] = partial(plots.histogram, study, i, labels)
-    return pictures
+    return {
+        "overview": partial(studies.overview, study, labels),
+        **{
+            histogram_name(name): partial(studies.histogram, study, i, labels)
+            for i, name in enumerate(study.parameters)
+        },
+    }
 
 
 @pictures_of.register
 def _(check: Check) -> Pictures:
-    """The figures of a check."""
-    pictures: Pictures = {"check": partial(plots.check_figure, check)}
-    if has_pairs(np.array([row.std for row in check.rows if not row.nuisance])):
-        pictures["pairs"] = partial(plots.check_pairs, check)
+    """The pictures of a check."""
+    pictures: Pictures = {"check": partial(studies.check, check)}
+    if estimate_studies.has_pairs(np.array([row.std for row in check.rows if not row.nuisance])):
+        pictures["pairs"] = partial(studies.check_pairs, check)
     return pictures
 
 
 @pictures_of.register
 def _(comparison: Comparison) -> Pictures:
-    """The figure of a comparison."""
-    return {"compare": partial(plots.compare_figure, comparison)}
+    """The picture of a comparison."""
+    return {"compare": partial(studies.compare, comparison)}
 
 
 @pictures_of.register
 def _(comparison: RobotComparison) -> Pictures:
-    """The figure of a comparison of two robots; none without a parameter in common."""
-    if not comparison.parameters:
-        return {}
-    return {"robots": partial(plots.robot_figure, comparison)}
+    """The picture of a comparison of two robots; none without a parameter in common."""
+    return {"robots": partial(studies.robots, comparison)} if comparison.parameters else {}
 
 
 @pictures_of.register
 def _(result: Robustness) -> Pictures:
-    """The figure of a robustness study."""
-    return {"playback": partial(plots.robustness_figure, result)}
+    """The picture of a robustness study."""
+    return {"playback": partial(studies.playback, result)}
 
 
 @pictures_of.register
 def _(campaign: Campaign) -> Pictures:
-    """The figure of a campaign; none before its first round."""
+    """The picture of a campaign; none before its first round."""
     if not campaign.rounds:
         return {}
     parameters = CampaignParameters.recorded(campaign)
-    return {"campaign": partial(plots.campaign_figure, campaign, parameters)}
+    return {"campaign": partial(studies.campaign, campaign, parameters)}

@@ -1,0 +1,598 @@
+"""Pictures of an estimate: parameters, fits and predictions over time, spectra of the residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices
+from mjfim.model.coordinates import split_unit
+from mjfim.output.distributions import chi_squared_quantiles
+from mjfim.output.panels import (
+    Axis,
+    Mark,
+    Panel,
+    Picture,
+    area,
+    around,
+    dots,
+    hline,
+    hspan,
+    in_grid,
+    intervals,
+    line,
+    mark,
+    range_of_intervals,
+    row_axis,
+    vline,
+)
+from mjfim.output.plots.words import (
+    format_number,
+    format_with_uncertainty,
+    shorten,
+    without_zeros,
+)
+from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
+from mjfim.output.welch import density_of
+from mjfim.records.estimate import Estimate, Prediction
+from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
+from mjfim.records.labels import Labels, with_unit
+from mjfim.records.trajectory import Recording
+
+# Largest numbers of outputs over time, of outputs with a spectrum, of predicted recordings, of
+# parameters over the iterations, and of equations; of more, those that say most are drawn.
+MAX_OUTPUTS, MAX_SPECTRA, MAX_PREDICTIONS, MAX_PARAMETERS, MAX_EQUATIONS = 8, 12, 8, 12, 10
+
+# Largest number of samples of a recording that are drawn, and of segments whose boundaries are.
+MAX_SAMPLES, MAX_BOUNDARIES = 4000, 40
+
+# Space above and below curves, and that a panel gains for a nominal model beyond them, over the
+# range of what was measured and identified.
+MARGIN, NOMINAL_ROOM = 0.08, 0.6
+
+# Characters to which the names of recordings are shortened.
+NAME_WIDTH = 60
+
+# Largest and smallest number of residuals in one segment of a smoothed density (Welch's method),
+# the number of segments that are aimed at, and the fewest residuals of a recording.
+LONGEST_SEGMENT, SHORTEST_SEGMENT, SEGMENTS, FEWEST = 256, 32, 10, 9
+
+# Effective number of independent densities per segment, for Hann windows that overlap by half.
+# Source: Welch (1967), correlation 1/6 between neighbours.
+INDEPENDENT_SHARE = 1.0 / (1.0 + 2.0 / 36.0)
+
+# Probability below which a p-value is not written as a number.
+SMALLEST_WRITTEN_P = 1e-6
+
+# Times between averages of forces above this multiple of the usual one are gaps.
+GAP = 2.5
+
+
+# ---- parameters
+
+
+def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
+    """Show estimates and 95 % intervals relative to the guess; hollow where at a bound."""
+    count = len(estimate.theta)
+    labels.check(parameters=count)
+    guess = estimate.initial_theta
+    percent = np.where(estimate.guess_sizes > 0.0, estimate.guess_sizes, np.nan) / 100.0
+    centre = (estimate.theta - guess) / percent
+    half = NORMAL_95 * np.where(np.isfinite(estimate.std), estimate.std, np.nan) / percent
+    low, high = ((end - guess) / percent for end in estimate.interval.T)
+
+    left, right = range_of_intervals(centre, low, high)
+    margin = 0.06 * (max(right, 0.0) - min(left, 0.0))
+    rows = np.arange(float(count))
+    is_at_bound = np.array([name in estimate.at_bound for name in estimate.parameters])
+    look = {"size": 6.5, "front": 3.0}
+    marks = [
+        vline(0.0, NOMINAL.word, width=1.6, label=NOMINAL.word),
+        intervals(
+            centre - half,
+            centre + half,
+            rows,
+            IDENTIFIED.word,
+            width=5.0,
+            opacity=0.3,
+            label="formal 95 %",
+        ),
+        intervals(low, high, rows, IDENTIFIED.word, width=1.4),
+        dots(
+            centre[~is_at_bound],
+            rows[~is_at_bound],
+            IDENTIFIED.word,
+            label=f"{IDENTIFIED.word}, 95 % interval",
+            **look,
+        ),
+    ]
+    if is_at_bound.any():
+        at = dots(
+            centre[is_at_bound],
+            rows[is_at_bound],
+            IDENTIFIED.word,
+            symbol="s",
+            hollow=True,
+            label="at its bound",
+            **look,
+        )
+        marks.append(at)
+    note = (
+        "The formal interval is right only if the model and the noise are right. The 95 % interval "
+        "also allows for autocorrelated residuals."
+    )
+    if estimate.misfit:
+        note += (
+            " Here the residuals are not explained by noise: no interval covers the bias of a "
+            "wrong model."
+        )
+    if not np.array_equal(np.abs(estimate.theta), estimate.sizes):
+        note += " The difference of an entry of a vector or tensor is a share of the whole."
+    if np.isnan(centre).any():
+        note += " For a nominal value of 0 there is no relative difference, only numbers."
+    texts = [_interval_text(estimate, j, labels.parameter_units[j]) for j in range(count)]
+    panel = Panel(
+        marks=marks,
+        x=Axis(
+            label=f"difference from the {NOMINAL.word} value [%]",
+            limits=(min(left, -margin), max(right, margin)),
+        ),
+        y=row_axis([labels.parameter(j) for j in range(count)]),
+        beside=[("", "text", texts)],
+    )
+    return Picture(
+        title="Estimated parameters",
+        panels=[panel],
+        note=note,
+        heights=[0.6 + (0.42 if count <= MAX_PARAMETERS else 0.27) * count],
+    )
+
+
+def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
+    """Write guess, estimate and half the width of the interval of parameter j in its unit."""
+    half_width = np.inf
+    if np.isfinite(estimate.std[j]):
+        half_width = 0.5 * float(np.ptp(estimate.interval[j]))
+    guess = without_zeros(format_number(float(estimate.initial_theta[j]), 4))
+    value = format_with_uncertainty(float(estimate.theta[j]), half_width)
+    text = f"{guess} → {value} {unit}".rstrip()
+    return f"{text}   (at its bound)" if estimate.parameters[j] in estimate.at_bound else text
+
+
+def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
+    """Show the parameters over the iterations of the search over all data."""
+    labels.check(parameters=len(estimate.theta))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        change = np.ptp(estimate.trace, axis=0) / np.ptp(estimate.interval, axis=1)
+    order = np.argsort(-np.nan_to_num(change, posinf=0.0), kind="stable")
+    panels = []
+    for j in np.sort(order[:MAX_PARAMETERS]).tolist():
+        values = np.append(estimate.trace[1:, j], estimate.theta[j])
+        marks = [
+            hline(float(estimate.trace[0, j]), NOMINAL.word, label=NOMINAL.word),
+            line(
+                np.arange(len(values)),
+                values,
+                IDENTIFIED.word,
+                symbol="o",
+                size=3.0,
+                label="estimate so far",
+            ),
+        ]
+        low, high = estimate.interval[j]
+        if np.isfinite(low) and np.isfinite(high):
+            label = "95 % interval of the result"
+            marks.append(hspan(low, high, IDENTIFIED.word, opacity=0.15, label=label))
+        panels.append(
+            Panel(
+                title=labels.parameter(j),
+                marks=marks,
+                x=Axis(label="iteration [–]", most=4, whole=True),
+                y=Axis(most=4),
+            )
+        )
+    columns = min(4, len(panels))
+    note = (
+        "0: begin of the search over all data, after short searches for a start. The last point is "
+        "the identified value."
+    )
+    if len(panels) < len(estimate.theta):
+        note += (
+            f" Shown: {len(panels)} of {len(estimate.theta)} parameters, those that changed most "
+            "over the width of their interval."
+        )
+    return Picture(
+        title="Parameters over the iterations of the fit",
+        panels=in_grid(panels, columns),
+        note=note,
+        heights=[1.5] * -(-len(panels) // columns),
+        widths=[1.0] * columns,
+    )
+
+
+# ---- recordings over time
+
+
+def fit(estimate: Estimate, index: int, labels: Labels) -> Picture:
+    """Show measured and predicted outputs of one fitted recording, with their residuals."""
+    recording = estimate.recordings[index]
+    note = (
+        "Residual: measured − identified model. If the model and the noise are right, 4.6 % of the "
+        "samples are outside ±2σ."
+    )
+    if estimate.nominal:
+        note += " Both models begin each segment at the fitted initial state."
+    else:
+        note += f" {estimate.reason_without_nominal}"
+    return _over_time(
+        recording,
+        estimate.predicted[index],
+        estimate.nominal[index] if estimate.nominal else None,
+        np.array([estimate.sigma[name] for name in recording.outputs]),
+        labels,
+        title=f"Fit to {_file_name(recording.name)}",
+        note=note,
+        boundaries=estimate.segments[index][1:] if estimate.segments else np.zeros(0),
+    )
+
+
+def held_out(estimate: Estimate, index: int, labels: Labels) -> Picture:
+    """Show a held-out recording beside its predictions by the identified and the nominal model."""
+    found = [prediction for prediction in estimate.predictions if prediction.recording is not None]
+    prediction = found[index]
+    recording = prediction.recording
+    assert recording is not None
+    note = (
+        "Error: measured − predicted. The parameters were fitted to other recordings; of this "
+        "one, only initial states are estimated."
+    )
+    return _over_time(
+        recording,
+        prediction.identified_outputs,
+        prediction.nominal_outputs,
+        np.array([estimate.sigma.get(name, np.nan) for name in recording.outputs]),
+        labels,
+        title=f"Prediction of {_file_name(recording.name)}, held out",
+        note=note,
+        boundaries=np.zeros(0),
+        is_prediction=True,
+    )
+
+
+def _file_name(name: str, width: int = NAME_WIDTH) -> str:
+    """Return the short name of a recording."""
+    return shorten(Path(name).name, width)
+
+
+def _over_time(
+    recording: Recording,
+    identified: Array,
+    nominal: Array | None,
+    sigma: Array,
+    labels: Labels,
+    *,
+    title: str,
+    note: str,
+    boundaries: Array,
+    is_prediction: bool = False,
+) -> Picture:
+    """Show a row per output: the curves over time, and their errors."""
+    columns = shown_outputs([recording.y], [identified], sigma, MAX_OUTPUTS)
+    rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
+    size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
+    t = recording.t[rows]
+    panels = []
+    for place, j in enumerate(columns):
+        y, model = recording.y[rows, j], identified[rows, j]
+        guess = None if nominal is None else nominal[rows, j]
+        label = labels.output(recording.outputs[j])
+        time = Axis(label="time [s]" if place == len(columns) - 1 else "")
+        marks = [
+            dots(t, y, MEASURED.word, symbol=".", size=size, label="measured"),
+            line(t, model, IDENTIFIED.word, width=1.2, label="identified model"),
+        ]
+        if guess is not None:
+            marks.append(line(t, guess, NOMINAL.word, width=0.8, front=1.5, label="nominal model"))
+        if 0 < len(boundaries) <= MAX_BOUNDARIES:
+            look = {"width": 0.6, "dash": "--", "opacity": 0.6, "label": "begin of a segment"}
+            marks += [vline(float(begin), "muted", **look) for begin in boundaries]
+        shown = Axis(most=4, limits=_visible_range(np.concatenate([y, model]), guess))
+        panels.append(Panel(title=label, marks=marks, x=time, y=shown, place=(place, 0)))
+
+        errors, remark = _errors(
+            t, y, model, guess, float(sigma[j]), is_prediction=is_prediction, size=size
+        )
+        unit = Axis(label=f"[{split_unit(label)[1] or '–'}]", most=4)
+        message = "" if remark else "not measured"
+        panels.append(
+            Panel(
+                title=remark,
+                role="muted",
+                marks=errors,
+                x=time,
+                y=unit,
+                message=message,
+                place=(place, 1),
+            )
+        )
+    if len(columns) < len(recording.outputs):
+        note += (
+            f" Shown: those {len(columns)} of {len(recording.outputs)} outputs "
+            "whose residuals over σ are largest."
+        )
+    heights = [1.2] * len(columns)
+    heights[-1] += 0.2
+    return Picture(title=title, panels=panels, note=note, heights=heights, widths=[1.4, 1.0])
+
+
+def _visible_range(values: Array, nominal: Array | None) -> tuple[float, float] | None:
+    """Return the range of a panel; a nominal model that is far away does not flatten the curves."""
+    finite = values[np.isfinite(values)]
+    if not len(finite) or not np.ptp(finite):
+        return None
+    low, high = float(finite.min()), float(finite.max())
+    if nominal is not None:
+        room = NOMINAL_ROOM * (high - low)
+        low, high = (
+            max(min(low, np.nanmin(nominal, initial=np.inf)), low - room),
+            min(max(high, np.nanmax(nominal, initial=-np.inf)), high + room),
+        )
+    margin = MARGIN * (high - low)
+    return low - margin, high + margin
+
+
+def _errors(
+    t: Array,
+    y: Array,
+    identified: Array,
+    nominal: Array | None,
+    sigma: float,
+    *,
+    is_prediction: bool,
+    size: float,
+) -> tuple[list[Mark], str]:
+    """Return the errors of one output over the band of two sigma, and their rms in words."""
+    marks = [hline(0.0, width=0.8)]
+    if np.isfinite(sigma):
+        marks.append(hspan(-2.0 * sigma, 2.0 * sigma, opacity=0.8, label="±2σ of the noise"))
+    residual = y - identified
+    role = IDENTIFIED.word if is_prediction else MEASURED.word
+    marks.append(dots(t, residual, role, symbol=".", size=size, front=2.5))
+    if is_prediction and nominal is not None:
+        marks.append(dots(t, y - nominal, NOMINAL.word, symbol=".", size=0.7 * size))
+    known = residual[np.isfinite(residual)]
+    if not known.size:
+        return marks, ""
+    words = "error" if is_prediction else "residual"
+    if np.isfinite(sigma):
+        relative_rms = float(np.sqrt(np.mean(known**2))) / sigma
+        outside = 100.0 * float(np.mean(np.abs(known) > 2.0 * sigma))
+        words += f": rms / σ = {relative_rms:.2f},  {outside:.1f} % outside"
+    return marks, words
+
+
+def shown_outputs(
+    measured: Sequence[Array], predicted: Sequence[Array], sigma: Array, largest: int
+) -> NDArray[np.intp]:
+    """Return the outputs to draw: of many, those with the largest residuals over sigma."""
+    residual = np.concatenate([y - model for y, model in zip(measured, predicted, strict=True)])
+    count = np.maximum(np.isfinite(residual).sum(axis=0), 1)
+    mean_square = np.nansum((residual / sigma) ** 2, axis=0) / count
+    return np.sort(np.argsort(-mean_square, kind="stable")[:largest])
+
+
+# ---- spectra of the residuals
+
+
+def residual_spectra(estimate: Estimate, labels: Labels) -> Picture:
+    """Show the smoothed density of the residuals of every output over that of white noise of σ."""
+    outputs = estimate.recordings[0].outputs
+    sigma = np.array([estimate.sigma[name] for name in outputs])
+    measured = [recording.y for recording in estimate.recordings]
+    shown = shown_outputs(measured, estimate.predicted, sigma, MAX_SPECTRA).tolist()
+    columns = 2 if len(shown) == 4 else min(3, len(shown))
+    panels = [_spectrum_panel(estimate, j, split_unit(labels.output(outputs[j]))[0]) for j in shown]
+    note = (
+        "Smoothed by Welch's method; samples count as evenly spaced. A band above the line at low "
+        "frequencies: the model lacks a slow effect. p(white): p-value of a test for white noise."
+    )
+    return Picture(
+        title="Spectra of the residuals",
+        panels=in_grid(panels, columns),
+        note=note,
+        heights=[1.9] * -(-len(panels) // columns),
+        widths=[1.0] * columns,
+    )
+
+
+def _spectrum_panel(estimate: Estimate, column: int, name: str) -> Panel:
+    """Return the density of one output with a band of 95 %."""
+    sigma = estimate.sigma[estimate.recordings[0].outputs[column]]
+    remark = ""
+    if column < len(estimate.whiteness):
+        test = estimate.whiteness[column]
+        p = "below 10⁻⁶" if test.p < SMALLEST_WRITTEN_P else format_number(test.p, 2)
+        remark = f"lag-1 correlation {test.correlation:+.2f},  p(white) {p}".replace("-0", "−0")
+    f, density, freedom = _smoothed_density(estimate, column, sigma)
+    if not freedom or not (density > 0.0).any():
+        return Panel(title=name, remark=remark, message="not measured")
+    low, high = (freedom / value for value in chi_squared_quantiles((0.975, 0.025), freedom))
+    label = "its 95 % confidence band"
+    return Panel(
+        title=name,
+        remark=remark,
+        marks=[
+            line(f, density, MEASURED.word, label="residual"),
+            area(f, low * density, high * density, MEASURED.word, label=label),
+            hline(1.0, width=0.8, label="white noise of the assumed σ"),
+        ],
+        x=Axis(label="frequency [Hz]", log=True),
+        y=Axis(label="density / white noise [–]", log=True),
+    )
+
+
+def _smoothed_density(estimate: Estimate, column: int, sigma: float) -> tuple[Array, Array, float]:
+    """Average the densities of all recordings.
+
+    Returns:
+        Frequencies [Hz], densities over that of white noise, and their degrees of freedom, which
+        are 0 where too little was measured.
+    """
+    parts, rates = [], []
+    for recording, predicted in zip(estimate.recordings, estimate.predicted, strict=True):
+        residual = (recording.y[:, column] - predicted[:, column]) / sigma
+        measured = np.isfinite(residual)
+        if np.count_nonzero(measured) >= FEWEST:
+            t = recording.t[measured]
+            parts.append(residual[measured])
+            rates.append((len(t) - 1) / (t[-1] - t[0]))
+    if not parts:
+        return np.zeros(0), np.zeros(0), 0.0
+
+    # Welch's segments overlap by half.
+    wanted = 2 * sum(map(len, parts)) // (SEGMENTS + 1)
+    length = min(int(np.clip(wanted, SHORTEST_SEGMENT, LONGEST_SEGMENT)), *map(len, parts))
+    weights = [max(2 * len(part) // length - 1, 1) for part in parts]
+    densities = [density_of(part, float(np.mean(rates)), length) for part in parts]
+    frequencies = densities[0][0]
+    mean = np.average([density for _, density in densities], axis=0, weights=weights)
+    count = sum(weights)
+    independent = INDEPENDENT_SHARE if count > 1 else 1.0
+
+    # The first and the last frequency have half the density and are left out.
+    relative = mean[1:-1] * max(float(frequencies[-1]), 1e-300)
+    return frequencies[1:-1], relative, 2.0 * count * independent
+
+
+# ---- predictions
+
+
+def predictions(estimate: Estimate, labels: Labels) -> Picture:
+    """Show prediction errors of the identified and of the nominal model over the noise."""
+    found = sorted(estimate.predictions, key=lambda prediction: not prediction.held_out)
+    shown = found[:MAX_PREDICTIONS]
+    outputs = shown[0].identified.outputs
+    measured = [
+        j for j in range(len(outputs)) if any(np.isfinite(p.identified.rms[j]) for p in shown)
+    ]
+    # With several recordings, the name of an output stands above them.
+    names: list[str] = []
+    errors, texts = [], []
+    for j in measured[:MAX_SPECTRA]:
+        label, unit = split_unit(labels.output(outputs[j]))
+        if len(shown) > 1:
+            names.append(label)
+            errors.append((np.nan, np.nan))
+            texts.append("")
+        sigma = estimate.sigma.get(outputs[j], np.nan)
+        if not sigma > 0.0:
+            # Without a known noise, errors are relative to the largest one of the nominal model.
+            sigma = max(float(p.nominal.rms[j]) for p in shown) or 1.0
+        for prediction in shown:
+            nominal, error = float(prediction.nominal.rms[j]), float(prediction.identified.rms[j])
+            names.append(_prediction_name(prediction) if len(shown) > 1 else label)
+            errors.append((nominal / sigma, error / sigma))
+            size = f"{format_number(error)} {unit}".rstrip()
+            ratio = error / nominal if nominal > 0.0 else np.nan
+            texts.append(f"{size}  (× {format_number(ratio, 2)})")
+    nominal, identified = np.array(errors).T
+    rows = np.arange(float(len(names)))
+    is_row = np.isfinite(nominal)
+    panel = Panel(
+        marks=[
+            mark(
+                "intervals",
+                nominal[is_row],
+                rows[is_row],
+                "band",
+                other=identified[is_row],
+                width=3.0,
+            ),
+            dots(nominal, rows, NOMINAL.word, size=6.0, label="nominal model"),
+            dots(identified, rows, IDENTIFIED.word, size=6.0, label="identified model"),
+            vline(1.0, MEASURED.word, width=1.2, dash="--", label="σ of the noise"),
+        ],
+        x=Axis(
+            label="rms prediction error / σ of the noise [–]",
+            log=True,
+            limits=around(np.append(np.concatenate([nominal, identified]), 1.0)),
+        ),
+        y=row_axis(names),
+        beside=[("", "text", texts)],
+    )
+    note = (
+        "The identified parameters were fitted to all other recordings; of the predicted "
+        "recording only the initial state is estimated. On the right: error of the identified "
+        "model, and its ratio to that of the nominal model."
+    )
+    if not all(prediction.held_out for prediction in shown):
+        note += " *: also part of the last fit; predicted here by a fit to the other recordings."
+    if len(shown) < len(found) or len(measured) > MAX_SPECTRA:
+        note += (
+            f" Shown: {len(shown)} of {len(found)} recordings and "
+            f"{min(len(measured), MAX_SPECTRA)} of {len(measured)} outputs."
+        )
+    title = "Predictions of recordings that were not fitted"
+    if len(shown) == 1:
+        title = f"Prediction of {_prediction_name(shown[0])}, which was not fitted"
+    return Picture(title=title, panels=[panel], note=note, heights=[0.6 + 0.25 * len(names)])
+
+
+def _prediction_name(prediction: Prediction) -> str:
+    """Return the short name of a predicted recording; one that the last fit holds has a star."""
+    name = _file_name(prediction.name, 34)
+    return name if prediction.held_out else f"{name} *"
+
+
+# ---- equation of motion
+
+
+def inverse_dynamics(fit: InverseDynamicsFit) -> Picture:
+    """Show the forces of the actuators and those that the measured motion needs."""
+    order = sorted(fit.equations, key=lambda each: -np.nan_to_num(each.share))
+    shown = [each for each in fit.equations if each in order[:MAX_EQUATIONS]]
+    panels = []
+    for row, each in enumerate(shown):
+        t, measured, explained = _with_gaps(each)
+        share = f"{100.0 * each.share:.2g} %" if np.isfinite(each.share) else "no force"
+        marks = [
+            line(t, measured, MEASURED.word, width=1.8, label="measured, or by the model"),
+            line(t, explained, IDENTIFIED.word, width=0.9, label="needed by the measured motion"),
+        ]
+        panels.append(
+            Panel(
+                title=f"{with_unit(shorten(each.name, 30), each.unit)}: residual {share}",
+                marks=marks,
+                x=Axis(label="time [s]" if row == len(shown) - 1 else ""),
+                y=Axis(most=3),
+                place=(row, 0),
+            )
+        )
+    shares = [100.0 * each.share for each in fit.equations if np.isfinite(each.share)]
+    title = "Equation of motion: no equation has a force"
+    if shares:
+        span = f"{min(shares):.2g} to {max(shares):.2g}" if len(shares) > 1 else f"{shares[0]:.2g}"
+        title = f"Equation of motion: residuals are {span} % of the forces"
+    note = (
+        f"Forces in {shorten(fit.recording, NAME_WIDTH)}, averaged over short windows; the share "
+        "is the root mean square residual over the force. Gaps: too little was measured, or "
+        "unknown forces act. An equation without actuators has no measured force."
+    )
+    if len(shown) < len(fit.equations):
+        note += f" {len(fit.equations) - len(shown)} equations with smaller residuals are left out."
+    return Picture(title=title, panels=panels, note=note, heights=[1.15] * len(shown))
+
+
+def _with_gaps(each: EquationFit) -> tuple[Array, Array, Array]:
+    """Return times and forces, with NaN where averages are missing."""
+    steps = np.diff(each.t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > GAP * usual) + 1
+    return (
+        np.insert(each.t, gaps, each.t[gaps]),
+        np.insert(each.measured, gaps, np.nan),
+        np.insert(each.explained, gaps, np.nan),
+    )

@@ -1,0 +1,495 @@
+"""Pictures of studies of an estimate: terms, segments, recordings, and scatter of pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mjfim.arrays import NORMAL_95, Array
+from mjfim.output.distributions import normal_density
+from mjfim.output.panels import (
+    Axis,
+    Mark,
+    Panel,
+    Picture,
+    area,
+    dots,
+    hline,
+    in_grid,
+    intervals,
+    line,
+    mark,
+    range_of_intervals,
+    row_axis,
+    vline,
+    vspan,
+)
+from mjfim.output.plots.words import as_sentence, format_number, shorten
+from mjfim.output.vocabulary import DESIGNED, IDENTIFIED, MEASURED, NOMINAL
+from mjfim.records.estimate import Estimate, HorizonStudy
+from mjfim.records.labels import with_unit
+from mjfim.records.robots import RecordingComparison
+from mjfim.records.terms import Decision, SelectionStep
+
+# Largest numbers of parameters of pictures of pairs and of lengths, of parameters and of recordings
+# that are compared; of more, those that say most are drawn.
+MAX_PAIRED, MAX_COMPARED, MAX_RECORDINGS = 6, 9, 24
+
+# Errors of rejected terms above this multiple of the largest kept one are arrows at the right end,
+# and largest number of rejected terms that have a row each.
+LARGEST_DRAWN_RATIO, MAX_NAMED = 1.5, 20
+
+# Dashes and symbols of the curves of the lengths that were not chosen.
+DASHES, SYMBOLS = (":", "--", "-.", (0, (8, 2)), (0, (1, 4))), ("s", "^", "D", "v", "P")
+
+# Half the range of an axis of pairs, places of its ticks, and standard deviations of the ellipses
+# with their opacities [standard deviations].
+RANGE, TICK, ELLIPSES = 3.2, 2.0, ((2.0, 0.18), (1.0, 0.35))
+
+# Number of points of a curve, largest number of robots that are dots, and bars of a histogram.
+CURVE_POINTS, MAX_DOTS, MOST_BARS = 90, 1000, 30
+
+
+# ---- selection of terms
+
+
+def selection(estimate: Estimate) -> Picture:
+    """Show the error of left-out data with each term that was tried."""
+    found = estimate.selection
+    assert found is not None
+    # A term with which the fit is no better has no error to draw.
+    steps = [step for step in found.steps if step.decision is not Decision.UNHELPFUL]
+    kept = [step for step in steps if step.is_kept]
+    rows = list(range(len(steps)))
+    shown: list[SelectionStep | None] = [*steps]
+    if len(steps) - len(kept) > MAX_NAMED:
+        # Rejected terms share the row of the next kept step; those at the end have an own one.
+        rows = np.cumsum([0, *(step.is_kept for step in steps)])[:-1].tolist()
+        shown = [*kept, *([] if steps[-1].is_kept else [None])]
+    row_of = {id(step): row for step, row in zip(steps, rows, strict=True)}
+
+    # The line joins the models with which the selection continued.
+    marks = [
+        line(
+            [step.error for step in phase],
+            [row_of[id(step)] for step in phase],
+            IDENTIFIED.word,
+            symbol="o",
+            size=6.0,
+            label="model of this step",
+        )
+        for phase in found.phases
+    ]
+    right = LARGEST_DRAWN_RATIO * max(step.error for step in kept)
+    tried = [(step.error, row_of[id(step)]) for step in steps if not step.is_kept]
+    for symbol, places in (
+        ("x", [each for each in tried if each[0] <= right]),
+        (">", [(right, row) for error, row in tried if error > right]),
+    ):
+        if places:
+            x, y = np.array(places, dtype=np.float64).T
+            label = "term that was tried"
+            marks.append(dots(x, y, "muted", symbol=symbol, size=6.0, label=label))
+
+    note = (
+        "Each part of the data is predicted by a fit to the other parts; with the right model and "
+        "noise, the error is about 1 σ. A term is added if it lowers the mean loss of left-out "
+        f"data by more than one standard error. {found.ending}"
+    )
+    if len(found.phases) > 1:
+        note += " Errors over segments are not comparable with those over whole recordings above."
+    before, after = found.errors
+    if np.isnan(before):
+        title = "No term was tried"
+    elif not found.terms:
+        title = f"No term was added: error of left-out data {format_number(before)} σ"
+    else:
+        noun = "term" if len(found.terms) == 1 else "terms"
+        change = f"{format_number(before)} σ → {format_number(after)} σ"
+        title = f"{len(found.terms)} {noun} added: error of left-out data {change}"
+    roles = ["text" if step is not None and step.is_kept else "muted" for step in shown]
+    axis = Axis(label="error of left-out data [σ of the noise]", hidden=bool(np.isnan(right)))
+    panel = Panel(marks=marks, x=axis, y=row_axis([_step_name(step) for step in shown], roles))
+    return Picture(title=title, panels=[panel], note=note, heights=[0.9 + 0.3 * len(shown)])
+
+
+def _step_name(step: SelectionStep | None) -> str:
+    """Return the name of a step of the selection."""
+    if step is None:
+        return "no further term"
+    if step.decision is Decision.BEGUN:
+        return "the stated model"
+    signs = {Decision.REMOVED: "without ", Decision.ADDED: "+ "}
+    return f"{signs.get(step.decision, '')}{step.description}"
+
+
+# ---- lengths of segments
+
+
+def horizons(estimate: Estimate) -> Picture:
+    """Show the error of left-out data over the horizon, and the estimates over the length."""
+    study = estimate.horizons
+    assert study is not None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moves = np.ptp(study.theta, axis=0) / np.nanmax(study.half_widths, axis=0)
+    dependent = np.asarray(study.is_apart, dtype=bool).any(axis=0)
+    shown = np.sort(np.lexsort((-np.nan_to_num(moves), ~dependent))[:MAX_PAIRED]).tolist()
+
+    lengths = study.lengths
+    axis = Axis(log=True, limits=(lengths[0] / 1.6, lengths[-1] * 1.6))
+    last = Axis(
+        label="time over which is predicted, and length of the fitted segments [s]",
+        log=True,
+        limits=axis.limits,
+    )
+    errors = Panel(
+        marks=[_curve_of_length(study, i) for i in range(len(lengths))],
+        x=axis if shown else last,
+        y=Axis(label="error of left-out data [σ]", log=True),
+    )
+    panels = [_estimates_by_length(study, j, last if j == shown[-1] else axis) for j in shown]
+    chosen = study.name_of(study.chosen)
+    title = f"{chosen[0].upper()}{chosen[1:]} were chosen"
+    if not study.is_used:
+        title += ", but not used"
+    if study.dependent:
+        verb = "depends" if len(study.dependent) == 1 else "depend"
+        title += f"; {', '.join(study.dependent[:MAX_PAIRED])} {verb} on the length"
+    note = (
+        "Each part of the data is predicted by fits to the other parts; with the right model and "
+        "noise, the error is about 1 σ over any time. Bars are 95 % intervals by the scatter "
+        "between the parts."
+    )
+    heights = [2.6, *[0.9] * len(panels)]
+    heights[-1] += 0.3
+    return Picture(title=title, panels=in_grid([errors, *panels], 1), note=note, heights=heights)
+
+
+def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
+    """Return the errors of the fit over segments of one length."""
+    name, errors = study.name_of(i), study.errors[i]
+    if i == study.chosen:
+        look = {"width": 2.2, "symbol": "o", "size": 5.0, "front": 3.0}
+        return line(study.lengths, errors, IDENTIFIED.word, label=f"{name}, chosen", **look)
+    k = i % len(DASHES)
+    look = {"width": 1.1, "dash": DASHES[k], "symbol": SYMBOLS[k], "size": 4.5}
+    return line(study.lengths, errors, "muted", label=name, **look)
+
+
+def _estimates_by_length(study: HorizonStudy, j: int, axis: Axis) -> Panel:
+    """Return the estimates of one parameter with their intervals."""
+    marks = [hline(float(study.theta[study.chosen, j]), IDENTIFIED.word, width=0.6)]
+    for i, length in enumerate(study.lengths.tolist()):
+        role = IDENTIFIED.word if i == study.chosen else "muted"
+        value, half = float(study.theta[i, j]), float(np.nan_to_num(study.half_widths[i, j]))
+        marks += [
+            line([length] * 2, [value - half, value + half], role, symbol="_", size=6.0),
+            dots([length], [value], role),
+        ]
+    label = with_unit(shorten(study.parameters[j], 14), study.units[j])
+    return Panel(marks=marks, x=axis, y=Axis(label=label, most=3))
+
+
+# ---- comparison of recordings
+
+
+def recordings(estimate: Estimate) -> Picture:
+    """Show what each recording suggests for the parameters that differ most."""
+    comparison = estimate.recording_comparison
+    assert comparison is not None
+    odd = [recording.index for recording in comparison.odd]
+    others = [k for k in range(len(comparison.recordings)) if k not in odd]
+    rows = sorted([*odd, *others][:MAX_RECORDINGS])
+    shown = [int(j) for j in comparison.order[:MAX_COMPARED]]
+    columns = min(3, len(shown))
+    panels = [
+        _recordings_panel(comparison, j, rows, odd, is_left=k % columns == 0)
+        for k, j in enumerate(shown)
+    ]
+    count = len(comparison.recordings)
+    title = f"{count} recordings that agree"
+    if odd:
+        names = ", ".join(shorten(each.name) for each in comparison.odd)
+        title = f"{names} {'is' if len(odd) == 1 else 'are'} odd among {count} recordings"
+    elif comparison.apart:
+        title = f"{count} recordings that differ by more than their noise"
+    note = "Each value is one Gauss-Newton step away from the estimate of all recordings."
+    if np.isfinite(comparison.prediction).any():
+        note += " Another recording: 95 % interval of what it would suggest."
+    if estimate.misfit:
+        note += " " + as_sentence(
+            "the model does not explain the recordings, and its error can make them differ"
+        )
+    if len(shown) < len(comparison.parameters):
+        note += (
+            f" Shown: {len(shown)} of {len(comparison.parameters)} parameters, those that differ "
+            "most."
+        )
+    if len(rows) < count:
+        note += f" Shown: {len(rows)} of {count} recordings."
+    height = 0.95 + 0.2 * (len(rows) + 1)
+    return Picture(
+        title=title,
+        panels=in_grid(panels, columns),
+        note=note,
+        heights=[height] * -(-len(panels) // columns),
+        widths=[1.0] * columns,
+    )
+
+
+def _recordings_panel(
+    comparison: RecordingComparison, j: int, rows: list[int], odd: list[int], *, is_left: bool
+) -> Panel:
+    """Return the values of one parameter, a row for each recording and one for another one."""
+    value, half = comparison.values[:, j], NORMAL_95 * comparison.std[:, j]
+    mean = float(comparison.mean[j])
+    marks = []
+    if np.isfinite(mean):
+        low, high = comparison.interval[j]
+        label = "95 % interval of the mean"
+        marks = [
+            vspan(low, high, IDENTIFIED.word, opacity=0.2, label=label),
+            vline(mean, IDENTIFIED.word, width=1.2, label="mean"),
+        ]
+    for row, k in enumerate(rows):
+        role = DESIGNED.word if k in odd else MEASURED.word
+        label = "odd recording" if k in odd else "one recording, 95 % interval"
+        marks += [
+            intervals(value[[k]] - half[[k]], value[[k]] + half[[k]], [row], role),
+            dots(value[[k]], [row], role, size=4.5, label=label),
+        ]
+    names = [comparison.recordings[k] for k in rows]
+    if np.isfinite(comparison.prediction[j]).all():
+        begin, end = comparison.prediction[j]
+        names.append("another one")
+        marks.append(intervals([begin], [end], [len(rows)], "muted", width=3.0))
+    limits = range_of_intervals(value, value - half, value + half)
+    roles = [DESIGNED.word if k in odd else "text" for k in rows]
+    shown = row_axis([shorten(name, 16) for name in names], roles)
+    if not is_left:
+        shown = Axis(ticks=[], limits=shown.limits)
+    label = with_unit(comparison.parameters[j], comparison.units[j])
+    return Panel(marks=marks, x=Axis(label=label, limits=limits, most=3), y=shown)
+
+
+# ---- scatter of pairs of parameters
+
+
+def has_pairs(std: Array) -> bool:
+    """Return whether at least two parameters have a standard deviation."""
+    return bool(np.count_nonzero(np.isfinite(std) & (std > 0.0)) > 1)
+
+
+def pairs(
+    names: Sequence[str],
+    units: Sequence[str],
+    values: Array,
+    covariance: Array,
+    role: str,
+    *,
+    guess: Array | None = None,
+    title: str,
+    note: str,
+) -> Picture:
+    """Show the joint uncertainty of every pair of parameters as ellipses of 1 σ and 2 σ.
+
+    Args:
+        names: Names of the p parameters.
+        units: Their units.
+        values: (p,) their values.
+        covariance: (p, p) their covariance.
+        role: Role of the ellipses.
+        guess: (p,) nominal values that are marked, if they are near.
+        title: Title of the picture.
+        note: What is behind the covariance.
+    """
+    std = np.sqrt(np.diagonal(covariance))
+    known = np.isfinite(std) & (std > 0.0)
+    correlation = np.clip(covariance / np.outer(std, std), -1.0, 1.0)
+    shown = _most_correlated(np.where(np.outer(known, known), correlation, np.nan))
+    offsets = np.full(len(std), np.inf) if guess is None else (guess - values) / std
+    x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
+    angle = np.linspace(0.0, 2.0 * np.pi, CURVE_POINTS)
+
+    def nominal(across: float, up: float) -> list[Mark]:
+        """Mark the nominal values of a panel, if they lie in it."""
+        if max(abs(across), abs(up)) > RANGE:
+            return []
+        return [dots([across], [up], NOMINAL.word, symbol="x", size=5.0, label=NOMINAL.word)]
+
+    def density(j: int) -> list[Mark]:
+        """Draw the normal density of one parameter."""
+        y = normal_density(x)
+        return [area(x, np.zeros(len(x)), y, role), line(x, y, role), *nominal(offsets[j], 0.02)]
+
+    def ellipses(j: int, i: int) -> list[Mark]:
+        """Draw the ellipses of parameter j across and i up."""
+        r = correlation[i, j]
+        rest = np.sqrt(1.0 - r**2)
+        # Lower and upper half of each ellipse, over its width.
+        across = np.sin(np.linspace(-0.5, 0.5, CURVE_POINTS) * np.pi)
+        half = rest * np.sqrt(1.0 - across**2)
+        filled = [
+            area(s * across, s * (r * across - half), s * (r * across + half), role, opacity=o)
+            for s, o in ELLIPSES
+        ]
+        up = r * np.cos(angle) + rest * np.sin(angle)
+        edge = line(2.0 * np.cos(angle), 2.0 * up, role, width=0.8)
+        return [*filled, edge, *nominal(offsets[j], offsets[i])]
+
+    def axis(j: int) -> Axis:
+        """Return the axis of a parameter in its standard deviations, with values at two ticks."""
+        ticks = values[j] + std[j] * np.array([-TICK, TICK])
+        texts = _distinct(ticks)
+        return Axis(ticks=[-TICK, TICK], names=texts, limits=(-RANGE, RANGE))
+
+    if len(shown) < len(names):
+        note += _share_note(len(shown), len(names))
+    keys = [
+        line([], [], role, width=7.0, opacity=opacity + 0.1, label=f"{size:g} σ")
+        for size, opacity in reversed(ELLIPSES)
+    ]
+    return _corner(names, units, shown, density, ellipses, axis, title=title, note=note, keys=keys)
+
+
+def estimate_pairs(estimate: Estimate) -> Picture:
+    """Show the joint uncertainty of the estimates of every pair of parameters."""
+    return pairs(
+        estimate.parameters,
+        estimate.units,
+        estimate.theta,
+        estimate.covariance,
+        IDENTIFIED.word,
+        guess=estimate.initial_theta,
+        title="Joint uncertainty of the identified parameters",
+        note="Formal uncertainty: it is right only if the model and the noise are right.",
+    )
+
+
+def samples(estimate: Estimate) -> Picture:
+    """Show the parameters of all drawn robots: a histogram of each, and dots for every pair."""
+    draws = estimate.draws
+    assert draws is not None
+    robots = draws.values[:MAX_DOTS]
+    products = np.atleast_2d(np.corrcoef(draws.values.T))
+    shown = _most_correlated(np.nan_to_num(products))
+    low = np.minimum(draws.values.min(axis=0), draws.centre)
+    high = np.maximum(draws.values.max(axis=0), draws.centre)
+    margin = np.maximum(0.06 * (high - low), 1e-9 * np.abs(draws.centre) + 1e-300)
+    low, high = low - margin, high + margin
+    bins = int(np.clip(np.sqrt(len(draws)), 5, MOST_BARS))
+
+    def histogram(j: int) -> list[Mark]:
+        """Draw how often the values of one parameter were drawn."""
+        counts, edges = np.histogram(draws.values[:, j], bins=bins, range=(low[j], high[j]))
+        return [
+            mark(
+                "columns",
+                edges,
+                counts / counts.max(),
+                MEASURED.word,
+                opacity=0.6,
+                label="drawn robots",
+            ),
+            vline(float(draws.centre[j]), IDENTIFIED.word, width=1.4, label=IDENTIFIED.word),
+        ]
+
+    def scatter(j: int, i: int) -> list[Mark]:
+        """Draw parameter j across and i up."""
+        return [
+            dots(robots[:, j], robots[:, i], MEASURED.word, symbol=".", size=2.5, opacity=0.6),
+            dots(draws.centre[[j]], draws.centre[[i]], IDENTIFIED.word),
+        ]
+
+    def axis(j: int) -> Axis:
+        """Return the axis of a parameter with two ticks."""
+        ticks = low[j] + np.array([0.2, 0.8]) * (high[j] - low[j])
+        return Axis(ticks=ticks.tolist(), names=_distinct(ticks), limits=(low[j], high[j]))
+
+    note = (
+        "Drawn from the normal distribution with the honest covariance of the estimate, which "
+        "agrees with the 95 % intervals, inside the bounds."
+    )
+    if estimate.misfit:
+        note += " It does not cover the error of a model that does not explain the recordings."
+    if len(shown) < len(draws.parameters):
+        note += _share_note(len(shown), len(draws.parameters))
+    if len(shown) > 1 and len(draws) > MAX_DOTS:
+        note += f" The panels of pairs show {MAX_DOTS} robots."
+    title = f"{len(draws)} drawn {'robot' if len(draws) == 1 else 'robots'}"
+    return _corner(
+        draws.parameters, draws.units, shown, histogram, scatter, axis, title=title, note=note
+    )
+
+
+def _corner(
+    names: Sequence[str],
+    units: Sequence[str],
+    shown: list[int],
+    single: Callable[[int], list[Mark]],
+    pair: Callable[[int, int], list[Mark]],
+    axis: Callable[[int], Axis],
+    *,
+    title: str,
+    note: str,
+    keys: Sequence[Mark] = (),
+) -> Picture:
+    """Show a panel for each parameter, and below the diagonal one for each pair."""
+    panels = []
+    for row, i in enumerate(shown):
+        for column, j in enumerate(shown[: row + 1]):
+            across, up = axis(j), axis(i) if i != j else Axis(ticks=[])
+            is_lowest, is_left = row == len(shown) - 1, column == 0 and row > 0
+            panels.append(
+                Panel(
+                    title=shorten(names[i], 18) if i == j else "",
+                    marks=single(i) if i == j else pair(j, i),
+                    x=_outer(across, names[j], units[j], is_lowest),
+                    y=_outer(up, names[i], units[i], is_left),
+                    place=(row, column),
+                )
+            )
+    heights = [1.2 if len(shown) > 1 else 2.2] * len(shown)
+    heights[-1] += 0.6
+    return Picture(
+        title=title,
+        panels=panels,
+        note=note,
+        heights=heights,
+        widths=[1.0] * len(shown),
+        keys=keys,
+    )
+
+
+def _outer(axis: Axis, name: str, unit: str, is_outer: bool) -> Axis:
+    """Return an axis that has words only at the edge of the picture."""
+    label = f"{shorten(name, 14)}\n[{unit}]" if unit else shorten(name, 14)
+    return Axis(
+        label=label if is_outer else "",
+        ticks=axis.ticks,
+        names=axis.names if is_outer else None,
+        limits=axis.limits,
+        hidden=not is_outer,
+    )
+
+
+def _most_correlated(correlation: Array) -> list[int]:
+    """Return the parameters to draw: of many, those with the largest correlations."""
+    known = np.flatnonzero(np.isfinite(np.diagonal(correlation)))
+    others = np.abs(correlation - np.diag(np.diagonal(correlation)))
+    largest = np.nan_to_num(others).max(axis=0)[known]
+    return sorted(known[np.argsort(-largest, kind="stable")[:MAX_PAIRED]].tolist())
+
+
+def _distinct(numbers: Array) -> list[str]:
+    """Write two numbers with so many digits that they differ."""
+    spread = float(np.ptp(numbers)) or 1.0
+    largest = float(np.abs(numbers).max()) or 1.0
+    digits = int(np.clip(np.ceil(np.log10(largest / spread)) + 2, 2, 9))
+    return [format_number(float(number), digits) for number in numbers]
+
+
+def _share_note(shown: int, count: int) -> str:
+    """Say that only some parameters are shown."""
+    return f" Shown: {shown} of {count} parameters, those with the largest correlations."

@@ -1,0 +1,808 @@
+"""Pictures of checks, comparisons, studies of robots, and campaigns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mjfim.arrays import NORMAL_95, Array
+from mjfim.output.campaign_parameters import CampaignParameters
+from mjfim.output.correlation_colours import SCALE_IN_WORDS, colour_strength
+from mjfim.output.distributions import normal_density
+from mjfim.output.panels import (
+    Axis,
+    Cells,
+    Mark,
+    Panel,
+    Picture,
+    around,
+    bars,
+    dots,
+    hline,
+    hspan,
+    intervals,
+    line,
+    mark,
+    row_axis,
+    vline,
+    vspan,
+    words,
+)
+from mjfim.output.plots.estimate_studies import pairs
+from mjfim.output.plots.words import (
+    as_sentence,
+    format_number,
+    format_percent,
+    format_with_uncertainty,
+    quotient_unit,
+    shorten,
+    squared_unit,
+    without_zeros,
+)
+from mjfim.output.summaries.accuracy import BEST_CASE
+from mjfim.output.summaries.comparison import budget_in_words
+from mjfim.output.vocabulary import (
+    DESIGNED,
+    IDENTIFIED,
+    INITIAL,
+    MEASURED,
+    NOMINAL,
+    OTHER,
+    TRAJECTORY_TERMS,
+)
+from mjfim.records.campaign import Campaign
+from mjfim.records.check import CONFOUNDED_CORRELATION, Check
+from mjfim.records.comparison import DESIGN, Comparison, MethodResult
+from mjfim.records.labels import Labels, with_unit
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.robots import RobotComparison
+from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
+
+# Largest numbers of parameters of a Monte Carlo study, of two robots and of a campaign; of more,
+# those that say most are drawn.
+MAX_STUDIED, MAX_DIFFERENCES, MAX_ROUNDS = 30, 40, 8
+
+# Largest numbers of parameters for which correlations, and ratios, are written into the cells.
+MAX_CORRELATIONS, MAX_RATIOS = 8, 12
+
+# Number of rows up to which rows are high, and characters of a title above which what stands in
+# brackets is left out.
+MAX_HIGH_ROWS, MAX_TITLE = 12, 260
+
+# Ratio of standard deviations to the design's at which the colours of the cells end, and ratios at
+# the bar of colours.
+LARGEST_RATIO, RATIOS = 3.0, (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
+
+# Distance from the quartiles beyond which estimates are outliers, over the distance between the
+# quartiles, and reach of the bound that a histogram shows [standard deviations].
+OUTLIER_DISTANCE, SHOWN_STDS = 4.0, 4.0
+
+# Largest error, smallest margin and largest difference on their axes; what lies beyond is drawn
+# there.
+LARGEST_ERROR, LEAST_MARGIN, LARGEST_DIFFERENCE = 5.0, -1.0, 6.0
+
+
+# ---- checks
+
+
+def check(result: Check) -> Picture:
+    """Show predicted and wanted relative standard deviations, and correlations of the estimates."""
+    rows = [row for row in result.rows if not row.nuisance]
+    combined = result.combined
+    shares = [c.std_final / abs(c.value) if c.value else np.nan for c in combined]
+    percent = 100.0 * np.array([*(row.relative for row in rows), *shares])
+    wanted = 100.0 * np.array([row.wanted / row.size for row in rows])
+    places = np.arange(float(len(percent)))
+    known = np.isfinite(percent) & (percent > 0.0)
+    is_alone = np.array([np.isfinite(row.std) for row in rows] + [True] * len(combined))
+    is_single = places < len(rows)
+    low, high = around(np.concatenate([percent[known], wanted]), factor=3.0)
+
+    role = source_role(result)
+    label = f"predicted σ, {result.source} ({duration(result)})"
+    kinds: list[tuple[NDArray[np.bool_], dict[str, Any]]] = [
+        (known & is_single, {"label": label}),
+        (known & ~is_single, {"opacity": 0.45, "label": "identifiable combination"}),
+    ]
+    begin = np.full(len(places), low)
+    marks = [
+        bars(percent[chosen], places[chosen], role, left=begin[chosen], **look)
+        for chosen, look in kinds
+        if chosen.any()
+    ]
+    if not is_alone.all():
+        end = np.full(len(places), high)[~is_alone]
+        look = {"hollow": True, "label": "not identifiable alone"}
+        marks.append(bars(end, places[~is_alone], "muted", left=begin[~is_alone], **look))
+
+    # A light mark below the dark one can be seen on a bar.
+    at = {"symbol": "|", "size": 10.0}
+    marks += [
+        dots(wanted, places[: len(rows)], "white", width=3.2, **at),
+        dots(wanted, places[: len(rows)], "text", width=1.6, label="wanted σ", **at),
+    ]
+    texts = [format_percent(value / 100.0) if np.isfinite(value) else "" for value in percent]
+    names = [row.name for row in rows] + [each.expression for each in combined]
+    axis = Axis(
+        label="predicted σ, relative to the size of the parameter [%]",
+        log=True,
+        limits=(low, high),
+    )
+    panels = [Panel(marks=marks, x=axis, y=row_axis(names), beside=[("", role, texts)])]
+
+    note = BEST_CASE
+    count = len(result.wanted)
+    has_correlations = bool(np.isfinite(result.correlation).any()) and count > 1
+    if has_correlations:
+        panels.append(_correlations(result, len(names)))
+    elif count > 1:
+        note = f"No parameter is identifiable alone, so there are no correlations. {note}"
+    verdict = result.verdict[0] if result.verdict else "all parameters are identifiable"
+    title = verdict.replace("`", "").removesuffix(".")
+    if len(title) > MAX_TITLE:
+        title = re.sub(r" \([^()]*\)", "", title)
+    return Picture(
+        title=as_sentence(title),
+        panels=panels,
+        note=note,
+        heights=[1.8 + (0.3 if len(names) <= MAX_STUDIED else 0.16) * len(names)],
+        widths=[1.15, 1.0] if has_correlations else [1.0],
+    )
+
+
+def source_role(result: Check) -> str:
+    """Return the role of the motion that was checked."""
+    if "recording" in result.source:
+        return MEASURED.word
+    return DESIGNED.word if "design" in result.source else INITIAL.word
+
+
+def duration(result: Check) -> str:
+    """Return the duration of the motion that was checked, with its unit."""
+    return f"{without_zeros(format_number(result.horizon))} s"
+
+
+def _correlations(result: Check, rows: int) -> Panel:
+    """Return the correlation matrix of the estimates as cells, beside rows of bars."""
+    correlation = np.array(result.correlation)
+    count = len(correlation)
+    np.fill_diagonal(correlation, np.where(np.isfinite(np.diagonal(correlation)), 0.0, np.nan))
+    confounded = np.abs(correlation) > CONFOUNDED_CORRELATION
+    texts: list[list[str]] = []
+    marks = []
+    if count <= MAX_CORRELATIONS:
+        texts = [
+            [
+                f"{value:+.2f}".replace("-", "−") if value and np.isfinite(value) else ""
+                for value in row
+            ]
+            for row in correlation
+        ]
+    else:
+        up, across = np.nonzero(confounded)
+        marks = [dots(across, up, "white", size=3.0)]
+    sign = "bold" if texts else "dot"
+    remark = (
+        f"correlation (red: positive, blue: negative); {SCALE_IN_WORDS}; {sign}: beyond "
+        f"±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
+    )
+    if np.isnan(correlation).any():
+        remark += "; grey: not identifiable alone"
+    cells = Cells(values=colour_strength(correlation), texts=texts, is_bold=confounded)
+    return Panel(
+        cells=cells,
+        marks=marks,
+        x=Axis(ticks=range(count), names=result.wanted),
+        y=Axis(ticks=[], limits=(rows - 0.5, -0.5)),
+        remark=remark,
+        place=(0, 1),
+    )
+
+
+def check_pairs(result: Check) -> Picture:
+    """Show the predicted joint uncertainty of the estimates of every pair of parameters."""
+    rows = [row for row in result.rows if not row.nuisance]
+    std = np.array([row.std if np.isfinite(row.std) else np.nan for row in rows])
+    return pairs(
+        [row.name for row in rows],
+        [row.unit for row in rows],
+        np.array([row.value for row in rows]),
+        result.correlation * np.outer(std, std),
+        source_role(result),
+        title=f"Predicted joint uncertainty, {result.source} ({duration(result)})",
+        note=BEST_CASE,
+    )
+
+
+# ---- comparison of methods
+
+
+def compare(comparison: Comparison) -> Picture:
+    """Show standard deviations over the design's (cells), and the worst combination (bars)."""
+    rows = sorted(
+        comparison.rows, key=lambda row: (not row.sound, np.nan_to_num(row.cost, nan=np.inf))
+    )
+    roles = [_method_role(comparison, row) for row in rows]
+    names = [comparison.parameters[j] for j in comparison.wanted]
+    methods = row_axis(
+        [row.title for row in rows],
+        [role if row.sound else "muted" for role, row in zip(roles, rows, strict=True)],
+    )
+    verdict = comparison.verdict or ("The design compared with other methods",)
+    has_margins = any(row.tightest[0] for row in rows)
+    note = (
+        f"{' '.join(verdict[1:])} Each method had {budget_in_words(comparison)}. "
+        "Predicted standard deviations are the best case. Sorted by the cost J, best first. "
+    )
+    if has_margins:
+        note += (
+            "Beside σ: the smallest margin of all limits, as a share of half of the limit's range, "
+            "and its kind; negative: the limit is violated."
+        )
+    else:
+        note += (
+            "Beside σ: J, which also weighs the effort of the control: without limits, more effort "
+            "buys a smaller σ."
+        )
+    return Picture(
+        title=verdict[0].removesuffix("."),
+        panels=[
+            _ratios(comparison, rows, names, methods),
+            _worst_combinations(comparison, rows, roles, has_margins=has_margins),
+        ],
+        note=note.strip(),
+        heights=[float(np.clip(1.2 + 0.36 * len(rows), 2.2, 11.0))],
+        widths=[float(np.clip(0.55 * len(names), 2.2, 9.0)), 3.6],
+    )
+
+
+def _method_role(comparison: Comparison, row: MethodResult) -> str:
+    """Return the role of a method."""
+    if row.method == DESIGN:
+        return DESIGNED.word
+    return OTHER.word if row in comparison.beating else INITIAL.word
+
+
+def _ratios(
+    comparison: Comparison, rows: Sequence[MethodResult], names: list[str], methods: Axis
+) -> Panel:
+    """Return standard deviations over the design's, or over the scales if the design has none."""
+    wanted = list(comparison.wanted)
+    std = np.array([row.std[wanted] for row in rows]).reshape(len(rows), len(wanted))
+    design = comparison.design
+    reference, title = comparison.scale[wanted], "σ of each parameter / its scale"
+    against_design = design is not None and bool(np.isfinite(design.std[wanted]).any())
+    if design is not None and against_design:
+        reference, title = design.std[wanted], "σ of each parameter / σ of the design"
+    ratios = std / reference
+    logarithms = np.log(np.where(np.isfinite(ratios), ratios, np.nan))
+    if np.isnan(logarithms).all():
+        return Panel(message="no parameter is identifiable alone", y=methods)
+
+    # White is the design's standard deviation; without one, it is the mean of what is shown.
+    middle, reach = 0.0, float(np.log(LARGEST_RATIO))
+    if not against_design:
+        middle = float(np.nanmean(logarithms))
+        reach = max(2.0 * float(np.nanstd(logarithms)), 0.1)
+    look: dict[str, Any] = {
+        "texts": [
+            [format_number(float(ratio)) if np.isfinite(ratio) else "–" for ratio in row]
+            for row in ratios
+        ]
+    }
+    if len(names) > MAX_RATIOS:
+        marked = [ratio for ratio in RATIOS if abs(np.log(ratio) - middle) <= reach]
+        look = {"scale": (np.log(marked).tolist(), [f"{ratio:g}" for ratio in marked])}
+    return Panel(
+        title=title,
+        cells=Cells(values=logarithms, middle=middle, reach=reach, **look),
+        x=Axis(ticks=range(len(names)), names=names),
+        y=methods,
+    )
+
+
+def _worst_combinations(
+    comparison: Comparison, rows: Sequence[MethodResult], roles: Sequence[str], *, has_margins: bool
+) -> Panel:
+    """Return the relative σ of the worst combination by method, with its tightest limit."""
+    title = "σ of the worst combination"
+    worst = np.array([row.worst_relative_std for row in rows])
+    known = np.isfinite(worst)
+    places = Axis(ticks=[], limits=(len(rows) - 0.5, -0.5))
+    if not known.any():
+        return Panel(
+            title=title, message="no method found a usable control", y=places, place=(0, 1)
+        )
+    high, low = float(worst[known].max()), 0.0
+    axis = Axis(label="σ / scale [–]", limits=(0.0, 1.7 * high), most=5)
+    if high > 8.0 * worst[known].min():
+        low = 0.5 * float(worst[known].min())
+        room = (high / low) ** (0.75 if has_margins else 0.45)
+        axis = Axis(label=axis.label, limits=(low, high * room), log=True)
+
+    labels = {
+        DESIGNED.word: "design",
+        INITIAL.word: "baseline",
+        OTHER.word: "baseline that beats the design",
+    }
+    marks: list[Mark] = []
+    for place, (row, role) in enumerate(zip(rows, roles, strict=True)):
+        if not known[place]:
+            marks.append(words([low], [place], [row.outcome.value], "muted"))
+            continue
+        look: dict[str, Any] = {"label": labels[role]}
+        if not row.sound:
+            role, look = "muted", {"hollow": True, "label": "not usable"}
+        kind, margin = row.tightest
+        text = f"J {format_number(row.cost)}"
+        if kind and np.isfinite(margin):
+            text = f"{format_percent(margin)} {kind.replace('_', ' ')}"
+        end = [row.worst_relative_std]
+        marks += [
+            bars(end, [place], role, left=[low], **look),
+            words(end, [place], [f"{format_number(end[0])}   {text}"], "text"),
+        ]
+    return Panel(title=title, marks=marks, x=axis, y=places, place=(0, 1))
+
+
+# ---- Monte Carlo studies
+
+
+def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
+    """Show scatter, Cramér-Rao bound and efficiency of every parameter along each trajectory."""
+    labels.check(parameters=len(study.theta))
+    smallest = np.min([trials.efficiency for trials in study.sets.values()], axis=0)
+    order = np.argsort(np.nan_to_num(smallest, nan=np.inf), kind="stable")
+    shown = np.sort(order[:MAX_STUDIED])
+
+    # Standard deviations over the least one of the first trajectory.
+    first = next(iter(study.sets.values()))
+    least, seen = (np.sqrt(np.diagonal(matrix)[shown]) for matrix in (first.crlb, first.covariance))
+    size = np.where(np.isfinite(least), least, seen)
+    size = np.where(size > 0.0, size, np.nan)
+    scatter: list[Mark] = []
+    efficiency = [vline(1.0, dash="--")]
+    shifts = 0.3 * (np.arange(len(study.sets)) - 0.5 * (len(study.sets) - 1))
+    for shift, (key, trials) in zip(shifts, study.sets.items(), strict=True):
+        word, role = _trajectory(key)
+        rows = np.arange(len(shown)) + shift
+        observed = np.sqrt(np.diagonal(trials.covariance)[shown]) / size
+        bound = np.sqrt(np.diagonal(trials.crlb)[shown]) / size
+        bound = np.where(np.isfinite(bound), bound, np.nan)
+        tick = {"symbol": "|", "size": 10.0, "width": 1.4}
+        low, high = trials.efficiency_interval[shown].T
+        scatter += [
+            dots(observed, rows, role, size=4.5, label=f"{word}: estimates"),
+            dots(bound, rows, "text", label="Cramér–Rao bound", **tick),
+        ]
+        efficiency += [
+            line(np.column_stack([low, high, high * np.nan]).ravel(), np.repeat(rows, 3), role),
+            dots(trials.efficiency[shown], rows, role, size=4.5),
+        ]
+    names = [labels.parameter(int(j)) for j in shown]
+    label = f"standard deviation / bound of the {_trajectory(next(iter(study.sets)))[0]} trajectory"
+    note = (
+        f"Simulated recordings of the model with noise of the stated σ, at {study.measure_rate:g} "
+        "Hz. Efficiency with its 95 % interval; 1: the bound is reached."
+    )
+    if len(shown) < len(study.theta):
+        note += (
+            f" Shown: {len(shown)} of {len(study.theta)} parameters, those with the smallest "
+            "efficiency."
+        )
+    rows_only = Axis(ticks=[], limits=(len(shown) - 0.5, -0.5))
+    panels = [
+        Panel(marks=scatter, x=Axis(label=f"{label} [–]", log=True), y=row_axis(names)),
+        Panel(
+            marks=efficiency,
+            x=Axis(label="efficiency: bound / observed variance [–]"),
+            y=rows_only,
+            place=(0, 1),
+        ),
+    ]
+    return Picture(
+        title="Monte Carlo study against the Cramér–Rao bound",
+        panels=panels,
+        note=note,
+        heights=[0.9 + 0.36 * len(shown)],
+        widths=[1.3, 1.0],
+    )
+
+
+def _trajectory(key: str) -> tuple[str, str]:
+    """Return the word and the role of a trajectory of a study."""
+    term = TRAJECTORY_TERMS.get(key)
+    return (key, OTHER.word) if term is None else (term.word, term.word)
+
+
+def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Picture:
+    """Show the estimates of one parameter along each trajectory (the paper's figures 4 to 6)."""
+    labels.check(parameters=len(study.theta))
+    unit, label = labels.parameter_units[index], labels.parameter(index)
+    theta = float(study.theta[index])
+    true = f"true value {format_number(theta)} {unit}".rstrip()
+    axis = Axis(label=f"density [{quotient_unit('', unit)}]")
+    panels, overlay = [], []
+    for place, (key, trials) in enumerate(study.sets.items()):
+        word, role = _trajectory(key)
+        values = trials.estimates[:, index]
+        values = values[np.isfinite(values)]
+        if not len(values):
+            panels.append(Panel(title=word, message="no successful trials", place=(0, place)))
+            continue
+        std = float(np.sqrt(trials.crlb[index, index]))
+        low, high = _central_range(values, theta, std)
+        bins = int(np.clip(2.0 * np.sqrt(len(values)), 8, 60))
+        counts, edges = np.histogram(values, bins=bins, range=(low, high))
+        density = counts / (len(values) * np.diff(edges))
+        marks = [
+            mark("columns", edges, density, role, opacity=0.5, label=word),
+            vline(theta, dash="--", label=true),
+        ]
+        if np.isfinite(std) and std > 0.0:
+            x = np.linspace(low, high, 400)
+            bound = "normal curve of the Cramér–Rao bound"
+            marks.append(line(x, normal_density(x, theta, std), "text", width=1.4, label=bound))
+        hidden = int(np.sum((values < low) | (values > high)))
+        panels.append(
+            Panel(
+                title=word,
+                role=role,
+                remark=_statistics(trials, index, unit, hidden),
+                marks=marks,
+                x=Axis(label=label, limits=(low, high), most=5),
+                y=axis,
+                place=(0, place),
+            )
+        )
+        peak = max(float(density.max()), 1e-300)
+        overlay.append(mark("columns", edges, density / peak, role, opacity=0.5))
+    all_on_one = Panel(
+        title="all trajectories on one axis",
+        role="muted",
+        marks=[*overlay, vline(theta, dash="--")],
+        message="" if overlay else "no successful trials",
+        x=Axis(label=label),
+        y=Axis(label="density / peak [–]", limits=(0.0, 1.08)),
+        place=(1, 0),
+        is_wide=True,
+    )
+    note = (
+        "Simulated recordings of the model with noise of the stated σ. The upper panels have "
+        "different ranges."
+    )
+    return Picture(
+        title=f"Monte Carlo estimates of {labels.parameters[index]}",
+        panels=[*panels, all_on_one],
+        note=note,
+        heights=[3.2, 1.5],
+        widths=[1.0] * len(study.sets),
+    )
+
+
+def _central_range(values: Array, theta: float, std: float) -> tuple[float, float]:
+    """Return a range that shows most estimates and the true value; outliers do not widen it."""
+    first, median, third = (float(value) for value in np.quantile(values, (0.25, 0.5, 0.75)))
+    reach = OUTLIER_DISTANCE * (third - first)
+    low, high = max(float(values.min()), first - reach), min(float(values.max()), third + reach)
+
+    # A bound that is far wider than the estimates would hide them.
+    half = 0.5 * (high - low)
+    shown = SHOWN_STDS * std if np.isfinite(std) and (std < 20.0 * half or not half) else 0.0
+    low, high = min(low - 0.1 * half, theta - shown), max(high + 0.1 * half, theta + shown)
+
+    # Estimates that are all equal need some width around them.
+    smallest = 1e-9 * max(abs(median), abs(theta), 1e-9)
+    if high - low <= smallest:
+        return median - 1e3 * smallest, median + 1e3 * smallest
+    return low, high
+
+
+def _statistics(trials: TrialStatistics, index: int, unit: str, hidden: int) -> str:
+    """Return variance, bound, efficiency and counts of one histogram in words."""
+    variance, bound = (
+        f"{format_number(float(matrix[index, index]))} {squared_unit(unit)}".rstrip()
+        for matrix in (trials.covariance, trials.crlb)
+    )
+    low, high = (format_number(float(end)) for end in trials.efficiency_interval[index])
+    text = (
+        f"variance {variance}, bound {bound}; efficiency "
+        f"{format_number(float(trials.efficiency[index]))}, 95 % interval [{low}, {high}]; "
+        f"{trials.trials} trials, {trials.failed} failed"
+    )
+    return f"{text}, {hidden} outside this range" if hidden else text
+
+
+# ---- two robots
+
+
+def robots(comparison: RobotComparison) -> Picture:
+    """Show the difference of every parameter of two robots with its interval."""
+    order = comparison.order[:MAX_DIFFERENCES].tolist()
+    size = np.where(comparison.detectable > 0.0, comparison.detectable, np.nan)[order]
+    ends = np.column_stack([comparison.difference, comparison.interval])[order]
+    centre, low, high = np.nan_to_num(ends / size[:, None]).T
+    largest = max(np.abs(each).max(initial=1.3) for each in (centre, low, high))
+    reach = 1.08 * min(float(largest), LARGEST_DIFFERENCE)
+    rows = np.arange(float(len(order)))
+    is_changed = np.array([j in comparison.changed for j in order], dtype=bool)
+    marks = [vspan(-1.0, 1.0, opacity=0.6, label="would hardly be found"), vline(0.0)]
+    for chosen, role, label in (
+        (is_changed, DESIGNED.word, "differs"),
+        (~is_changed, IDENTIFIED.word, "no difference found"),
+    ):
+        inside = chosen & (np.abs(centre) <= reach)
+        marks += [
+            intervals(low[chosen], high[chosen], rows[chosen], role, width=1.4),
+            dots(centre[inside], rows[inside], role, size=5.5, label=label),
+        ]
+    first, second = (shorten(name, 24) for name in comparison.names)
+    texts = [
+        " → ".join(
+            format_with_uncertainty(float(value), NORMAL_95 * float(std))
+            for value, std in zip(comparison.values[:, j], comparison.std[:, j], strict=True)
+        )
+        for j in order
+    ]
+    note = (
+        f"Numbers: {first} → {second}, each with half the width of its 95 % interval. A difference "
+        "outside the strip would be found with a probability of 80 % or more."
+    )
+    if len(order) < len(comparison.parameters):
+        note += (
+            f" Shown: {len(order)} of {len(comparison.parameters)} parameters, the most "
+            "significant ones."
+        )
+    if not comparison.is_reliable:
+        note += " One of the estimates is not reliable, or does not fit its recordings."
+
+    title = f"{second} and {first}: no difference found"
+    if comparison.changed:
+        names = [shorten(comparison.parameters[j], 26) for j in comparison.changed[:3]]
+        more = len(comparison.changed) - len(names)
+        others = f" and {more} more" if more else ""
+        title = f"{second} differs from {first} in {', '.join(names)}{others}"
+    elif comparison.differs:
+        title = f"{second} differs from {first}, but not in a single parameter"
+    labels = [with_unit(comparison.parameters[j], comparison.units[j]) for j in order]
+    panel = Panel(
+        marks=marks,
+        x=Axis(label="difference / difference that would be found [–]", limits=(-reach, reach)),
+        y=row_axis(labels, [DESIGNED.word if changed else "text" for changed in is_changed]),
+        beside=[("", "text", texts)],
+    )
+    row = 0.36 if len(order) <= MAX_HIGH_ROWS else 0.25
+    return Picture(title=title, panels=[panel], note=note, heights=[0.7 + row * len(order)])
+
+
+# ---- robots that differ from the model
+
+
+def playback(result: Robustness) -> Picture:
+    """Show the margins of every limit, the errors, the coverage, and errors of nominal values."""
+    has_limits = bool(result.limits)
+    column = int(has_limits)
+    panels = [_margins(result)] if has_limits else []
+    panels += [
+        _errors(result, column),
+        _coverage(result, column),
+        _before_and_after(result, column),
+    ]
+    conditions = result.conditions
+    control = "with the gains K(t)" if conditions.feedback else "open loop"
+    title = (
+        f"{result.runs} robots, every parameter {100 * conditions.wrong:g} % off, commands "
+        f"{1e3 * conditions.latency:g} ms late, {control}"
+    )
+    place = "Left: dots are robots. Right, from above:" if has_limits else "From above:"
+    note = (
+        f"{place} errors over the formal σ (shaded: 95 % range; red: outside); robots whose 95 % "
+        "interval holds the true value (dashed: required, shaded: expected); errors in percent of "
+        "the error of the nominal value."
+    )
+    if not has_limits:
+        note += " The experiment states no limits."
+    height = max(5.4, 1.0 + 0.22 * len(result.limits))
+    return Picture(
+        title=title,
+        panels=panels,
+        note=note,
+        heights=[0.4 * height, 0.25 * height, 0.35 * height],
+        widths=[1.0, 1.3] if has_limits else [1.0],
+    )
+
+
+def _margins(result: Robustness) -> Panel:
+    """Return a row per limit: margin of the design, and of every robot."""
+    percent = 100.0 * np.maximum(result.margins, LEAST_MARGIN)
+    low = min(-5.0, float(percent.min(initial=0.0)) - 5.0)
+    high = max(100.0, 100.0 * float(result.planned.max(initial=0.0)) + 5.0)
+    marks = [vspan(low, 0.0, DESIGNED.word, opacity=0.1)]
+    # The robots of a row are spread at random over its height, so that all dots are visible.
+    rng = np.random.default_rng(0)
+    for i in range(len(result.limits)):
+        role, label = MEASURED.word, "robots, all keep the limit"
+        if not result.kept[:, i].all():
+            role, label = DESIGNED.word, "robots, some exceed the limit"
+        rows = i + rng.uniform(-0.22, 0.22, result.runs)
+        look = {"size": 3.5, "opacity": 0.5, "label": label}
+        marks.append(dots(percent[:, i], rows, role, **look))
+    look = {"symbol": "|", "size": 14.0, "width": 1.6, "label": "planned"}
+    rows = np.arange(float(len(result.limits)))
+    marks.append(dots(100.0 * result.planned, rows, "text", **look))
+    names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in result.limits]
+    return Panel(
+        title=f"{result.all_kept} of {result.runs} robots keep all limits",
+        marks=marks,
+        x=Axis(label="margin over half of the range [%]", limits=(low, high)),
+        y=row_axis(names),
+        is_tall=True,
+    )
+
+
+def _errors(result: Robustness, column: int) -> Panel:
+    """Return the errors of all estimates in standard deviations."""
+    rng = np.random.default_rng(0)
+    z = np.clip(result.z, -LARGEST_ERROR, LARGEST_ERROR)
+    x = np.arange(z.shape[1]) + rng.uniform(-0.28, 0.28, z.shape)
+    inside = np.abs(z) <= NORMAL_95
+    reach = LARGEST_ERROR + 0.2
+    return Panel(
+        title="errors of the estimates",
+        marks=[
+            hspan(-NORMAL_95, NORMAL_95, opacity=0.8),
+            hline(0.0, "muted", width=0.8),
+            dots(x[inside], z[inside], IDENTIFIED.word, size=3.5, opacity=0.6),
+            dots(x[~inside], z[~inside], DESIGNED.word, size=3.5),
+        ],
+        x=Axis(ticks=[], limits=(-0.5, z.shape[1] - 0.5)),
+        y=Axis(label="(estimate − truth) / σ", limits=(-reach, reach)),
+        place=(0, column),
+    )
+
+
+def _coverage(result: Robustness, column: int) -> Panel:
+    """Return how often the interval of each unknown holds the true value."""
+    from scipy.stats import binom  # slow, and only this picture needs it
+
+    n = max(result.runs, 1)
+    share = 100.0 * result.inside / n
+    x = np.arange(float(len(share)))
+    low, high = (100.0 * k / n for k in binom.interval(CONFIDENCE, n, CONFIDENCE))
+    marks = [
+        hspan(low, high, opacity=0.8),
+        hline(100.0 * REQUIRED_COVERAGE, DESIGNED.word, dash="--"),
+        dots(x, share, IDENTIFIED.word, size=5.0),
+    ]
+    if len(share) <= MAX_HIGH_ROWS:
+        marks.append(words(x, share, [f"{value:.0f}" for value in share], "text"))
+    return Panel(
+        title="robots whose 95 % interval holds the true value",
+        marks=marks,
+        x=Axis(ticks=[], limits=(-0.5, len(share) - 0.5)),
+        y=Axis(
+            label="coverage [%]", limits=(min(85.0, float(share.min(initial=100.0)) - 3.0), 103.0)
+        ),
+        place=(1, column),
+    )
+
+
+def _before_and_after(result: Robustness, column: int) -> Panel:
+    """Return nominal, predicted and observed errors of each unknown."""
+    count = len(result.names)
+    x = np.arange(float(count))
+    percent = np.where(result.wrong > 0.0, result.wrong, np.nan) / 100.0
+    predicted, observed = result.predicted / percent, result.observed / percent
+    low = 0.6 * float(np.nanmin([predicted, observed], initial=100.0))
+    look = {"symbol": "_", "size": 18.0, "width": 1.8, "label": "σ predicted by the design"}
+    return Panel(
+        title="rms error and σ, over the error of the nominal value",
+        marks=[
+            dots(x, np.full(count, 100.0), NOMINAL.word, label=NOMINAL.word),
+            dots(x, predicted, "text", **look),
+            dots(x, observed, IDENTIFIED.word, label="estimates"),
+        ],
+        x=Axis(ticks=range(count), names=result.names, limits=(-0.5, count - 0.5)),
+        y=Axis(label="error [%]", log=True, limits=(low, 400.0)),
+        place=(2, column),
+    )
+
+
+# ---- campaigns
+
+
+def campaign(result: Campaign, parameters: CampaignParameters) -> Picture:
+    """Show standard deviation and estimate of each parameter over the rounds."""
+    has_target = np.isfinite(result.wanted)
+    shown = sorted(parameters.interest, key=lambda j: not has_target[j])[:MAX_ROUNDS]
+    numbers = np.array([float(r.number) for r in result.rounds])
+    limits = (0.5, float(numbers[-1]) + 0.5)
+    panels = []
+    for row, j in enumerate(shown):
+        name, unit = shorten(parameters.names[j], 18), parameters.units[j]
+        label = "round" if row == len(shown) - 1 else ""
+        axis = Axis(label=label, limits=limits, most=min(len(numbers), 8), whole=True)
+        guess = format_number(float(result.rounds[0].theta[j]), 4)
+        true = None if parameters.true is None else float(parameters.true[j])
+        panels += [
+            _accuracy_over_rounds(
+                result, numbers, j, title=with_unit(f"σ of {name}", unit), axis=axis, row=row
+            ),
+            _estimate_over_rounds(
+                result,
+                numbers,
+                j,
+                true,
+                title=f"{with_unit(name, unit)}, first design at {guess}",
+                axis=axis,
+                row=row,
+            ),
+        ]
+    count = len(numbers)
+    note = (
+        f"{as_sentence(result.status.value)} Bars, and the band of the last round: ± 1 and ± 2 "
+        "formal σ, which are the true accuracy only if the model and the noise are right."
+    )
+    heights = [1.75] * len(shown)
+    return Picture(
+        title=f"{count} {'round' if count == 1 else 'rounds'} of design, recording and estimate",
+        panels=panels,
+        note=note,
+        heights=heights,
+        widths=[1.0, 1.0],
+    )
+
+
+def _accuracy_over_rounds(
+    result: Campaign, numbers: Array, j: int, *, title: str, axis: Axis, row: int
+) -> Panel:
+    """Return predicted and formal standard deviations of parameter j."""
+    predicted = np.array([r.predicted[j] for r in result.rounds])
+    attained = np.array([r.attained[j] for r in result.rounds])
+    wanted = float(result.wanted[j])
+    low, high = around(np.concatenate([predicted, attained, [wanted]]), factor=1.5)
+    before, after = "predicted before the round", "estimated after the round, from all recordings"
+    marks = [
+        dots(numbers, predicted, DESIGNED.word, size=8.0, hollow=True, label=before),
+        line(numbers, attained, IDENTIFIED.word, symbol="o", front=3.0, label=after),
+    ]
+    if np.isfinite(wanted):
+        title += f", wanted {format_number(wanted, 2)}"
+        marks += [
+            hline(wanted, dash="--", label="wanted"),
+            hspan(low, wanted, "text", opacity=0.06),
+        ]
+    return Panel(
+        title=title, marks=marks, x=axis, y=Axis(log=True, limits=(low, high)), place=(row, 0)
+    )
+
+
+def _estimate_over_rounds(
+    result: Campaign,
+    numbers: Array,
+    j: int,
+    true: float | None,
+    *,
+    title: str,
+    axis: Axis,
+    row: int,
+) -> Panel:
+    """Return the estimates of parameter j, with the true value if it is known."""
+    theta = np.array([r.estimate.theta[j] for r in result.rounds])
+    std = np.array([r.attained[j] for r in result.rounds])
+    bar = np.where(np.isfinite(std), std, 0.0)
+    marks = [dots(numbers, theta, IDENTIFIED.word)]
+    for factor, width in ((1.0, 2.4), (2.0, 0.9)):
+        ends = np.column_stack(
+            [theta - factor * bar, theta + factor * bar, np.full(len(bar), np.nan)]
+        )
+        marks.append(line(np.repeat(numbers, 3), ends.ravel(), IDENTIFIED.word, width=width))
+        if np.isfinite(std[-1]):
+            marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED.word, opacity=0.07))
+    if true is not None:
+        marks.append(hline(true, label="true value"))
+    return Panel(title=title, marks=marks, x=axis, y=Axis(most=4), place=(row, 1))

@@ -1,0 +1,135 @@
+"""Numbers, units and names as pictures write them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Digits of a power of ten, raised.
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+# ---- units
+
+
+def quotient_unit(unit: str, divisor: str) -> str:
+    """Return the unit of a quotient: `quotient_unit("m", "kg")` is "m/kg".
+
+    Compound units are put in brackets.
+
+    Args:
+        unit: Unit of the numerator; may be empty.
+        divisor: Unit of the denominator; may be empty.
+    """
+    numerator = unit or "1"
+    if not divisor:
+        return numerator
+    return f"{bracketed_unit(numerator)}/{bracketed_unit(divisor)}"
+
+
+def bracketed_unit(unit: str) -> str:
+    """Return a unit that may be divided or raised as a whole.
+
+    Args:
+        unit: The unit.
+    """
+    compound = any(character in unit for character in " /·*^²³")
+    return f"({unit})" if compound else unit
+
+
+def squared_unit(unit: str) -> str:
+    """Return the unit of a variance: "kg" becomes "kg²".
+
+    Args:
+        unit: Unit of the quantity; may be empty.
+    """
+    return f"{bracketed_unit(unit)}²" if unit else ""
+
+
+# ---- numbers
+
+
+def format_number(value: float, digits: int = 3) -> str:
+    """Write a number with raised powers of ten: 0.874, 1.65×10⁴, ∞; a dash stands for NaN.
+
+    Args:
+        value: The number.
+        digits: Significant digits.
+    """
+    if np.isnan(value):
+        return "–"
+    if np.isinf(value):
+        return "∞" if value > 0 else "−∞"
+
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    power = int(exponent)
+
+    # Numbers of moderate size are written without a power of ten.
+    if value == 0.0 or -4 < power < max(4, digits):
+        shown_power = power if value else 0
+        decimals = max(digits - 1 - shown_power, 0)
+        return f"{value:.{decimals}f}".replace("-", "−")
+
+    raised = str(power).translate(SUPERSCRIPTS)
+    return f"{mantissa}×10{raised}".replace("-", "−")
+
+
+def without_zeros(text: str) -> str:
+    """Leave out zeros at the end of a decimal number: `0.05000` becomes `0.05`.
+
+    Args:
+        text: The number, as `format_number` writes it.
+    """
+    mantissa, times, power = text.partition("×")
+    if "." in mantissa:
+        mantissa = mantissa.rstrip("0").rstrip(".")
+    return mantissa + times + power
+
+
+def format_with_uncertainty(value: float, half_width: float) -> str:
+    """Write a value with as many digits as its uncertainty leaves: `0.994 ± 0.012`.
+
+    Args:
+        value: The value.
+        half_width: Half the width of its interval, in the unit of the value.
+    """
+    usable = bool(np.isfinite(half_width)) and half_width > 0.0
+    largest = max(abs(value), half_width)
+    if not usable or not 1e-3 <= largest < 1e5:
+        return f"{format_number(value, 4)} ± {format_number(half_width, 2)}"
+
+    # The uncertainty has two significant digits.
+    decimals = int(np.clip(1 - np.floor(np.log10(half_width)), 0, 8))
+    text = f"{value:.{decimals}f} ± {half_width:.{decimals}f}"
+    return text.replace("-", "−")
+
+
+def format_percent(value: float) -> str:
+    """Write a fraction as percent with two significant digits.
+
+    Args:
+        value: The fraction, 1 for 100 %.
+    """
+    if not np.isfinite(value):
+        return format_number(value)
+    return f"{format_number(100.0 * value, 2)} %"
+
+
+def shorten(text: str, width: int = 28) -> str:
+    """Shorten a long name; both of its ends stay, with an ellipsis between them.
+
+    Args:
+        text: The name.
+        width: Largest number of characters.
+    """
+    if len(text) <= width:
+        return text
+    kept = (width - 1) // 2
+    return f"{text[:kept]}…{text[-kept:]}"
+
+
+def as_sentence(text: str) -> str:
+    """Return a text with a capital first letter and a full stop.
+
+    Args:
+        text: The text, without a full stop.
+    """
+    return f"{text[:1].upper()}{text[1:]}."
