@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from mjfim.identification.report import _warnings_of_bounds, _warnings_of_search
 from mjfim.identification.starts import divergence_at_start
 from mjfim.identification.task import _start
 from mjfim.output.campaign_folder import accuracy_sentence
-from mjfim.output.summaries.robustness import MAX_MISSED_LIMITS, _limit_sentences
+from mjfim.output.pages.robots import MAX_MISSED_LIMITS, _limit_sentences
 from mjfim.records.campaign import missed_targets
 from mjfim.records.check import (
     Combination,
@@ -29,7 +30,7 @@ from mjfim.records.check import (
     SelfTest,
     groups_in_words,
 )
-from mjfim.studies.check import _Verdict
+from mjfim.studies.check_verdict import verdict_of_check
 
 # Longest message [characters].
 LONGEST_MESSAGE = 600
@@ -112,12 +113,15 @@ def test_the_verdict_of_a_check_is_short() -> None:
         "not_separable": (GROUP, SILENT),
         "not_excited": (GROUP, SILENT),
         "confounded": pairs,
-        "tested": SelfTest(roughness=None, recursion=0.0, slope=0.0),
+        "refused": (),
+        "violations": (),
+        "self_test": SelfTest(roughness=None, recursion=0.0, slope=0.0),
         "source": "the initial control",
         "missing": (),
     }
     for rows in (known, known[:1]):
-        sentences = list(_Verdict(rows=rows, **findings).sentences())
+        check: Any = SimpleNamespace(rows=rows, **findings)
+        sentences = list(verdict_of_check(check))
         assert max(map(len, sentences)) < LONGEST_MESSAGE
         assert sum(" more" in sentence for sentence in sentences) == 3
 

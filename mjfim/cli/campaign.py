@@ -64,7 +64,7 @@ def campaign(
     from mjfim.experiment.input_files import input_files
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.campaign_parameters import CampaignParameters
-    from mjfim.output.summaries.campaign import describe_campaign
+    from mjfim.output.pages.robots import campaign_page
     from mjfim.records.campaign import CampaignStatus
 
     task = DesignTask.resolve(with_target_accuracies(stated, wanted), threads=run.threads)
@@ -93,7 +93,7 @@ def campaign(
         found = lab.campaign(measure, workers)
 
     parameters = CampaignParameters.stated(task.parameters, simulated=simulated)
-    print_result(False, {}, describe_campaign(found, parameters), verbose=run.verbose)
+    print_result(False, {}, campaign_page(found, parameters), verbose=run.verbose)
     with writing(run.output):
         remarks = folder.write_campaign(found, simulated=simulated)
     for remark in remarks:

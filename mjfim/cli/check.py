@@ -34,7 +34,7 @@ def check(
     from mjfim.experiment.system import System
     from mjfim.output import archive
     from mjfim.output.folders import CHECK_FILES
-    from mjfim.output.presentation import describe
+    from mjfim.output.pages import page_of
     from mjfim.recordings.read import read_recording, recording_paths
 
     system = System.resolve(stated, threads=run.threads)
@@ -54,5 +54,5 @@ def check(
     if has_folder:
         run.finish(result, system)
     else:
-        run.print(result.summary(), describe(result))
+        run.print(result.summary(), page_of(result))
     raise typer.Exit(0 if result.ok else 1)

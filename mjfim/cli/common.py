@@ -33,10 +33,10 @@ from mjfim.errors import (
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
 from mjfim.output.optional_files import write_optional
+from mjfim.output.page import Page
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.report import OWN_REPORTS, REPORT, is_report
-from mjfim.output.summary_parts import Summary
-from mjfim.output.text import render
+from mjfim.output.report import REPORT
+from mjfim.output.terminal import render
 from mjfim.output.video.video import NoVideoError, require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
@@ -232,15 +232,15 @@ class Run:
         if pool.has_lost_worker:
             say_from_program(LOST_SENTENCE)
 
-    def print(self, values: Mapping[str, object], summary: Summary, verdict: str = "") -> None:
+    def print(self, values: Mapping[str, object], page: Page, verdict: str = "") -> None:
         """Print a result on stdout.
 
         Args:
             values: Contents of its JSON file.
-            summary: Its words and tables.
+            page: Its words and tables.
             verdict: Sentence for those who do not read the result on their terminal.
         """
-        print_result(self.as_json, values, summary, verbose=self.verbose)
+        print_result(self.as_json, values, page, verbose=self.verbose)
         if verdict and (self.as_json or not out.is_terminal):
             say_from_program(verdict)
 
@@ -278,15 +278,15 @@ class Run:
     ) -> None:
         """Print a result and write its files; see `print` and `write`."""
         from mjfim.output.archive import summary_with_origin
-        from mjfim.output.presentation import describe
+        from mjfim.output.pages import page_of
 
         values = {**summary_with_origin(result, system, self.output), **further}
-        self.print(values, describe(result), verdict)
+        self.print(values, page_of(result), verdict)
         self.write(result, system, further, remark)
 
 
 def print_result(
-    as_json: bool, values: Mapping[str, object], summary: Summary, *, verbose: bool = False
+    as_json: bool, values: Mapping[str, object], page: Page, *, verbose: bool = False
 ) -> None:
     """Print a result on stdout, as JSON or in words and tables."""
     if as_json:
@@ -294,7 +294,7 @@ def print_result(
 
         typer.echo(json_of(values), nl=False)
     else:
-        out.print(render(summary, verbose=verbose))
+        out.print(render(page, verbose=verbose))
 
 
 # ---- files
@@ -307,13 +307,9 @@ def claim_folder(
     from mjfim.output.folders import check_folder
     from mjfim.output.manifest import OutputGuard, claimed
 
-    files = [folder / name for name in names]
-    # The pages of other results in the folder name this result, or give it their place.
-    if folder / REPORT in files:
-        files += [folder / name for name in OWN_REPORTS]
     check_folder(folder)
     guard = OutputGuard(inputs, force=force)
-    guard.check(files)
+    guard.check(folder / name for name in names)
     _claims.enter_context(claimed(folder, guard, exclusive=True))
 
 
@@ -386,9 +382,8 @@ def writing(folder: Path) -> Iterator[None]:
 
 def say_written(folder: Path, remark: str = "") -> None:
     """Say where the results are, and which page shows all of them."""
-    pages = [path for path in folder.iterdir() if is_report(path)]
-    newest = max(pages, key=lambda path: path.stat().st_mtime_ns, default=None)
-    say(f"wrote {folder}/{f'; see {newest}' if newest else ''}{remark}")
+    report = folder / REPORT
+    say(f"wrote {folder}/{f'; see {report}' if report.is_file() else ''}{remark}")
 
 
 # ---- verbs
@@ -535,13 +530,13 @@ def _say_what_is_there(folder: Path | None) -> None:
         say_from_program(NOTHING_SENTENCE)
         return
 
-    from mjfim.output.report.build import verbs_in  # takes a while to import
+    from mjfim.output.report.build import kinds_in  # takes a while to import
 
     sentence = (
         f"interrupted; {folder}/ holds only a part of the results, but each file in it is complete"
     )
     try:
-        has_result = bool(verbs_in(folder))
+        has_result = bool(kinds_in(folder))
     except RecordingError:
         has_result = False
     if has_result:

@@ -82,9 +82,9 @@ def identify(
     from mjfim.experiment.system import System
     from mjfim.output.archive import summary_with_origin
     from mjfim.output.folders import estimate_files, parts_of_identified
-    from mjfim.output.presentation import describe
+    from mjfim.output.pages import page_of
+    from mjfim.output.pages.files import log_section
     from mjfim.output.robot_samples import sample_files
-    from mjfim.output.summaries.logs import describe_logs
     from mjfim.recordings.read import read_log, recording_paths
 
     system = System.resolve(stated, threads=run.threads)
@@ -121,11 +121,11 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    summary = describe(result)
+    page = page_of(result)
     if run.verbose:
-        parts = describe_logs([log.summary for log in logs]).parts
-        summary = replace(summary, parts=(*summary.parts, *parts))
-    run.print(summary_with_origin(result, system, run.output), summary)
+        section = log_section([log.summary for log in logs])
+        page = replace(page, sections=[*page.sections, section])
+    run.print(summary_with_origin(result, system, run.output), page)
     run.write(result, system)
     if not_drawn:
         say(f"warning: --samples: no robots were drawn{not_drawn}")

@@ -31,7 +31,7 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List the parameters, outputs, actuators, keyframes, limits and terms of a model."""
-    from mjfim.output.summaries.inventory import describe_inventory
+    from mjfim.output.pages.files import inventory_page
     from mjfim.studies.inventory import list_model
 
     inventory = list_model(model)
@@ -47,7 +47,7 @@ def list_(
             )
 
     # Everything that was asked for is listed.
-    print_result(as_json, inventory.summary(), describe_inventory(inventory), verbose=True)
+    print_result(as_json, inventory.summary(), inventory_page(inventory), verbose=True)
 
 
 def _matches(name: str, pattern: str) -> bool:

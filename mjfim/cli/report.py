@@ -10,7 +10,7 @@ import typer
 from mjfim.cli.common import Force, Pictures, claim_file, keep_result, verb
 from mjfim.cli.progress import say
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.report import is_report
+from mjfim.output.report import REPORT
 
 
 @verb()
@@ -27,22 +27,22 @@ def report(
     pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
 ) -> None:
-    """Write the reports of a folder of results again, without computing anything anew."""
+    """Write the report of a folder of results again, without computing anything anew."""
     # The parts of a report take a while to import; other verbs need them only when they write.
     from mjfim.output.folders import missing_pictures, write_pictures
-    from mjfim.output.report.build import report_files, rewrite_reports
+    from mjfim.output.report.build import kinds_in, write_report
 
-    files = report_files(folder)
+    kinds_in(folder)
     drawn = missing_pictures(folder) if missing else {}
 
     # A picture that is older than its result is replaced, in whatever format it is.
     replaced = {folder / ending.file_of(name) for name in drawn for ending in PictureFormat}
-    present = [path for path in sorted(folder.iterdir()) if not is_report(path)]
+    present = [path for path in sorted(folder.iterdir()) if path.name != REPORT]
     inputs = [path for path in present if path not in replaced]
-    for file in (*files.values(), *(folder / pictures.file_of(name) for name in drawn)):
+    for file in (folder / REPORT, *(folder / pictures.file_of(name) for name in drawn)):
         claim_file(file, inputs, force=force)
 
     # From here on, files are there after Ctrl-C.
     keep_result(folder)
-    for file in (*rewrite_reports(folder), *write_pictures(folder, drawn, pictures)):
+    for file in (write_report(folder), *write_pictures(folder, drawn, pictures)):
         say(f"wrote {file}")

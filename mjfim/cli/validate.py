@@ -35,8 +35,8 @@ def validate(
         raise ExperimentError("validate needs an experiment file, or --schema")
     read = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.output.summaries.stated_experiment import describe_experiment
+    from mjfim.output.pages.files import experiment_page
     from mjfim.studies.inventory import stated_experiment
 
     stated = stated_experiment(read)
-    print_result(as_json, stated.summary(), describe_experiment(stated), verbose=verbose)
+    print_result(as_json, stated.summary(), experiment_page(stated), verbose=verbose)

@@ -222,7 +222,7 @@ class CampaignFolder:
             "true": parameters.true if simulated else None,
         }
         write_json(self.path / "campaign.json", values)
-        write_optional(REPORT, lambda: write_report(self.path, Campaign))
+        write_optional(REPORT, lambda: write_report(self.path))
         if campaign.estimate is None:
             return []
 

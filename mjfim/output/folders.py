@@ -16,7 +16,7 @@ from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.output import archive
 from mjfim.output import rerun as rerun_log
-from mjfim.output.drawing import begin_pictures, picture_contents
+from mjfim.output.drawing import begin_pictures
 from mjfim.output.models.mjcf import identified_files, write_identified
 from mjfim.output.optional_files import write_optional
 from mjfim.output.panels import Picture
@@ -29,7 +29,7 @@ from mjfim.output.plots.pictures import (
     pictures_of,
 )
 from mjfim.output.report import REPORT
-from mjfim.output.report.build import records_in, write_report
+from mjfim.output.report.build import Media, kinds_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
 from mjfim.output.video.video import report_video
 from mjfim.parallel.budget import current_interruption
@@ -242,13 +242,15 @@ def write_result(
         Sentences about models that could not be written completely.
     """
     # Another process draws the pictures, while this one writes the other files.
-    begin_pictures(record, picture_format)
+    drawn = begin_pictures(record, picture_format)
     if type(record) in STALE:
         clear(folder, STALE[type(record)])
     remarks = _write_data(folder, record, system, further)
 
-    write_optional(REPORT, lambda: write_report(folder, type(record), made=record))
-    _write_figures(folder, record, picture_format)
+    # A video of the robot belongs to the motion of an earlier design or estimate.
+    media = Media() if isinstance(record, Design | Estimate) else None
+    write_optional(REPORT, lambda: write_report(folder, record, media))
+    _write_figures(folder, record, picture_format, drawn)
     if system is not None and isinstance(record, Design | Estimate):
         log = f"{record.file_stem}.rrd"
         write_optional(log, lambda: _write_log(folder / log, record, system))
@@ -306,13 +308,18 @@ def _add_video(folder: Path, record: Design | Estimate, system: System) -> None:
         return  # who has pressed Ctrl-C does not wait for a video
     begin_stage("drawing the video of the report")
     video, sentence = report_video(system, record)
-    write_report(folder, type(record), video, sentence, made=record)
+    write_report(folder, record, Media(video, sentence))
 
 
-def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
+def _write_figures(
+    folder: Path,
+    record: ShownRecord,
+    picture_format: PictureFormat,
+    drawn: Callable[[], dict[str, bytes]],
+) -> None:
     """Write all pictures of a result, which another process may have drawn."""
     contents: dict[str, bytes] = {}
-    write_optional("the pictures", lambda: contents.update(picture_contents(record)))
+    write_optional("the pictures", lambda: contents.update(drawn()))
     if contents:
         writers = {name: partial(_write_content, content) for name, content in contents.items()}
         _write_picture_files(folder, writers, picture_format)
@@ -344,14 +351,13 @@ def missing_pictures(folder: Path) -> Pictures:
             drawn[path.stem] = max(drawn.get(path.stem, 0), path.stat().st_mtime_ns)
 
     # Pictures of two results may have the same name; the later result has written it.
-    records = [
-        ((folder / f"{record.file_stem}.npz").stat().st_mtime_ns, record)
-        for record in records_in(folder).values()
-    ]
+    written = {
+        kind: (folder / f"{kind.file_stem}.npz").stat().st_mtime_ns for kind in kinds_in(folder)
+    }
     wanted: dict[str, tuple[int, Callable[[], Picture]]] = {}
-    for written, record in sorted(records, key=lambda each: each[0]):
-        wanted.update({name: (written, draw) for name, draw in pictures_of(record).items()})
-    return {name: draw for name, (written, draw) in wanted.items() if drawn.get(name, 0) < written}
+    for kind, time in sorted(written.items(), key=lambda each: each[1]):
+        wanted |= {name: (time, draw) for name, draw in pictures_of(kind.load(folder)).items()}
+    return {name: draw for name, (time, draw) in wanted.items() if drawn.get(name, 0) < time}
 
 
 def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureFormat) -> list[Path]:

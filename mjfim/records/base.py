@@ -30,7 +30,7 @@ MAX_VALUE_LENGTH = 48
 MAX_ENTRIES = 4
 
 # Modules that show records as HTML, and that draw their figures.
-PRESENTATION = "mjfim.output.presentation"
+PRESENTATION = "mjfim.output.html"
 PICTURES = "mjfim.output.plots.pictures"
 
 T = TypeVar("T")

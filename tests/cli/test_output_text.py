@@ -12,9 +12,10 @@ import pytest
 
 from mjfim.cli.common import replace_unencodable_characters
 from mjfim.cli.progress import errors, out
-from mjfim.output.summary_parts import Row, Summary, SummaryTable, columns
-from mjfim.output.text import render
+from mjfim.output.page import Row, Table
+from mjfim.output.terminal import render
 from tests.support.cli import PROCESS, loads, misused, run, write_experiment
+from tests.support.pages import page_with
 from tests.support.paths import ROOT
 
 # Name that a terminal library would take for markup, a closing tag without a begin, and an emoji.
@@ -36,14 +37,10 @@ def test_brackets_in_the_path_of_results(study: Path, archived: Path, tmp_path: 
 
 def test_brackets_in_tables(capsys: pytest.CaptureFixture[str]) -> None:
     """Titles, headings, cells and notes of a table show brackets as they are."""
-    table = SummaryTable(
-        key="t",
-        title="title [/a]",
-        columns=columns("heading [b]"),
-        rows=(Row(cells=(NAME,)),),
-        note="note [/c]",
+    table = Table(
+        title="title [/a]", columns=("heading [b]",), rows=(Row((NAME,)),), note="note [/c]"
     )
-    out.print(render(Summary(title="", outcome="", parts=(table,))))
+    out.print(render(page_with(table)))
     printed = capsys.readouterr().out
     shown = ("title [/a]", "heading [b]", NAME, "note [/c]")
     assert [text for text in shown if text not in printed] == []

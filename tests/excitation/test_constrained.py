@@ -18,8 +18,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.signals import spline_basis
-from mjfim.output.summaries.design import describe_design
-from mjfim.output.summary_parts import Paragraph
+from mjfim.output.pages import page_of
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Design, HistoryRow, Status
 from mjfim.records.events import DesignEvent
@@ -31,6 +30,7 @@ from tests.support.numerics import (
     make_task,
     relative_error,
 )
+from tests.support.pages import sentences
 from tests.support.paths import MODELS
 
 
@@ -162,8 +162,7 @@ def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path
     assert slide.since == pytest.approx((np.flatnonzero(beyond > 0.0)[0] + 1) * step)
 
     # The summary and the JSON name joint, value and time.
-    parts = describe_design(design, task.system.units).parts
-    text = " ".join(part.text for part in parts if isinstance(part, Paragraph))
+    text = sentences(page_of(design))
     said = f"position of slide is {slide.value:.4g} m at {slide.t:.4g} s, above 0.5"
     assert said in text
     kinds = [entry["kind"] for entry in design.summary()["limits"]["initial"]]

@@ -23,9 +23,8 @@ from mjfim.excitation.violations import violations_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
 from mjfim.output.labels import complete_labels
+from mjfim.output.pages.files import experiment_page
 from mjfim.output.plots.design import limits as limits_picture
-from mjfim.output.summaries.stated_experiment import describe_experiment
-from mjfim.output.summary_parts import SummaryTable
 from mjfim.studies.inventory import stated_experiment
 from tests.support.limits import barrier_check
 from tests.support.numerics import Array, make_task
@@ -574,8 +573,8 @@ def test_a_quadrotor_flies_inside_its_box_speeds_and_tilt(tmp_path: Path) -> Non
 
 def test_a_file_that_is_validated_shows_every_limit_with_its_unit(tmp_path: Path) -> None:
     task = flight(tmp_path, limits={"velocity": 0.8, "tilt": "30 deg"})
-    parts = describe_experiment(stated_experiment(task.experiment)).parts
-    (table,) = [part for part in parts if isinstance(part, SummaryTable) and part.key == "limits"]
+    tables = experiment_page(stated_experiment(task.experiment)).tables
+    (table,) = [table for table in tables if table.title.startswith("Limits")]
     cells = {(row.cells[0], row.cells[1]): row.cells[-1] for row in table.rows}
     assert cells["velocity", "float"] == "m/s"
     assert cells["tilt", "float"] == "rad"

@@ -10,8 +10,7 @@ import pytest
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.output.report.build import page_of
-from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.output.pages import page_of
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording
 from tests.identification.test_inverse_dynamics import STATE, cart, cart_log
@@ -58,7 +57,6 @@ def test_it_is_saved_shown_and_drawn(estimate: Estimate, tmp_path: Path) -> None
     np.testing.assert_array_equal(first.equations[0].explained, second.equations[0].explained)
     assert loaded.summary()["inverse_dynamics"]["equations"][1]["name"] == "hinge"
 
-    assert "equations" in [table.key for table in describe_estimate(loaded).tables]
     assert "Equation of motion" in [section.title for section in page_of(loaded).sections]
     assert "inverse_dynamics" in loaded.pictures
     loaded.plot("inverse_dynamics", file=tmp_path / "forces.png")

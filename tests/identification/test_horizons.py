@@ -17,7 +17,7 @@ from mjfim.identification.horizons import _chosen
 from mjfim.identification.identify import DIVERGED
 from mjfim.identification.left_out import HeldOutLosses
 from mjfim.identification.search import FitSearch
-from mjfim.output.summaries.horizons import describe_horizons
+from mjfim.output.pages.estimate_parts import horizon_parts
 from mjfim.records.estimate import HorizonStudy
 from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT
@@ -165,7 +165,7 @@ def test_an_estimate_that_is_not_over_the_chosen_length_covers_it() -> None:
         "the fit over this length diverged."
     )
     assert unused.about_use in str(unused)
-    parts = describe_horizons(unused)
+    parts = horizon_parts(unused)
     assert any(unused.about_use == getattr(part, "text", "") for part in parts)
 
 

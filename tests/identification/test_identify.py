@@ -24,7 +24,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify, identify_system, least_squares, newton_raphson
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
-from mjfim.output.summaries.verdicts import verdict_of
+from mjfim.output.pages import page_of
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import FitEvent, stages_observed_by
 from mjfim.records.trajectory import Recording
@@ -437,4 +437,6 @@ def test_an_entry_of_a_vector_is_known_compared_with_the_whole_vector(tmp_path: 
     assert estimate.sizes[0] >= 0.4
     assert not estimate.sloppy
     assert not any("sloppy" in text for text in estimate.warnings)
-    assert re.search(r"every parameter is known to ± [\d.]+ % or better", verdict_of(estimate).text)
+    assert re.search(
+        r"every parameter is known to ± [\d.]+ % or better", page_of(estimate).verdict.text
+    )

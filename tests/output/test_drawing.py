@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import multiprocessing
 import os
 import pickle
@@ -15,23 +14,11 @@ import pytest
 
 from mjfim.errors import MjfimError
 from mjfim.output import drawing
-from mjfim.output.drawing import begin_pictures, drawing_elsewhere, picture_contents
+from mjfim.output.drawing import begin_pictures, drawing_elsewhere
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.draw import content
 from mjfim.output.plots.pictures import pictures_of
 from tests.support import results
-
-
-def test_without_another_process_nothing_is_begun() -> None:
-    record = results.check()
-    begin_pictures(record, PictureFormat.PNG)
-    assert picture_contents(record) == {}
-
-
-def test_a_single_processor_starts_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mjfim.parallel.cores", lambda: 1)
-    with drawing_elsewhere():
-        assert drawing._process.get() is None
 
 
 def test_a_picture_that_cannot_be_drawn_names_its_reason() -> None:
@@ -44,16 +31,13 @@ class FaultyPool:
     """A pool that fails at its second task, or whose second task fails."""
 
     def __init__(self, raised: Exception | None, failed: Exception | None) -> None:
-        self._raised = raised
-        self._failed = failed
-        self._tasks = 0
+        self._raised, self._failed, self._tasks = raised, failed, 0
 
     def submit(self, *_: Any) -> Future[Any]:
         """Submit a task."""
         self._tasks += 1
         if self._tasks > 1 and self._raised is not None:
             raise self._raised
-
         future: Future[Any] = Future()
         future.set_exception(self._failed)
         return future
@@ -62,71 +46,48 @@ class FaultyPool:
         """There is nothing to end."""
 
 
+def without_semaphores(count: int) -> Any:
+    """Some systems can start no process."""
+    raise OSError("no semaphores")
+
+
 @pytest.mark.parametrize(
-    ("raised", "failed"),
-    [(OSError("no memory"), None), (None, pickle.PicklingError("record"))],
+    ("cores", "pool"),
+    [
+        (1, None),
+        (2, without_semaphores),
+        (2, lambda _: FaultyPool(OSError("no memory"), None)),
+        (2, lambda _: FaultyPool(None, pickle.PicklingError("record"))),
+    ],
 )
-def test_a_process_that_fails_leaves_the_pictures_to_this_one(
-    raised: Exception | None,
-    failed: Exception | None,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+def test_without_another_process_or_if_it_fails_this_one_draws(
+    cores: int, pool: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The data of a result are written after its pictures are begun, so nothing is raised."""
-    monkeypatch.setattr("mjfim.parallel.cores", lambda: 2)
-    monkeypatch.setattr("mjfim.parallel.Pool", lambda count: FaultyPool(raised, failed))
-    record = results.check()
+    monkeypatch.setattr("mjfim.parallel.cores", lambda: cores)
+    monkeypatch.setattr("mjfim.parallel.Pool", pool)
     with drawing_elsewhere():
-        assert drawing._process.get() is not None
-        begin_pictures(record, PictureFormat.PNG)
-        with caplog.at_level(logging.INFO, "mjfim.output.drawing"):
-            assert picture_contents(record) == {}
-    assert ("PicklingError('record')" in caplog.text) == (failed is not None)
-
-
-@pytest.mark.parametrize("error", [ImportError, NotImplementedError, OSError])
-def test_a_computer_that_can_start_no_process_draws_here(
-    error: type[Exception], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Some systems have no shared semaphores."""
-
-    def fail(count: int) -> Any:
-        raise error("no semaphores")
-
-    monkeypatch.setattr("mjfim.parallel.cores", lambda: 2)
-    monkeypatch.setattr("mjfim.parallel.Pool", fail)
-    with drawing_elsewhere():
-        assert drawing._process.get() is None
+        assert begin_pictures(results.check(), PictureFormat.PNG)() == {}
 
 
 @pytest.mark.slow
 def test_another_process_draws_the_same_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mjfim.parallel.cores", lambda: 2)
     record, format_name = results.check(), PictureFormat.SVG
-
     # Processes of other tests may still be about to end.
     others = set(multiprocessing.active_children())
-
-    def children() -> set[multiprocessing.process.BaseProcess]:
-        """Processes that this test has started."""
-        return set(multiprocessing.active_children()) - others
-
     with drawing_elsewhere():
-        begin_pictures(record, format_name)
-        assert picture_contents(results.check()) == {}
-        found = picture_contents(record)
+        found = begin_pictures(record, format_name)()
     here = {name: content(draw(), format_name) for name, draw in pictures_of(record).items()}
     assert found == here
-
     # A process that is killed leaves the work to this one.
     with drawing_elsewhere():
-        (child,) = children()
+        (child,) = set(multiprocessing.active_children()) - others
         assert child.pid is not None
         os.kill(child.pid, signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
-        begin_pictures(record, format_name)
-        assert picture_contents(record) in ({}, here)
+        assert begin_pictures(record, format_name)() in ({}, here)
 
     deadline = time.monotonic() + 60.0
-    while children() and time.monotonic() < deadline:
+    while set(multiprocessing.active_children()) - others and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not children()
+    assert not set(multiprocessing.active_children()) - others

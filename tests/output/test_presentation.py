@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,24 +15,17 @@ from matplotlib.figure import Figure
 import mjfim
 from mjfim.errors import MjfimError
 from mjfim.output.folders import DESIGN_FILES, estimate_files, study_files, write_pictures
-from mjfim.output.html import render
+from mjfim.output.html import STYLES, template
 from mjfim.output.manifest import OutputGuard, claimed
+from mjfim.output.page import Emphasis, Listing, Row, Table, Text
+from mjfim.output.pages import page_of
 from mjfim.output.panels import Picture
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import Pictures
-from mjfim.output.presentation import describe
-from mjfim.output.summary_parts import (
-    Emphasis,
-    Listing,
-    Paragraph,
-    Row,
-    Summary,
-    SummaryTable,
-    columns,
-)
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import Design
 from mjfim.records.robustness import RobotConditions, Robustness
+from tests.support.pages import page_with
 from tests.support.paths import MODELS
 
 # A name that would change a page, if it were not escaped.
@@ -127,17 +119,11 @@ def texts(html: str) -> list[str]:
     return list(ElementTree.fromstring(html).itertext())
 
 
-def numbers_of(summary: Summary) -> Iterator[str]:
-    """Yield all cells of the tables of a summary."""
-    for table in summary.tables:
-        for row in table.rows:
-            yield from (str(cell) for cell in row.cells)
-
-
 def test_the_html_is_well_formed_and_has_all_cells(record: ShownRecord) -> None:
     html = record._repr_html_()
-    found = set(texts(html))
-    assert {cell for cell in numbers_of(describe(record)) if cell} <= found
+    cells = {cell for table in page_of(record).tables for row in table.rows for cell in row.cells}
+    shown = {text.replace("\N{NO-BREAK SPACE}", " ") for text in texts(html)}
+    assert cells - {""} <= shown
     assert "nan" not in html and "None" not in html
 
 
@@ -168,7 +154,7 @@ def test_an_unknown_figure_is_an_error_that_lists_the_names(design: Design) -> N
 
 def test_a_campaign_before_its_first_round_is_shown_in_words(campaign: mjfim.Campaign) -> None:
     begun = replace(campaign, rounds=())
-    assert "Campaign" in texts(begun._repr_html_())
+    assert "Campaign of designs and recordings" in texts(begun._repr_html_())
     assert begun.pictures == ()
     with pytest.raises(MjfimError, match="no results yet"):
         begun.plot()
@@ -205,48 +191,28 @@ def test_records_of_earlier_versions_are_drawn_without_names(
     assert texts(earlier._repr_html_())
 
 
-def test_names_and_sentences_are_escaped(design: Design) -> None:
-    labels = design.labels
-    assert labels is not None
-    names = (HOSTILE, *design.parameters[1:])
-    odd = replace(
-        design,
-        parameters=names,
-        labels=replace(labels, parameters=names, parameter_units=("<b>", "", "")),
-        warnings=(HOSTILE,),
-        found_by=HOSTILE,
-    )
-    html = odd._repr_html_()
-    assert "<script" not in html and "<b>" not in html
-    assert f"{HOSTILE} (<b>)" in texts(html)
-
-
-def test_every_part_of_a_summary_is_escaped() -> None:
-    table = SummaryTable(
-        key="k",
+def test_every_part_of_a_page_is_escaped() -> None:
+    table = Table(
         title=HOSTILE,
-        columns=columns(HOSTILE),
-        rows=(Row(cells=(HOSTILE,), emphasis=Emphasis.WARNING),),
+        columns=(HOSTILE,),
+        rows=(Row((HOSTILE,), Emphasis.WARNING),),
         note=HOSTILE,
     )
     parts = (
         table,
         replace(table, detail=True),
-        Paragraph(text=HOSTILE, emphasis=Emphasis.STRONG),
-        Listing(title=HOSTILE, items=(f"• {HOSTILE}\nsecond line",)),
+        Text(HOSTILE, Emphasis.STRONG),
+        Listing(HOSTILE, (f"{HOSTILE}\nsecond line",)),
+        Listing(HOSTILE, (HOSTILE,), code=True),
+        Text("use `a<b` or ` alone"),
     )
-    summary = Summary(title=HOSTILE, outcome=HOSTILE, parts=parts, warnings=(HOSTILE,))
-    html = render(summary)
+    page = replace(page_with(*parts, verdict=HOSTILE), kind=HOSTILE, warnings=(HOSTILE,))
+    html = template("notebook.html.j2").render(page=page, styles=STYLES)
     found = texts(html)
     assert "<script" not in html
-    assert found.count(HOSTILE) == 13
+    assert found.count(HOSTILE) == 14
     assert f"Warning: {HOSTILE}" in found
-    assert "second line" in found
-
-
-def test_words_in_backquotes_are_code() -> None:
-    summary = Summary(title="", outcome="", parts=(Paragraph(text="use `a<b` or ` alone"),))
-    assert "<p>use <code>a&lt;b</code> or ` alone</p>" in render(summary)
+    assert "<code>a&lt;b</code> or ` alone" in html
 
 
 # ---- what pictures of a fit need

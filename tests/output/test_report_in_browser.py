@@ -12,8 +12,7 @@ from typing import Any
 
 import pytest
 
-from mjfim.output.report.build import page_of
-from mjfim.output.report.render import rendered
+from mjfim.output.report.build import report_of
 from mjfim.output.vocabulary import DESIGNED
 from mjfim.records.base import ShownRecord
 from tests.support import results
@@ -102,7 +101,7 @@ def rgb_text(colour: str) -> str:
 def report_file(folder: Path, record: ShownRecord) -> Path:
     """Write a report."""
     path = folder / "report.html"
-    path.write_text(rendered(page_of(record), "made up"), encoding="utf-8")
+    path.write_text(report_of([record], ["made up"]), encoding="utf-8")
     return path
 
 

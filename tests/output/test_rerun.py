@@ -623,10 +623,10 @@ class TestDesign:
     def test_summary_holds_outcome_accuracy_warnings_and_starts(self, file: Path) -> None:
         text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
         assert "Stopped at its budget (max_iterations" in text
-        assert "| mass | 2 | 0.5 | 0.0312 | 1.6 % | ÷ 16.0 | 25 % |" in text
-        assert "Limits are violated: position" in text
+        assert "| mass | 2 | 0.5 | 25 % | 0.0312 | 1.6 % | ÷ 16.0 |" in text
+        assert "it violates limits (position)" in text
         assert "nearly confounded" in text
-        assert "Best of 2 starts: multisine 2" in text
+        assert "the best one: multisine 2" in text
         assert "a caller's" in text
 
     def test_phase_plots_share_one_scale(self, file: Path) -> None:

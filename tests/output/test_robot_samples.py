@@ -17,9 +17,9 @@ from mjfim.identification.parameter_draws import complete_theta, draw_parameters
 from mjfim.output import robot_samples
 from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
 from mjfim.output.models.mjcf import same_dynamics, write_identified
+from mjfim.output.page import Text
+from mjfim.output.pages.estimate_parts import sample_parts
 from mjfim.output.robot_samples import clear_samples, sample_files, write_samples
-from mjfim.output.summaries.samples import describe_samples
-from mjfim.output.summary_parts import Paragraph
 from mjfim.records.estimate import Estimate, PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
 from tests.support.paths import MODELS
@@ -165,5 +165,5 @@ def test_what_is_equal_in_all_robots_is_said(system: System) -> None:
 
 def texts(estimate: Estimate) -> str:
     """All sentences about the drawn robots."""
-    parts = describe_samples(estimate)
-    return " ".join(part.text for part in parts if isinstance(part, Paragraph))
+    parts = sample_parts(estimate)
+    return " ".join(part.text for part in parts if isinstance(part, Text))

@@ -16,16 +16,16 @@ from matplotlib.text import Text
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.output import archive
-from mjfim.output.presentation import describe
+from mjfim.output.page import number
+from mjfim.output.pages import page_of
+from mjfim.output.pages.accuracy import relative
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import write_report
-from mjfim.output.summaries.accuracy import relative
-from mjfim.output.summary_parts import Quantity
-from mjfim.output.text import render
 from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from tests.support.pages import printed
 from tests.support.paths import MODELS
 
 
@@ -58,7 +58,7 @@ def estimate(task: DesignTask, design: Design) -> Estimate:
 
 def in_terminal(record: ShownRecord) -> str:
     """The long form in a wide terminal."""
-    return "\n".join(line for line, _ in render(describe(record), verbose=True).lines(200))
+    return printed(page_of(record), verbose=True)
 
 
 def texts_of(figure: Figure) -> str:
@@ -84,11 +84,11 @@ def test_a_design_and_its_check_state_the_same_accuracy(
     task: DesignTask, design: Design, check: Check, tmp_path: Path
 ) -> None:
     archive.write_design(tmp_path, design, task.system)
-    write_report(tmp_path, Design)
+    write_report(tmp_path)
     stored = json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
     std = stored["final"]["std"]
-    sigmas = [str(Quantity(value=value)) for value in std]
-    shares = [str(relative(*pair)) for pair in zip(std, design.sizes.tolist(), strict=True)]
+    sigmas = [number(value) for value in std]
+    shares = [relative(*pair) for pair in zip(std, design.sizes.tolist(), strict=True)]
 
     report = (tmp_path / REPORT).read_text(encoding="utf-8")
     notebook = design._repr_html_()
@@ -105,7 +105,7 @@ def test_a_design_and_its_check_state_the_same_accuracy(
 def test_a_share_of_a_whole_vector_is_the_same_in_table_verdict_and_figure(design: Design) -> None:
     of_vectors = replace(design, sizes=10.0 * design.sizes)
     std = design.final.std.tolist()
-    shares = [str(relative(*pair)) for pair in zip(std, of_vectors.sizes.tolist(), strict=True)]
+    shares = [relative(*pair) for pair in zip(std, of_vectors.sizes.tolist(), strict=True)]
 
     for text in (in_terminal(of_vectors), texts_of(of_vectors.plot("standard_deviations"))):
         assert missing(shares, text) == []
@@ -117,8 +117,8 @@ def test_the_accuracy_of_an_entry_of_a_vector_is_a_share_of_the_whole(estimate: 
     of_vectors = replace(estimate, sizes=sizes)
     half = 0.5 * np.diff(estimate.interval, axis=1)[:, 0]
 
-    (share,) = re.findall(r"± (\S+ %)", describe(of_vectors).outcome)
-    assert share == str(relative(float((half / sizes).max()), 1.0))
+    (share,) = re.findall(r"± (\S+ %)", page_of(of_vectors).verdict.text)
+    assert share == relative(float((half / sizes).max()), 1.0)
 
     # The difference from the guess is a share of the same size.
     np.testing.assert_array_equal(of_vectors.guess_sizes[0], sizes[0])
@@ -129,18 +129,18 @@ def test_an_estimate_states_the_same_accuracy_everywhere(
     estimate: Estimate, tmp_path: Path
 ) -> None:
     estimate.save(tmp_path)
-    write_report(tmp_path, Estimate)
+    write_report(tmp_path)
     stored = json.loads((tmp_path / "estimate.json").read_text(encoding="utf-8"))
     honest = [0.25 * (high - low) for low, high in stored["interval"]]
-    sigmas = [str(Quantity(value=value, digits=2)) for value in (*honest, *stored["std"])]
+    sigmas = [number(value, 2) for value in (*honest, *stored["std"])]
 
     report = (tmp_path / REPORT).read_text(encoding="utf-8")
     for text in (in_terminal(estimate), estimate._repr_html_(), report):
         assert missing(sigmas, text) == []
 
     # The verdict is one sentence with one percentage.
-    verdict = describe(estimate).outcome
+    verdict = page_of(estimate).verdict.text
     (share,) = re.findall(r"± (\S+ %)", verdict)
     half = 2.0 * np.array(honest) / np.abs(stored["theta"])
-    assert share == str(relative(float(half.max()), 1.0))
+    assert share == relative(float(half.max()), 1.0)
     assert f"± {share}" in plain(report)

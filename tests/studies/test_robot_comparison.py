@@ -19,7 +19,8 @@ from mjfim.identification.independent_blocks import (
 )
 from mjfim.identification.recording_comparison import compare_evidence
 from mjfim.identification.robust_covariance import robust_uncertainty
-from mjfim.output.summaries.verdicts import Level, verdict_of
+from mjfim.output.page import Level
+from mjfim.output.pages import page_of
 from mjfim.records.estimate import PriorDirections
 from mjfim.records.robots import RobotComparison
 from mjfim.records.trajectory import Recording
@@ -81,7 +82,7 @@ def test_a_worn_joint_is_named() -> None:
     assert sentence.startswith("damping of friday is 40 % above that of monday: 0.21 ± 0.02 ag")
     assert "0.15 ± 0.02 N m s/rad, p = " in sentence
     assert str(found) == "There is a difference between monday and friday in damping."
-    assert verdict_of(found).level is Level.DOUBTFUL
+    assert page_of(found).verdict.level is Level.DOUBTFUL
 
     # The distance is 4.2 standard deviations; four tests are made.
     sigmas = 0.06 / np.hypot(0.01, 0.01)
@@ -101,7 +102,7 @@ def test_equal_robots_say_what_would_have_been_found() -> None:
     assert "no difference between A and B. A change of" in str(found)
     assert "% in mass" in str(found)
     assert "with 80 % power" in str(found)
-    assert verdict_of(found).level is Level.GOOD
+    assert page_of(found).verdict.level is Level.GOOD
 
     # 2.50 standard deviations for significance, and 0.84 for the power.
     expected = (student.isf(0.025 / 4, 1e6) + student.isf(0.2, 1e6)) * 0.02 * 2**0.5

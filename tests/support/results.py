@@ -297,7 +297,6 @@ def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> C
         "nuisance": (),
         "rows": rows,
         "seconds": 1.0,
-        "steps": np.inf,
         "seed": 0,
         "weighted": False,
     }

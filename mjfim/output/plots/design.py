@@ -17,6 +17,7 @@ from mjfim.output.limit_curves import (
     whole_percent,
     would_be_solid,
 )
+from mjfim.output.pages.accuracy import BEST_CASE, improvement, relative, size_sentence
 from mjfim.output.panels import (
     SERIES,
     Axis,
@@ -39,7 +40,6 @@ from mjfim.output.panels import (
 )
 from mjfim.output.plots.words import as_sentence, format_number, quotient_unit, shorten
 from mjfim.output.positions import shown_positions
-from mjfim.output.summaries.accuracy import BEST_CASE, improvement, relative, size_sentence
 from mjfim.output.vocabulary import DESIGNED, INITIAL
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.labels import Labels
@@ -115,7 +115,7 @@ def trajectories(design: Design, labels: Labels) -> Picture:
         )
     ]
     information = Panel(
-        title=r"$\sqrt{\lambda_{\min}}$ up to each time  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]",
+        title="√λ_min up to each time  [√s / unit of θ]",
         marks=[*_both(design, roots), *ends],
         x=Axis(label="time [s]"),
         y=Axis(label="information", most=4),
@@ -218,7 +218,7 @@ def convergence(design: Design) -> Picture:
     values = {
         "cost J [–]": np.array([row.cost for row in history], dtype=np.float64),
         "slope |DJ·ζ| [–]": np.abs([row.slope for row in history]),
-        r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]": np.array(
+        "λ_min  [s / (unit of θ)²]": np.array(
             [row.min_eigenvalue for row in history], dtype=np.float64
         ),
     }

@@ -13,6 +13,8 @@ from mjfim.arrays import NORMAL_95, Array
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.correlation_colours import SCALE_IN_WORDS, colour_strength
 from mjfim.output.distributions import normal_density
+from mjfim.output.pages.accuracy import BEST_CASE
+from mjfim.output.pages.studies import budget_in_words
 from mjfim.output.panels import (
     Axis,
     Cells,
@@ -43,8 +45,6 @@ from mjfim.output.plots.words import (
     squared_unit,
     without_zeros,
 )
-from mjfim.output.summaries.accuracy import BEST_CASE
-from mjfim.output.summaries.comparison import budget_in_words
 from mjfim.output.vocabulary import (
     DESIGNED,
     IDENTIFIED,

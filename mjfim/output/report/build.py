@@ -1,25 +1,28 @@
-"""The report of every kind of result, and the reports of a folder."""
+"""The report of a folder: one file that holds its style, its plots and the plotting library.
+
+The file makes no request to any network. All names and sentences are escaped, because they may come
+from files of others.
+"""
 
 from __future__ import annotations
 
+import base64
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import singledispatch
+from html import unescape
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
+from typing import NamedTuple
 
-from mjfim.errors import MjfimError, RecordingError, first_ones, listed
+from mjfim.errors import RecordingError, first_ones, listed
 from mjfim.files import read_json, replacing
-from mjfim.output.report import OWN_REPORTS, REPORT, own_report
-from mjfim.output.report.campaign import campaign_page
-from mjfim.output.report.check import check_page
-from mjfim.output.report.comparison import comparison_page
-from mjfim.output.report.design import design_page
-from mjfim.output.report.estimate import estimate_page
-from mjfim.output.report.monte_carlo import study_page
-from mjfim.output.report.page import Page
-from mjfim.output.report.render import is_page_of, no_video_in, rendered, video_in
-from mjfim.output.report.robot_comparison import robots_page
-from mjfim.output.report.robustness import robustness_page
+from mjfim.output.html import template
+from mjfim.output.page import Page, Plot, Text
+from mjfim.output.pages import page_of
+from mjfim.output.panels import Picture
+from mjfim.output.plots.pictures import pictures_of
+from mjfim.output.report import REPORT
+from mjfim.output.report.palette import palettes
+from mjfim.output.report.plotly import Group, group_of
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
@@ -31,217 +34,212 @@ from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
 
-# Kinds of results that have a report, by the verb, in the order of `VERBS`.
-KINDS: dict[str, type[ShownRecord]] = {
-    "campaign": Campaign,
-    "identify": Estimate,
-    "design": Design,
-    "compare": Comparison,
-    "compare-robots": RobotComparison,
-    "montecarlo": MonteCarloStudy,
-    "robustness": Robustness,
-    "check": Check,
-}
+# Results that have a report; of several in a folder, the first one stands at the top.
+KINDS: tuple[type[ShownRecord], ...] = (
+    Campaign,
+    Estimate,
+    Design,
+    Comparison,
+    RobotComparison,
+    MonteCarloStudy,
+    Robustness,
+    Check,
+)
 
 # Longest list of recordings among the facts [characters].
 MAX_RECORDINGS_TEXT = 60
 
+# Largest size of a report, and size of its tables and sentences [bytes].
+MAX_SIZE, TEXT_SIZE = 7_800_000, 250_000
 
-@dataclass(frozen=True, kw_only=True)
-class Media:
-    """The video of a page.
+# Largest size of a point of a curve in the file [bytes], and fewest and most points of a curve.
+POINT_SIZE, FEWEST_POINTS, MOST_POINTS = 22, 40, 4000
 
-    Attributes:
-        video: The video, or None.
-        no_video: Sentence that says why there is none; may be empty.
-    """
+# The video of a report, and the sentence that stands there instead; the template writes both.
+VIDEO = re.compile(
+    r'<(?:video|img) class="robot" width="(\d+)" height="(\d+)" [^>]*'
+    r'src="data:([\w/.+-]+);base64,([\w+/=]+)"'
+    r'.*?<p class="note">(.*?)</p>',
+    re.DOTALL,
+)
+NO_VIDEO = re.compile(r'<p class="note no-video">(.*?)</p>', re.DOTALL)
+
+
+class Result(NamedTuple):
+    """A result in a report: its words, what it is named after, and its plots by their names."""
+
+    page: Page
+    name: str
+    facts: Mapping[str, str]
+    groups: Mapping[str, Sequence[Group]]
+    said: set[str]
+
+
+class Media(NamedTuple):
+    """The video of a report, or why there is none."""
 
     video: Video | None = None
     no_video: str = ""
 
 
-@singledispatch
-def page_of(record: ShownRecord) -> Page:
-    """Return the report of a result.
-
-    Args:
-        record: The result of a verb.
+def kinds_in(folder: Path) -> list[type[ShownRecord]]:
+    """Return the kinds of the results that a folder holds, that of the main result first.
 
     Raises:
-        MjfimError: This kind of record has no report.
-    """
-    raise MjfimError(f"a {type(record).__name__} has no report")
-
-
-page_of.register(Design, design_page)
-page_of.register(Estimate, estimate_page)
-page_of.register(Check, check_page)
-page_of.register(MonteCarloStudy, study_page)
-page_of.register(Comparison, comparison_page)
-page_of.register(RobotComparison, robots_page)
-page_of.register(Robustness, robustness_page)
-page_of.register(Campaign, campaign_page)
-
-
-def verbs_in(folder: Path) -> list[str]:
-    """Return the verbs whose results a folder holds, that of the main result first.
-
-    Args:
-        folder: Folder of results.
-
-    Raises:
-        RecordingError: The folder holds no result that has a report.
+        RecordingError: There is no such folder, or it holds no result.
     """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: no such folder")
-
-    archives = {verb: folder / f"{kind.file_stem}.npz" for verb, kind in KINDS.items()}
-    found = [verb for verb, path in archives.items() if path.is_file()]
+    found = [kind for kind in KINDS if (folder / f"{kind.file_stem}.npz").is_file()]
     if not found:
-        names = listed([path.name for path in archives.values()])
+        names = listed([f"{kind.file_stem}.npz" for kind in KINDS])
         raise RecordingError(f"{folder}: holds no result; a report needs one of {names}")
     return found
 
 
-def report_files(folder: Path) -> dict[str, Path]:
-    """Return the page of every result of a folder, by its verb; the main result comes first.
-
-    Args:
-        folder: Folder of results.
-
-    Raises:
-        RecordingError: The folder holds no result that has a report.
-    """
-    main, *others = verbs_in(folder)
-    return {main: folder / REPORT, **{verb: folder / own_report(verb) for verb in others}}
-
-
-def write_report(
-    folder: Path,
-    kind: type[ShownRecord],
-    video: Video | None = None,
-    no_video: str = "",
-    *,
-    made: ShownRecord | None = None,
-) -> Path:
-    """Write the report of a result, as the files in its folder give it.
-
-    Pages of other results in the folder are written again, because they name this result, or give
-    it their place.
-
-    Args:
-        folder: Folder of results.
-        kind: Kind of the result.
-        video: A video of the robot, or None.
-        no_video: Sentence that says why there is no video; may be empty.
-        made: The result, where this process has just written it; its files are not read then.
-
-    Returns:
-        The file.
-
-    Raises:
-        RecordingError: The result cannot be read.
-    """
-    verb = next(verb for verb, other in KINDS.items() if other is kind)
-    records: dict[str, ShownRecord] = {}
-    for other in verbs_in(folder):
-        # A result of an earlier version, which cannot be read, keeps the page that it has.
-        try:
-            if other == verb and made is not None:
-                records[other] = made.as_saved()
-            else:
-                records[other] = KINDS[other].load(folder)
-        except RecordingError:
-            if other == verb:
-                raise
-
-    # The page of this result is the last one, so that it is the latest of the folder.
-    media = {verb: Media(video=video, no_video=no_video)}
-    records[verb] = records.pop(verb)
-    return _write_pages(folder, records, media)[-1]
-
-
-def rewrite_reports(folder: Path) -> list[Path]:
-    """Write all reports of a folder again; the videos of the present ones are kept.
-
-    Args:
-        folder: Folder of results.
-
-    Returns:
-        The files, that of the main result first.
-
-    Raises:
-        RecordingError: The folder holds no result that has a report, or one cannot be read.
-    """
-    return _write_pages(folder, records_in(folder), {})
-
-
-def records_in(folder: Path) -> dict[str, ShownRecord]:
-    """Read all results of a folder that have a report, by their verbs; the main one comes first.
-
-    Args:
-        folder: Folder of results.
-
-    Raises:
-        RecordingError: The folder holds no such result, or one cannot be read.
-    """
-    return {verb: KINDS[verb].load(folder) for verb in verbs_in(folder)}
-
-
-def _write_pages(
-    folder: Path, records: Mapping[str, ShownRecord], media: Mapping[str, Media]
-) -> list[Path]:
-    """Write the pages of several results of a folder.
+def write_report(folder: Path, made: ShownRecord | None = None, media: Media | None = None) -> Path:
+    """Write the report of a folder, as its files give it.
 
     Args:
         folder: The folder.
-        records: The results by their verbs.
-        media: Videos of pages that have a new one, by verb; others keep that of the present page.
+        made: A result that was just written; others are read. Default: all are read.
+        media: The video; default: that of the present report.
 
     Returns:
-        The files.
+        The report.
+
+    Raises:
+        RecordingError: A result cannot be read, or there is none.
     """
-    files = report_files(folder)
-    present = _present_pages(folder)
-    written = []
-    for verb, record in records.items():
-        page = page_of(record)
-        page = replace(page, facts={**_origin(folder, record), **page.facts})
-        found = media.get(verb) or _media_of(page, present)
-        others = {other: file.name for other, file in files.items() if other != verb}
-        name = _name(folder, record)
-        html = rendered(page, name, found.video, found.no_video, others=others)
-
-        with replacing(files[verb]) as temporary:
-            temporary.write_text(html, encoding="utf-8", newline="\n")
-        written.append(files[verb])
-    return written
-
-
-def _present_pages(folder: Path) -> list[str]:
-    """Read the reports that a folder holds already."""
-    files = [folder / name for name in (REPORT, *OWN_REPORTS)]
-    return [f.read_text(encoding="utf-8", errors="replace") for f in files if f.is_file()]
+    records = []
+    for kind in kinds_in(folder):
+        if isinstance(made, kind):
+            records.append(made.as_saved())
+            continue
+        # A result of an earlier version, which cannot be read, is left out beside a new one.
+        try:
+            records.append(kind.load(folder))
+        except RecordingError:
+            if made is None:
+                raise
+    file = folder / REPORT
+    names = [_name(folder, record) for record in records]
+    facts = [_origin(folder, record) for record in records]
+    html = report_of(records, names, facts, media or media_in(file))
+    with replacing(file) as temporary:
+        temporary.write_text(html, encoding="utf-8", newline="\n")
+    return file
 
 
-def _media_of(page: Page, present: Sequence[str]) -> Media:
-    """Return the video of the present page of a result, whatever the name of its file is."""
-    for html in present:
-        if is_page_of(html, page.kind):
-            return Media(video=video_in(html), no_video=no_video_in(html))
-    return Media()
+def report_of(
+    records: Sequence[ShownRecord],
+    names: Sequence[str] = (),
+    facts: Sequence[Mapping[str, str]] = (),
+    media: Media | None = None,
+) -> str:
+    """Return the report of some results as HTML.
+
+    Args:
+        records: The results, the main one first.
+        names: What each of them is named after.
+        facts: Further facts of each of them.
+        media: The video of the report.
+    """
+    # These libraries are slow to import, and only reports need them.
+    from jinja2.utils import htmlsafe_json_dumps
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    library, media = get_plotlyjs(), media or Media()
+    pages = [page_of(record) for record in records]
+    drawn = [_pictures(record, page) for record, page in zip(records, pages, strict=True)]
+    limit = _limit_of([each for some in drawn for each in some.values()], len(library), media)
+    results = [
+        Result(
+            page=page,
+            name=names[i] if names else "",
+            facts={**(facts[i] if facts else {}), **page.facts},
+            groups={
+                part: [group_of(each, limit) for each in some] for part, some in drawn[i].items()
+            },
+            said={part.text for part in page.parts if isinstance(part, Text)},
+        )
+        for i, page in enumerate(pages)
+    ]
+    plots = [
+        plot
+        for result in results
+        for some in result.groups.values()
+        for group in some
+        for plot in group.plots
+    ]
+    number_of = {id(plot): i for i, plot in enumerate(plots)}
+    data = {"palettes": palettes(), "panels": [plot.data for plot in plots]}
+    video = media.video
+    html: str = template("report.html.j2").render(
+        results=results,
+        video=video,
+        no_video=media.no_video,
+        encoded="" if video is None else base64.b64encode(video.data).decode("ascii"),
+        palettes=palettes(),
+        number_of=lambda plot: number_of[id(plot)],
+        data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
+        css=Markup(template("report.css").render()),
+        js=Markup(template("report.js").render()),
+        plotly=Markup(library),
+    )
+    return html
 
 
-# ---- what a report is named after
+def _pictures(record: ShownRecord, page: Page) -> dict[str, list[Picture]]:
+    """The pictures of a page, by their names in it."""
+    pictures = pictures_of(record)
+    return {
+        part.name: [
+            make() for name, make in pictures.items() if re.fullmatch(rf"{part.name}(_.*)?", name)
+        ]
+        for part in page.every_part
+        if isinstance(part, Plot)
+    }
+
+
+def _limit_of(pictures: Sequence[Sequence[Picture]], library: int, media: Media) -> int:
+    """How many points a curve may have, so that the file is small enough."""
+    taken = library + TEXT_SIZE
+    if media.video is not None:
+        taken += 4 * len(media.video.data) // 3
+    panels = [panel for some in pictures for picture in some for panel in picture.panels]
+    curves = sum(len(panel.marks) for panel in panels)
+    share = max(MAX_SIZE - taken, 0) // POINT_SIZE // max(curves, 1)
+    return min(max(share, FEWEST_POINTS), MOST_POINTS)
+
+
+def media_in(file: Path) -> Media:
+    """Return the video that a report embeds, or the sentence why it has none."""
+    html = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
+    sentence, found = NO_VIDEO.search(html), VIDEO.search(html)
+    if found is None:
+        return Media(no_video="" if sentence is None else unescape(sentence.group(1)))
+    width, height, media_type, content, caption = found.groups()
+    video = Video(
+        data=base64.b64decode(content),
+        media_type=media_type,
+        caption=unescape(caption),
+        width=int(width),
+        height=int(height),
+    )
+    return Media(video)
+
+
+# ---- what a result is named after
 
 
 def _stated(folder: Path, record: ShownRecord, key: str) -> str:
-    """Return the name of a file that the JSON file of a result names; empty where it does not."""
+    """The name of a file that the JSON file of a result names; empty where it does not."""
     try:
         stated = read_json(folder / f"{record.file_stem}.json").get(key)
     except RecordingError:
         return ""
-
     # The file may have been written on another system.
     if not isinstance(stated, str):
         return ""
@@ -249,7 +247,7 @@ def _stated(folder: Path, record: ShownRecord, key: str) -> str:
 
 
 def _origin(folder: Path, record: ShownRecord) -> dict[str, str]:
-    """Return the experiment, the model and the recordings of a result, as far as they are known."""
+    """The experiment, the model and the recordings of a result, as far as they are known."""
     found = {key: _stated(folder, record, key) for key in ("experiment", "model")}
     if isinstance(record, Estimate):
         names = [PurePath(recording.name).name for recording in record.recordings]
@@ -258,11 +256,10 @@ def _origin(folder: Path, record: ShownRecord) -> dict[str, str]:
 
 
 def _name(folder: Path, record: ShownRecord) -> str:
-    """Return what a report is named after: the experiment, else the recordings or the folder."""
+    """What a result is named after: the experiment, else the recordings or the folder."""
     experiment = _stated(folder, record, "experiment")
     if experiment:
         return PurePath(experiment).stem
-
     if isinstance(record, Estimate):
         return first_ones([PurePath(recording.name).name for recording in record.recordings])
     if isinstance(record, Comparison):

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from mjfim.output.correlation_colours import colour_strength
+from mjfim.output.panels import ROLES
 from mjfim.output.vocabulary import OTHER, TERMS
 
 # Colours of page and plots that belong to no term of the vocabulary, by their role.
@@ -17,8 +15,7 @@ LIGHT = {
     "muted": "#5c6268",
     "grid": "#e2e5e8",
     "band": "#d9dcdf",
-    "bound": "#6b7076",
-    "forbidden": "#f4dcd7",
+    "white": "#ffffff",
     "good": "#1a7f4b",
     "doubtful": "#9a6700",
     "bad": "#c0281a",
@@ -31,70 +28,39 @@ DARK = {
     "muted": "#a3abb3",
     "grid": "#333a42",
     "band": "#3a424b",
-    "bound": "#98a1aa",
-    "forbidden": "#452a28",
+    "white": "#16191d",
     "good": "#4fc78a",
     "doubtful": "#e0b04c",
     "bad": "#ff8072",
     "link": "#7dbdf5",
 }
 
-# Colours of curves without a meaning of their own, which differ also for colour-blind readers.
-SERIES_LIGHT = (
-    "#0077bb",
-    "#ee7733",
-    "#009988",
-    "#aa3377",
-    "#8a6d3b",
-    "#cc3311",
-    "#33669a",
-    "#6b7076",
-)
-SERIES_DARK = (
-    "#4fb0f0",
-    "#f7a55c",
-    "#2fc9b5",
-    "#e884bd",
-    "#cdb07a",
-    "#ff7f66",
-    "#8fb4dd",
-    "#a3abb3",
-)
+# Colours of negative, small and positive values of cells.
+CELLS_LIGHT = ("#2166ac", "#f7f7f7", "#b2182b")
+CELLS_DARK = ("#2a73b5", "#262b31", "#c2412f")
 
-# Colours of the correlations -1, 0 and 1, and number of colours from one to the next.
-DIVERGING_LIGHT = ("#2166ac", "#f7f7f7", "#b2182b")
-DIVERGING_DARK = ("#2a73b5", "#262b31", "#c2412f")
-DIVERGING_STEPS = 12
+# How much lighter the colours of curves without a role are on a dark page.
+LIGHTER = 0.35
 
 
 def palettes() -> dict[str, dict[str, Any]]:
     """Return the colours by theme, `light` and `dark`, and role."""
-    light: dict[str, Any] = {**LIGHT, "diverging": _diverging(DIVERGING_LIGHT)}
-    dark: dict[str, Any] = {**DARK, "diverging": _diverging(DIVERGING_DARK)}
-
-    for term in (*TERMS, OTHER):
-        light[term.word] = term.colour
-        dark[term.word] = term.colour_on_dark
-
-    light.update((f"series{i}", colour) for i, colour in enumerate(SERIES_LIGHT))
-    dark.update((f"series{i}", colour) for i, colour in enumerate(SERIES_DARK))
+    places = (0.0, 0.5, 1.0)
+    light: dict[str, Any] = {
+        **ROLES,
+        **LIGHT,
+        "diverging": list(zip(places, CELLS_LIGHT, strict=True)),
+    }
+    dark: dict[str, Any] = {
+        **{role: _lighter(colour) for role, colour in ROLES.items()},
+        **{term.word: term.colour_on_dark for term in (*TERMS, OTHER)},
+        **DARK,
+        "diverging": list(zip(places, CELLS_DARK, strict=True)),
+    }
     return {"light": light, "dark": dark}
 
 
-def _diverging(ends: tuple[str, str, str]) -> list[tuple[float, str]]:
-    """Return places from 0 to 1 on a scale of correlations, with their colours.
-
-    Args:
-        ends: Colours at -1, 0 and 1, `#rrggbb`.
-    """
-    # Colours change faster near 0, so the places there are closer.
-    even = np.linspace(-1.0, 1.0, 2 * DIVERGING_STEPS + 1)
-    correlations = np.sign(even) * even**2
-    known = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in ends])
-    strengths = colour_strength(correlations)
-    channels = [np.interp(strengths, (-1.0, 0.0, 1.0), known[:, i]) for i in range(3)]
-    colours = np.round(np.stack(channels, axis=1)).astype(int).tolist()
-    return [
-        (float(place), "#{:02x}{:02x}{:02x}".format(*colour))
-        for place, colour in zip((1.0 + correlations) / 2.0, colours, strict=True)
-    ]
+def _lighter(colour: str) -> str:
+    """A colour that can be read on a dark page."""
+    channels = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return "#" + "".join(f"{round(c + LIGHTER * (255 - c)):02x}" for c in channels)

@@ -108,9 +108,8 @@ def log_design(
     robots = _robots(model, poses, titles, (INITIAL, DESIGNED), ASPECT_WITH_TEXT)
     layout = arrange(robots, content.tabs(labels))
 
-    units = labels.parameter_units or ("",) * len(design.parameters)
     with open_recording(path, model, "design", layout) as rec:
-        _log_text(rec, design_text(design, units, addition))
+        _log_text(rec, design_text(design, addition))
         content.log(rec, labels)
 
 

@@ -1,0 +1,302 @@
+"""The page of a design."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mjfim.errors import first_ones, listed
+from mjfim.output.labels import complete_labels
+from mjfim.output.page import (
+    Emphasis,
+    Level,
+    Page,
+    Part,
+    Plot,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    capitalised,
+    named,
+    number,
+    numbers,
+    tabulated,
+)
+from mjfim.output.pages.accuracy import (
+    BEST_CASE,
+    NOT_ALONE,
+    improvement,
+    relative,
+    size_sentence,
+)
+from mjfim.records.design import Design, ScaledStart, Status
+
+# Ratio of two standard deviations above which one of them counts as smaller.
+RELEVANT_RATIO = 1.05
+
+# Largest number of limits that the initial control violates and that a page lists.
+MAX_VIOLATIONS = 4
+
+# Numbers of the eigenvalues that a table shows where there are more than these, largest first.
+SHOWN_EIGENVALUES = (0, 1, 2, -2, -1)
+
+# Digits as subscripts.
+SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+
+# Smallest divisor of the improvement of an eigenvalue; avoids a division by zero.
+TINY = 1e-300
+
+
+def design_page(design: Design) -> Page:
+    """Describe predicted standard deviations before and after a design, and how it ended."""
+    search: list[Part] = [Plot("convergence"), _eigenvalue_table(design)]
+    if len(design.starts) > 1:
+        search += [_start_table(design)]
+    sections = [
+        Section("Accuracy", list(_accuracy_parts(design))),
+        Section("Motion", [Plot("trajectories"), Plot("sensitivity_phase")]),
+        Section("Optimisation", search),
+    ]
+    if design.limits:
+        sections.insert(2, Section("Limits", [Plot("limits"), _limit_table(design)]))
+    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    return Page(
+        kind="Design of an experiment",
+        verdict=_verdict(design),
+        next_steps=tuple(_next_steps(design)),
+        warnings=design.warnings,
+        facts={
+            "duration": f"{_seconds(design):.4g} s",
+            "λ_min": f"{number(before)} → {number(after)}",
+            "iterations": str(design.iterations),
+            "time of the search": f"{design.seconds:.3g} s",
+        },
+        sections=sections,
+    )
+
+
+def _seconds(design: Design) -> float:
+    """Duration of the motion [s]."""
+    return float(design.trajectory.t[-1] - design.trajectory.t[0])
+
+
+# ---- verdict
+
+
+def _verdict(design: Design) -> Verdict:
+    violated = [kind.replace("_", " ") for kind, margin in design.limits.items() if margin < 0.0]
+    if violated:
+        text = f"Do not play this motion: it violates limits ({first_ones(violated)})."
+        return Verdict(text, Level.BAD)
+    if not design.sound:
+        return Verdict(f"The design is not ready: {design.outcome}.", Level.BAD)
+    kept = "It keeps all limits" if design.limits else "No limits were stated"
+    if not design.separable:
+        text = (
+            f"The design is made for combinations of parameters, because no control separates all "
+            f"of them. {kept}."
+        )
+        return Verdict(text, Level.DOUBTFUL)
+    reservation = _reservation(design)
+    if reservation:
+        text = f"This motion can be played, but {reservation}. {kept}."
+        return Verdict(text, Level.DOUBTFUL)
+    return Verdict(f"Ready to play: {_accuracy(design)}. {kept}.", Level.GOOD)
+
+
+def _undetermined(design: Design) -> list[int]:
+    """Numbers of the wanted parameters whose standard deviation exceeds their size."""
+    std, sizes = design.final.std, design.sizes
+    return [j for j in design.wanted if not np.isfinite(std[j]) or 0.0 < sizes[j] < std[j]]
+
+
+def _reservation(design: Design) -> str:
+    """Say which parameters a design does not determine; empty where it determines all of them."""
+    found = _undetermined(design)
+    if not found:
+        return ""
+    std, sizes = design.final.std, design.sizes
+    worst = max(found, key=lambda j: float(std[j] / sizes[j]) if np.isfinite(std[j]) else np.inf)
+    text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
+    if not np.isfinite(std[worst]):
+        return text
+    share = relative(float(std[worst]), float(sizes[worst]))
+    of_one = f": σ is {share} of its size"
+    return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
+
+
+def _accuracy(design: Design) -> str:
+    """The accuracy of the parameter that a design determines worst, in words."""
+    shares = design.final.std / np.where(design.sizes > 0.0, design.sizes, np.nan)
+    wanted = [j for j in design.wanted if np.isfinite(shares[j])]
+    sentence = f"one experiment of {_seconds(design):.3g} s determines every parameter"
+    if not wanted:
+        return sentence
+    worst = max(wanted, key=lambda j: float(shares[j]))
+    name = design.parameters[worst]
+    before, after = float(design.initial.std[worst]), float(design.final.std[worst])
+    sentence += f" with a σ of {relative(after, float(design.sizes[worst]))} or less"
+    if not np.isfinite(before):
+        return f"{sentence}; the initial motion does not determine {name}"
+    if before > RELEVANT_RATIO * after:
+        times = f"{before / after:.3g} times smaller than with the initial motion"
+        return f"{sentence} (largest for {name}, {times})"
+    return f"{sentence} (largest for {name})"
+
+
+def _next_steps(design: Design) -> Iterator[str]:
+    if not design.within_limits:
+        yield "Widen the limit that is violated, or begin with an initial control that is smaller."
+        return
+    if not design.separable:
+        groups = first_ones(design.combinations, "; ")
+        yield (
+            f"Remove or fix one parameter of each group, give it a prior, or measure another "
+            f"output: {groups}."
+        )
+    if design.status is Status.ROUGH:
+        yield (
+            "Keep the motion away from contacts, dry friction and saturated actuators: begin with "
+            "an initial control of smaller amplitude, or state narrower limits."
+        )
+    undetermined = _undetermined(design) if design.separable else []
+    if undetermined:
+        names = first_ones([design.parameters[j] for j in undetermined])
+        yield (
+            f"Determine {names} with a longer or larger motion, by measuring another output, or "
+            "state what is known with `prior`."
+        )
+    if not design.status.success and design.status is not Status.ROUGH:
+        yield "Allow more time or iterations in the table `[descent]` for a better design."
+    if design.sound:
+        yield "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o FILE`."
+        yield "Record it, then estimate: `mjfim identify EXPERIMENT RECORDING -o FOLDER`."
+
+
+# ---- sentences
+
+
+def _accuracy_parts(design: Design) -> Iterator[Part]:
+    if design.outcome.lower() not in _verdict(design).text.lower():
+        yield Text(capitalised(design.outcome))
+    yield _accuracy_table(design)
+    yield Plot("standard_deviations")
+    broken = [str(violation) for violation in design.initial_violations]
+    if broken:
+        others = len(broken) - MAX_VIOLATIONS
+        more = f"; and {others} more, see limits.initial in design.json" if others > 0 else ""
+        yield Text(
+            f"The initial control violates limits: {'; '.join(broken[:MAX_VIOLATIONS])}{more}. Its "
+            "standard deviations are those of a motion outside the limits."
+        )
+    if design.scaled_start is not None:
+        yield Text(_scaled_sentence(design, design.scaled_start))
+    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    yield Text(
+        f"λ_min {before:.4g} → {after:.4g} ({after / max(before, TINY):.1f} ×), cost J "
+        f"{design.initial.cost:.5g} → {design.final.cost:.5g}, found from the {design.found_by}"
+    )
+    count = design.iterations
+    iterations = "1 iteration" if count == 1 else f"{count} iterations"
+    effort = f"{design.seconds:.2f} s, {design.steps / 1e6:.2f} million MuJoCo steps"
+    yield Text(f"{iterations}, {effort}", detail=True)
+    if design.nuisance:
+        names = listed(design.nuisance)
+        yield Text(f"Nuisance parameters, whose accuracy the design ignores: {names}", detail=True)
+    if design.combinations:
+        yield Text(
+            "Some parameters are not identifiable alone; the search maximises the information of "
+            "combinations of them, see design.json"
+        )
+    of_size = size_sentence(design.theta, design.sizes)
+    if of_size:
+        yield Text(of_size, Emphasis.WEAK)
+    yield Text(BEST_CASE, Emphasis.WEAK)
+
+
+def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
+    """Compare a design with the initial control, scaled until it keeps all limits."""
+    share = f"The initial control scaled by {scaled.share:.2g} keeps all limits"
+    if not design.within_limits:
+        return f"{share}; the design does not."
+    after = float(design.final.eigenvalues[0])
+    times = after / max(scaled.min_eigenvalue, TINY)
+    return (
+        f"{share}; the design is {times:.3g} times better than that (λ_min "
+        f"{scaled.min_eigenvalue:.4g} → {after:.4g})."
+    )
+
+
+# ---- tables
+
+
+def _accuracy_table(design: Design) -> Table:
+    """Tabulate the predicted standard deviations before and after a design."""
+    wanted, combined = list(design.wanted), design.combined
+    units = complete_labels(design).parameter_units
+    names = [named(design.parameters[j], units[j]) for j in wanted]
+    values = [*design.theta[wanted], *(each.value for each in combined)]
+    sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
+    before = [*design.initial.std[wanted], *(each.std_initial for each in combined)]
+    after = [*design.final.std[wanted], *(each.std_final for each in combined)]
+    return tabulated(
+        "Predicted standard deviation σ of each parameter after one experiment",
+        {
+            "parameter": [*names, *(each.expression for each in combined)],
+            "value": numbers(values, 4),
+            "σ initial": numbers(before, infinite=NOT_ALONE),
+            "relative σ initial": list(map(relative, before, sizes)),
+            "σ designed": numbers(after, infinite=NOT_ALONE),
+            "relative σ": list(map(relative, after, sizes)),
+            "change of σ": list(map(improvement, before, after)),
+        },
+        [Emphasis.NORMAL] * len(wanted) + [Emphasis.DERIVED] * len(combined),
+        spare=("value", "relative σ initial"),
+    )
+
+
+def _eigenvalue_table(design: Design) -> Table:
+    """Tabulate eigenvalues (largest first), criterion and cost of both trajectories."""
+    both = (design.initial, design.final)
+    count = len(design.final.eigenvalues)
+    shown = range(count) if count <= len(SHOWN_EIGENVALUES) else SHOWN_EIGENVALUES
+    eigenvalues = {
+        f"λ{k % count + 1}".translate(SUBSCRIPTS): numbers(
+            [each.eigenvalues[::-1][k] for each in both], 5
+        )
+        for k in shown
+    }
+    return tabulated(
+        "Eigenvalues of the Fisher information, and cost",
+        {
+            "trajectory": ["initial", "designed"],
+            **eigenvalues,
+            "criterion": numbers([each.criterion for each in both], 5),
+            "J": numbers([each.cost for each in both], 5),
+        },
+        detail=True,
+    )
+
+
+def _limit_table(design: Design) -> Table:
+    """Tabulate the worst margin of each kind of limit."""
+    margins = numbers(design.limits.values())
+    columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
+    return tabulated("Limits", columns, detail=True)
+
+
+def _start_table(design: Design) -> Table:
+    """Tabulate the initial controls from which the search started."""
+    starts = design.starts
+    return tabulated(
+        f"Initial controls from which the search started; the best one: {design.found_by}",
+        {
+            "initial control": [start.name for start in starts],
+            "cost": numbers([start.cost for start in starts], 5),
+            "iterations": [str(start.iterations) for start in starts],
+            "outcome": [start.status.name.lower() for start in starts],
+        },
+        detail=True,
+    )

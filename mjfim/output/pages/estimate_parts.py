@@ -1,0 +1,204 @@
+"""Studies beside an estimate: lengths of segments, recordings, and drawn robots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from mjfim.arrays import NORMAL_95
+from mjfim.errors import first_ones
+from mjfim.identification.accuracy import POORLY_KNOWN_SHARE
+from mjfim.output.page import (
+    Emphasis,
+    Part,
+    Plot,
+    Table,
+    Text,
+    named,
+    numbers,
+    tabulated,
+    warned,
+)
+from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws
+from mjfim.records.robots import RecordingComparison, p_text
+
+# Largest number of rows of the table with the values of single recordings.
+MAX_VALUES = 60
+
+
+# ---- lengths of segments
+
+
+def horizon_parts(study: HorizonStudy | None) -> Sequence[Part]:
+    """Which length of segments was chosen, and which estimates depend on it."""
+    if study is None:
+        return ()
+    cautions = study.findings if study.is_used else (study.about_use, *study.findings)
+    names = [study.name_of(i) for i in range(len(study.errors))]
+    names[study.chosen] += " (chosen)" if study.is_used else " (chosen, but not used)"
+    errors = {
+        f"over {length:.2g} s": numbers(errors)
+        for length, errors in zip(study.lengths, np.transpose(study.errors), strict=True)
+    }
+    title = "Error of data that were left out of the fit [σ], by the time that is predicted"
+    table = tabulated(title, {"fit over": names, **errors}, detail=True)
+    return (
+        Text(f"{study.about_choice} {study.about_growth}"),
+        *(Text(caution, Emphasis.WARNING) for caution in cautions),
+        table,
+        Plot("horizons"),
+    )
+
+
+# ---- recordings
+
+
+def recording_parts(estimate: Estimate) -> Sequence[Part]:
+    """Whether recordings agree, their scatter, and what each of them suggests."""
+    comparison = estimate.recording_comparison
+    if comparison is None:
+        return ()
+    # An odd recording is a warning already.
+    differs = bool(comparison.odd or comparison.apart)
+    emphasis = Emphasis.WARNING if differs else Emphasis.NORMAL
+    in_short_form = differs and not comparison.odd
+    parts: list[Part] = [Text(str(comparison), emphasis, detail=not in_short_form)]
+    if differs and estimate.misfit:
+        text = (
+            "The model does not explain the recordings: its error acts differently along different "
+            "motions, and this alone can make recordings differ."
+        )
+        parts.append(Text(text, Emphasis.WEAK, detail=True))
+    tables = (_scatter_table(comparison), _value_table(comparison))
+    return (*parts, *tables, Plot("recordings"))
+
+
+def _scatter_table(comparison: RecordingComparison) -> Table:
+    """Tabulate means over the recordings, and the scatter between them."""
+    low, high = comparison.interval.T
+    new = np.where(np.isfinite(comparison.prediction), comparison.prediction, np.nan).T
+    p = [
+        "stated" if is_stated else p_text(p).removeprefix("p = ")
+        for is_stated, p in zip(comparison.is_stated, comparison.p, strict=True)
+    ]
+    return tabulated(
+        "Means over the recordings, and another recording",
+        {
+            "parameter": list(map(named, comparison.parameters, comparison.units)),
+            "mean": numbers(comparison.mean, 4),
+            "95 % low": numbers(low, 4),
+            "high": numbers(high, 4),
+            "σ between": numbers(comparison.tau, 2),
+            "I²": numbers(100.0 * comparison.share, 2, " %"),
+            "new low": numbers(new[0], 4),
+            "new high": numbers(new[1], 4),
+            "p": p,
+        },
+        warned(j in comparison.apart for j in range(len(p))),
+        spare=("95 % low", "high", "I²", "new low", "new high"),
+        note=(
+            "σ between: standard deviation between recordings beyond their noise; I²: its share of "
+            "the scatter; new: 95 % interval of what another recording would suggest; p: "
+            "probability of a scatter as large if all recordings had the same value, corrected for "
+            "the number of parameters."
+        ),
+        detail=True,
+    )
+
+
+def _value_table(comparison: RecordingComparison) -> Table:
+    """Tabulate what each recording suggests alone; of many, the parameters that differ most."""
+    count = len(comparison.recordings)
+    shown = comparison.order[: max(MAX_VALUES // count, 1)]
+    odd = {recording.index for recording in comparison.odd}
+    pairs = [(j, k) for j in shown for k in range(count)]
+    note = "Each value is one Gauss-Newton step away from the estimate of all recordings."
+    if len(shown) < len(comparison.parameters):
+        of_all = f"{len(shown)} of {len(comparison.parameters)} parameters"
+        note += f" Shown: {of_all}, those that differ most."
+    return tabulated(
+        "What each recording suggests alone",
+        {
+            "recording": [
+                comparison.recordings[k] + (" (odd)" if k in odd else "") for _, k in pairs
+            ],
+            "parameter": [named(comparison.parameters[j], comparison.units[j]) for j, _ in pairs],
+            "value": numbers([comparison.values[k, j] for j, k in pairs], 4),
+            "σ": numbers([comparison.std[k, j] for j, k in pairs], 2, infinite="-"),
+        },
+        warned(k in odd for _, k in pairs),
+        note=note,
+        detail=True,
+    )
+
+
+# ---- drawn robots
+
+
+def sample_parts(estimate: Estimate) -> Iterator[Part]:
+    """Which robots were drawn, where they are, and what they do not cover."""
+    draws = estimate.draws
+    if draws is None:
+        return
+    yield Text(f"{draws}.")
+    yield _sample_table(draws)
+    yield from (Text(caution, Emphasis.WARNING) for caution in _not_covered(estimate, draws))
+    yield Plot("samples")
+
+
+def _not_covered(estimate: Estimate, draws: ParameterDraws) -> Iterator[str]:
+    """Sentences about what the drawn robots do not cover."""
+    if estimate.misfit:
+        yield (
+            "The drawn robots do not cover the error of a model that does not explain the "
+            "recordings; find the missing term first (--select), or randomise more widely."
+        )
+    wide = [
+        name
+        for name in estimate.sloppy
+        if name in draws.parameters
+        and NORMAL_95 * float(draws.std[draws.parameters.index(name)])
+        > POORLY_KNOWN_SHARE * float(estimate.sizes[estimate.parameters.index(name)])
+    ]
+    if wide:
+        yield (
+            f"The drawn robots differ widely in {first_ones(wide)}, which the recordings hardly "
+            "determine."
+        )
+    directions = estimate.prior_directions
+    if draws.held_combinations and directions is not None:
+        yield (
+            f"The drawn robots differ in {directions.determined} of {directions.count} "
+            f"combinations of the inertial parameters of {first_ones(directions.bodies)}. The "
+            f"recordings do not determine the other {draws.held_combinations}, which are those of "
+            "the estimate in all robots; what is wrong in them is not covered."
+        )
+    held = [name for name in estimate.held if name in draws.parameters]
+    if held:
+        yield (
+            f"The drawn robots do not differ in {first_ones(held)}, which the fit held at the "
+            "guess; its error is not covered."
+        )
+
+
+def _sample_table(draws: ParameterDraws) -> Table:
+    """Tabulate the range of every drawn parameter."""
+    low, middle, high = np.quantile(draws.values, (0.0, 0.5, 1.0), axis=0)
+    return tabulated(
+        "Parameters of the drawn robots",
+        {
+            "parameter": list(map(named, draws.parameters, draws.units)),
+            "centre": numbers(draws.centre, 4),
+            "σ": numbers(draws.std, 2),
+            "smallest": numbers(low, 4),
+            "median": numbers(middle, 4),
+            "largest": numbers(high, 4),
+        },
+        spare=("median",),
+        note=(
+            "σ is that of the 95 % intervals, before the bounds cut the distribution off; a bound "
+            "shifts the median. It is smaller where combinations of inertias stay at the estimate."
+        ),
+        detail=True,
+    )

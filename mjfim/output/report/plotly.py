@@ -1,0 +1,364 @@
+"""Pictures for Plotly: the traces and the layout of each panel, small enough for one file."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.output.panels import Axis, Cells, Mark, Panel, Picture
+
+# Values that JSON can hold, for the plotting library.
+Plotly = dict[str, Any]
+
+# Share of the range of values below which single precision is exact enough for display.
+DISPLAY_PRECISION = 1e-5
+
+# Names of dashes and of symbols.
+DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
+SYMBOLS = {
+    "o": "circle",
+    ".": "circle",
+    "|": "line-ns-open",
+    "_": "line-ew-open",
+    "x": "x",
+    "s": "square",
+    "D": "diamond",
+    "^": "triangle-up",
+    "v": "triangle-down",
+    "<": "triangle-left",
+    ">": "triangle-right",
+}
+
+# Shapes of marks in the legend; others are lines.
+SHAPES = {
+    "dots": "dot",
+    "bars": "bar",
+    "columns": "bar",
+    "area": "band",
+    "vspan": "band",
+    "hspan": "band",
+}
+
+# Points of a figure over CSS pixels, pixels of an inch, and least height of a plot [CSS pixels].
+PIXELS, INCH, LEAST_HEIGHT = 1.3, 100, 170
+
+# Width of a letter beside rows [CSS pixels], and characters of names beside rows.
+LETTER, NAME_WIDTH = 6.5, 26
+
+# Decades of a logarithmic axis below which values between the powers of ten have labels, too.
+SHORT_LOG_AXIS = 2.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """An entry of the legend: its name, role and shape."""
+
+    name: str
+    role: str
+    shape: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot:
+    """One plot: its words, and what the script of the page reads."""
+
+    title: str
+    remark: str
+    height: int
+    is_wide: bool
+    data: Plotly
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """Plots of one picture, under one legend."""
+
+    title: str
+    plots: Sequence[Plot]
+    keys: Sequence[Key]
+    note: str
+    columns: int
+
+
+def group_of(picture: Picture, limit: int) -> Group:
+    """Turn a picture into plots.
+
+    Args:
+        picture: The picture.
+        limit: Largest number of points of a curve.
+    """
+    # Only the lowest panel of a column names the axis that all of it share.
+    shared = {panel.place[1]: panel.x.label for panel in picture.panels if panel.x.label}
+    keys = [
+        Key(name=mark.label, role=mark.role, shape=SHAPES.get(mark.kind, "line"))
+        for mark in picture.legend()
+    ]
+    columns = len(picture.widths)
+    plots = []
+    for panel in picture.panels:
+        label = panel.x.label or shared.get(panel.place[1], "")
+        rows = picture.heights if panel.is_tall else [picture.heights[panel.place[0]]]
+        height = max(int(INCH * sum(rows)), LEAST_HEIGHT)
+        linked = "" if panel.x.names is not None or panel.cells else f"{picture.title} {label}"
+        plots.append(
+            Plot(
+                title=panel.title or panel.y.label,
+                remark=panel.remark,
+                height=height,
+                is_wide=panel.is_wide or columns == 1,
+                data={
+                    "traces": [trace for mark in panel.marks for trace in _traces(mark, limit)]
+                    + ([] if panel.cells is None else [_heatmap(panel.cells)]),
+                    "layout": _layout(panel, label),
+                    "height": height,
+                    "linked": linked,
+                },
+            )
+        )
+    return Group(
+        title=picture.title, plots=plots, keys=keys, note=picture.note, columns=min(columns, 3)
+    )
+
+
+# ---- marks
+
+
+def _traces(mark: Mark, limit: int) -> list[Plotly]:
+    """The traces of a mark; straight lines and strips are shapes of the layout."""
+    colour = f"role:{mark.role}"
+    named = {"name": escape(mark.label), "legendgroup": mark.label, "opacity": mark.opacity}
+    other = np.zeros(0) if mark.other is None else mark.other
+    lines: Plotly = {**named, "type": "scatter", "mode": "lines", "hoverinfo": "skip"}
+    match mark.kind:
+        case "line" | "steps" | "dots":
+            return [{**named, **_points(mark, colour, limit)}]
+        case "area":
+            x, y = np.append(mark.x, mark.x[::-1]), np.append(mark.y, other[::-1])
+            fill = {"fill": "toself", "fillcolor": colour, "line": {"width": 0}}
+            return [{**lines, **fill, "x": packed(x), "y": packed(y)}]
+        case "columns":
+            return [
+                {
+                    **named,
+                    "type": "bar",
+                    "x": packed(0.5 * (mark.x[1:] + mark.x[:-1])),
+                    "y": packed(mark.y),
+                    "width": np.diff(mark.x).tolist(),
+                    "marker": {"color": colour},
+                }
+            ]
+        case "bars":
+            pattern = {"pattern": {"shape": "/"}} if mark.hollow else {}
+            return [
+                {
+                    **named,
+                    "type": "bar",
+                    "orientation": "h",
+                    "base": other.tolist(),
+                    "x": packed(mark.x - other),
+                    "y": packed(mark.y),
+                    "width": mark.size,
+                    "marker": {"color": colour, **pattern},
+                    "hovertext": [f"{value:.4g}" for value in mark.x],
+                    "hoverinfo": "text+name",
+                }
+            ]
+        case "intervals":
+            gap = np.full(len(mark.x), np.nan)
+            x = np.stack([mark.x, other, gap], axis=1).ravel()
+            line = {"color": colour, "width": PIXELS * mark.width}
+            return [{**lines, "line": line, "x": packed(x), "y": packed(np.repeat(mark.y, 3))}]
+        case "words":
+            words = [escape(text) for text in mark.texts]
+            look: Plotly = {
+                "textposition": "middle right",
+                "textfont": {"color": colour, "size": 11},
+            }
+            drawn = {**lines, **look, "mode": "text", "cliponaxis": False, "text": words}
+            return [{**drawn, "x": packed(mark.x), "y": packed(mark.y)}]
+    return []
+
+
+def _points(mark: Mark, colour: str, limit: int) -> Plotly:
+    """A curve, held values, or dots; of many points, the peaks stay."""
+    y = np.append(mark.y, mark.y[-1:]) if mark.kind == "steps" else mark.y
+    kept = thinned(y, limit)
+    drawn: Plotly = {"type": "scatter", "x": packed(mark.x[kept]), "y": packed(y[kept])}
+    parts = [] if mark.kind == "dots" else ["lines"]
+    if parts:
+        look = {"color": colour, "width": PIXELS * mark.width, "dash": DASHES[mark.dash]}
+        drawn["line"] = look | ({"shape": "hv"} if mark.kind == "steps" else {})
+    if mark.symbol:
+        parts.append("markers")
+        symbol = SYMBOLS[mark.symbol]
+        if mark.hollow and not symbol.endswith("open"):
+            symbol += "-open"
+        width = {"width": PIXELS * mark.width, "color": colour}
+        size = max(PIXELS * mark.size * (0.6 if mark.symbol == "." else 1.0), 3.0)
+        drawn["marker"] = {"color": colour, "size": size, "symbol": symbol}
+        if symbol.startswith("line"):
+            drawn["marker"]["line"] = width
+    if mark.texts:
+        drawn["text"] = [escape(mark.texts[i]) for i in kept]
+        drawn["hoverinfo"] = "text+name"
+    return {**drawn, "mode": "+".join(parts)}
+
+
+def _heatmap(cells: Cells) -> Plotly:
+    """Coloured cells with their words."""
+    values = cells.values - cells.middle
+    trace: Plotly = {
+        "type": "heatmap",
+        "z": [[float(v) if np.isfinite(v) else None for v in row] for row in values],
+        "colorscale": "role:diverging",
+        "zmin": -cells.reach,
+        "zmax": cells.reach,
+        "xgap": 1,
+        "ygap": 1,
+        "hoverongaps": False,
+        "hoverinfo": "z",
+        "showscale": cells.scale is not None,
+    }
+    if cells.scale is not None:
+        places = [float(place) - cells.middle for place in cells.scale[0]]
+        ticks = {"tickvals": places, "ticktext": list(cells.scale[1])}
+        trace["colorbar"] = {"thickness": 10, "outlinewidth": 0, **ticks}
+    if len(cells.texts):
+        texts = [[escape(text) for text in row] for row in cells.texts]
+        trace |= {"text": texts, "texttemplate": "%{text}", "hoverinfo": "text"}
+    return trace
+
+
+# ---- layout
+
+
+def _layout(panel: Panel, label: str) -> Plotly:
+    """Axes, straight lines and strips, and words beside the rows."""
+    # Cells without names of their rows have those of their columns.
+    rows = panel.y
+    if panel.cells is not None and not rows.names:
+        rows = replace(panel.x, limits=(len(panel.cells.values) - 0.5, -0.5))
+    layout: Plotly = {
+        "xaxis": _axis(panel.x, label),
+        "yaxis": _axis(rows, rows.label if panel.title else ""),
+        "shapes": [shape for mark in panel.marks for shape in _shapes(mark)],
+        "annotations": _words_beside(panel),
+        "barmode": "overlay",
+        "bargap": 0,
+    }
+    if panel.message:
+        place = {"xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5, "showarrow": False}
+        layout["annotations"].append({**place, "text": escape(panel.message)})
+    if panel.y.names is not None or panel.cells is not None:
+        layout["hovermode"] = "closest"
+    right = sum(LETTER * _letters(heading, texts) for heading, _, texts in panel.beside)
+    if right:
+        layout["margin"] = {"r": int(right) + 14, "t": 24}
+    return layout
+
+
+def _axis(axis: Axis, label: str) -> Plotly:
+    """An axis of a plot."""
+    shown: Plotly = {"title": {"text": escape(label)}} if label else {}
+    if axis.limits is not None:
+        ends = np.log10(axis.limits) if axis.log else np.asarray(axis.limits)
+        shown["range"] = ends.tolist()
+    if axis.log:
+        shown |= {"type": "log", "tickformat": "~g"}
+        span = abs(shown["range"][1] - shown["range"][0]) if "range" in shown else SHORT_LOG_AXIS
+        shown["dtick"] = max(1, int(np.ceil(span / 6.0)))
+        if span < SHORT_LOG_AXIS:
+            shown |= {"dtick": "D2", "minorloglabels": "complete"}
+    if axis.whole:
+        shown["tickformat"] = "d"
+    if axis.ticks is not None:
+        shown |= {"tickmode": "array", "tickvals": [float(tick) for tick in axis.ticks]}
+    if axis.names is not None:
+        names = [escape(shortened_name(name)) for name in axis.names]
+        shown |= {"ticktext": names, "showgrid": False, "zeroline": False, "fixedrange": True}
+    return shown
+
+
+def _shapes(mark: Mark) -> list[Plotly]:
+    """A straight line or a strip through the whole panel."""
+    if mark.kind not in ("vline", "hline", "vspan", "hspan"):
+        return []
+    upright = mark.kind[0] == "v"
+    along, across = ("x", "y") if upright else ("y", "x")
+    begin = float((mark.x if upright else mark.y)[0])
+    end = begin if mark.other is None else float(mark.other[0])
+    place = {f"{along}0": begin, f"{along}1": end, f"{across}ref": f"{across} domain"}
+    place |= {f"{across}0": 0, f"{across}1": 1, "layer": "below", "opacity": mark.opacity}
+    colour = f"role:{mark.role}"
+    if mark.kind.endswith("span"):
+        return [{"type": "rect", **place, "fillcolor": colour, "line": {"width": 0}}]
+    line = {"color": colour, "width": mark.width, "dash": DASHES[mark.dash]}
+    return [{"type": "line", **place, "line": line}]
+
+
+def _words_beside(panel: Panel) -> list[Plotly]:
+    """The columns of words right of the rows."""
+    found, right = [], 8.0
+    place: Plotly = {"xref": "paper", "x": 1.0, "xanchor": "left", "showarrow": False}
+    for heading, role, texts in panel.beside:
+        look = {**place, "xshift": right, "font": {"size": 11, "color": f"role:{role}"}}
+        top = {"yref": "paper", "y": 1.0, "yanchor": "bottom"}
+        found.append({**look, **top, "text": escape(heading)})
+        found += [{**look, "y": row, "text": escape(text)} for row, text in enumerate(texts)]
+        right += LETTER * _letters(heading, texts)
+    return found
+
+
+def _letters(heading: str, texts: Sequence[str]) -> int:
+    """Number of letters of the widest of some words, with a space."""
+    return 2 + max(map(len, (heading, *texts)))
+
+
+def shortened_name(name: str, width: int = NAME_WIDTH) -> str:
+    """Shorten a long name; both of its ends stay."""
+    if len(name) <= width:
+        return name
+    kept = (width - 1) // 2
+    return f"{name[:kept]}…{name[-kept:]}"
+
+
+# ---- numbers
+
+
+def packed(values: Array) -> dict[str, str]:
+    """Return numbers as the library reads them from text, in single precision if possible."""
+    array = np.asarray(values, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = array.astype(np.float32)
+        rounding = np.abs(single - array)
+    finite = np.isfinite(array)
+    extent = float(np.ptp(array[finite])) if finite.any() else 0.0
+    is_exact = bool((rounding[finite] <= DISPLAY_PRECISION * extent).all())
+    kind, stored = ("f4", single) if is_exact else ("f8", array)
+    content = stored.astype(f"<{kind}").tobytes()
+    return {"dtype": kind, "bdata": base64.b64encode(content).decode("ascii")}
+
+
+def thinned(values: Array, limit: int) -> np.ndarray:
+    """Return which points of a curve are drawn, so that the peaks of all intervals stay."""
+    count = len(values)
+    if count <= limit:
+        return np.arange(count)
+    # The last interval is filled up with its last value.
+    bins = max((limit - 2) // 2, 1)
+    width = -(-count // bins)
+    bins = -(-count // width)
+    filled = np.pad(values, (0, bins * width - count), mode="edge").reshape(bins, width)
+    # A gap is shown only where an interval has no value at all.
+    measured = np.isfinite(filled)
+    starts = width * np.arange(bins)
+    smallest = starts + np.where(measured, filled, np.inf).argmin(axis=1)
+    largest = starts + np.where(measured, filled, -np.inf).argmax(axis=1)
+    ends = np.concatenate([[0], smallest, largest, [count - 1]])
+    return np.unique(np.minimum(ends, count - 1))

@@ -1,1 +1,0 @@
-"""Results in words and tables, for the terminal, Rerun and figures; a module per record."""

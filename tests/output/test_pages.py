@@ -1,0 +1,297 @@
+"""Pages: verdicts, next steps, and tables and sentences that hold what a reader needs."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import MjfimError
+from mjfim.experiment.system import System
+from mjfim.output.markdown import as_markdown
+from mjfim.output.page import Emphasis, Level, Listing, Row, Table, named, number
+from mjfim.output.pages import page_of
+from mjfim.output.pages.accuracy import improvement, relative
+from mjfim.output.pages.selection import selection_parts
+from mjfim.records.base import ShownRecord
+from mjfim.records.campaign import CampaignStatus
+from mjfim.records.design import CombinationAccuracy, Status
+from mjfim.records.terms import (
+    AlternativeTerm,
+    Decision,
+    Selection,
+    SelectionStep,
+    Term,
+    TermNumber,
+    TermTestData,
+)
+from mjfim.studies.selected_models import possible_pools, selected_experiment
+from tests.support import results
+from tests.support.pages import page_with, printed, sentences
+from tests.support.paths import ROOT
+from tests.support.results import SLIDE_FRICTION
+
+BEGUN = SelectionStep(decision=Decision.BEGUN, error=2.0)
+
+
+@pytest.mark.parametrize("verb", results.MAKERS)
+def test_every_page_has_tables_with_a_cell_for_every_column(verb: str) -> None:
+    page = page_of(results.MAKERS[verb]())
+    assert page.tables and page.verdict.text and page.facts
+    for table in page.tables:
+        assert all(len(row.cells) == len(table.columns) for row in table.rows), table.title
+        assert set(table.spare) - {"at bound"} <= set(table.columns), table.title
+
+
+def test_a_record_without_page_is_refused() -> None:
+    class Other(ShownRecord):
+        """A record that nobody knows."""
+
+    with pytest.raises(MjfimError, match="a Other cannot be shown"):
+        page_of(Other())
+
+
+# ---- verdicts and next steps
+
+
+LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
+
+
+@pytest.mark.parametrize(
+    ("verb", "changes", "level", "words"),
+    [
+        ("design", {}, Level.GOOD, "Ready to play: one experiment"),
+        ("design", {"limits": {"position": -0.1}}, Level.BAD, "violates limits (position)"),
+        ("design", {"status": Status.INFEASIBLE}, Level.BAD, "not ready"),
+        ("design", LENGTH_UNKNOWN, Level.DOUBTFUL, "length, damping: σ is 1000 % of its size for"),
+        ("identify", {}, Level.GOOD, "explains the recordings"),
+        ("identify", {"misfit": True, "chi2": 800.0}, Level.DOUBTFUL, "2.01 times the noise"),
+        ("identify", {"success": False, "status": "stopped early"}, Level.BAD, "stopped early."),
+        ("identify", {"success": False, "combinations": ("a b",)}, Level.BAD, "combination only"),
+        ("check", {}, Level.GOOD, "σ of 2 %"),
+        ("check", {"refused": ("too long",), "verdict": ("a b",)}, Level.DOUBTFUL, "A b."),
+        ("compare", {}, Level.GOOD, "The design is the best"),
+        ("montecarlo", {}, Level.GOOD, "scatter as predicted"),
+        ("robustness", {}, Level.DOUBTFUL, "of 20 robots keep all limits"),
+        ("campaign", {}, Level.GOOD, "Reached"),
+        ("campaign", {"status": CampaignStatus.INFEASIBLE}, Level.BAD, "No design keeps"),
+        ("campaign", {"status": CampaignStatus.WAITING, "rounds": ()}, Level.GOOD, "waits"),
+    ],
+)
+def test_the_verdict(verb: str, changes: dict[str, Any], level: Level, words: str) -> None:
+    verdict = page_of(results.MAKERS[verb](**changes)).verdict
+    assert verdict.level is level
+    assert words in verdict.text
+
+
+@pytest.mark.parametrize(
+    ("verb", "changes", "words"),
+    [
+        ("design", {}, "mjfim export"),
+        ("design", {"status": Status.ROUGH}, "away from contacts"),
+        ("design", {"limits": {"position": -0.1}}, "Widen the limit"),
+        ("identify", {"missing_terms": (results.missing_term(),)}, "joint/hinge:frictionloss"),
+        ("campaign", {"status": CampaignStatus.WAITING}, "--recordings FILE"),
+        ("check", {}, "mjfim design"),
+    ],
+)
+def test_the_first_next_step(verb: str, changes: dict[str, Any], words: str) -> None:
+    assert words in page_of(results.MAKERS[verb](**changes)).next_steps[0]
+
+
+def test_fits_that_failed_or_scatter_too_much_put_a_study_in_doubt() -> None:
+    sets = results.study().sets
+
+    def verdict(**changed: Any) -> Any:
+        return page_of(results.study(sets={**sets, **changed})).verdict
+
+    assert "3 of 200 (designed)" in verdict(final=replace(sets["final"], failed=3)).text
+    # One interval of six may miss 1 by chance, and the verdict says so.
+    intervals = np.array([[1.01, 1.2], [0.9, 1.1], [0.9, 1.1]])
+    by_chance = replace(sets["final"], efficiency_interval=intervals)
+    inside = replace(sets["initial"], efficiency_interval=np.tile([0.9, 1.1], (3, 1)))
+    lucky = verdict(initial=inside, final=by_chance)
+    assert lucky.level is Level.GOOD and "1 of 6 intervals of 95 % misses it" in lucky.text
+    wide = verdict(final=replace(sets["final"], efficiency_interval=np.tile([0.1, 0.2], (3, 1))))
+    assert wide.level is Level.DOUBTFUL and "the designed trajectory" in wide.text
+
+
+def test_missing_terms_say_on_how_much_of_the_data_they_were_tested() -> None:
+    tested = TermTestData(share=0.17, recordings=4, count=4)
+    estimate = results.estimate(
+        misfit=True, missing_terms=(results.missing_term(),), tested_data=tested
+    )
+    text = printed(page_of(estimate), verbose=True)
+    assert "residuals (17 % of the data, from all 4 recordings)" in text
+    assert "were tested on 17 % of the data, from all 4 recordings." in text
+    assert estimate.summary()["suspects_tested"]["share"] == 0.17
+
+
+# ---- numbers and tables
+
+
+def test_inseparable_parameters_are_marked() -> None:
+    """The combination has a row, and nothing is divided by zero."""
+    design = results.design()
+    std = np.array([np.inf, 0.1, 0.1])
+    combined = CombinationAccuracy(expression="m + 2 l", value=0.0, std_initial=0.4, std_final=0.1)
+    blind = replace(
+        design,
+        initial=replace(design.initial, std=std),
+        final=replace(design.final, std=std),
+        combined=(combined,),
+        combinations=("m and l only as m + 2 l",),
+    )
+    text = printed(page_of(blind))
+    assert "not alone" in text and "m + 2 l" in text and "÷ 4.0" in text
+
+
+def test_an_estimate_names_bounds_and_warnings_in_all_places() -> None:
+    estimate = results.estimate(misfit=True, at_bound=("mass",), warnings=("residuals are [odd]",))
+    page = page_of(estimate)
+    for text in (printed(page, verbose=True), as_markdown(page).replace("\\", "")):
+        for words in ("at bound", "residuals are [odd]", "the formal σ underestimates the errors"):
+            assert words in text
+    assert "at bound" not in printed(page_of(results.estimate()), verbose=True)
+
+
+def test_a_prediction_without_error_has_no_ratio() -> None:
+    """A log that was simulated without noise may be predicted exactly by both models."""
+    found = results.estimate().predictions[0]
+    exact = replace(found.nominal, rms=0.0 * found.nominal.rms)
+    predictions = (replace(found, nominal=exact, identified=exact),)
+    text = printed(page_of(results.estimate(predictions=predictions)), verbose=True)
+    assert "nan" not in text.lower()
+
+
+@pytest.mark.parametrize(
+    ("shown", "text"),
+    [
+        (improvement(2.0, 0.5), "÷ 4.0"),
+        (improvement(0.5, 2.0), "× 4.0"),
+        (improvement(np.inf, 2.0), "-"),
+        (improvement(1.0, 0.0), "-"),
+        (relative(0.00123, 1.0), "0.12 %"),
+        (relative(0.998, 1.0), "99.8 %"),
+        (relative(6.32, 1.0), "632 %"),
+        (named("m", "kg"), "m (kg)"),
+        (named("ratio", ""), "ratio"),
+        (number(0.12345, 2, " %"), "0.12 %"),
+        (number(np.nan), "-"),
+        (number(-np.inf), "-∞"),
+        (number(np.inf, infinite="not alone"), "not alone"),
+    ],
+)
+def test_numbers_and_names_as_text(shown: str, text: str) -> None:
+    assert shown == text
+
+
+def test_markdown_escapes_marks_and_keeps_lines_to_be_copied() -> None:
+    table = Table(title="a_b", columns=("x", "y"), rows=(Row(("a|b `c`", "1")),))
+    text = as_markdown(page_with(table, Listing("Copy", ("[fit]\nhold = ['a*b']",), code=True)))
+    assert r"| a\|b \`c\` | 1 |" in text
+    assert "```toml\n[fit]\nhold = ['a*b']\n```" in text
+
+
+# ---- selection of terms
+
+
+def selection(*steps: SelectionStep, **changes: Any) -> Selection:
+    """A selection that added dry friction of the slide, unless stated otherwise."""
+    stated: dict[str, Any] = {"terms": (SLIDE_FRICTION,), "ending": "No further term."}
+    return Selection(steps=(BEGUN, *steps), **{**stated, **changes})
+
+
+def test_alternatives_of_a_removed_term_are_not_named() -> None:
+    other = AlternativeTerm(description="a spring", path="joint/slide:stiffness", values={"m": 2.0})
+    added = SelectionStep(
+        decision=Decision.ADDED,
+        description=SLIDE_FRICTION.description,
+        path=SLIDE_FRICTION.path,
+        count=1,
+        error=1.0,
+        alternatives=(other,),
+    )
+    kept, removed = (
+        sentences(page_of(results.estimate(selection=found)))
+        for found in (selection(added), selection(added, terms=()))
+    )
+    assert "do not tell dry friction of slide apart from a spring" in kept
+    assert "do not tell" not in removed
+
+
+def test_the_verdict_names_the_added_terms() -> None:
+    verdict = page_of(results.estimate(selection=selection())).verdict
+    assert verdict.text.startswith("With dry friction of slide added, the model explains")
+
+
+def test_rows_that_changed_the_model_stand_out_and_useless_ones_have_no_numbers() -> None:
+    steps = (
+        SelectionStep(decision=Decision.REJECTED, description="a spring", error=1.9),
+        SelectionStep(decision=Decision.ADDED, description=SLIDE_FRICTION.description, error=1.0),
+        SelectionStep(decision=Decision.UNHELPFUL, description="damping", error=np.nan),
+    )
+    (table,) = [part for part in selection_parts(selection(*steps)) if isinstance(part, Table)]
+    emphases = [row.emphasis for row in table.rows]
+    assert emphases == [Emphasis.NORMAL, Emphasis.NORMAL, Emphasis.STRONG, Emphasis.NORMAL]
+    assert table.rows[-1].cells == ("damping", "no better fit", "0", "-", "", "")
+
+
+def test_the_tables_to_keep_state_the_selected_experiment() -> None:
+    base = mjfim.Experiment.from_file(ROOT / "models" / "double_pendulum.toml")
+    experiment = base.replace(
+        parameters={
+            "d1": {"guess": 0.2, "bounds": [0.0, 5.0]},
+            "d2": {"guess": 0.05, "bounds": [0.0, 5.0]},
+        },
+        fit={"hold": ["m2"], "bootstrap": 0},
+    )
+    # A number of the model, a term of the library with two parameters, a pool and held parameters.
+    places = [("friction", "N", 0.1 + 0.2), ("velocity", "rad/s", 1 / 3)]
+    stribeck = Term(
+        description="Stribeck friction of elbow",
+        numbers=tuple(
+            TermNumber(
+                name=f"stribeck_{name}",
+                path=f"term/elbow_stribeck:{name}",
+                value=0.1,
+                unit=unit,
+                scale=scale,
+            )
+            for name, unit, scale in places
+        ),
+        tables={
+            "elbow_stribeck": {"kind": "stribeck", "joint": "elbow", "values": {"velocity": 1e-5}}
+        },
+    )
+    (pool,) = possible_pools(System.resolve(experiment).parameters, ("d1", "d2"))
+    found = selection(
+        terms=(SLIDE_FRICTION, stribeck),
+        pooled=(pool,),
+        held=("I1",),
+        hold=("m2", "I1"),
+        segments=0.123456789,
+    )
+    (listing,) = (part for part in selection_parts(found) if isinstance(part, Listing))
+    added = tomllib.loads("\n\n".join(listing.items))
+
+    # Pasted, with the tables of the pooled parameters removed, they give the selected experiment.
+    values = experiment.model_dump(exclude_unset=True)
+    kept = {n: t for n, t in values["parameters"].items() if n not in pool.members}
+    pasted = experiment.restated(
+        {
+            **values,
+            "terms": added["terms"],
+            "parameters": {**kept, **added["parameters"]},
+            "fit": {**values["fit"], **added["fit"]},
+        }
+    )
+    assert pasted == selected_experiment(experiment, found)
+    assert pasted.fit.segments == 0.123456789
+    assert "# in place of [parameters.d1], [parameters.d2]" in listing.items[-2]
+    # The lines fit into a terminal, so that none is folded.
+    assert max(len(line) for item in listing.items for line in item.split("\n")) < 76
