@@ -28,7 +28,7 @@ from mjfim.parallel import (
     one_blas_thread,
     pool_stop_token,
 )
-from mjfim.parallel.budget import Budget, StopToken
+from mjfim.parallel.budget import Budget, StopReason, StopToken
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import SharedValue
 from mjfim.records.design import (
@@ -245,6 +245,7 @@ class Move:
         seconds: Time [s].
         budget: Budget of the design.
         keeps_curves: The candidate remains a sum of its curves.
+        may_continue: Another move follows where the time is over before the descent.
         plan: How a worker makes the levels; None in the process of the design.
     """
 
@@ -255,6 +256,7 @@ class Move:
     seconds: float
     budget: Budget
     keeps_curves: bool = False
+    may_continue: bool = False
     plan: SharedValue[Plan] | None = None
 
 
@@ -310,8 +312,12 @@ class Climb:
                     break
         except (SimulationDivergedError, np.linalg.LinAlgError):
             self.candidate = replace(self.candidate, status=Status.STALLED)
+        is_unfinished = self._move.may_continue and self._budget.exhausted is StopReason.SECONDS
         if rung.barrier is not None and not self.candidate.has_left:
-            self.candidate = self.judged(rung.variant)
+            if not is_unfinished:
+                return self.judged(rung.variant)
+            weight = self.candidate.history[-1].mu if self.candidate.history else None
+            self.candidate = replace(self.candidate, first_weight=weight)
         return self.candidate
 
     @property

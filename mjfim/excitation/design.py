@@ -23,7 +23,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import Identifiability
-from mjfim.parallel import ExecutorLike, LostWorkError, Workers, one_blas_thread
+from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design, Status
@@ -212,11 +212,6 @@ def _chosen(
         return best, point
 
     if not interrupted:
-        if results and all(result.status is Status.LOST for result in results):
-            fault = "" if search.executor is None else Workers.of(search.executor).probable_fault
-            raise LostWorkError(
-                f"the worker of every start was lost several times, so there is no design: {fault}"
-            )
         raise SimulationDivergedError("the simulation diverges from every start")
     return best, begins[0]
 

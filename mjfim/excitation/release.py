@@ -437,7 +437,7 @@ class ReleaseSearch:
         results: list[tuple[list[Release], Status | None]] = [([], None) for _ in starts]
         for outcome in carry_out(self._workers, _in_worker, orders, self._budget):
             if outcome.is_lost:
-                results[outcome.index] = [], Status.LOST
+                results[outcome.index] = self._releases.followed(starts[outcome.index], is_over)
                 continue
             found, status, steps = outcome.result
             self._releases.plant.simulator.add_steps(steps)

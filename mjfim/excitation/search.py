@@ -99,6 +99,11 @@ CLOSING_SHARE = 0.95
 # Factor by which a control is enlarged where there is time for few evaluations only.
 ENLARGING = 1.25
 
+# Time of a move on a worker, and the same in evaluations; the longer one counts. Between two moves
+# the iterates are shown, and a request to stop costs one move at most where workers do not see it.
+MOVE_SECONDS = 8.0
+MOVE_EVALUATIONS = 60.0
+
 # Number of random changes without progress after which others moves follow.
 PATIENCE = 16
 
@@ -518,31 +523,51 @@ class Search:
         """Let candidates climb some rungs on the workers of the executor."""
         assert self.executor is not None
         workers = Workers.of(self.executor)
-        turns = -(-len(candidates) // workers.count)
-        seconds = share * self.budget.seconds_left / turns
         plan = self._plan(workers.threads_for(len(candidates)))
-        moves = [
-            replace(self._move(each, rungs, seconds, is_last), plan=plan) for each in candidates
-        ]
-        moved: list[Candidate] = []
-        for outcome in carry_out(self.executor, move_in_worker, moves, self.budget):
-            before = candidates[outcome.index]
-            if outcome.is_lost:
-                moved.append(replace(before, status=Status.LOST))
-                continue
-            found = outcome.result
-            self.remote_steps += found.steps - before.steps
-            for row in found.history[len(before.history) :]:
-                if self.budget.stop.requested:
-                    break
-                yield DesignEvent(start=found.name, row=row)
-            if rungs[-1].barrier is not None and not found.is_judged:
-                move = self._move(found, rungs, 0.0, is_last)
-                found = replace(
-                    Climb(self.grounds, move).judged(rungs[-1].variant), status=found.status
+        end = self.budget.seconds_used + share * self.budget.seconds_left
+        longest = max(MOVE_SECONDS, MOVE_EVALUATIONS * self.evaluation_seconds)
+        results = {each.name: each for each in candidates}
+        waiting = list(candidates)
+        while waiting:
+            turns = -(-len(waiting) // workers.count)
+            seconds = max(end - self.budget.seconds_used, 0.0) / turns
+            moves = [
+                replace(
+                    self._move(each, _rungs_left(each, rungs), min(seconds, longest), is_last),
+                    may_continue=seconds > longest,
+                    plan=plan,
                 )
-            moved.append(_named_stop(found, self.budget))
-        return moved
+                for each in waiting
+            ]
+            before, waiting = waiting, []
+            for outcome in carry_out(self.executor, move_in_worker, moves, self.budget):
+                begun = before[outcome.index]
+                if outcome.is_lost:
+                    # What was lost with its worker is done here.
+                    found = yield from Climb(self.grounds, moves[outcome.index]).run()
+                else:
+                    found = outcome.result
+                    self.remote_steps += found.steps - begun.steps
+                    for row in found.history[len(begun.history) :]:
+                        if not self.budget.stop.requested:
+                            yield DesignEvent(start=found.name, row=row)
+                results[found.name] = found
+                has_moved = len(found.history) > len(begun.history)
+                if moves[outcome.index].may_continue and has_moved and _is_unfinished(found):
+                    waiting.append(found)
+            if self.budget.exhausted is not None:
+                break
+
+        ended = [results[each.name] for each in candidates if results[each.name] is not each]
+        return [self._ended(each, rungs[-1], is_last) for each in ended]
+
+    def _ended(self, found: Candidate, rung: Rung, is_last: bool) -> Candidate:
+        """A candidate after its last move, compared on the stated plant."""
+        if rung.barrier is not None and not (found.is_judged or found.has_left):
+            move = self._move(found, (rung,), 0.0, is_last)
+            judged = Climb(self.grounds, move).judged(rung.variant)
+            found = replace(judged, status=found.status)
+        return _named_stop(found, self.budget)
 
     def _plan(self, threads: int) -> SharedValue[Plan]:
         """What all moves share."""
@@ -569,6 +594,17 @@ def candidate_of(start: InitialControl) -> Candidate:
     return Candidate(
         name=start.name, control=start.control, curves=start.basis, repeats=start.repeats
     )
+
+
+def _rungs_left(candidate: Candidate, rungs: tuple[Rung, ...]) -> tuple[Rung, ...]:
+    """The rungs that a candidate has not left behind."""
+    return rungs if candidate.best is None else rungs[-1:]
+
+
+def _is_unfinished(candidate: Candidate) -> bool:
+    """Whether the time of a move was over before its descent."""
+    is_over = candidate.is_judged or candidate.has_left or candidate.is_held_up
+    return candidate.status is None and not is_over
 
 
 def _named_stop(candidate: Candidate, budget: Budget) -> Candidate:
