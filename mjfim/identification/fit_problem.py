@@ -259,23 +259,6 @@ class FitProblem(SegmentSimulation):
             pins=Pins.none(parameters),
         )
 
-    def from_known_states(
-        self, at: UnknownValues, unknown: Sequence[int] = ()
-    ) -> tuple[FitProblem, UnknownValues]:
-        """The problem with initial states most of whose components are no unknowns.
-
-        See `SegmentSimulation.from_known_states`.
-        """
-        known = replace(self, start_directions=self.start_directions[:, list(unknown)])
-        if not self.layout.free_starts:
-            return known, at
-        segments = tuple(
-            replace(segment, start=self._initial_state(at, i))
-            for i, segment in enumerate(self.segments)
-        )
-        private = np.zeros((len(segments), len(unknown)))
-        return replace(known, segments=segments), replace(at, private=private)
-
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
         """This problem with some measured values only.
 
@@ -557,7 +540,7 @@ class FitProblem(SegmentSimulation):
                 return None
 
             found = self.whitened.linearised(rows)
-            weighted = found.weighted(self.loss).rows
+            weighted = found.weighted(self.loss)
 
             # Values are added to the triangle of the block of their row.
             block = self.blocks.of_rows(rows)[found.row]

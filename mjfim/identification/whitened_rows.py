@@ -13,19 +13,6 @@ from mjfim.plant.noise import Noise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class WeightedRows:
-    """The n values of some rows that count, row by row.
-
-    Attributes:
-        rows: (n, m) whitened rows `[J_private, J_common, r]`, each multiplied by its weight.
-        weight: (n,) weights of the robust loss; 1 for the linear one.
-    """
-
-    rows: Array
-    weight: Array
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class LinearisedRows:
     """The values of some rows that count, row by row.
 
@@ -39,17 +26,15 @@ class LinearisedRows:
     r: Array
     J: Array
 
-    def weighted(self, loss: RobustLoss) -> WeightedRows:
-        """These values with the weights that linearise a robust loss.
+    def weighted(self, loss: RobustLoss) -> Array:
+        """(n, m) rows `[J_private, J_common, r]`, each with the weight that linearises a loss.
 
         Their squares are those of iteratively reweighted least squares.
 
         Args:
             loss: The loss of a whitened residual.
         """
-        weight = loss.weight(self.r)
-        rows = np.concatenate([self.J, self.r[:, None]], axis=1) * weight[:, None]
-        return WeightedRows(rows=rows, weight=weight)
+        return np.column_stack([self.J, self.r]) * loss.weight(self.r)[:, None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
