@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,30 +95,19 @@ def test_too_many_recordings_are_not_cut_into_crumbs(
     assert part.problem.segments[0].recording < 3 <= part.problem.segments[1].recording
 
 
-def test_the_tested_data_are_said() -> None:
-    complete = TermTestData(share=1.0, recordings=4, count=4)
-    assert TermTests(data=complete).remark == ""
-    assert TermTests().remark == ""
-    for recordings, count, words in (
-        (4, 4, "17 % of the data, from all 4 recordings"),
-        (2, 8, "17 % of the data, from 2 of 8 recordings"),
-        (1, 1, "17 % of the data, the first part of the recording"),
-    ):
-        part = TermTestData(share=0.17, recordings=recordings, count=count)
-        expected = f" Terms that the model may lack were tested on {words}."
-        assert TermTests(data=part).remark == expected
-
-
-def test_terms_that_could_not_be_tested_are_said() -> None:
-    one = TermTestData(share=1.0, recordings=1, count=1, untested=("Stribeck friction of pivot",))
-    assert TermTests(data=one).remark == (
-        " Not tested, because the simulation with it diverges or the model cannot have it: "
-        "Stribeck friction of pivot."
-    )
-    assert one.summary()["untested"] == ["Stribeck friction of pivot"]
-    two = TermTestData(share=0.5, recordings=1, count=1, untested=("a", "b"))
-    assert "first part of the recording. Not tested" in TermTests(data=two).remark
-    assert two.untested_sentence.endswith("cannot have them: a, b.")
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({"share": 1.0, "recordings": 4, "count": 4}, ""),
+        ({"share": 0.17, "recordings": 4, "count": 4}, "17 % of the data, from all 4 recordings."),
+        ({"share": 0.17, "recordings": 2, "count": 8}, "from 2 of 8 recordings."),
+        ({"share": 0.17, "recordings": 1, "count": 1}, "the first part of the recording."),
+        ({"share": 1.0, "recordings": 1, "count": 1, "untested": ("a",)}, "cannot have it: a."),
+        ({"share": 1.0, "recordings": 1, "count": 1, "untested": ("a", "b")}, "have them: a, b."),
+    ],
+)
+def test_what_was_not_tested_is_said(data: dict[str, Any], words: str) -> None:
+    assert TermTests(data=TermTestData(**data)).remark.endswith(words)
 
 
 @pytest.mark.slow
@@ -148,7 +138,7 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
         problem.of_segments(first.segments), logs, first.unknowns(at)
     ).terms
 
-    monkeypatch.setattr(score_tests, "_affordable_samples", lambda *_: 300)
+    monkeypatch.setattr(score_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
     found = find_missing_terms(problem, logs, at)
     assert found.data is not None
     assert found.data.recordings == 4
@@ -163,7 +153,7 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     experiment = experiment_of(tmp_path, "tilt", fit={"bootstrap": 0})
     system = System.resolve(experiment)
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in (0, 1)]
-    monkeypatch.setattr(score_tests, "_affordable_samples", lambda *_: 100)
+    monkeypatch.setattr(score_tests, "part_of_data", lambda problem, _: part_of_data(problem, 100))
     found = mjfim.select_terms(experiment, logs)
     assert not found.misfit
     words = "Terms that the model may lack were tested on 25 % of the data, from all 2 recordings."

@@ -12,14 +12,11 @@ import mjfim
 from mjfim.experiment.signals import multisine
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.terms.candidates import Candidate, Effect
 from mjfim.identification.terms.score_tests import (
     MAX_NAMED_TERMS,
-    MAX_TESTED,
     TermTests,
     find_missing_terms,
     first_terms,
-    in_groups,
 )
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import Term, TermNumber
@@ -171,21 +168,6 @@ def test_a_selection_adds_the_friction_of_all_joints_in_one_step(tmp_path: Path)
     }
     for joint, excess in zip(JOINTS, EXCESS, strict=True):
         assert values[names[f"term/{joint}_stribeck:excess"]] == pytest.approx(excess, rel=0.2)
-
-
-def test_terms_of_joints_that_follow_each_other_are_in_one_group() -> None:
-    def candidate(kind: str) -> Candidate:
-        number = Effect(path="p", unit="", value=0.0, begin=0.0, size=1.0)
-        return Candidate(description=kind, tested=(number,), kind=kind, joint=kind and "j")
-
-    # By their number alone, the second group would begin within the terms of the joints.
-    plain, of_joint = candidate(""), candidate("damping")
-    candidates = [plain] * 60 + [of_joint] * 80
-    assert [len(group) for group in in_groups(candidates)] == [60, 80]
-    assert [len(group) for group in in_groups([plain] * 140)] == [MAX_TESTED, 40]
-
-    # More of them than one linearisation tests are divided.
-    assert max(len(group) for group in in_groups([of_joint] * 250)) <= MAX_TESTED
 
 
 def missing(path: str, *, sigmas: float, joints: tuple[str, ...] = ()) -> Term:
