@@ -16,9 +16,9 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import (
-    cross_validation,
     fit_workers,
-    left_out_parts,
+    left_out,
+    predictions,
     search,
     segment_simulation,
 )
@@ -194,7 +194,7 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
     monkeypatch: pytest.MonkeyPatch,
     samples: int,
 ) -> None:
-    monkeypatch.setattr(left_out_parts, "MAX_SAMPLES", samples)
+    monkeypatch.setattr(left_out, "MAX_SAMPLES", samples)
     named = [replace(recording, name=f"log {i}") for i, recording in enumerate(recordings)]
     problem = problem_of(experiment, named, WHOLE)
     plant = problem.system.plant
@@ -202,11 +202,11 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
         problem, problem.system.parameters.guess, SearchSettings(max_iterations=2)
     )
     begin = plant.engine_steps
-    alone = cross_validation.predict_unfitted(problem, solution, None, Budget())
+    alone = predictions.predict_unfitted(problem, solution, None, Budget())
     steps = plant.engine_steps
     with LosingThreads() as threads:
         divided = problem.on_workers(FitWorkers(threads))
-        found = cross_validation.predict_unfitted(divided, solution, None, Budget())
+        found = predictions.predict_unfitted(divided, solution, None, Budget())
 
     assert [part.name for part in found] == [part.name for part in alone]
     assert [part.name for part in found][:2] == (
