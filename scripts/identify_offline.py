@@ -53,7 +53,7 @@ def main() -> int:
 def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
     """Identify from recordings, and return the exit code."""
     # These imports take a second, in which Ctrl-C is handled already.
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.identification.identify import identify_system
     from mjfim.output.manifest import OutputGuard, claimed

@@ -61,7 +61,7 @@ def campaign(
     stated = mjfim.Experiment.from_file(experiment)
 
     from mjfim.excitation.task import DesignTask
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.campaign_parameters import CampaignParameters
     from mjfim.output.pages.robots import campaign_page

@@ -30,7 +30,7 @@ def check(
     if has_folder:
         draw_elsewhere()
 
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
     from mjfim.output.folders import CHECK_FILES

@@ -33,7 +33,7 @@ def compare(
     stated = mjfim.Experiment.from_file(experiment)
 
     from mjfim.excitation.task import DesignTask
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.output.folders import comparison_files
     from mjfim.studies.compare import chosen_methods, compare_task
 

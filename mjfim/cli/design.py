@@ -56,7 +56,7 @@ def design(
     from mjfim.excitation.shortest_horizon import OutOfReachError
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 

@@ -44,7 +44,7 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a design for ROS 2 or LeRobot, or as a stand-alone Python program that plays it."""
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output.folders import find_experiment_file
     from mjfim.output.robots.export import (

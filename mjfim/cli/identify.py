@@ -78,7 +78,7 @@ def identify(
     if select and method == "newton":
         raise ExperimentError("--select: fits with the method least_squares only, not newton")
 
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output.archive import summary_with_origin
     from mjfim.output.folders import estimate_files, parts_of_identified

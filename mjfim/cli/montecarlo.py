@@ -30,7 +30,7 @@ def montecarlo(
     if measure_rate is not None:
         stated = stated.replace(measure_rate=measure_rate)
 
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
     from mjfim.output.folders import study_files

@@ -66,7 +66,7 @@ def payload(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.output.folders import estimate_files, parts_of_identified
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.studies.payload import PayloadTask

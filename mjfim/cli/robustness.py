@@ -51,7 +51,7 @@ def robustness(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output.folders import ROBUSTNESS_FILES
     from mjfim.parallel import cores

@@ -49,7 +49,7 @@ def simulate(
     from mjfim.excitation.stated_inputs import stated_motion
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys
-    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.packing import input_files
     from mjfim.experiment.simulate import simulate_system
     from mjfim.experiment.system import System
     from mjfim.output import archive

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from mjfim.recordings.quantities import WithUnit
-from mjfim.recordings.spec import (
+from mjfim.recordings.section import (
     Boolean,
     Bound,
     Finite,

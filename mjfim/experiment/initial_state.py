@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -64,65 +63,41 @@ def initial_state(stated: Initial, model: Any, key: Any, layout: StateLayout | N
     if key is not None:
         qpos, qvel, act = np.array(key.qpos), np.array(key.qvel), np.array(key.act)
     else:
-        sizes = _Sizes(model, layout)
-        qpos = sizes.positions(stated.qpos)
-        qvel = sizes.velocities(stated.qvel)
-        act = sizes.activations(stated.act, qpos)
+        # Without terms the MJCF has the whole state.
+        own = layout or StateLayout(
+            qpos=np.arange(model.nq), qvel=np.arange(model.nv), act=np.arange(model.na), model=model
+        )
+        qpos = np.array(model.qpos0)
+        if stated.qpos is not None:
+            qpos = _completed("qpos", stated.qpos, model.nq, len(own.qpos), own.positions)
+        zeros = np.zeros(model.nv)
+        qvel = _completed("qvel", stated.qvel or zeros, model.nv, len(own.qvel), own.velocities)
+
+        def activations(numbers: Array) -> Array:
+            """Activations of the model at the initial positions."""
+            return own.activations(numbers, qpos, None)
+
+        zeros = np.zeros(len(own.act))
+        act = _completed("act", stated.act or zeros, model.na, len(own.act), activations)
 
     _require_rotations(model, qpos)
     mujoco.mj_normalizeQuat(model, qpos)
     return np.concatenate([qpos, qvel, act])
 
 
-@dataclass(frozen=True, eq=False)
-class _Sizes:
-    """Sizes of the stated parts of a state: those of the model, or of the MJCF without terms.
-
-    Attributes:
-        model: MjModel.
-        layout: Where the state of the MJCF is in that of the model; None without terms.
-    """
-
-    model: Any
-    layout: StateLayout | None
-
-    def positions(self, stated: Sequence[float] | None) -> Array:
-        """(nq,) positions."""
-        if stated is None:
-            return np.array(self.model.qpos0, dtype=np.float64)
-        numbers = np.array(stated, dtype=np.float64)
-        if self.layout is not None and len(numbers) == len(self.layout.qpos):
-            return self.layout.positions(numbers)
-        return self._whole("qpos", numbers, self.model.nq)
-
-    def velocities(self, stated: Sequence[float] | None) -> Array:
-        """(nv,) velocities."""
-        if stated is None:
-            return np.zeros(self.model.nv)
-        numbers = np.array(stated, dtype=np.float64)
-        if self.layout is not None and len(numbers) == len(self.layout.qvel):
-            return self.layout.velocities(numbers)
-        return self._whole("qvel", numbers, self.model.nv)
-
-    def activations(self, stated: Sequence[float] | None, qpos: Array) -> Array:
-        """(na,) activations at the positions qpos: (nq,)."""
-        if self.layout is None:
-            numbers = np.zeros(self.model.na) if stated is None else np.array(stated)
-            return self._whole("act", numbers, self.model.na)
-
-        count = len(self.layout.act)
-        numbers = np.zeros(count) if stated is None else np.array(stated)
-        if len(numbers) == count:
-            return self.layout.activations(numbers, qpos, None)
-        return self._whole("act", numbers, self.model.na)
-
-    def _whole(self, name: str, numbers: Array, count: int) -> Array:
-        """The numbers, of which there must be as many as the model has; ExperimentError if not."""
-        if len(numbers) != count:
-            raise ExperimentError(
-                f"initial.{name}: {len(numbers)} numbers; this model needs {count}"
-            )
-        return np.asarray(numbers, dtype=np.float64)
+def _completed(
+    name: str,
+    numbers: Sequence[float] | Array,
+    count: int,
+    own_count: int,
+    complete: Callable[[Array], Array],
+) -> Array:
+    """Numbers of the model; those of the MJCF alone are completed."""
+    if len(numbers) == own_count:
+        return complete(np.array(numbers, dtype=np.float64))
+    if len(numbers) != count:
+        raise ExperimentError(f"initial.{name}: {len(numbers)} numbers; this model needs {count}")
+    return np.array(numbers, dtype=np.float64)
 
 
 def _require_rotations(model: Any, qpos: Array) -> None:

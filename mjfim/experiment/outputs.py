@@ -41,16 +41,16 @@ def resolve_outputs(
 
     Args:
         experiment: The experiment.
-        coordinates: Coordinates of its model that can be measured.
-        space: The state space of the model.
-        stride: Samples from one measurement to the next at `measure_rate`.
-        stride_of_key: Samples between measurements, for each key of `noise` that states a rate.
+        coordinates: Coordinates and sensors of the model.
+        space: Layout of the state.
+        stride: Samples from one measurement to the next.
+        stride_of_key: The same for keys of the table `noise` with a rate of their own.
 
     Returns:
-        The outputs, and the noise with their covariance and strides.
+        The outputs in the order of the columns, and their noise.
 
     Raises:
-        ExperimentError: A key of the tables is not valid for the model; the message names it.
+        ExperimentError: A key names no output, or a covariance is not valid.
     """
     columns_of_key = columns_of_keys(coordinates)
     stated = dict(experiment.noise) or _noise_of_mjcf(
@@ -62,105 +62,77 @@ def resolve_outputs(
                 f"noise: {unknown_coordinate('sensor', key, list(columns_of_key))}"
             )
 
-    table = _NoiseTable(coordinates, stride)
-
+    columns = list(coordinates.measurable)
+    covariance = np.zeros((len(columns), len(columns)))
+    strides = np.full(len(columns), stride)
+    measured: set[int] = set()
     # Keys that cover fewer outputs are entered last, so that they take precedence over keys that
     # cover more outputs.
     for key in sorted(stated, key=lambda k: -len(columns_of_key[k])):
-        table.set_key(key, stated[key], columns_of_key[key], stride_of_key.get(key, stride))
-    for block in experiment.correlated:
-        table.correlate(block)
+        rows = [columns.index(name) for name in columns_of_key[key]]
+        if not rows:
+            raise ExperimentError(
+                "noise.state: the model has no joint to measure; name sensors instead"
+            )
+        covariance[rows] = 0.0
+        covariance[:, rows] = 0.0
+        factors = [coordinates.state[i].sigma_factor for i in rows if i < len(coordinates.state)]
+        factors += [1.0] * (len(rows) - len(factors))
+        covariance[np.ix_(rows, rows)] = _key_covariance(
+            f"noise.{key}", stated[key], np.array(factors)
+        )
+        strides[rows] = stride_of_key.get(key, stride)
+        measured.update(rows)
 
-    measured = sorted(table.measured)
-    outputs = _outputs(coordinates, table.covariance, measured)
-    noise = Noise(
-        covariance=table.covariance[np.ix_(measured, measured)], strides=table.strides[measured]
+    for block in experiment.correlated:
+        rows = _correlated_rows(block, columns, covariance, strides)
+        covariance[np.ix_(rows, rows)] = _checked_covariance(
+            "correlated.covariance", block.covariance, len(rows)
+        )
+        measured.update(rows)
+
+    kept = sorted(measured)
+    noise = Noise(covariance=covariance[np.ix_(kept, kept)], strides=strides[kept])
+    components: list[StateComponent | SensorComponent] = [*coordinates.state, *coordinates.sensors]
+    outputs = tuple(
+        Output(
+            name=components[i].name,
+            sigma=float(np.sqrt(covariance[i, i])),
+            **_place(components[i]),
+        )
+        for i in kept
     )
     return Outputs(outputs=outputs, space=space), noise
 
 
-class _NoiseTable:
-    """Noise of all n columns that can be measured, filled key by key.
+def _place(component: StateComponent | SensorComponent) -> dict[str, Any]:
+    """Where an output is read: in the state, with its unit, or in the data of the sensors."""
+    if isinstance(component, StateComponent):
+        return {"unit": component.unit, "state": component.address}
+    return {"sensor": component.address}
 
-    Attributes:
-        columns: Names of the n columns.
-        covariance: (n, n) covariance of the noise; zero for columns that are not measured.
-        strides: (n,) samples from one measurement to the next.
-        measured: Indices of the columns that are measured.
-    """
 
-    def __init__(self, coordinates: ModelCoordinates, stride: int) -> None:
-        """Begin without measured columns.
-
-        stride: samples from one measurement to the next, for keys that state no rate.
-        """
-        self.columns = list(coordinates.measurable)
-        n = len(self.columns)
-        self.covariance = np.zeros((n, n))
-        self.strides = np.full(n, stride)
-        self.measured: set[int] = set()
-
-        self._sigma_factors = np.ones(n)
-        self._sigma_factors[: len(coordinates.state)] = [
-            component.sigma_factor for component in coordinates.state
-        ]
-
-    def indices(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
-        """Indices of columns by their names."""
-        found = [self.columns.index(name) for name in names]
-        return np.array(found, dtype=np.intp)
-
-    def set_key(self, key: str, value: float | NoiseSpec, names: list[str], stride: int) -> None:
-        """Enter one key of the table `noise`.
-
-        Args:
-            key: The key.
-            value: What the table states for it.
-            names: The columns for which it is valid.
-            stride: Samples from one of their measurements to the next.
-        """
-        if not names:
+def _correlated_rows(
+    block: Correlated, columns: list[str], covariance: Array, strides: np.ndarray
+) -> list[int]:
+    """Columns of a block of the table `correlated`, which must be free of other correlations."""
+    for name in block.outputs:
+        if name not in columns:
             raise ExperimentError(
-                "noise.state: the model has no joint to measure; name sensors instead"
+                f"correlated.outputs: {unknown_coordinate('output', name, columns)}"
             )
-
-        spec = value if isinstance(value, NoiseSpec) else NoiseSpec(sigma=value)
-        rows = self.indices(names)
-        self.covariance[rows] = 0.0
-        self.covariance[:, rows] = 0.0
-        self.covariance[np.ix_(rows, rows)] = _key_covariance(
-            f"noise.{key}", spec, self._sigma_factors[rows]
-        )
-        self.measured.update(rows.tolist())
-
-        self.strides[rows] = stride
-
-    def correlate(self, block: Correlated) -> None:
-        """Enter one block of the table `correlated`."""
-        for name in block.outputs:
-            if name not in self.columns:
-                raise ExperimentError(
-                    f"correlated.outputs: {unknown_coordinate('output', name, self.columns)}"
-                )
-
-        rows = self.indices(block.outputs)
-        outputs = listed(block.outputs)
-        if len(set(rows.tolist())) < len(rows):
-            raise ExperimentError(f"correlated.outputs: an output is listed twice: {outputs}")
-        if len(set(self.strides[rows].tolist())) > 1:
-            raise ExperimentError(f"correlated.outputs: {outputs} are measured at different rates")
-
-        others = np.setdiff1d(np.arange(len(self.columns)), rows)
-        if np.any(self.covariance[np.ix_(rows, others)]):
-            raise ExperimentError(
-                "correlated.outputs: one of them is already correlated with an output that is not "
-                "listed"
-            )
-
-        self.covariance[np.ix_(rows, rows)] = _checked_covariance(
-            "correlated.covariance", block.covariance, len(rows)
-        )
-        self.measured.update(rows.tolist())
+    rows = [columns.index(name) for name in block.outputs]
+    others = np.setdiff1d(np.arange(len(columns)), rows)
+    fault = ""
+    if len(set(rows)) < len(rows):
+        fault = "an output is listed twice"
+    elif len(set(strides[rows].tolist())) > 1:
+        fault = "these outputs are measured at different rates"
+    elif np.any(covariance[rows][:, others]):
+        fault = "one of them is already correlated with an output that is not listed"
+    if fault:
+        raise ExperimentError(f"correlated.outputs: {fault}: {listed(block.outputs)}")
+    return rows
 
 
 def columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
@@ -195,44 +167,10 @@ def _noise_of_mjcf(coordinates: ModelCoordinates, *, required: bool) -> dict[str
     return stated
 
 
-def _outputs(
-    coordinates: ModelCoordinates, covariance: Array, measured: list[int]
-) -> tuple[Output, ...]:
-    """The measured outputs, in the order of the columns.
-
-    Args:
-        coordinates: What can be measured: n columns.
-        covariance: (n, n) covariance of the noise.
-        measured: Places of the columns that are measured.
-    """
-    components: list[StateComponent | SensorComponent] = [*coordinates.state, *coordinates.sensors]
-    sigma = np.sqrt(np.diag(covariance))
-
-    outputs = []
-    for i in measured:
-        component = components[i]
-        if isinstance(component, StateComponent):
-            output = Output(
-                name=component.name,
-                sigma=float(sigma[i]),
-                unit=component.unit,
-                state=component.address,
-            )
-        else:
-            output = Output(name=component.name, sigma=float(sigma[i]), sensor=component.address)
-        outputs.append(output)
-    return tuple(outputs)
-
-
-def _key_covariance(key: str, spec: NoiseSpec, sigma_factors: Array) -> Array:
-    """(n, n) covariance of the n columns of one key.
-
-    Args:
-        key: The key, for messages.
-        spec: The stated noise.
-        sigma_factors: (n,) ratio of each column's standard deviation to the stated one.
-    """
+def _key_covariance(key: str, stated: float | NoiseSpec, sigma_factors: Array) -> Array:
+    """(n, n) covariance of the n columns of one key."""
     n = len(sigma_factors)
+    spec = stated if isinstance(stated, NoiseSpec) else NoiseSpec(sigma=stated)
     if spec.covariance is not None:
         if (sigma_factors != 1.0).any():
             raise ExperimentError(f"{key}: an orientation takes one sigma [rad] and no covariance")

@@ -1,4 +1,4 @@
-"""Packed experiments, which contain their files, and access to the files of any experiment."""
+"""The files that an experiment reads, on the disk or packed in the experiment."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ from mjfim.model.loading import ModelSource, packed_model
 from mjfim.model.model_files import PackedFiles, files_of_model
 
 
-def packed(experiment: Experiment) -> Experiment:
-    """Make a copy that contains all its files. See `Experiment.packed`."""
-    before = experiment.files or PackedFiles.of({})
-    model = experiment.directory / experiment.model
-    tables = [experiment.directory / name for name in tables_of(experiment)]
-    if all(before.content(file) is not None for file in (model, *tables)):
-        return experiment
+def input_files(experiment: Experiment, further: Iterable[Path | None] = ()) -> tuple[Path, ...]:
+    """List the files of an experiment and of a call, none of which a result may replace.
 
-    # A packed model contains what it includes.
-    needed = [*map(Path, before.contents), *tables]
-    if before.content(model) is None:
-        if not model.is_file():
-            raise ModelError(f"{model}: no such model file")
-        needed += files_of_model(model)
-    return experiment.model_copy(update={"files": PackedFiles.read(needed, before)})
+    Args:
+        experiment: The experiment.
+        further: Files and folders of the call, such as recordings; None for those it lacks.
+    """
+    model = experiment.directory / experiment.model
+    files = [Path(experiment.source), *files_of_model(model)]
+    files += [experiment.directory / name for name in experiment.tables]
+    for path in further:
+        if path is not None:
+            files += sorted(path.iterdir()) if path.is_dir() else [path]
+    return tuple(files)
 
 
 def for_workers(
@@ -41,77 +40,42 @@ def for_workers(
         further: Further files that the orders need; `opened_file` gives them by their paths.
 
     Returns:
-        The copy, which is pickled with the hash of its files. It is for `parallel.carry_out` only.
+        The copy, which is pickled with the hash of its files. It is for orders of workers only.
 
     Raises:
         ExperimentError: A file cannot be read.
     """
-    before = experiment.files or PackedFiles.of({})
-    kept = {Path(name): content for name, content in before.contents.items()}
-    if before.content(source.path) is None:
-        kept.update(source.contents)
-
-    tables = [experiment.directory / name for name in tables_of(experiment)]
-    files = PackedFiles.read([*kept, *tables, *further], PackedFiles.of(kept))
+    before = experiment.files or PackedFiles.of(dict(source.contents))
+    tables = [experiment.directory / name for name in experiment.tables]
+    files = PackedFiles.read([*map(Path, before.contents), *tables, *further], before)
     return experiment.model_copy(update={"files": files.shared()})
 
 
-def tables_of(experiment: Experiment) -> tuple[str, ...]:
-    """Names of the files that an experiment states besides its model.
-
-    Returns:
-        The table of the initial control, previous designs and earlier results.
-    """
-    named = [*experiment.descent.previous, *experiment.earlier]
-    if isinstance(experiment.initial.control, str):
-        named.append(experiment.initial.control)
-    return tuple(dict.fromkeys(named))
-
-
 def model_of(experiment: Experiment) -> ModelSource:
-    """Load the model of an experiment.
-
-    Args:
-        experiment: The experiment. The model of a packed one is parsed once in a process.
+    """Load the model of an experiment; that of a packed one is parsed once in a process.
 
     Raises:
         ModelError: The model cannot be used.
     """
     path = experiment.directory / experiment.model
-    if experiment.files is None or experiment.files.content(path) is None:
-        if not path.is_file():
-            raise ModelError(
-                f"{experiment.source}: model: {path}: no such model file; state the path of an "
-                "MJCF or URDF, which begins in the folder of the experiment file"
-            )
-        return ModelSource(path)
-    return packed_model(experiment.files, path)
+    if experiment.files is not None and experiment.files.content(path) is not None:
+        return packed_model(experiment.files, path)
+    if not path.is_file():
+        raise ModelError(
+            f"{experiment.source}: model: {path}: no such model file; state the path of an MJCF or "
+            "URDF, which begins in the folder of the experiment file"
+        )
+    return ModelSource(path)
 
 
 def opened(experiment: Experiment, name: str) -> AbstractContextManager[Path]:
-    """Give a file that an experiment states, other than its model.
-
-    Args:
-        experiment: The experiment.
-        name: Path as the experiment states it.
-
-    Returns:
-        See `opened_file`.
-    """
+    """Give a file by its path as the experiment states it. See `opened_file`."""
     return opened_file(experiment, experiment.directory / name)
 
 
 @contextmanager
 def opened_file(experiment: Experiment, path: Path) -> Iterator[Path]:
-    """Give a file that may be packed in an experiment.
-
-    Args:
-        experiment: The experiment.
-        path: The file.
-
-    Yields:
-        The file on the disk. That of a packed experiment exists inside the block only.
-    """
+    """Give a file that may be packed in an experiment; then it exists inside the block only."""
     content = None if experiment.files is None else experiment.files.content(path)
     if content is None:
         yield path

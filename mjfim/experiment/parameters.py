@@ -19,12 +19,7 @@ from mjfim.model.loading import ModelSource
 from mjfim.model.parameter_ranges import physical_bounds
 from mjfim.model.parameters import Parameter, ParameterSet, Target
 from mjfim.model.paths import ParameterPath, resolve, term_quantity, unit_of
-from mjfim.model.targets import (
-    InertiaField,
-    InitialStateField,
-    OutputBiasField,
-    OutputDelayField,
-)
+from mjfim.model.targets import InertiaField, OutputBiasField, OutputDelayField
 from mjfim.model.variants import MocapPlacement
 
 # Prefix of the names of parameters that are nuisance deviations of the initial state.
@@ -46,16 +41,18 @@ LOGCHOLESKY_FIELDS = tuple(f"logcholesky[{i}]" for i in range(10))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MeasurementSizes:
-    """Sizes of parameters of the measurement, which no model shows.
+class Measured:
+    """The measured outputs, as far as parameters depend on them.
 
     Attributes:
-        period: Size of a delay: the sample period of the experiment [s].
+        names: ny names of the outputs.
         sigma: (ny,) sizes of biases: the standard deviations of the outputs' noise [y-unit].
+        period: Size of a delay: the sample period of the experiment [s].
     """
 
-    period: float
+    names: Sequence[str]
     sigma: Array
+    period: float
 
     def magnitude(self, target: Target, model: Any) -> float:
         """Size with which a change of a target is compared [unit of the target]."""
@@ -70,11 +67,7 @@ class MeasurementSizes:
 
 
 def resolve_parameters(
-    experiment: Experiment,
-    source: ModelSource,
-    outputs: Sequence[str],
-    mocap: MocapPlacement | None,
-    sizes: MeasurementSizes,
+    experiment: Experiment, source: ModelSource, mocap: MocapPlacement | None, measured: Measured
 ) -> ParameterSet:
     """Resolve all parameters in the order of theta.
 
@@ -83,9 +76,8 @@ def resolve_parameters(
     Args:
         experiment: The experiment.
         source: Its model.
-        outputs: Names of the measured columns.
         mocap: Where mocap bodies start; None where they start as compiled.
-        sizes: Sizes of parameters of the measurement.
+        measured: The measured outputs.
 
     Returns:
         The p parameters.
@@ -93,21 +85,18 @@ def resolve_parameters(
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
-    nuisance = list(_nuisance_parameters(experiment.nuisance, source, outputs, sizes))
-
+    nuisance = dict(_nuisance(experiment.nuisance, source, measured.names))
     resolved: list[Parameter] = []
-    for name, spec in experiment.parameters.items():
+    for name, spec in (*experiment.parameters.items(), *nuisance.items()):
         if spec.inertial is None:
-            resolved.append(_single_parameter(name, spec, source, outputs, sizes))
+            resolved.append(_single_parameter(name, spec, source, measured))
         else:
             resolved += _inertia_parameters(name, spec, source.model)
-    resolved += nuisance
 
     names = [parameter.name for parameter in resolved]
     duplicate = next((name for name in names if names.count(name) > 1), None)
     if duplicate is not None:
         raise ExperimentError(f"parameters.{duplicate}: duplicate parameter name; rename one")
-
     if all(parameter.nuisance for parameter in resolved):
         raise ExperimentError(
             "parameters: all are nuisance parameters; at least one must be of interest"
@@ -116,62 +105,43 @@ def resolve_parameters(
 
 
 def _single_parameter(
-    name: str,
-    spec: ParameterSpec,
-    source: ModelSource,
-    outputs: Sequence[str],
-    sizes: MeasurementSizes,
+    name: str, spec: ParameterSpec, source: ModelSource, measured: Measured
 ) -> Parameter:
-    """A parameter with targets or a function.
-
-    Its guess, magnitude and unit default to those of its first target.
-    """
-    model = source.model
-    guess = spec.guess
-    magnitude = 0.0
-    unit = spec.unit
-
+    """A parameter with targets or a function."""
+    guess, unit, magnitude = spec.guess, spec.unit, 0.0
     try:
-        targets = tuple(_target(stated, source, outputs) for stated in spec.all_targets)
-        if targets:
-            first = targets[0]
+        targets = tuple(_target(stated, source, measured.names) for stated in spec.all_targets)
+        for target in targets[:1]:
             if guess is None:
-                guess = (first.field.read(model) - first.offset) / first.scale
-            magnitude = sizes.magnitude(first, model) / abs(first.scale)
+                guess = (target.field.read(source.model) - target.offset) / target.scale
+            magnitude = measured.magnitude(target, source.model) / abs(target.scale)
+            # A parameter whose factor is not 1 may have another unit than its target.
+            if not unit and target.scale == 1.0:
+                unit = unit_of(source.model, target.path, source.terms)
     except ExperimentError as error:
         raise ExperimentError(f"parameters.{name}: {error}") from None
-
-    # A parameter whose factor is not 1 may have another unit than its target.
-    if targets and not unit and targets[0].scale == 1.0:
-        unit = unit_of(model, targets[0].path, source.terms)
-
     if guess is None:
         raise ExperimentError(f"parameters.{name}.guess: a function needs a guess")
 
     bounds = spec.bounds or physical_bounds(targets)
-    for key, value in (("guess", guess), ("true", spec.true)):
-        if spec.bounds is None and value is not None and not bounds[0] <= value <= bounds[1]:
-            raise ExperimentError(
-                f"parameters.{name}.{key}: {value:g} makes {targets[0].path} "
-                f"{_fault_beyond(bounds)}, which is not physical; state another value, or "
-                "`bounds` that contain it"
-            )
-    for key, value, origin in (("guess", guess, spec.guess), ("true", spec.true, spec.true)):
-        if value is not None and not bounds[0] <= value <= bounds[1]:
-            place = " in the model" if origin is None else ""
-            raise ExperimentError(
-                f"parameters.{name}.{key}: the value {value:g}{place} is outside bounds "
-                f"{list(bounds)}"
-            )
+    _require_inside(name, spec, guess, bounds)
 
     magnitude = max(abs(guess), magnitude)
+    scale = spec.scale if isinstance(spec.scale, float) else magnitude
+    if spec.scale == "guess":
+        scale = abs(guess)
+    if scale == 0.0:
+        raise ExperimentError(
+            f"parameters.{name}.scale: the guess (or the value in the model) is 0; state another "
+            "guess, or a scale in the parameter's unit"
+        )
     return Parameter(
         name=name,
         targets=targets,
         guess=guess,
         true=spec.true,
         bounds=bounds,
-        scale=_scale(name, spec, guess, magnitude),
+        scale=scale,
         prior=spec.prior,
         unit=unit,
         size=magnitude,
@@ -180,6 +150,26 @@ def _single_parameter(
         wanted=spec.wanted,
         per_recording=spec.per_recording,
     )
+
+
+def _require_inside(
+    name: str, spec: ParameterSpec, guess: float, bounds: tuple[float, float]
+) -> None:
+    """Refuse a guess or a true value outside the bounds, which physics may have set."""
+    for key, value in (("guess", guess), ("true", spec.true)):
+        if value is None or bounds[0] <= value <= bounds[1]:
+            continue
+        if spec.bounds is None:
+            is_sign = 0.0 in bounds and np.isinf(bounds).any()
+            fault = "negative" if is_sign else f"leave its range {list(bounds)}"
+            raise ExperimentError(
+                f"parameters.{name}.{key}: {value:g} makes {spec.all_targets[0].path} {fault}, "
+                "which is not physical; state another value, or `bounds` that contain it"
+            )
+        place = " in the model" if getattr(spec, key) is None else ""
+        raise ExperimentError(
+            f"parameters.{name}.{key}: the value {value:g}{place} is outside bounds {list(bounds)}"
+        )
 
 
 def _target(stated: TargetSpec, source: ModelSource, outputs: Sequence[str]) -> Target:
@@ -192,32 +182,6 @@ def _target(stated: TargetSpec, source: ModelSource, outputs: Sequence[str]) -> 
         offset=stated.offset,
         term=term_quantity(path, source.terms) if path.kind == "term" else None,
     )
-
-
-def _fault_beyond(bounds: tuple[float, float]) -> str:
-    """Describe the fault of a value beyond the physical bounds of a parameter."""
-    is_sign = 0.0 in bounds and np.isinf(bounds).any()
-    return "negative" if is_sign else f"leave its range {list(bounds)}"
-
-
-def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> float:
-    """Unit in which the criterion measures the error of a parameter [parameter unit].
-
-    It is the stated number, the size of the guess, or the magnitude of the quantity.
-    """
-    if isinstance(spec.scale, float):
-        scale = spec.scale
-    elif spec.scale == "guess":
-        scale = abs(guess)
-    else:
-        scale = magnitude
-
-    if scale == 0.0:
-        raise ExperimentError(
-            f"parameters.{name}.scale: the guess (or the value in the model) is 0; state another "
-            "guess, or a scale in the parameter's unit"
-        )
-    return scale
 
 
 def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]:
@@ -289,90 +253,56 @@ def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[in
         ) from None
 
 
-def _nuisance_parameters(
-    stated: Nuisance, source: ModelSource, outputs: Sequence[str], sizes: MeasurementSizes
-) -> Iterator[Parameter]:
-    """Parameters of the table `nuisance`.
-
-    They are deviations of the initial state, biases of outputs, and the delay of all outputs.
-    """
+def _nuisance(
+    stated: Nuisance, source: ModelSource, outputs: Sequence[str]
+) -> Iterator[tuple[str, ParameterSpec]]:
+    """Names and tables of the parameters for which the table `nuisance` is short."""
     coordinates = source.coordinates
-    deviations = {
-        component.name: component for component in coordinates.deviations if component.path
-    }
+    paths = {c.name: c.path for c in coordinates.deviations if c.path}
+    units = {c.name: c.unit for c in coordinates.deviations}
     unnamed = coordinates.unnamed_joints
     if unnamed and stated.initial is not None and not isinstance(stated.initial, Mapping):
         raise ExperimentError(
             f"nuisance.initial: {unnamed} joints have no name; name them in the MJCF, or state "
             "deviations by coordinate"
         )
-    for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(deviations)):
-        deviation = deviations[name]
-        start = InitialStateField(deviation.address)
-        yield _nuisance_parameter(
+    for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(paths)):
+        yield (
             f"{INITIAL_STATE_PREFIX}{name}",
-            Target(path=deviation.path, field=start),
-            prior,
-            unit=deviation.unit,
-            magnitude=start.magnitude(source.model),
+            _deviation(paths[name], prior, units[name], per_recording=False),
         )
-
     for name, prior in _priors_by_name("nuisance.bias", stated.bias, outputs):
-        bias = OutputBiasField(list(outputs).index(name))
-        target = Target(path=f"output/{name}:bias", field=bias)
-        yield _nuisance_parameter(
+        unit = split_unit(output_label(source.model, name))[1]
+        yield (
             f"bias {name}",
-            target,
-            prior,
-            unit=split_unit(output_label(source.model, name))[1],
-            magnitude=float(sizes.sigma[bias.output]),
-            per_recording=stated.per_recording,
+            _deviation(f"output/{name}:bias", prior, unit, per_recording=stated.per_recording),
+        )
+    if stated.delay is not None:
+        yield (
+            "delay",
+            _deviation("output:delay", stated.delay, "s", per_recording=stated.per_recording),
         )
 
-    if stated.delay is not None:
-        yield _nuisance_parameter(
-            "delay",
-            Target(path="output:delay", field=OutputDelayField()),
-            stated.delay,
-            unit="s",
-            magnitude=sizes.period,
-            per_recording=stated.per_recording,
-        )
+
+def _deviation(path: str, prior: Any, unit: str, *, per_recording: bool) -> ParameterSpec:
+    """A nuisance parameter whose guess is zero."""
+    return ParameterSpec(
+        target=path,
+        guess=0.0,
+        bounds=(-np.inf, np.inf),
+        prior=None if prior is True else float(prior),
+        unit=unit,
+        nuisance=True,
+        per_recording=per_recording,
+    )
 
 
 def _priors_by_name(key: str, stated: Any, names: Sequence[str]) -> Iterator[tuple[str, Any]]:
     """(name, prior) of one value that holds for all names, or of a table by name."""
     if stated is None:
         return
-
     table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
     for name, prior in table.items():
         if name not in names:
             raise ExperimentError(f"{key}: {unknown_coordinate('name', name, list(names))}")
         yield name, prior
-
-
-def _nuisance_parameter(
-    name: str,
-    target: Target,
-    prior: Any,
-    *,
-    magnitude: float,
-    unit: str = "",
-    per_recording: bool = False,
-) -> Parameter:
-    """A nuisance parameter whose guess is zero.
-
-    prior: standard deviation [parameter unit], or True if nothing is known beforehand.
-    """
-    return Parameter(
-        name=name,
-        targets=(target,),
-        guess=0.0,
-        scale=magnitude,
-        prior=None if prior is True else float(prior),
-        unit=unit,
-        size=magnitude,
-        nuisance=True,
-        per_recording=per_recording,
-    )

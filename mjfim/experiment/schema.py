@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,8 @@ from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticSerializationError
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError, ModelError, unknown
 from mjfim.experiment.controller_tables import ControllerSpec
-from mjfim.experiment.experiment_file import read_tables
-from mjfim.experiment.messages import explain, valid_keys
 from mjfim.experiment.system_tables import (
     Correlated,
     Initial,
@@ -26,11 +25,13 @@ from mjfim.experiment.system_tables import (
 )
 from mjfim.experiment.task_tables import Boundary, Cost, Descent, FitSpec, Limits, Robust
 from mjfim.model.model_files import PackedFiles
-from mjfim.recordings.spec import Hertz, PositiveWithUnit, RecordingSpec, Seconds, Section
+from mjfim.recordings.section import Hertz, PositiveWithUnit, Seconds, Section, explain
+from mjfim.recordings.spec import RecordingSpec
 
-ONLY_IN_PYTHON = ("function",)  # Keys of a parameter that a file cannot state.
-# Attributes of an experiment that are no keys of the file.
-RESERVED = ("directory", "source", "files")
+# Endings of files of other kinds, which are no experiments.
+MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")
+LOG_ENDINGS = (".csv", ".gz", ".parquet", ".npz", ".json", ".mcap", ".db3")
+
 DIALECT = "https://json-schema.org/draft/2020-12/schema"  # Dialect of the JSON schema.
 
 
@@ -40,6 +41,8 @@ class Experiment(Section):
     Immutable; `replace` makes a changed copy. Relative paths inside are relative to `directory`,
     the folder of the experiment file.
     """
+
+    only_in_python = ("directory", "source", "files")
 
     model: str = Field(description="Path of the MJCF file, relative to the experiment file.")
     rate: Hertz = Field(
@@ -168,24 +171,20 @@ class Experiment(Section):
             super().__init__(**values)
         except ValidationError as error:
             source = str(values.get("source", "experiment"))
-            raise ExperimentError(explain(error, source, Experiment, ONLY_IN_PYTHON)) from None
+            raise ExperimentError(explain(error, source, values)) from None
 
     @staticmethod
     def from_file(path: str | Path) -> Experiment:
-        """Read an experiment file.
-
-        Args:
-            path: TOML file.
-
-        Returns:
-            The checked experiment, with the file's folder as `directory`.
+        """Read an experiment file (TOML); its folder becomes `directory`.
 
         Raises:
             ExperimentError: The file cannot be read, or a key or a value in it is not valid.
         """
         path = Path(path)
-        values = read_tables(path)
-        _refuse_python_keys(path, values)
+        values = _read_tables(path)
+        for key in Experiment.only_in_python:
+            if key in values:
+                raise ExperimentError(f"{path}: {unknown('key', key, Experiment.valid_keys())}")
         return Experiment(**values, directory=path.parent, source=str(path))
 
     def replace(self, **tables: Any) -> Experiment:
@@ -198,22 +197,12 @@ class Experiment(Section):
         Args:
             **tables: Keys and tables to change, with the names of the experiment file.
 
-        Returns:
-            The changed copy.
-
         Raises:
             ExperimentError: A new value is not valid.
         """
         values = self.model_dump(exclude_unset=True)
-
         for key, value in tables.items():
-            if key == "parameters":
-                values[key] = _merged_parameters(values[key], value)
-            elif isinstance(values.get(key), dict) and isinstance(value, Mapping):
-                values[key] = {**values[key], **value}
-            else:
-                values[key] = value
-
+            values[key] = _merged(values.get(key), value, levels=2 if key == "parameters" else 1)
         return self.restated(values)
 
     def restated(self, values: Mapping[str, Any]) -> Experiment:
@@ -256,9 +245,47 @@ class Experiment(Section):
             ModelError: There is no such model file.
         """
         # The model is not needed where an experiment is only read.
-        from mjfim.experiment.packing import packed
+        from mjfim.model.model_files import files_of_model
 
-        return packed(self)
+        before = self.files or PackedFiles.of({})
+        model = self.directory / self.model
+        tables = [self.directory / name for name in self.tables]
+        if all(before.content(file) is not None for file in (model, *tables)):
+            return self
+        # A packed model contains what it includes.
+        needed = [*map(Path, before.contents), *tables]
+        if before.content(model) is None:
+            if not model.is_file():
+                raise ModelError(f"{model}: no such model file")
+            needed += files_of_model(model)
+        return self.model_copy(update={"files": PackedFiles.read(needed, before)})
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """Names of the files that the experiment states besides its model."""
+        control = self.initial.control
+        files = [control] if isinstance(control, str) else []
+        return tuple(dict.fromkeys([*self.descent.previous, *self.earlier, *files]))
+
+
+def _read_tables(path: Path) -> dict[str, Any]:
+    """The keys and tables of an experiment file, which are not checked yet."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ExperimentError(
+            f"{path}: cannot read the experiment file: {error.strerror}"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        fault = f"not valid TOML: {error}"
+        if path.suffix.lower() in MODEL_ENDINGS:
+            fault = (
+                "a model, but an experiment file (TOML) is needed, which states the model; "
+                f"`mjfim init {path}` writes a first one"
+            )
+        if path.suffix.lower() in LOG_ENDINGS:
+            fault = "a log, but an experiment file (TOML) is needed; it comes before the logs"
+        raise ExperimentError(f"{path}: {fault}") from None
 
 
 def json_schema() -> dict[str, Any]:
@@ -299,28 +326,8 @@ def by_name(
     return np.array([float(value.get(name, 0.0)) for name in names])
 
 
-def _refuse_python_keys(path: Path, values: Mapping[str, Any]) -> None:
-    """Raise ExperimentError for keys that only Python can state."""
-    for reserved in RESERVED:
-        if reserved in values:
-            raise ExperimentError(f"{path}: {unknown('key', reserved, valid_keys(Experiment))}")
-
-    # A table of the wrong type is reported by the validation that follows.
-    parameters = values.get("parameters")
-    tables = parameters if isinstance(parameters, dict) else {}
-
-    for name, table in tables.items():
-        if isinstance(table, dict) and "function" in table:
-            raise ExperimentError(
-                f"{path}: parameters.{name}.function: a function is given in Python, not in a file"
-            )
-
-
-def _merged_parameters(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameter tables, each with its changes merged into it."""
-    merged = dict(old)
-
-    for name, table in new.items():
-        merged[name] = {**old.get(name, {}), **table}
-
-    return merged
+def _merged(old: Any, new: Any, levels: int) -> Any:
+    """A value with its changes; tables merge down to some levels."""
+    if levels == 0 or not isinstance(old, Mapping) or not isinstance(new, Mapping):
+        return new
+    return {**old, **{key: _merged(old.get(key), v, levels - 1) for key, v in new.items()}}

@@ -1,21 +1,22 @@
 """Units of the numbers of an experiment: those that are stated, and angles that look like degrees.
 
-A number without a unit is in the unit of the model. A number with a unit has been converted when
-the file was read; here its unit is compared with that of the model.
+Numbers in the file are in the units of the model, or have a unit of their own ("90 deg"), which is
+compared here with the unit of what the number states.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment.outputs import columns_of_keys
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system_tables import NoiseSpec, ParameterSpec, Signal
+from mjfim.experiment.system_tables import ParameterSpec
 from mjfim.model.elements import identifier
 from mjfim.model.limited_elements import limited_elements
 from mjfim.model.loading import ModelSource
@@ -31,258 +32,196 @@ ROUND_DEGREES = 5.0
 TURN = 2.0 * np.pi
 DEGREE = TURN / 360.0
 
-
-@dataclass(frozen=True, kw_only=True)
-class StatedNumber:
-    """One number of an experiment whose unit depends on the model.
-
-    Attributes:
-        key: Key of the experiment file.
-        value: The number, a `Quantity` where it was stated with a unit.
-        units: Units of all the numbers of the model that it states; an empty text where the unit
-            does not follow from the model.
-        range: Range of the joint in the MJCF; None without one, or where the number is no position.
-        is_position: The number is a position, or the control of a servo.
-    """
-
-    key: str
-    value: float
-    units: tuple[str, ...]
-    range: tuple[float, float] | None = None
-    is_position: bool = False
+# Keys that lead to a number of an experiment, indices in lists among them.
+Keys = tuple[Any, ...]
+Range = tuple[float, float]
 
 
 def require_units(experiment: Experiment, source: ModelSource) -> None:
     """Check every number that is stated with a unit against the model.
 
-    Args:
-        experiment: The experiment.
-        source: Its model.
-
     Raises:
-        ExperimentError: A number has the unit of another quantity; the message names its key.
+        ExperimentError: A unit does not fit what the number states.
     """
-    for number in _numbers(experiment, source):
-        if not isinstance(number.value, Quantity):
-            continue
-
-        fault = wrong_unit(number.value, list(dict.fromkeys(number.units)))
-        if fault is not None:
-            raise ExperimentError(f"{number.key}: {fault}")
+    units = _Units(experiment, source)
+    for keys, number in _numbers(experiment):
+        if isinstance(number, Quantity):
+            of_model = units.of(keys)
+            fault = of_model and wrong_unit(number, list(dict.fromkeys(of_model)))
+            if fault:
+                raise ExperimentError(f"{_place(keys)}: {fault}")
 
 
 def probable_degrees(experiment: Experiment, source: ModelSource) -> tuple[str, ...]:
     """Find angles in radians that were probably meant in degrees.
 
-    These are plain numbers for positions of hinges and for the controls of their servos that are
-    beyond two turns and a multiple of five, or beyond one turn and inside the range of their joint
-    only in degrees.
-
-    Args:
-        experiment: The experiment.
-        source: Its model.
-
     Returns:
-        A sentence for each key, which says how to state the unit.
+        One sentence for each of them.
     """
+    units = _Units(experiment, source)
     found: dict[str, str] = {}
-    for number in _numbers(experiment, source):
-        if number.is_position and _looks_like_degrees(number):
-            value = f"{number.value:g}"
+    for keys, number in _numbers(experiment):
+        ranges = units.ranges(keys)
+        is_angle = ranges is not None and set(units.of(keys) or ()) == {ANGLE}
+        if is_angle and _looks_like_degrees(number, ranges):
+            value = f"{number:g}"
             found.setdefault(
-                number.key,
-                f"{number.key}: {value} rad are {abs(number.value) / TURN:.3g} turns and look like "
+                _place(keys),
+                f"{_place(keys)}: {value} rad are {abs(number) / TURN:.3g} turns and look like "
                 f'degrees; state "{value} deg" if they are, or "{value} rad" if not',
             )
     return tuple(found.values())
 
 
-def _looks_like_degrees(number: StatedNumber) -> bool:
+def _numbers(value: Any, keys: Keys = ()) -> Iterator[tuple[Keys, float]]:
+    """Every number of an experiment, with the keys that lead to it."""
+    if isinstance(value, float):
+        yield keys, value
+    items: Any = ()
+    if isinstance(value, BaseModel):
+        items = value
+    elif isinstance(value, (Mapping, tuple)):
+        items = value.items() if isinstance(value, Mapping) else enumerate(value)
+    for key, inner in items:
+        yield from _numbers(inner, (*keys, key))
+
+
+def _place(keys: Keys) -> str:
+    """A number in messages, such as `initial.qpos[1]`; both bounds of a range have one name."""
+    if isinstance(keys[-1], int) and keys[0] != "initial":
+        keys = keys[:-1]
+    parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
+    return "".join(parts).removeprefix(".")
+
+
+def _looks_like_degrees(number: float, ranges: Sequence[Range] | None) -> bool:
     """Whether an angle in radians was probably meant in degrees."""
-    angle = abs(number.value)
-    is_plain = not isinstance(number.value, Quantity) and np.isfinite(angle)
-    if not is_plain or set(number.units) != {ANGLE} or angle <= TURN:
+    angle = abs(number)
+    if isinstance(number, Quantity) or not TURN < angle < np.inf:
         return False
-
-    if angle > TURNS * TURN and angle % ROUND_DEGREES == 0.0:
-        return True
-    if number.range is None:
-        return False
-    low, high = number.range
-    return not low <= number.value <= high and low <= number.value * DEGREE <= high
+    is_round = angle > TURNS * TURN and angle % ROUND_DEGREES == 0.0
+    return is_round or any(
+        not low <= number <= high and low <= number * DEGREE <= high for low, high in ranges or ()
+    )
 
 
-def _numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
-    """All numbers of an experiment whose unit depends on the model."""
-    yield from _initial_numbers(experiment, source)
-    yield from _limit_numbers(experiment, source)
-    yield from _noise_numbers(experiment, source)
-    yield from _nuisance_numbers(experiment, source)
-    for name, spec in experiment.parameters.items():
-        yield from _parameter_numbers(name, spec, source)
-    yield from _term_numbers(experiment, source)
+class _Units:
+    """Units in the model of the numbers of an experiment."""
 
-    about = experiment.cost.control_about
-    yield from _by_name("cost.control_about", about, _control_units(source))
+    def __init__(self, experiment: Experiment, source: ModelSource) -> None:
+        self.experiment = experiment
+        self.source = source
 
-    units = tuple({joint.unit for joint in source.coordinates.scalar_joints})
-    boundary = experiment.boundary
-    yield StatedNumber(key="boundary.position", value=boundary.position, units=units)
-    speeds = tuple(per_second(unit) for unit in units)
-    yield StatedNumber(key="boundary.velocity", value=boundary.velocity, units=speeds)
+    def of(self, keys: Keys) -> tuple[str, ...] | None:
+        """Units of all numbers of the model that a number states; None if they do not depend on it.
 
+        A unit is empty where it does not follow from the model.
+        """
+        for length in (2, 3):
+            if keys[:length] in self.tables:
+                return _named(self.tables[keys[:length]], keys[length:])
 
-def _by_name(
-    key: str,
-    stated: Any,
-    units: Mapping[str, str],
-    ranges: Mapping[str, tuple[float, float]] | None = None,
-) -> Iterator[StatedNumber]:
-    """Numbers of a key: one for all names, or by name one or several.
+        found: tuple[str, ...] | None = None
+        match keys:
+            case ("initial", "qpos" | "qvel", i):
+                found = (self._component(keys[1], i)[1],)
+            case ("noise", key, *rest):
+                columns = columns_of_keys(self.source.coordinates).get(key, [])
+                is_one = rest and isinstance(rest[-1], int)
+                columns = columns[rest[-1] : rest[-1] + 1] if is_one else columns
+                found = None if rest[:1] == ["rate"] else tuple(self.outputs[c] for c in columns)
+            case ("parameters", name, "targets", i, "offset"):
+                path = self.experiment.parameters[name].targets[i].path
+                found = (_unit_of_path(self.source, path),)
+            case ("parameters", name, _) | ("parameters", name, "bounds", _):
+                found = (_parameter_unit(self.experiment.parameters[name], self.source),)
+            case ("terms", name, "values", field):
+                found = (_unit_of_path(self.source, f"term/{name}:{field}"),)
+            case ("boundary", "position" | "velocity"):
+                joints = {joint.unit for joint in self.source.coordinates.scalar_joints}
+                is_speed = keys[1] == "velocity"
+                found = tuple(per_second(unit) if is_speed else unit for unit in joints)
+        return found
 
-    Args:
-        key: The key.
-        stated: One number for all names, a table by name, or None. True states no number.
-        units: Unit by name. Unknown names are left out; they are refused elsewhere.
-        ranges: Ranges of the positions in the MJCF by name; None if the numbers are no positions.
-    """
-    if isinstance(stated, float):
-        yield StatedNumber(key=key, value=stated, units=tuple(units.values()))
-    if not isinstance(stated, Mapping):
-        return
+    def ranges(self, keys: Keys) -> tuple[Range, ...] | None:
+        """Range of a position in the MJCF, if there is one; None for a number of another kind."""
+        model, coordinates = self.source.model, self.source.coordinates
+        joints = {joint.name: joint.joint for joint in coordinates.scalar_joints}
+        controls = {name: i for i, name in enumerate(coordinates.controls)}
+        limited, bounds, number = model.jnt_limited, model.jnt_range, None
+        match keys:
+            case ("initial", "qpos", i):
+                number = joints.get(self._component("qpos", i)[0].removeprefix("qpos:"))
+            case ("limits", "position", str(name), *_):
+                number = joints.get(name)
+            case ("initial", "control", "amplitude" | "offset", str(name)) | (
+                "limits",
+                "control",
+                str(name),
+                *_,
+            ):
+                number = controls.get(name)
+                limited, bounds = model.actuator_ctrllimited, model.actuator_ctrlrange
+            case _:
+                return None
+        if number is None or not limited[number]:
+            return ()
+        return ((float(bounds[number, 0]), float(bounds[number, 1])),)
 
-    for name, value in stated.items():
-        for number in _flat(value):
-            if name in units and isinstance(number, float):
-                yield StatedNumber(
-                    key=f"{key}.{name}",
-                    value=number,
-                    units=(units[name],),
-                    range=None if ranges is None else ranges.get(name),
-                    is_position=ranges is not None,
-                )
+    def _component(self, kind: str, i: int) -> tuple[str, str]:
+        """Name and unit of an entry of `initial.qpos` or `initial.qvel`."""
+        # Numbers may be stated for the MJCF alone, without the joints that physical terms add.
+        stated = getattr(self.experiment.initial, kind)
+        size = "nq" if kind == "qpos" else "nv"
+        is_plain = len(stated) == getattr(self.source.stated.model, size)
+        source = self.source.stated if is_plain else self.source
+        # Addresses of velocities follow those of the positions.
+        address = i if kind == "qpos" else source.model.nq + i
+        parts = {c.address: (c.name, c.unit) for c in source.coordinates.state}
+        return parts.get(address, ("", ""))
 
+    @cached_property
+    def tables(self) -> dict[Keys, dict[str, str]]:
+        """Units by name for the keys that state one number for all names, or numbers by name."""
+        model, coordinates = self.source.model, self.source.coordinates
+        actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
+        controls = {
+            name: control_unit(model, i)
+            for name, i in zip(coordinates.controls, actuators, strict=True)
+        }
+        deviations = {c.name: c.unit for c in coordinates.deviations}
+        tables: dict[Keys, dict[str, str]] = {
+            ("initial", "control", "amplitude"): controls,
+            ("initial", "control", "offset"): controls,
+            ("cost", "control_about"): controls,
+            ("initial", "free"): deviations,
+            ("nuisance", "initial"): deviations,
+            ("nuisance", "bias"): self.outputs,
+        }
+        elements = limited_elements(model, coordinates.controls, 1.0 / self.experiment.rate)
+        for kind, limited in elements.by_kind.items():
+            units = {name: element.unit for name, element in limited.items()}
+            # A free joint is stated by its name, with the ranges of its coordinates.
+            boxes = {name.removesuffix(".x"): units[name] for name in units if name.endswith(".x")}
+            tables["limits", kind] = {**boxes, **units}
+        return tables
 
-def _flat(value: Any) -> Iterator[Any]:
-    """The numbers of a number, of a range, or of several ranges."""
-    if not isinstance(value, tuple):
-        yield value
-        return
-    for each in value:
-        yield from _flat(each)
-
-
-def _initial_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
-    """Numbers of the table `initial`."""
-    stated = experiment.initial
-    ranges = _joint_ranges(source)
-
-    # Addresses of velocities follow those of the positions. Numbers may be stated for the MJCF
-    # alone, without the joints that physical terms add.
-    for name, numbers in (("qpos", stated.qpos), ("qvel", stated.qvel)):
-        size = {"qpos": "nq", "qvel": "nv"}[name]
-        is_plain = len(numbers or ()) == getattr(source.stated.model, size)
-        of = source.stated if is_plain else source
-        first = 0 if name == "qpos" else of.model.nq
-        units = {c.address - first: (c.unit, c.name) for c in of.coordinates.state}
-        for i, value in enumerate(numbers or ()):
-            unit, column = units.get(i, ("", ""))
-            yield StatedNumber(
-                key=f"initial.{name}[{i}]",
-                value=value,
-                units=(unit,),
-                range=ranges.get(column.removeprefix("qpos:")),
-                is_position=name == "qpos",
-            )
-
-    if isinstance(stated.control, Signal):
-        units_of_controls = _control_units(source)
-        for key in ("amplitude", "offset"):
-            yield from _by_name(
-                f"initial.control.{key}",
-                getattr(stated.control, key),
-                units_of_controls,
-                _servo_ranges(source),
-            )
-
-
-def _limit_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
-    """Numbers of the table `limits`."""
-    stated, controls = experiment.limits, source.coordinates.controls
-    ranges = {"position": _joint_ranges(source), "control": _servo_ranges(source)}
-    period = 1.0 / experiment.rate
-
-    for kind, elements in limited_elements(source.model, controls, period).by_kind.items():
-        units = {name: element.unit for name, element in elements.items()}
-
-        # A free joint is stated by its name, with the ranges of its coordinates.
-        boxes = {name.removesuffix(".x"): units[name] for name in units if name.endswith(".x")}
-        key = f"limits.{kind}"
-        yield from _by_name(key, getattr(stated, kind), {**boxes, **units}, ranges.get(kind))
-
-
-def _noise_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
-    """Numbers of the table `noise`."""
-    units = _output_units(source)
-    columns = columns_of_keys(source.coordinates)
-
-    for key, stated in experiment.noise.items():
-        sigma = stated.sigma if isinstance(stated, NoiseSpec) else stated
-        suffix = ".sigma" if isinstance(stated, NoiseSpec) else ""
-        names = columns.get(key, [])
-        several = isinstance(sigma, tuple)
-
-        for i, value in enumerate(sigma if isinstance(sigma, tuple) else (sigma,)):
-            covered = names[i : i + 1] if several else names
-            if value is not None:
-                yield StatedNumber(
-                    key=f"noise.{key}{suffix}",
-                    value=value,
-                    units=tuple(units[name] for name in covered),
-                )
+    @cached_property
+    def outputs(self) -> dict[str, str]:
+        """Unit of the noise of everything that can be measured, by name."""
+        model, coordinates = self.source.model, self.source.coordinates
+        # The noise of an orientation is an angle, although its quaternion has no unit.
+        units = {c.name: c.unit if c.sigma_factor == 1.0 else ANGLE for c in coordinates.state}
+        for number in coordinates.sensors:
+            units[number.name] = sensor_unit(model, identifier(model, "sensor", number.sensor))
+        return units
 
 
-def _nuisance_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
-    """Numbers of the table `nuisance`."""
-    stated = experiment.nuisance
-    deviations = {c.name: c.unit for c in source.coordinates.deviations}
-
-    yield from _by_name("nuisance.initial", stated.initial, deviations)
-    yield from _by_name("initial.free", experiment.initial.free, deviations)
-    yield from _by_name("nuisance.bias", stated.bias, _output_units(source))
-
-
-def _term_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
-    """Numbers of the table `terms`."""
-    for name, spec in experiment.terms.items():
-        for field, value in spec.values.items():
-            unit = _unit_of_path(source, f"term/{name}:{field}")
-            yield StatedNumber(key=f"terms.{name}.values.{field}", value=value, units=(unit,))
-
-
-def _parameter_numbers(
-    name: str, spec: ParameterSpec, source: ModelSource
-) -> Iterator[StatedNumber]:
-    """Numbers of one parameter."""
-    units = (_parameter_unit(spec, source),)
-    low, high = spec.bounds or (None, None)
-    values = {
-        "guess": (spec.guess,),
-        "true": (spec.true,),
-        "bounds": (low, high),
-        "scale": (spec.scale,),
-        "prior": (spec.prior,),
-        "wanted": (spec.wanted,),
-    }
-    for key, numbers in values.items():
-        for value in numbers:
-            if isinstance(value, float):
-                yield StatedNumber(key=f"parameters.{name}.{key}", value=value, units=units)
-
-    for target in spec.targets:
-        unit = _unit_of_path(source, target.path)
-        key = f"parameters.{name}.targets.offset"
-        yield StatedNumber(key=key, value=target.offset, units=(unit,))
+def _named(units: Mapping[str, str], names: Sequence[Any]) -> tuple[str, ...] | None:
+    """Unit of the element that a table names, or of all of them; a wrong name is refused later."""
+    if not names:
+        return tuple(units.values())
+    return (units[names[0]],) if names[0] in units else None
 
 
 def _parameter_unit(spec: ParameterSpec, source: ModelSource) -> str:
@@ -290,7 +229,6 @@ def _parameter_unit(spec: ParameterSpec, source: ModelSource) -> str:
     targets = spec.all_targets
     if targets and abs(targets[0].scale) == 1.0:
         return _unit_of_path(source, targets[0].path)
-
     # The parameter has a unit of its own; only numbers in SI units fit to what was converted.
     try:
         is_si = Unit.parse(spec.unit).factor == 1.0
@@ -305,42 +243,3 @@ def _unit_of_path(source: ModelSource, path: str) -> str:
         return unit_of(source.model, path, source.terms)
     except ExperimentError:
         return ""
-
-
-def _output_units(source: ModelSource) -> dict[str, str]:
-    """Unit of the noise of everything that can be measured, by name."""
-    model, coordinates = source.model, source.coordinates
-
-    # The noise of an orientation is an angle, although its quaternion has no unit.
-    units = {c.name: c.unit if c.sigma_factor == 1.0 else ANGLE for c in coordinates.state}
-    for number in coordinates.sensors:
-        units[number.name] = sensor_unit(model, identifier(model, "sensor", number.sensor))
-    return units
-
-
-def _control_units(source: ModelSource) -> dict[str, str]:
-    """Unit of every control by name; empty where it does not follow from the model."""
-    model = source.model
-    actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
-    names: Sequence[str] = source.coordinates.controls
-    return {name: control_unit(model, i) for name, i in zip(names, actuators, strict=True)}
-
-
-def _joint_ranges(source: ModelSource) -> dict[str, tuple[float, float]]:
-    """Ranges of the joints in the MJCF, by name."""
-    model = source.model
-    return {
-        joint.name: (float(model.jnt_range[joint.joint, 0]), float(model.jnt_range[joint.joint, 1]))
-        for joint in source.coordinates.scalar_joints
-        if model.jnt_limited[joint.joint]
-    }
-
-
-def _servo_ranges(source: ModelSource) -> dict[str, tuple[float, float]]:
-    """Ranges of the controls in the MJCF, by name."""
-    model = source.model
-    return {
-        name: (float(model.actuator_ctrlrange[i, 0]), float(model.actuator_ctrlrange[i, 1]))
-        for i, name in enumerate(source.coordinates.controls)
-        if model.actuator_ctrllimited[i]
-    }

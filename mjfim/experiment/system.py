@@ -20,15 +20,16 @@ from mjfim.experiment.controllers import resolve_controllers
 from mjfim.experiment.initial_state import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.packing import model_of
-from mjfim.experiment.parameters import MeasurementSizes, resolve_parameters
+from mjfim.experiment.parameters import Measured, resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
-from mjfim.experiment.terms import terms_of
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import ParameterSet
+from mjfim.model.terms.library import resolve_terms
+from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
 from mjfim.parallel import require_threads
 from mjfim.plant.batch import state_space
@@ -105,7 +106,7 @@ class System:
         if source is None:
             source = model_of(experiment)
         _require_supported(source)
-        source = source.extended(terms_of(experiment, source.stated))
+        source = source.extended(_terms_of(experiment, source.stated))
         source, laws = resolve_controllers(experiment, source)
         require_units(experiment, source)
         model = source.model
@@ -125,8 +126,8 @@ class System:
         start = initial_state(experiment.initial, model, key, source.layout)
         mocap = MocapPlacement.of(model, key)
         sigma = np.sqrt(np.diag(noise.covariance))
-        sizes = MeasurementSizes(period=1.0 / experiment.rate, sigma=sigma)
-        parameters = resolve_parameters(experiment, source, outputs.names, mocap, sizes)
+        measured = Measured(names=outputs.names, sigma=sigma, period=1.0 / experiment.rate)
+        parameters = resolve_parameters(experiment, source, mocap, measured)
 
         # The plant that the parameters act on.
         private = PlantModel(
@@ -176,17 +177,14 @@ class System:
 
         def plant(speeds: tuple[float, ...], smooth: Plant | None) -> Plant:
             """A plant whose dry friction is viscous below these speeds."""
-            plant_relaxation = relaxation
+            relaxed = relaxation
             if speeds:
-                plant_relaxation = replace(relaxation or Relaxation(), smoothing_speeds=speeds)
-            model = PlantModel(
-                self.source,
-                moved_bodies=self.parameters.moved_bodies,
+                relaxed = replace(relaxation or Relaxation(), smoothing_speeds=speeds)
+            model = self._plant_model(
                 sensors=self.outputs.needs_sensors,
                 friction=self.parameters.changes_friction,
                 timestep_factor=variant.sample_factor * variant.timestep_factor,
-                mocap=self.mocap,
-                relaxation=plant_relaxation,
+                relaxation=relaxed,
             )
             return Plant(
                 source=model,
@@ -391,19 +389,15 @@ class System:
             return np.zeros(len(self.controls))
         return np.array(key.ctrl)
 
+    def _plant_model(self, **options: Any) -> PlantModel:
+        """A private copy of the user's model for these parameters."""
+        moved = self.parameters.moved_bodies
+        return PlantModel(self.source, moved_bodies=moved, mocap=self.mocap, **options)
+
     @cached_property
     def _whole_model(self) -> PlantModel:
-        """The user's model with sensors and constraints on.
-
-        Bodies whose inertia parameters change are not compiled as "simple" bodies.
-        """
-        return PlantModel(
-            self.source,
-            moved_bodies=self.parameters.moved_bodies,
-            sensors=True,
-            friction=True,
-            mocap=self.mocap,
-        )
+        """The user's model with sensors and constraints on."""
+        return self._plant_model(sensors=True, friction=True)
 
     def model_at(self, theta: Array, *, at_keyframe: bool = True) -> Any:
         """The user's model with parameters written into it.
@@ -472,3 +466,18 @@ def _require_supported(source: ModelSource) -> None:
             f"{source.path}: the model has {feature}, whose internal state mjfim cannot read; "
             "remove them from the model"
         )
+
+
+def _terms_of(experiment: Experiment, stated: ModelSource) -> tuple[Term, ...]:
+    """Physical terms of an experiment, in their order in the file."""
+    tables = []
+    for name, spec in experiment.terms.items():
+        elements = ((key, getattr(spec, key)) for key in ELEMENT_KEYS)
+        table = TermTable(
+            name=name,
+            element=tuple((key, element) for key, element in elements if element is not None),
+            encoder=spec.encoder,
+            values=tuple((field, float(value)) for field, value in spec.values.items()),
+        )
+        tables.append((spec.kind, table))
+    return resolve_terms(tables, stated.model, 1.0 / experiment.rate)

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SkipValidation, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from mjfim.recordings.quantities import Quantity
-from mjfim.recordings.spec import (
+from mjfim.recordings.section import (
     Boolean,
     Finite,
     FiniteWithUnit,
@@ -362,14 +361,6 @@ class ParameterSpec(Section):
         """Raise ValueError if the bounds are inverted, or exclude the guess or the true value."""
         if not low < high:
             raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
-
-        # Numbers with a unit are compared once the model has told whether the unit is right.
-        if any(isinstance(number, Quantity) for number in (low, high, self.guess, self.true)):
-            return
-
-        for key, value in (("guess", self.guess), ("true", self.true)):
-            if value is not None and not low <= value <= high:
-                raise ValueError(f"{key} {value} is outside bounds [{low}, {high}]")
 
     @property
     def all_targets(self) -> tuple[TargetSpec, ...]:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from mjfim.errors import MAX_ITERATIONS, MAX_REPLICATES, MAX_SAMPLES, MAX_STARTS
-from mjfim.recordings.spec import (
+from mjfim.recordings.section import (
     Boolean,
     Finite,
     FiniteWithUnit,

@@ -22,10 +22,10 @@ class TimeGrid:
     """Division of the time into samples, measurements and engine steps.
 
     Attributes:
-        dt: Sample period, for which a control is held [s].
-        substeps: Engine steps of a sample.
+        dt: Sample period [s].
+        substeps: Engine steps per sample.
         stride: Samples from one measurement to the next.
-        playback_steps: Engine steps of the stated model from one row of design.csv to the next.
+        playback_steps: Engine steps per row of design.csv, on the stated grid.
     """
 
     dt: float
@@ -35,23 +35,39 @@ class TimeGrid:
 
     @staticmethod
     def stated(experiment: Experiment, timestep: float) -> TimeGrid:
-        """The grid that an experiment states.
-
-        Args:
-            experiment: The experiment.
-            timestep: Timestep of the user's model [s].
+        """The grid that an experiment states, with the timestep of its model [s].
 
         Raises:
-            ExperimentError: The rates are not multiples of each other as required.
+            ExperimentError: A rate does not divide the other one, or is not a whole number of
+                timesteps.
         """
-        rate = experiment.rate
-        measure_rate = experiment.measure_rate or rate
-        substeps = _substeps(rate, timestep)
+        rate, playback_rate = experiment.rate, experiment.playback_rate
+        substeps = whole_timesteps(rate, timestep)
+        if substeps is None:
+            raise ExperimentError(
+                f"rate: at {rate:g} Hz, a sample is not a whole number of timesteps ({timestep:g} "
+                f"s); valid for example: {possible_rates(timestep)} Hz"
+            )
+        if substeps > MAX_SUBSTEPS:
+            raise ExperimentError(
+                f"rate: at {rate:g} Hz, a sample is {substeps:g} timesteps ({timestep:g} s); at "
+                f"most {MAX_SUBSTEPS:g} are possible, that is {1.0 / (MAX_SUBSTEPS * timestep):g} "
+                "Hz or more"
+            )
+
+        rows = 1 if playback_rate is None else _whole(playback_rate / rate)
+        if rows is None or substeps % rows:
+            valid = [k for k in range(1, substeps + 1) if substeps % k == 0]
+            raise ExperimentError(
+                f"playback_rate: {playback_rate:g} Hz is not a multiple of rate ({rate:g} Hz) that "
+                f"divides the engine's rate ({substeps * rate:g} Hz); valid: "
+                f"{', '.join(f'{k * rate:g}' for k in valid)}"
+            )
         return TimeGrid(
             dt=substeps * timestep,
             substeps=substeps,
-            stride=_stride("measure_rate", rate, measure_rate),
-            playback_steps=_playback_steps(rate, experiment.playback_rate, substeps),
+            stride=_stride("measure_rate", rate, experiment.measure_rate or rate),
+            playback_steps=substeps // rows,
         )
 
     @property
@@ -66,7 +82,6 @@ class TimeGrid:
                 f"{self.substeps} engine steps per sample do not divide by "
                 f"{variant.timestep_factor}"
             )
-
         return replace(
             self,
             dt=self.dt * variant.sample_factor,
@@ -78,23 +93,14 @@ class TimeGrid:
 def noise_strides(experiment: Experiment) -> dict[str, int]:
     """Samples from one measurement to the next for the keys of the table `noise` that state a rate.
 
-    Args:
-        experiment: The experiment.
-
-    Returns:
-        The strides by key; keys without a rate are measured at `measure_rate`.
-
     Raises:
-        ExperimentError: A rate does not divide that of the samples, or gives no measurement within
-            the horizon.
+        ExperimentError: A rate does not divide `rate`, or gives no measurement.
     """
     horizon = experiment.horizon
     strides: dict[str, int] = {}
-
     for name, spec in experiment.noise.items():
         if not isinstance(spec, NoiseSpec) or spec.rate is None:
             continue
-
         key = f"noise.{name}.rate"
         strides[name] = _stride(key, experiment.rate, spec.rate)
         if horizon is not None and spec.rate * horizon < 1.0 - RATE_TOLERANCE:
@@ -105,82 +111,31 @@ def noise_strides(experiment: Experiment) -> dict[str, int]:
 
 
 def whole_timesteps(rate: float, timestep: float) -> int | None:
-    """Number of timesteps in a period; None if it is not a whole number.
+    """Number of timesteps in a period; None if it is not a whole number."""
+    return _whole(1.0 / (rate * timestep))
 
-    Args:
-        rate: The rate [Hz].
-        timestep: The timestep [s].
-    """
-    ratio = 1.0 / (rate * timestep)
+
+def possible_rates(timestep: float) -> str:
+    """Some rates whose periods are whole numbers of timesteps [Hz], for a message."""
+    return _parts(1.0 / timestep)
+
+
+def _whole(ratio: float) -> int | None:
+    """A ratio that is a whole number within the tolerance, or None."""
     n = round(ratio)
     return n if n >= 1 and abs(ratio - n) <= RATE_TOLERANCE * n else None
 
 
-def possible_rates(timestep: float) -> str:
-    """Some rates whose periods are whole numbers of timesteps [Hz], for a message.
-
-    Args:
-        timestep: The timestep [s].
-    """
-    return ", ".join(f"{1.0 / (k * timestep):g}" for k in (1, 2, 4, 5, 10))
-
-
-def _substeps(rate: float, timestep: float) -> int:
-    """Engine steps per sample.
-
-    Raises ExperimentError if a sample is not a whole number of timesteps [s], or too many of them.
-    """
-    n = whole_timesteps(rate, timestep)
-    if n is None:
-        raise ExperimentError(
-            f"rate: at {rate:g} Hz, a sample is not a whole number of timesteps ({timestep:g} s); "
-            f"valid for example: {possible_rates(timestep)} Hz"
-        )
-    if n > MAX_SUBSTEPS:
-        raise ExperimentError(
-            f"rate: at {rate:g} Hz, a sample is {n:g} timesteps ({timestep:g} s); at most "
-            f"{MAX_SUBSTEPS:g} are possible, that is {1.0 / (MAX_SUBSTEPS * timestep):g} Hz or more"
-        )
-    return n
-
-
-def _playback_steps(rate: float, playback_rate: float | None, substeps: int) -> int:
-    """Engine steps per row of design.csv, those of a sample where no playback rate [Hz] is stated.
-
-    Raises ExperimentError if a row is not a whole number of engine steps, or a sample not a whole
-    number of rows.
-    """
-    if playback_rate is None:
-        return substeps
-
-    valid = [k for k in range(1, substeps + 1) if substeps % k == 0]
-    ratio = playback_rate / rate
-    rows = round(ratio)
-    if rows not in valid or abs(ratio - rows) > RATE_TOLERANCE * rows:
-        listed = ", ".join(f"{k * rate:g}" for k in valid)
-        raise ExperimentError(
-            f"playback_rate: {playback_rate:g} Hz is not a multiple of rate ({rate:g} Hz) that "
-            f"divides the engine's rate ({substeps * rate:g} Hz); valid: {listed}"
-        )
-    return substeps // rows
+def _parts(rate: float) -> str:
+    """Some rates that divide another one [Hz]."""
+    return ", ".join(f"{rate / k:g}" for k in (1, 2, 4, 5, 10))
 
 
 def _stride(key: str, rate: float, measure_rate: float) -> int:
-    """Samples from one measurement to the next.
-
-    Args:
-        key: The key that states the rate of measurements, for messages.
-        rate: Rate of the samples [Hz].
-        measure_rate: Rate of the measurements [Hz].
-
-    Raises:
-        ExperimentError: The rate of the measurements does not divide that of the samples.
-    """
-    ratio = rate / measure_rate
-    stride = round(ratio)
-    if stride < 1 or abs(ratio - stride) > RATE_TOLERANCE * stride:
-        valid = ", ".join(f"{rate / k:g}" for k in (1, 2, 4, 5, 10))
+    """Samples from one measurement to the next."""
+    stride = _whole(rate / measure_rate)
+    if stride is None:
         raise ExperimentError(
-            f"{key}: {measure_rate:g} Hz does not divide rate {rate:g} Hz; valid: {valid}"
+            f"{key}: {measure_rate:g} Hz does not divide rate {rate:g} Hz; valid: {_parts(rate)}"
         )
     return stride

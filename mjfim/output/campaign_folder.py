@@ -18,7 +18,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, RecordingError, first_ones, listed, shortened
-from mjfim.experiment.input_files import input_files
+from mjfim.experiment.packing import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import as_json, read_json, replacing, write_json

@@ -2,53 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from mjfim.recordings.quantities import WithUnit
-
-# Sizes between which the squares and quotients of numbers neither vanish nor overflow. No physical
-# quantity in any unit is outside.
-SMALLEST_SIZE = 1e-100
-LARGEST_SIZE = 1e100
-
-
-def _usable_size(value: float) -> float:
-    """Return a number with whose square one can compute; ValueError for others, except 0 and inf.
-
-    Args:
-        value: The number.
-    """
-    is_ordinary = value == 0.0 or SMALLEST_SIZE <= abs(value) <= LARGEST_SIZE
-    if is_ordinary or not math.isfinite(value):
-        return value
-
-    raise ValueError(f"should be of a size from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}")
-
-
-# Types of numbers in the experiment file. A bound of a range may be infinite.
-UsableSize = AfterValidator(_usable_size)
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True), UsableSize]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True), UsableSize]
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True), UsableSize]
-Bound = Annotated[float, Field(strict=True), UsableSize]
-Integer = Annotated[int, Field(strict=True)]
-Boolean = Annotated[bool, Field(strict=True)]
-Range = tuple[Bound, Bound]
-
-# Numbers that may be stated with a unit, which `System` compares with that of the model.
-PositiveWithUnit = Annotated[Positive, WithUnit()]
-FiniteWithUnit = Annotated[Finite, WithUnit()]
-RangeWithUnit = tuple[Annotated[Bound, WithUnit()], Annotated[Bound, WithUnit()]]
-
-# Numbers whose unit is always the same.
-Seconds = Annotated[Positive, WithUnit("s")]
-Hertz = Annotated[Positive, WithUnit("Hz")]
-Metres = Annotated[Positive, WithUnit("m")]
-Period = tuple[Annotated[Bound, WithUnit("s")], Annotated[Bound, WithUnit("s")]]
-
+from mjfim.recordings.section import Boolean, Finite, Period, Positive, Seconds, Section
 
 # Units that a column of a log may have; their factors are in `mjfim.recordings.quantities`.
 LogUnit = Literal[
@@ -60,12 +18,6 @@ LogUnit = Literal[
 # simulation.
 LAW_PREFIXES = ("reference:", "reference_velocity:", "feedforward:", "gain:", "enable:")
 INPUT_PREFIXES = ("ctrl:", *LAW_PREFIXES)
-
-
-class Section(BaseModel):
-    """A table of the experiment file; it is immutable and refuses unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class ColumnSpec(Section):

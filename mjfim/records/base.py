@@ -11,6 +11,7 @@ from functools import cache
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
+from reprlib import Repr
 from typing import Any, ClassVar, Self, TypeVar, dataclass_transform
 
 import numpy as np
@@ -34,6 +35,11 @@ PRESENTATION = "mjfim.output.html"
 PICTURES = "mjfim.output.plots.pictures"
 
 T = TypeVar("T")
+
+
+def no_array(*shape: int) -> Any:
+    """Field whose default is an array without entries, for what was not computed."""
+    return field(default_factory=lambda: np.zeros(shape or (0,)))
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
@@ -267,21 +273,27 @@ def _fault(error: ValueError) -> str:
     return f"the field {place!r}: {first['msg']}"
 
 
-def _short(value: Any) -> str:
-    """Describe a value in a few words: arrays and long values by their size."""
-    if isinstance(value, np.ndarray):
-        return f"<array of shape {value.shape}>"
-    if isinstance(value, Enum):
-        return f"{type(value).__name__}.{value.name}"
-    if is_dataclass(value):
-        return f"<{type(value).__name__}>"
-    if isinstance(value, Mapping):
-        return f"<{len(value)} entries>" if value else "{}"
+class _Short(Repr):
+    """Values in a few words: arrays, records and long values by their size."""
 
-    text = repr(value)
-    if isinstance(value, (tuple, list)):
-        simple = all(isinstance(entry, (str, int, float)) for entry in value)
-        if not simple or len(value) > MAX_ENTRIES or len(text) > MAX_VALUE_LENGTH:
-            kinds = {type(entry).__name__ for entry in value}
-            return f"<{len(value)} × {kinds.pop() if len(kinds) == 1 else 'values'}>"
-    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[:MAX_VALUE_LENGTH]}…"
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = MAX_VALUE_LENGTH
+        self.maxtuple = MAX_ENTRIES
+
+    def repr1(self, value: Any, level: int) -> str:
+        """Describe one value."""
+        if isinstance(value, np.ndarray):
+            return f"<array of shape {value.shape}>"
+        if isinstance(value, Enum):
+            return f"{type(value).__name__}.{value.name}"
+        if is_dataclass(value):
+            return f"<{type(value).__name__}>"
+        if isinstance(value, Mapping) and value:
+            return f"<{len(value)} entries>"
+        text: str = super().repr1(value, level)
+        is_long = isinstance(value, (tuple, list)) and len(text) > MAX_VALUE_LENGTH
+        return f"<{len(value)} values>" if is_long else text
+
+
+_short = _Short().repr

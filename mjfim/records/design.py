@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, record
+from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.labels import Labels
 from mjfim.records.trajectory import Trajectory
 
@@ -96,27 +96,6 @@ class IterateMotions(Record):
             qpos=np.stack([motion.qpos for _, motion in motions]),
             ctrl=np.stack([motion.ctrl for _, motion in motions]),
         )
-
-
-def superfluous(iterations: Sequence[int], limit: int = MAX_MOTIONS) -> set[int]:
-    """Choose iterates whose motions are dropped, so that at most `limit` remain.
-
-    One after the other the iterate is dropped whose neighbours are nearest to each other. The first
-    and the last one stay.
-
-    Args:
-        iterations: Ascending numbers of the iterates that have a motion.
-        limit: Largest number that remains, at least 2.
-
-    Returns:
-        Places in `iterations` of those that are dropped.
-    """
-    kept = list(range(len(iterations)))
-    while len(kept) > limit:
-        numbers = np.array([iterations[place] for place in kept])
-        gaps = numbers[2:] - numbers[:-2]
-        del kept[1 + int(np.argmin(gaps))]
-    return set(range(len(iterations))) - set(kept)
 
 
 # Number of iterations at the end of a search over which its improvement is measured.
@@ -259,16 +238,14 @@ class HistoryRow(Record):
 
 
 def extended(history: tuple[HistoryRow, ...], rows: Iterable[HistoryRow]) -> tuple[HistoryRow, ...]:
-    """Append iterates to a history, of which at most `MAX_MOTIONS` keep their motions.
-
-    Args:
-        history: The history.
-        rows: The iterates.
-    """
+    """Append iterates to a history, of which at most `MAX_MOTIONS` keep their motions."""
     joined = [*history, *rows]
     moving = [place for place, row in enumerate(joined) if row.motion is not None]
-    for dropped in superfluous([joined[place].iteration for place in moving]):
-        joined[moving[dropped]] = replace(joined[moving[dropped]], motion=None)
+    while len(moving) > MAX_MOTIONS:
+        # The iterate between the nearest neighbours goes; the first and the last one stay.
+        numbers = np.array([joined[place].iteration for place in moving])
+        place = moving.pop(1 + int(np.argmin(numbers[2:] - numbers[:-2])))
+        joined[place] = replace(joined[place], motion=None)
     return tuple(joined)
 
 
@@ -277,11 +254,8 @@ def without_motions(
 ) -> tuple[tuple[HistoryRow, ...], IterateMotions | None]:
     """Separate the motions from a history.
 
-    Args:
-        history: The history.
-
     Returns:
-        The history without motions, and the motions; None if there are none.
+        The iterates without motions, and the motions of those that had one; None without any.
     """
     rows = extended((), history)
     motions = [(row.iteration, row.motion) for row in rows if row.motion is not None]
@@ -291,44 +265,30 @@ def without_motions(
 def improvement_per_iteration(history: Sequence[HistoryRow], size: float) -> float:
     """Share by which the last iterations of a search lowered the cost, per iteration.
 
-    Only iterates at the last sample rate count. Under hard limits only the last unbroken run of
-    iterates inside counts: what brings a search back inside is no improvement.
-
     Args:
-        history: The iterates.
-        size: Size of the final cost, to which its change is relative.
+        history: Iterates of the search. Those outside the limits, and of other samples than the
+            last one, do not count.
+        size: Size of the last cost, above zero.
 
     Returns:
-        A number from 0 to 1, by which an iteration reduces the cost; NaN where fewer than two
-        iterates count.
+        The share, 0 or more; NaN where it cannot be measured.
     """
-    counted = _last_run_inside(row for row in history if row.rate == history[-1].rate)
-    counted = [row for row in counted if np.isfinite(row.cost)]
-    if not counted or not 0.0 < size < np.inf:
+    counted = [
+        row
+        for row in history
+        if row.rate == history[-1].rate and np.isfinite(row.cost) and not row.margin < 0.0
+    ]
+    if len(counted) < 2 or not 0.0 < size < np.inf:
         return float("nan")
-
     # The best iterate before the window; the first one where the search was shorter.
     end = counted[-1].iteration
-    before = [row for row in counted if row.iteration <= end - IMPROVEMENT_WINDOW]
-    before = before or counted[:1]
-
+    before = [row for row in counted if row.iteration <= end - IMPROVEMENT_WINDOW] or counted[:1]
     # A new stage of the barrier begins with the last iterate of the stage before.
     iterations = end - before[-1].iteration
     if iterations == 0:
         return float("nan")
     fall = min(row.cost for row in before) - min(row.cost for row in counted)
     return float(1.0 - (1.0 + fall / size) ** (-1.0 / iterations))
-
-
-def _last_run_inside(history: Iterable[HistoryRow]) -> list[HistoryRow]:
-    """Return the last iterates without one outside the limits between them."""
-    runs: list[list[HistoryRow]] = [[]]
-    for row in history:
-        if not row.margin < 0.0:
-            runs[-1].append(row)
-        elif runs[-1]:
-            runs.append([])
-    return runs[-1] or runs[max(len(runs) - 2, 0)]
 
 
 @record
@@ -517,10 +477,10 @@ class Design(ShownRecord):
     nuisance: tuple[str, ...] = ()
     combinations: tuple[str, ...] = ()
     combined: tuple[CombinationAccuracy, ...] = ()
-    prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    data: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    prior: Array = no_array(0, 0)
+    data: Array = no_array(0, 0)
     labels: Labels | None = None
-    sizes: Array = field(default_factory=lambda: np.zeros(0))
+    sizes: Array = no_array()
     motions: IterateMotions | None = None
     improvement: float = float("nan")
 

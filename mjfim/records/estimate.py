@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, field
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import first_ones
-from mjfim.records.base import Record, SavedRecord, ShownRecord, record
+from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.check import join_names
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
@@ -76,11 +77,6 @@ class HorizonStudy(Record):
         "dependent",
     )
     json_names = {"dependent": "depends_on_length"}
-
-    @property
-    def chosen_whole(self) -> bool:
-        """Whether whole recordings were chosen."""
-        return self.is_whole and self.chosen == len(self.lengths) - 1
 
     @property
     def dependent(self) -> tuple[str, ...]:
@@ -490,10 +486,10 @@ class Estimate(ShownRecord):
     recordings: tuple[Recording, ...]
     warnings: tuple[str, ...] = ()
     combinations: tuple[str, ...] = ()
-    data: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    std_sandwich: Array = field(default_factory=lambda: np.zeros(0))
-    interval: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    between_recordings: Array = field(default_factory=lambda: np.zeros(0))
+    data: Array = no_array(0, 0)
+    std_sandwich: Array = no_array()
+    interval: Array = no_array(0, 2)
+    between_recordings: Array = no_array()
     sigma: dict[str, float] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
     whiteness: tuple[Whiteness, ...] = ()
@@ -508,13 +504,13 @@ class Estimate(ShownRecord):
     seconds: float = 0.0
     steps: int = 0
     units: tuple[str, ...] = ()
-    prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    prior: Array = no_array(0, 0)
     labels: Labels | None = None
     restart: Restart | None = None
-    trace: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    trace: Array = no_array(0, 0)
     nominal: tuple[Array, ...] = ()
     segments: tuple[Array, ...] = ()
-    sizes: Array = field(default_factory=lambda: np.zeros(0))
+    sizes: Array = no_array()
     selection: Selection | None = None
     controllers: tuple[ControlLawInLoop, ...] = ()
     horizons: HorizonStudy | None = None
@@ -525,7 +521,7 @@ class Estimate(ShownRecord):
     prior_directions: PriorDirections | None = None
     payload: PayloadEstimate | None = None
     tested_data: TermTestData | None = None
-    honest_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    honest_covariance: Array = no_array(0, 0)
 
     file_stem = "estimate"
     made_by = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -583,24 +579,22 @@ class Estimate(ShownRecord):
     }
 
     def __post_init__(self) -> None:
-        count = len(self.parameters)
-
         # Formal values replace robust ones that were not computed.
-        if len(self.interval) != count:
-            theta = np.asarray(self.theta)
-            half_width = NORMAL_95 * np.asarray(self.std)
-            interval = np.column_stack([theta - half_width, theta + half_width])
-            object.__setattr__(self, "interval", interval)
-        if len(self.std_sandwich) != count:
-            object.__setattr__(self, "std_sandwich", self.std)
-        if len(self.between_recordings) != count:
-            object.__setattr__(self, "between_recordings", np.zeros(count))
-        if len(self.prior) != count:
-            object.__setattr__(self, "prior", np.zeros((count, count)))
-        if len(self.sizes) != count:
-            object.__setattr__(self, "sizes", np.abs(self.theta))
-        if len(self.units) != count:
-            object.__setattr__(self, "units", ("",) * count)
+        count = len(self.parameters)
+        defaults: dict[str, Callable[[], Any]] = {
+            "interval": lambda: np.stack(
+                [self.theta + side * np.asarray(self.std) for side in (-NORMAL_95, NORMAL_95)],
+                axis=1,
+            ),
+            "std_sandwich": lambda: self.std,
+            "between_recordings": lambda: np.zeros(count),
+            "prior": lambda: np.zeros((count, count)),
+            "sizes": lambda: np.abs(self.theta),
+            "units": lambda: ("",) * count,
+        }
+        for name, value in defaults.items():
+            if len(getattr(self, name)) != count:
+                object.__setattr__(self, name, value())
 
     @property
     def guess_sizes(self) -> Array:
@@ -623,8 +617,6 @@ class Estimate(ShownRecord):
                 "The nominal model is not drawn for recordings of more than "
                 f"{MAX_NOMINAL_ROWS:,} rows together."
             )
-        if not len(self.trace):
-            return "The nominal model is not drawn: an earlier version of mjfim saved the estimate."
         return "The nominal model is not drawn: its simulation diverges."
 
     def summary(self) -> dict[str, Any]:
@@ -764,8 +756,8 @@ class Prediction(Record):
     nominal: PredictionErrors
     held_out: bool
     recording: Recording | None = None
-    identified_outputs: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    nominal_outputs: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    identified_outputs: Array = no_array(0, 0)
+    nominal_outputs: Array = no_array(0, 0)
 
     in_json = (
         "name",
@@ -828,7 +820,7 @@ class Uncertainty(Record):
     each: Array
     blocks: int
     draws: Array
-    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    covariance: Array = no_array(0, 0)
 
 
 @record

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import field
-
-import numpy as np
-
 from mjfim.arrays import Array
-from mjfim.records.base import Record, ShownRecord, record
+from mjfim.records.base import Record, ShownRecord, no_array, record
 
 
 @record
@@ -106,7 +102,7 @@ class InverseDynamicsFit(ShownRecord):
     recording: str = ""
     seconds: float = 0.0
     steps: int = 0
-    sizes: Array = field(default_factory=lambda: np.zeros(0))
+    sizes: Array = no_array()
 
     file_stem = "inverse_dynamics"
     made_by = "`InverseDynamicsFit.save`"

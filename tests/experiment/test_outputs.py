@@ -389,7 +389,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
             "noise": {"rate": 0.1, "angle": {"sigma": 0.1, "rate": 10.0}},
             "correlated": pair("rate", "angle"),
         },
-        r"correlated\.outputs: rate, angle are measured at different rates",
+        r"correlated\.outputs: these outputs are measured at different rates",
     ),
     "correlated outside": (
         {"noise": {"acc": {"covariance": BLOCK.tolist()}}, "correlated": pair("acc[0]", "rate")},

@@ -12,7 +12,6 @@ from mjfim.records.design import (
     HistoryRow,
     IterateMotion,
     extended,
-    superfluous,
     without_motions,
 )
 from mjfim.records.trajectory import Trajectory
@@ -65,7 +64,3 @@ def test_motions_are_separated_from_the_history() -> None:
     assert motions is not None and motions.iteration.tolist() == [1.0, 4.0]
     assert motions.qpos.shape == (2, MOTION_SAMPLES, 1)
     assert without_motions(history)[1] is None
-
-
-def test_the_iterate_between_the_nearest_neighbours_is_dropped() -> None:
-    assert superfluous([0, 10, 11, 20, 30], limit=4) == {2}
