@@ -113,22 +113,6 @@ def test_unknown_actuator(key: str) -> None:
         generate(signal, T, NAMES, REST)
 
 
-def test_setup_samples_the_signal_at_its_rate() -> None:
-    """At 20 Hz it has every fifth sample of 100 Hz; a coarser task has the mean over its longer
-    samples.
-    """
-    e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
-        horizon=2.0, initial={"control": {"kind": "sine", "frequency": 0.7}}
-    )
-    fine, slow = DesignTask.resolve(e), DesignTask.resolve(e.replace(rate=20.0, measure_rate=20.0))
-    assert np.allclose(slow.control, fine.control[::5], rtol=0, atol=1e-12)
-    coarse = fine.coarser(4)
-    assert coarse.dt == pytest.approx(4 * fine.dt)
-    assert np.allclose(
-        coarse.control[:, 0], fine.control.reshape(-1, 4).mean(axis=1), rtol=0, atol=1e-12
-    )
-
-
 def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path) -> None:
     """The signal starts at the keyframe's control; an offset in the file replaces it."""
     model = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")

@@ -23,7 +23,6 @@ from mjfim.model.coordinates import (
     state_components,
 )
 from tests.support.numerics import FREE_BODY, Array, Loop, body_task, cart_task, make_task
-from tests.support.paths import MODELS
 
 FREE = [f"qpos:float.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
 BALL = [f"qpos:ball.q{part}" for part in "wxyz"]
@@ -65,25 +64,6 @@ def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
         "tip[2]",
     ]
     assert list(measurable_columns(task.system.model)) == [*FREE, *BALL, *RATES, *sensors]
-
-
-def test_groups_of_columns_can_be_named(tmp_path: Path) -> None:
-    """`.pos` and `.rot`, the whole joint, one component; the key that names fewer columns wins, in
-    any order of the file.
-    """
-    table = {
-        "qpos:float.rot": 0.2,
-        "qpos:float": 0.1,
-        "qvel:float.pos": 0.3,
-        "qpos:float.x": 0.7,
-        "acc": 0.4,
-    }
-    for noise in (table, dict(reversed(table.items()))):
-        found = sigmas(body_task(tmp_path, noise=noise))
-        wanted = dict.fromkeys(FREE, 0.1) | {"qpos:float.x": 0.7} | dict.fromkeys(FREE[3:], 0.1)
-        wanted |= dict.fromkeys(RATES[:3], 0.3) | {f"acc[{i}]": 0.4 for i in range(3)}
-        assert found == pytest.approx(wanted)
-        assert list(found) == [*FREE, *RATES[:3], "acc[0]", "acc[1]", "acc[2]"]
 
 
 @pytest.mark.parametrize("joint", ["ball", "float"])
@@ -249,42 +229,6 @@ def test_correlated_outputs_replace_their_sigmas(tmp_path: Path) -> None:
     )
     assert not task.system.noise.covariance[np.ix_(rest, at)].any()
     assert sigmas(task)["acc[2]"] == pytest.approx(0.3)
-
-
-def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
-    """Neither the experiment nor the MJCF states a sigma."""
-    plain = {"outputs": ["qpos:slide", "qvel:hinge"], "covariance": [[0.04, 0.01], [0.01, 0.09]]}
-    model = tmp_path / "silent.xml"
-    text = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
-    model.write_text(text.replace('noise="0.05"', ""), encoding="utf-8")
-    values: dict[str, Any] = {
-        "model": str(model),
-        "rate": 100.0,
-        "horizon": 0.5,
-        "initial": {"control": {"kind": "sine"}},
-        "parameters": {"m": {"target": "body/bob:mass"}},
-    }
-    task = DesignTask.resolve(Experiment(**values, correlated=[plain]), threads=1)
-    assert task.system.outputs.names == ("qpos:slide", "qvel:hinge")
-    np.testing.assert_allclose(task.system.noise.covariance, [[0.04, 0.01], [0.01, 0.09]])
-    with pytest.raises(
-        ExperimentError,
-        match=r"noise: no output is measured; .*state, qpos:slide, .*hinge_velocity",
-    ):
-        DesignTask.resolve(Experiment(**values), threads=1)
-
-
-def test_the_joint_information_needs_the_correlation(tmp_path: Path) -> None:
-    """G' Sigma^-1 G with the full inverse, sample by sample."""
-    task = cart_task(tmp_path, measure_rate=50.0, noise={"acc": {"covariance": BLOCK.tolist()}})
-    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
-    inverse = np.linalg.inv(BLOCK)
-    wanted = sum(found.G[k].T @ inverse @ found.G[k] for k in range(2, 51, 2))
-    np.testing.assert_allclose(
-        task.information.matrix(found), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max()
-    )
-    apart = sum(found.G[k].T @ np.diag(1 / np.diag(BLOCK)) @ found.G[k] for k in range(2, 51, 2))
-    assert np.abs(apart - wanted).max() > 0.01 * np.abs(wanted).max(), "a weak test"
 
 
 def square(n: int, value: float = 1.0) -> list[list[float]]:

@@ -83,15 +83,6 @@ def test_a_packed_experiment_does_not_see_later_changes_of_its_files(tmp_path: P
     assert System.resolve(experiment).model.opt.timestep == 0.001
 
 
-def test_changed_files_have_another_hash(tmp_path: Path) -> None:
-    experiment = stated(tmp_path)
-    before, again = experiment.packed(), experiment.packed()
-    (tmp_path / "robot/meshes/tool.obj").write_text("v 0 0 0")
-
-    assert before == again
-    assert before.files != experiment.packed().files
-
-
 def test_a_changed_copy_keeps_the_files_and_takes_new_ones(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
     packed = experiment.packed()
@@ -129,26 +120,6 @@ def test_a_process_parses_a_packed_model_once(
     assert len(parsed) == 1
 
 
-def test_only_the_latest_models_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = Kept(loading.KEPT_MODELS)
-    monkeypatch.setattr(loading, "_models", kept)
-    for number in range(loading.KEPT_MODELS + 2):
-        (tmp_path / "m.xml").write_text(
-            '<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>'
-            f"<!-- {number} --></mujoco>"
-        )
-        experiment = Experiment(
-            model="m.xml",
-            rate=100.0,
-            parameters={"d": {"target": "joint/j:damping", "scale": 1.0}},
-            noise={"qpos:j": 0.1},
-            directory=tmp_path,
-        )
-        System.resolve(experiment.packed(), threads=1)
-
-    assert len(kept) == loading.KEPT_MODELS
-
-
 def test_messages_of_packed_files_name_the_file_of_the_user(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
     (tmp_path / "robot/parts/sensors.xml").write_text("<mujoco><nothing/></mujoco>")
@@ -164,12 +135,6 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         experiment.replace(initial={"control": "absent.csv"}).packed()
     with pytest.raises(ModelError, match=r"absent\.xml: no such model file"):
         experiment.replace(model="absent.xml").packed()
-
-
-def test_the_packed_cart_pendulum_has_the_same_cost() -> None:
-    experiment = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=1.0)
-
-    assert cost_of(sent(experiment)) == cost_of(experiment)
 
 
 @pytest.mark.slow

@@ -74,21 +74,6 @@ def test_the_inertia_of_a_body_is_ten_parameters(coordinates: str | None, tmp_pa
     )
 
 
-@pytest.mark.parametrize("coordinates", ["logcholesky", "barycentric"])
-def test_all_parameters_of_an_inertia_are_written_together(
-    coordinates: str, tmp_path: Path
-) -> None:
-    """With the numbers of another body the model holds that body."""
-    task = body_task(tmp_path, parameters={"arm": {**ARM, "coordinates": coordinates}})
-    chart, arm = INERTIA_PARAMETRISATIONS[coordinates], task.system.model.body("arm").id
-    rng = np.random.default_rng(0)
-    theta = task.parameters.guess + 0.05 * task.parameters.scale * rng.standard_normal(10)
-    wanted, found = chart.inertia(theta), body_inertia(task.system.model_at(theta), arm)
-    assert found.mass == pytest.approx(wanted.mass, rel=1e-12)
-    np.testing.assert_allclose(found.com, wanted.com, rtol=1e-12)
-    np.testing.assert_allclose(found.inertia, wanted.inertia, rtol=1e-9, atol=1e-12)
-
-
 def test_priors_of_an_inertia_are_relative_to_the_magnitude_of_each(tmp_path: Path) -> None:
     """One number stands for ten units."""
     table = {
@@ -257,23 +242,6 @@ def test_guess_unit_and_scale_come_from_the_first_target(
     parameters = named(body_task(tmp_path, parameters={"p": {"target": path}}))
     p = parameters["p"]
     assert (p.guess, p.unit, p.scale) == pytest.approx((guess, unit, scale))
-
-
-def test_positions_are_scaled_by_the_size_of_the_body(tmp_path: Path) -> None:
-    """A centre of mass at zero still has a scale: the radius of gyration; `scale = "guess"` asks
-    for the value itself.
-    """
-    task = body_task(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]"}})
-    radius = body_inertia(task.system.model, task.system.model.body("arm").id).gyration_radius
-    assert task.parameters.guess.tolist() == [0.0]
-    assert task.parameters.scale.tolist() == task.parameters.magnitude.tolist() == [radius]
-    with pytest.raises(ExperimentError, match=r"parameters\.y\.scale"):
-        body_task(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]", "scale": "guess"}})
-    turned = {"y": {"targets": [{"path": "body/arm:ipos[2]", "scale": -2.0, "offset": 1.0}]}}
-    task = body_task(tmp_path, parameters=turned)
-    assert task.parameters.guess.tolist() == [(0.25 - 1.0) / -2.0]
-    assert task.parameters.parameters[0].unit == ""
-    assert task.system.model_at(task.parameters.guess).body("arm").ipos[2] == 0.25
 
 
 def test_integers_are_valid_scales(tmp_path: Path) -> None:

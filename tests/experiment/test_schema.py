@@ -17,7 +17,7 @@ from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment, json_schema
 from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Signal
-from mjfim.experiment.task_tables import Cost, Descent, Limits, Robust
+from mjfim.experiment.task_tables import Robust
 from mjfim.recordings.section import Section
 from tests.support.paths import MODELS
 
@@ -162,44 +162,6 @@ def target(path: str) -> str:
 def control(value: str) -> str:
     """SHORT with another initial control."""
     return edited('{ kind = "sine" }', value)
-
-
-def test_contract_parses(folder: Path) -> None:
-    """Every key of DESIGN.md, with the value that was written."""
-    path = folder / "contract.toml"
-    path.write_text(CONTRACT, encoding="utf-8")
-    e = Experiment.from_file(path)
-    assert (e.model, e.rate, e.measure_rate, e.horizon) == ("cart_pendulum.xml", 100.0, 50.0, 1.0)
-    assert (e.initial.keyframe, e.initial.control) == ("hanging", "cart_pendulum.csv")
-    assert list(e.parameters) == ["m", "l", "c"]
-    m, rod, _ = e.parameters.values()
-    assert (m.target, m.guess, m.true, m.bounds, m.scale, m.prior, m.unit) == (
-        "body/bob:mass",
-        2.5,
-        2.0,
-        (0.1, 10.0),
-        1.0,
-        0.5,
-        "kg",
-    )
-    assert [(t.path, t.scale, t.offset) for t in rod.targets] == [
-        ("body/bob:pos[2]", -1.0, 0.25),
-        ("geom/rod:pos[2]", 0.5, 0.0),
-    ]
-    assert e.noise == {"state": 0.05, "hinge_angle": 0.01}
-    assert e.cost == Cost(
-        criterion="A",
-        information=2.0,
-        control={"force": 1e-2},
-        tracking={"slide": 0.05},
-        tracking_velocity={"hinge": 0.1},
-        linearize_at="true",
-    )
-    assert e.descent == Descent(method="metric", tolerance=1e-5, max_iterations=20)
-    assert e.limits == Limits(
-        position={"slide": (-1.0, 1.0)}, velocity={"hinge": 8.0}, control={"force": (-5.0, 5.0)}
-    )
-    assert (e.directory, e.source) == (folder, str(path))
 
 
 # Keys beyond those of the paper: correlated noise, rates, nuisance, whole inertias, other criteria.
@@ -375,14 +337,6 @@ def test_rate_below_the_timestep(resolve: Callable[[str], DesignTask]) -> None:
     assert task.dt == pytest.approx(0.05)
 
 
-def test_python_says_what_toml_says(folder: Path) -> None:
-    """The keys of the file make an equal experiment in Python."""
-    (folder / "contract.toml").write_text(CONTRACT, encoding="utf-8")
-    e = Experiment.from_file(folder / "contract.toml")
-    again = Experiment(**e.model_dump(), directory=folder, source=e.source)
-    assert again == e
-
-
 def test_replace_merges_and_checks(folder: Path) -> None:
     """Tables merge, other keys and the old experiment stay, and faults are refused as in a file."""
     e = Experiment.from_file(folder / "cart_pendulum.toml")
@@ -397,13 +351,6 @@ def test_replace_merges_and_checks(folder: Path) -> None:
         e.replace(cost={"contrl": 1.0})
     with pytest.raises(ExperimentError, match=r"horizon: .*greater than 0"):
         e.replace(horizon=-1.0)
-
-
-def test_experiments_are_immutable(folder: Path) -> None:
-    """Changes go through `replace`."""
-    e = Experiment.from_file(folder / "cart_pendulum.toml")
-    with pytest.raises(ValueError, match="frozen"):
-        e.rate = 50.0
 
 
 @pytest.mark.parametrize("name", ["cart_pendulum.toml", "cart_pendulum_guess.toml"])
@@ -444,16 +391,6 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "initial.control.amp", "amplitude, "],
     ),
-    "parameter key": (
-        parameter('target = "body/bob:mass"\ngues = 1'),
-        E,
-        [HOME, "parameters.m.gues", "'guess'", "bounds"],
-    ),
-    "target key": (
-        parameter('targets = [{ path = "body/bob:mass", scal = 1 }]'),
-        E,
-        [HOME, "parameters.m.targets.0.scal", "offset, path, scale"],
-    ),
     "limits key": (
         SHORT + "[limits]\nspeed = 1\n",
         E,
@@ -463,16 +400,6 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
             "acceleration, angular_velocity, bandwidth, clearance, control, control_rate, enforce, "
             "force, ignored, joint_force, position, tendon_force, tendon_length, tilt, velocity",
         ],
-    ),
-    "boundary key": (
-        SHORT + "[boundary]\nbegin = 1\n",
-        E,
-        [HOME, "boundary.begin", "end, keyframe, position, start, velocity"],
-    ),
-    "descent key": (
-        SHORT + "[descent]\niterations = 1\n",
-        E,
-        [HOME, "descent.iterations", "unknown key", "max_iterations"],
     ),
     "reserved key": ('source = "x"\n' + SHORT, E, [HOME, "source", "valid:", "model"]),
     "missing key": (
@@ -486,30 +413,15 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "cost.tracking", "hinge, slide"],
     ),
-    "velocity joint": (
-        edited("[cost]", "[cost]\ntracking_velocity = { slid = 1 }"),
-        E,
-        [HOME, "cost.tracking_velocity", "'slid'", "hinge, slide"],
-    ),
     "limit joint": (
         SHORT + "[limits]\nposition = { slid = [-1, 1] }\n",
         E,
         [HOME, "limits.position", "joint 'slid'", "hinge, slide"],
     ),
-    "limit actuator": (
-        SHORT + "[limits]\ncontrol = { motor = [-1, 1] }\n",
-        E,
-        [HOME, "limits.control", "actuator 'motor'", "force"],
-    ),
     "cost actuator": (
         edited("[cost]", "[cost]\ncontrol = { motor = 1 }"),
         E,
         [HOME, "cost.control", "actuator 'motor'", "force"],
-    ),
-    "signal actuator": (
-        control('{ kind = "sine", amplitude = { motor = 1 } }'),
-        E,
-        [HOME, "initial.control.amplitude", "'motor'", "force"],
     ),
     "sensor": (
         edited("state =", "angle ="),
@@ -548,13 +460,6 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [HOME, "parameters.m", "field 'mas'", "'mass'", "inertia, ipos, logcholesky, mass"],
     ),
     "path index": (target("body/bob:pos[3]"), E, [HOME, "parameters.m", "index 3", "0 to 2"]),
-    "path index of a scalar": (
-        target("joint/hinge:armature[1]"),
-        E,
-        [HOME, "parameters.m", "index 1", "0 to 0"],
-    ),
-    "path without a name": (target("body:mass"), E, [HOME, "parameters.m", "bob, cart, pendulum"]),
-    "option field": (target("option:grav"), E, [HOME, "parameters.m", "'grav'", "gravity"]),
     # model
     "model missing": (
         edited("cart_pendulum.xml", "gone.xml"),
@@ -566,30 +471,10 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         M,
         ["text.xml", "MuJoCo cannot read", "XML"],
     ),
-    "model schema": (
-        edited("cart_pendulum.xml", "schema.xml"),
-        M,
-        ["schema.xml", "MuJoCo cannot read", "worldbdy"],
-    ),
-    "model not compiling": (
-        edited("cart_pendulum.xml", "massless.xml"),
-        M,
-        ["massless.xml", "MuJoCo cannot compile", "mass and inertia", "thin"],
-    ),
-    "timestep zero": (
-        edited("cart_pendulum.xml", "still.xml"),
-        M,
-        ["still.xml", "option.timestep is 0 s", "positive"],
-    ),
     "timestep not a number": (
         edited("cart_pendulum.xml", "nan.xml"),
         M,
         ["nan.xml", "NaN", "finite"],
-    ),
-    "timestep negative": (
-        edited("cart_pendulum.xml", "backward.xml"),
-        M,
-        ["backward.xml", "option.timestep is -1 s", "positive"],
     ),
     # time
     "rate vanishing": (
@@ -602,30 +487,10 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "rate: at 1e-06 Hz", "1e+08 timesteps", "at most 100000", "0.001 Hz or more"],
     ),
-    "horizon overflowing": (
-        edited("horizon = 1.0", "horizon = 1e308"),
-        E,
-        [HOME, "horizon", "should be of a size from", "1e+308"],
-    ),
-    "limit vanishing": (
-        SHORT + "[limits]\ncontrol_rate = 5e-324",
-        E,
-        [HOME, "limits.control_rate", "should be of a size from", "5e-324"],
-    ),
-    "limit overflowing": (
-        SHORT + "[limits]\nposition = { slide = [-1e308, 1.0] }",
-        E,
-        [HOME, "limits.position.slide.0", "should be of a size from", "-1e+308"],
-    ),
     "rate": (
         edited("rate = 100.0", "rate = 30.0"),
         E,
         [HOME, "rate: at 30 Hz", "0.01 s", "100, 50, 25"],
-    ),
-    "rate above the timestep": (
-        edited("rate = 100.0", "rate = 200.0"),
-        E,
-        [HOME, "rate: at 200 Hz", "100, 50, 25"],
     ),
     "rate negative": (
         edited("rate = 100.0", "rate = -1.0"),
@@ -637,11 +502,6 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "measure_rate: 30 Hz", "100 Hz", "50, 25"],
     ),
-    "measure rate above": (
-        "measure_rate = 200.0" + SHORT,
-        E,
-        [HOME, "measure_rate: 200 Hz", "100 Hz", "50, 25"],
-    ),
     "horizon": (
         edited("horizon = 1.0", "horizon = 1.005"),
         E,
@@ -652,26 +512,11 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "horizon: 0.01 s", ">= 2"],
     ),
-    "horizon infinite": (
-        edited("horizon = 1.0", "horizon = inf"),
-        E,
-        [HOME, "horizon", "finite", "inf"],
-    ),
     # amounts
-    "starts": (
-        edited("[cost]", "[descent]\nstarts = 1e100\n[cost]"),
-        E,
-        [HOME, "descent.starts", "1e+100"],
-    ),
     "many starts": (
         edited("[cost]", "[descent]\nstarts = 1000000000\n[cost]"),
         E,
         [HOME, "descent.starts", "less than or equal to 10000", "1000000000"],
-    ),
-    "bootstrap": (
-        edited("[cost]", "[fit]\nbootstrap = 1000000000\n[cost]"),
-        E,
-        [HOME, "fit.bootstrap", "less than or equal to 100000"],
     ),
     # parameter values
     "bounds inverted": (
@@ -699,30 +544,10 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "parameters.m.guess: the value 0.0025 is outside bounds [1.0, 5.0]"],
     ),
-    "true outside of bounds with a unit": (
-        parameter('target = "body/bob:mass"\nbounds = ["1 kg", "5 kg"]\ntrue = 0.5'),
-        E,
-        [HOME, "parameters.m.true: the value 0.5 is outside bounds [1.0, 5.0]"],
-    ),
-    "true outside": (
-        parameter('target = "body/bob:mass"\nbounds = [1, 5]\ntrue = 0.5'),
-        E,
-        [HOME, "parameters.m.true", "the value 0.5 is outside"],
-    ),
     "guess zero": (
         parameter('target = "joint/slide:damping"'),
         E,
         [HOME, "parameters.m.scale", "is 0; state another guess, or a scale"],
-    ),
-    "guess not a number": (
-        parameter('target = "body/bob:mass"\nguess = nan'),
-        E,
-        [HOME, "parameters.m.guess", "finite", "nan"],
-    ),
-    "prior zero": (
-        parameter('target = "body/bob:mass"\nprior = 0'),
-        E,
-        [HOME, "parameters.m.prior", "greater than 0"],
     ),
     "scale word": (
         parameter('target = "body/bob:mass"\nscale = "gues"'),
@@ -734,39 +559,21 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "parameters.m", "exactly one of target, targets and inertial"],
     ),
-    "target and targets": (
-        parameter('target = "body/bob:mass"\ntargets = [{ path = "body/bob:mass" }]'),
-        E,
-        [HOME, "parameters.m", "exactly one of target, targets and inertial"],
-    ),
     "dead target": (
         parameter('targets = [{ path = "body/bob:mass", scale = 0 }]'),
         E,
         [HOME, "parameters.m", "scale is 0"],
     ),
     # noise and weights
-    "sigma zero": (edited("state = 0.05", "state = 0"), E, [HOME, "noise.state", "greater than 0"]),
     "sigma negative": (
         edited("state = 0.05", "state = -0.1"),
         E,
         [HOME, "noise.state", "greater than 0", "-0.1"],
     ),
-    "sigma nan": (edited("state = 0.05", "state = nan"), E, [HOME, "noise.state", "finite", "nan"]),
-    "sigma inf": (edited("state = 0.05", "state = inf"), E, [HOME, "noise.state", "finite", "inf"]),
     "sigma text": (
         edited("state = 0.05", 'state = "loud"'),
         E,
         [HOME, "noise.state", "number", "'loud'"],
-    ),
-    "information weight": (
-        edited("[cost]", "[cost]\ninformation = -1"),
-        E,
-        [HOME, "cost.information", "-1"],
-    ),
-    "tracking weight": (
-        edited("[cost]", "[cost]\ntracking = { slide = -1 }"),
-        E,
-        [HOME, "cost.tracking.slide", "greater than or equal to 0"],
     ),
     # a weight of 0 is for controls with a hard range; without one it is the fault after this one
     "control weight": (
@@ -794,25 +601,10 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "cost", "exactly one of combination and subset"],
     ),
-    "combination of another criterion": (
-        edited("[cost]", "[cost]\ncombination = { m = 1 }"),
-        E,
-        [HOME, "cost", "other criteria allow neither"],
-    ),
-    "combination of nothing": (
-        edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { m = 0 }'),
-        E,
-        [HOME, "cost", "no coefficient other than 0"],
-    ),
     "combination of a stranger": (
         edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { l = 1 }'),
         E,
         [HOME, "cost.combination", "wanted parameter 'l'", "valid: m"],
-    ),
-    "subset of nothing": (
-        edited("[cost]", '[cost]\ncriterion = "c"\nsubset = []'),
-        E,
-        [HOME, "cost.subset", "names no parameter", "valid: m"],
     ),
     "metric weight without the metric": (
         SHORT + "[descent]\npsi_weight = 1\n",
@@ -840,41 +632,11 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "noise.state", "exactly one of sigma and covariance"],
     ),
-    "noise rate": (
-        edited("state = 0.05", "state = { sigma = 1, rate = 0 }"),
-        E,
-        [HOME, "noise.state.rate", "greater"],
-    ),
-    "noise infinite": (
-        edited("state = 0.05", "hinge_angle = { covariance = [[inf]] }"),
-        E,
-        [HOME, "noise.hinge_angle.covariance.0.0", "finite"],
-    ),
-    "correlated key": (
-        SHORT + "[[correlated]]\noutput = []\n",
-        E,
-        [HOME, "correlated.0.output", "covariance, outputs"],
-    ),
-    "nuisance key": (
-        SHORT + "[nuisance]\nstart = true\n",
-        E,
-        [HOME, "nuisance.start", "bias, delay, initial"],
-    ),
     "nuisance false": (SHORT + "[nuisance]\ndelay = false\n", E, [HOME, "nuisance.delay", "True"]),
-    "robust key": (
-        SHORT + "[robust]\ncount = 3\n",
-        E,
-        [HOME, "robust.count", "over, samples, seed"],
-    ),
     "robust over": (
         SHORT + '[robust]\nover = "best"\n',
         E,
         [HOME, "robust.over", "'mean' or 'worst'", "'best'"],
-    ),
-    "robust of one": (
-        SHORT + "[robust]\nsamples = 1\n",
-        E,
-        [HOME, "robust.samples", "greater than or equal to 2"],
     ),
     "robust without knowledge": (
         SHORT + "[robust]\n",
@@ -896,16 +658,6 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         SHORT + "[limits]\nposition = { slide = [1, -1] }\n",
         E,
         [HOME, "limits.position.slide", "[1, -1]", "lower < upper"],
-    ),
-    "control limits inverted": (
-        SHORT + "[limits]\ncontrol = { force = [1, -1] }\n",
-        E,
-        [HOME, "limits.control.force", "[1, -1]", "lower < upper"],
-    ),
-    "velocity limit negative": (
-        SHORT + "[limits]\nvelocity = { hinge = -8 }\n",
-        E,
-        [HOME, "limits.velocity.hinge", "greater than 0", "-8"],
     ),
     # start
     "qpos length": (
@@ -936,18 +688,14 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         R,
         ["columns.csv", "'force'", "expected columns: t, force", "t, forc"],
     ),
-    "table stray column": (control('"stray.csv"'), R, ["stray.csv", "'torque'", "force, t"]),
     "table without t": (control('"timeless.csv"'), R, ["timeless.csv", "'t' is missing", "force"]),
     "table NaN": (control('"nan.csv"'), R, ["nan.csv", "'force'", "row 2", "finite"]),
-    "table hole": (control('"hole.csv"'), R, ["hole.csv", "'force'", "row 3", "finite"]),
     "table too short": (
         control('"short.csv"'),
         R,
         ["short.csv", "too few rows", "3 rows", "0 ... 1 s", "100 samples"],
     ),
-    "table starts late": (control('"late.csv"'), R, ["late.csv", "0.5 ...", "0 ... 1 s"]),
     "table repeats t": (control('"repeated.csv"'), R, ["repeated.csv", "'t' must increase"]),
-    "table runs backward": (control('"backward.csv"'), R, ["backward.csv", "'t' must increase"]),
     "table with text": (control('"text.csv"'), R, ["text.csv", "column 'force'", "not numeric"]),
     "table without rows": (control('"header.csv"'), R, ["header.csv", "at least two rows"]),
 }

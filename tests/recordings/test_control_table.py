@@ -38,11 +38,6 @@ def read(tmp_path: Path) -> Read:
     return run
 
 
-def held(stamps: Array, values: Array, t: Array) -> Array:
-    """Zero-order hold by a plain search."""
-    return np.array([values[max(i for i, s in enumerate(stamps) if s <= now + 1e-9)] for now in t])
-
-
 def test_coarse_table_is_held(read: Read) -> None:
     """Ten samples per row, each with the row's value; the last row is held for one period."""
     u = read({"t": [0.0, 0.1, 0.2], "u": [1.0, -2.0, 5.0]}, 30, 0.01)
@@ -64,15 +59,6 @@ def test_rounded_stamps_hit_their_samples(read: Read) -> None:
     assert u[:, 0].tolist() == list(range(300))
     u = read({"t": t, "u": np.arange(300.0)}, 300, 0.01)
     assert u[:, 0].tolist() == list(range(300))
-
-
-def test_irregular_table_agrees_with_a_plain_search(read: Read) -> None:
-    """Random stamps, some before the start of the experiment."""
-    rng = np.random.default_rng(3)
-    stamps = np.concatenate([[-0.3, -0.1], np.sort(rng.uniform(0.0, 1.0, 25)), [1.0]])
-    values = rng.standard_normal(len(stamps))
-    u = read({"t": stamps, "u": values}, 100, 0.01)
-    assert u[:, 0].tolist() == held(stamps, values, np.arange(100) * 0.01).tolist()
 
 
 def test_columns_are_found_by_name(read: Read) -> None:
@@ -123,13 +109,3 @@ def test_table_keeps_every_digit(tmp_path: Path) -> None:
     values = np.random.default_rng(0).standard_normal(50) * 10.0 ** np.arange(-25, 25)
     path.write_text("u\n" + "\n".join(repr(float(v)) for v in values) + "\n", encoding="utf-8")
     assert read_table(path)["u"].tolist() == values.tolist()
-
-
-def test_messages_about_many_actuators_are_short(tmp_path: Path) -> None:
-    """They list the first names and count the others."""
-    names = tuple(f"a_rather_long_name_{i}" for i in range(300))
-    header = ",".join(("t", *names[:-1]))
-    (tmp_path / "u.csv").write_text(f"{header}\n{','.join(['0'] * 300)}\n", encoding="utf-8")
-    with pytest.raises(RecordingError, match=r"no column for actuator .* more; found: ") as told:
-        read_control(tmp_path / "u.csv", np.zeros(2), 0.1, names)
-    assert len(str(told.value).removeprefix(str(tmp_path))) < 600

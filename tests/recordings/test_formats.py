@@ -434,26 +434,3 @@ def test_json_lists(tmp_path: Path) -> None:
 def test_json_without_records(content: object, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"log\.json: holds no list of records"):
         read_json(content, tmp_path)
-
-
-def test_messages_quote_no_control_characters(tmp_path: Path) -> None:
-    """A damaged file may hold anything, also escape sequences."""
-    path = tmp_path / "log.csv"
-    path.write_bytes(b"t\n0\n\x1b[2J\x07\xff,1,2\n")
-    with pytest.raises(RecordingError) as refused:
-        read_columns(path, RecordingSpec())
-    assert str(refused.value).isprintable()
-    assert "Expected 1 columns" in str(refused.value)
-
-
-@formats
-def test_messages_about_wide_logs_are_short(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """They list the first columns and count the others."""
-    path = tmp_path / f"log{ending}"
-    WRITERS[ending](path, {f"a_rather_long_name_{i}": columns["u"] for i in range(300)})
-    spec = RecordingSpec(time="a_rather_long_name_0")
-    with pytest.raises(
-        RecordingError, match=r"'gone' is missing; found: .* and 2\d\d more"
-    ) as told:
-        read_columns(path, spec).column("gone")
-    assert len(str(told.value).removeprefix(str(path))) < 600

@@ -87,21 +87,6 @@ def test_names_have_many_forms(stated: Any, columns: list[str], tmp_path: Path) 
     assert set(table.names) == {"t", "action", *columns}
 
 
-def test_columns_are_mapped_by_the_experiment_file(tmp_path: Path) -> None:
-    """Names of another robot, degrees, and a window."""
-    data = episodes(1)[0]
-    data = {**data, "observation.state": np.rad2deg(data["observation.state"])}
-    names = {"action": ["m.torque"], "observation.state": ["x", "main_hinge"]}
-    folder = write_dataset(tmp_path / "set", [data], names)
-    columns = {
-        "ctrl:force": "action:m.torque",
-        "qpos:hinge": {"column": "observation.state:main_hinge", "unit": "deg"},
-    }
-    recording = read_recording(folder, cart(columns=columns, window=[0.1, 0.3]).channels)
-    wanted = episodes(1)[0]["observation.state"][10:31, 1]
-    np.testing.assert_allclose(recording.y[:, 0], wanted, rtol=1e-6)
-
-
 def test_degrees_are_refused_with_the_way_to_state_units(tmp_path: Path) -> None:
     """A joint with a range whose positions are in degrees; then commands without a unit."""
     model = System.resolve(mjfim.Experiment.from_file(MODELS / "servo_arm.toml")).model
@@ -176,26 +161,6 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
     (folder / "meta" / "info.json").write_text("[]", encoding="utf-8")
     with pytest.raises(RecordingError, match="not a JSON object"):
         read_columns(folder, ALL)
-
-
-@both
-def test_overwritten_bytes_never_cause_another_error(version: str, tmp_path: Path) -> None:
-    """Neither in the data nor in info.json."""
-    folder = write_dataset(tmp_path / "set", episodes(1), NAMES, version=version)
-    rng, refused = np.random.default_rng(4), 0
-    for file in (next(folder.rglob("*.parquet")), folder / "meta" / "info.json"):
-        whole = file.read_bytes()
-        for _ in range(30):
-            damaged = bytearray(whole)
-            for at in rng.integers(0, len(whole), 8).tolist():
-                damaged[at] = int(rng.integers(256))
-            file.write_bytes(bytes(damaged))
-            try:
-                read_columns(folder, ALL)
-            except RecordingError:
-                refused += 1
-        file.write_bytes(whole)
-    assert refused > 10
 
 
 def test_keys_that_do_not_fit(tmp_path: Path) -> None:

@@ -135,17 +135,6 @@ def test_numbers_that_are_too_large_to_be_measured(name: str, read: Read) -> Non
         read({"qpos:pin": wave(), name: values})
 
 
-def test_truth_values(read: Read) -> None:
-    """They may switch a control on and off, but they are no measured position."""
-    on = np.where(T < 1.0, "true", "false")
-    spec = {"column": "on", "multiply_by": ["on"]}
-    logged = read({"on": on, "q": wave()}, columns={"ctrl:push": spec, "qpos:pin": "q"})
-    assert np.array_equal(logged.recording.ctrl[:, 0], (T < 1.0)[:-1])
-
-    with pytest.raises(RecordingError, match=r"lab\.csv: column 'on' holds truth values"):
-        read({"on": on}, columns={"qpos:pin": "on"})
-
-
 @pytest.mark.parametrize(
     ("name", "unit", "factor"),
     [
@@ -240,19 +229,6 @@ def test_counters_wrap_around(read: Read) -> None:
     assert np.allclose(found[there], scale * truth[there], rtol=0, atol=1e-9)
 
 
-def test_angles_jump_by_turns(read: Read) -> None:
-    """Jumps by whole turns are removed in any unit, also after empty rows."""
-    truth = 4.0 * np.sin(2.0 * T)
-    raw = np.degrees(np.angle(np.exp(1j * truth)))
-    raw[::7] = np.nan
-    logged = read(
-        {"raw": raw}, columns={"qpos:pin": {"column": "raw", "unit": "deg", "unwrap": True}}
-    )
-    there = np.isfinite(raw)
-    assert np.abs(np.diff(raw[there])).max() > 300
-    assert np.allclose(column(logged, "qpos:pin")[there], truth[there], rtol=0, atol=1e-12)
-
-
 # ---- time
 
 
@@ -284,16 +260,6 @@ def test_window(read: Read) -> None:
         RecordingError, match=r"recording\.window: no row between 7 and 8 s; the log lasts 1\.995 s"
     ):
         read(columns, window=(7.0, 8.0))
-
-
-def test_faults_outside_the_window_do_not_matter(read: Read) -> None:
-    """A restarted clock, a gap or an infinite value after the window is no fault."""
-    t, q = np.array(T), wave()
-    t[300:] -= t[300]
-    q[350] = np.inf
-    with pytest.raises(RecordingError, match="data row 301"):
-        read({"t": t, "qpos:pin": q})
-    assert len(read({"t": t, "qpos:pin": q}, window=(0.0, 1.4)).recording.t) == 281
 
 
 @pytest.mark.parametrize(
@@ -332,11 +298,6 @@ def test_clocks_that_are_wrong(change: Callable[[Array], Array], said: str, read
     columns = {"t": t, **{n: c[: len(t)] for n, c in CTRL.items()}, "qpos:pin": wave()[: len(t)]}
     with pytest.raises(RecordingError, match=rf"lab\.csv: column 't'.*{said}"):
         read(columns, bare=True)
-
-
-def test_unit_of_time_is_guessed_from_the_stated_one(read: Read) -> None:
-    with pytest.raises(RecordingError, match=r'median step is 5e-12 s.*time_unit = "s"'):
-        read({"qpos:pin": wave()}, time_unit="ns")
 
 
 def test_gaps_in_time_can_be_allowed(read: Read) -> None:
@@ -526,25 +487,6 @@ def test_degrees_are_found_by_the_range_of_the_joint(read: Read) -> None:
     assert len(read({"s": wave(50.0, 6.0)}, columns=stated).recording.t) == M
 
 
-def test_degrees_are_found_by_the_speed(read: Read) -> None:
-    """Many turns at an implausible speed are refused, also where the velocity is in degrees as
-    well.
-    """
-    with pytest.raises(
-        RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"
-    ):
-        read({"qpos:pin": wave(90.0, 6.0)})
-    assert len(read({"qpos:pin": 60.0 * T}).recording.t) == M  # a motor that runs
-    both = {"qpos:pin": wave(90.0, 6.0), "qvel:pin": 540.0 * np.cos(6.0 * T)}
-    with pytest.raises(
-        RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"
-    ):
-        read(both)
-    stated = {"qpos:pin": {"column": "q", "unit": "rad"}, "qvel:pin": "v"}
-    fast = dict(zip("qv", both.values(), strict=True))
-    assert len(read(fast, columns=stated).recording.t) == M
-
-
 # ---- the summary
 
 
@@ -565,14 +507,6 @@ def test_summary(read: Read) -> None:
     assert (pin.source, pin.resolution) == ("q", pytest.approx(0.01))
     assert (pin.minimum, pin.maximum) == (np.nanmin(q[:297]), np.nanmax(q[:297]))
     assert pin.empty_share == pytest.approx(10 / 297)
-
-
-def test_resolution_ignores_rounding(read: Read) -> None:
-    """Angles that are equal except for their last digits after unwrapping count as equal."""
-    truth = np.rint(300 * np.sin(2 * T)) * (2 * np.pi / 100)
-    wrapped = np.mod(truth, 2 * np.pi)
-    summary = read({"q": wrapped}, columns={"qpos:pin": {"column": "q", "unwrap": True}}).summary
-    assert summary.columns[-1].resolution == pytest.approx(2 * np.pi / 100)
 
 
 # ---- archives of arrays
@@ -602,24 +536,6 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     assert np.array_equal(
         read_recording(tmp_path / "d.npz", stated.system.channels).y[:, 0], qpos[:, 1]
     )
-
-
-def test_archives_with_one_array_per_column(tmp_path: Path) -> None:
-    """An archive may have one array per column; the last row of a control of full length is
-    dropped.
-    """
-    task = task_of(tmp_path, {})
-    arrays = {
-        "t": T,
-        **CTRL,
-        "qpos:pin": wave(),
-        "gyro": np.column_stack([wave(), wave(2.0), wave(3.0)]),
-    }
-    np.savez(tmp_path / "r.npz", **arrays)
-    r = read_recording(tmp_path / "r.npz", task.system.channels)
-    assert r.outputs == ("qpos:pin", "gyro[0]", "gyro[1]", "gyro[2]")
-    assert np.array_equal(r.y[:, 3], wave(3.0))
-    assert r.ctrl.shape == (M - 1, 2)
 
 
 def test_bags_are_recordings(tmp_path: Path) -> None:
@@ -724,18 +640,6 @@ def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
         q, v = (r.y[:, r.outputs.index(f"{kind}:one")] for kind in ("qpos", "qvel"))
         way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(r.t))])
         assert np.corrcoef(q, way)[0, 1] > 0.9
-
-
-@pytest.mark.parametrize("pattern", ROBOTS)
-@pytest.mark.parametrize("kind", ["qpos", "qvel"])
-def test_logs_of_robots_in_degrees_are_refused(pattern: str, kind: str, tmp_path: Path) -> None:
-    """Every log would have been refused if it had been in degrees."""
-    sources = dict(ROBOTS[pattern]["columns"])
-    sources[f"{kind}:one"] = {"column": sources[f"{kind}:one"], "scale": 180.0 / np.pi}
-    files, task = robot(pattern, tmp_path, columns=sources)
-    for file in files:
-        with pytest.raises(RecordingError, match=f"'{kind}:one' is probably in deg"):
-            read_log(file, task.system.channels)
 
 
 def test_loads_of_a_servo(tmp_path: Path) -> None:
