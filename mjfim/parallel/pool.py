@@ -10,12 +10,12 @@ import ctypes
 import itertools
 import multiprocessing
 import os
-import pickle
-import shutil
 import signal
+import sys
 import tempfile
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
@@ -23,7 +23,7 @@ from functools import partial
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any, TypeVar
-from weakref import WeakKeyDictionary, finalize
+from weakref import WeakKeyDictionary
 
 from mjfim.parallel.budget import SIGNALS, StopToken
 from mjfim.parallel.threads import process_count
@@ -62,9 +62,11 @@ class Pool(Executor):
         self.max_workers = process_count(count)
         self.has_lost_worker = False
 
-        # Tasks that cannot end in time write their results so far into this folder.
-        self._folder = Path(tempfile.mkdtemp(prefix="mjfim-"))
-        self._remove_folder = finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        # Tasks that cannot end in time send their results so far to this address, at which somebody
+        # listens after a request to stop only.
+        self._address = _private_address()
+        self._listener: connection.Listener | None = None
+        self._offers: dict[int, Any] = {}
         self._next_number = itertools.count()
         self._numbers: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
         self._lock = threading.Lock()
@@ -93,11 +95,18 @@ class Pool(Executor):
 
     def stop(self) -> None:
         """Ask all running and later tasks to return their best result so far."""
+        if self._listener is None:
+            # Only processes that have the key of this process are heard.
+            key = multiprocessing.current_process().authkey
+            with suppress(OSError):
+                self._listener = connection.Listener(self._address, authkey=key)
+                _in_background(self._listen, self._listener)
         self._stop.value = True
 
     def resume(self) -> None:
         """Withdraw the request to stop. No task may be running."""
         self._stop.value = False
+        self._close_listener()
 
     def end_running(self, *, wait: bool = False) -> None:
         """End the processes at once with their tasks; the next task starts new processes.
@@ -107,6 +116,7 @@ class Pool(Executor):
         """
         self._release(self._hold)
         self._processes.shutdown(wait=wait, cancel_futures=True)
+        self._close_listener()
 
     def offered(self, future: Future[T]) -> list[T]:
         """Read what a running task has offered as its best result so far after `stop`.
@@ -114,13 +124,26 @@ class Pool(Executor):
         Returns:
             The result, or nothing where the task has offered none.
         """
-        path = self._folder / str(self._numbers[future])
-        return [pickle.loads(path.read_bytes())] if path.exists() else []
+        number = self._numbers[future]
+        return [self._offers[number]] if number in self._offers else []
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers; the arguments are those of `concurrent.futures.Executor.shutdown`."""
         self._processes.shutdown(wait, cancel_futures=cancel_futures)
-        self._remove_folder()
+        self._close_listener()
+
+    def _listen(self, listener: connection.Listener) -> None:
+        """Collect what workers offer, until the listener is closed."""
+        while self._listener is listener:
+            # A worker that is killed while it connects ends its own connection only.
+            with suppress(OSError, EOFError, multiprocessing.AuthenticationError):
+                _in_background(_receive, listener.accept(), self._offers)
+
+    def _close_listener(self) -> None:
+        """Hear no more offers."""
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            listener.close()
 
     def _start(self) -> None:
         """Prepare new processes, which are started by their first tasks."""
@@ -133,7 +156,7 @@ class Pool(Executor):
         # The workers end when nobody holds the writing end of this pipe any more.
         lifeline, self._hold = context.Pipe(duplex=False)
         self._processes = ProcessPoolExecutor(
-            self.max_workers, context, initialize_worker, (self._stop, lifeline, self._folder)
+            self.max_workers, context, initialize_worker, (self._stop, lifeline, self._address)
         )
 
     def _end_if_broken(self, hold: connection.Connection, future: Future[Any]) -> None:
@@ -159,6 +182,26 @@ def _interrupts_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _private_address() -> str:
+    """Return an unused address for processes of this computer."""
+    name = f"mjfim-{uuid.uuid4().hex}"
+    if sys.platform == "win32":
+        return rf"\\.\pipe\{name}"
+    return str(Path(tempfile.gettempdir()) / name)
+
+
+def _receive(heard: connection.Connection, offers: dict[int, Any]) -> None:
+    """Receive one offer; a worker that is killed meanwhile offers nothing."""
+    with suppress(OSError, EOFError), heard:
+        number, result = heard.recv()
+        offers[number] = result
+
+
+def _in_background(function: Callable[..., None], *arguments: object) -> None:
+    """Run a function in a thread that does not keep the process alive."""
+    threading.Thread(target=function, args=arguments, daemon=True).start()
 
 
 # ---- in a worker process
@@ -199,7 +242,7 @@ def run_task(number: int, function: Callable[..., T], /, *args: Any, **kwargs: A
         _task = _offer = None
 
 
-def initialize_worker(stop: ctypes.c_bool, lifeline: connection.Connection, folder: Path) -> None:
+def initialize_worker(stop: ctypes.c_bool, lifeline: connection.Connection, address: str) -> None:
     """Prepare a new worker process: it stops and ends with its pool alone."""
     global _pool_token
     _pool_token = StopToken(also=lambda: stop.value)
@@ -207,28 +250,26 @@ def initialize_worker(stop: ctypes.c_bool, lifeline: connection.Connection, fold
 
     # `timeout` and cluster managers send it to all processes; a running task hands over its result.
     signal.signal(signal.SIGTERM, lambda number, frame: None if _task is not None else os._exit(1))
-    for function, arguments in ((_end_with_parent, (lifeline,)), (_hand_over, (folder,))):
-        threading.Thread(target=function, args=arguments, daemon=True).start()
+    _in_background(_end_with_parent, lifeline)
+    _in_background(_hand_over, address)
 
     # The parent process blocked the signals while it started this process.
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
-def _hand_over(folder: Path) -> None:
-    """Write what the running task has offered, whenever a stop is requested."""
+def _hand_over(address: str) -> None:
+    """Send what the running task has offered, whenever a stop is requested."""
     sent: tuple[int, object] | None = None
+    key = multiprocessing.current_process().authkey
     while True:
         time.sleep(OFFER_INTERVAL)
         offer = _offer
         if not _pool_token.requested or offer is None or offer is sent:
             continue
-        number, result = offer
-        part = folder / f"{number}.part"
-        # The folder is gone where the parent process has what it needs.
-        with suppress(OSError):
-            part.write_bytes(pickle.dumps(result))
-            part.replace(folder / str(number))
+        # Nobody listens any more where the parent process has what it needs.
+        with suppress(OSError, EOFError), connection.Client(address, authkey=key) as parent:
+            parent.send(offer)
         sent = offer
 
 
