@@ -234,10 +234,13 @@ class FitProblem(SegmentSimulation):
             segments.append(segment.first_part(recording.t, recording.dt, share))
         return replace(self, segments=tuple(segments))
 
-    def cut(self, length: float) -> FitProblem | None:
+    def cut(self, length: float | None) -> FitProblem | None:
         """This problem over segments of a length [s] with free initial states.
 
         Parameters of the initial state say nothing about segments, and keep their values.
+
+        Args:
+            length: About the length of a segment [s]; None for whole recordings.
 
         Returns:
             The problem without pins; None where the segments would be too short.

@@ -60,7 +60,11 @@ def extended_problem(
 
     # The rows are those of the solution; a delay as a parameter would let the segments begin
     # earlier.
-    wider = FitProblem.of(extended, recordings)
+    wider: FitProblem | None = FitProblem.of(extended, recordings)
+    if wider is not None and problem.layout.free_starts and not wider.layout.free_starts:
+        wider = wider.cut(None)
+    if wider is None:
+        return None
     wider = replace(
         wider,
         segments=_extended_segments(problem, wider),
