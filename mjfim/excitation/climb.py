@@ -95,7 +95,6 @@ class Candidate:
         cost: J of the best control, as seen on the stated plant.
         best: (N, nu) control of lowest cost that was seen there; None where there is none yet.
         point: Its evaluation, where it is known.
-        earlier: Controls of earlier stages, for the case that the last one violates a limit.
         first_weight: Barrier weight with which the next rung begins; None for the usual one.
         status: Status of the last descent; None where its time was over.
         slope: Slope of the cost at the last iterate.
@@ -114,7 +113,6 @@ class Candidate:
     cost: float = np.inf
     best: Array | None = None
     point: DesignPoint | None = None
-    earlier: tuple[Array, ...] = ()
     first_weight: float | None = None
     status: Status | None = None
     slope: float = np.inf
@@ -291,11 +289,13 @@ class Climb:
         self._grounds = grounds
         self._move = move
         self._budget = Budget(seconds=move.seconds, stop=move.budget.stop)
-        self._begin = replace(move.candidate, is_judged=False, earlier=(), status=None)
+        self._begin = replace(move.candidate, is_judged=False, status=None)
         self.candidate = self._begin
         self._steps_before = grounds.steps - move.candidate.steps
-        # Cost of the best control on its own level.
+        # Cost of the best control on its own level, and the last control with its cost there, whether
+        # or not it keeps the limits.
         self._level_cost = np.inf
+        self._latest: tuple[Array, float] | None = None
         self._are_short: deque[bool] = deque(maxlen=SHORT_WINDOW)
 
     def run(self) -> Generator[DesignEvent, None, Candidate]:
@@ -312,6 +312,9 @@ class Climb:
                     break
         except (SimulationDivergedError, np.linalg.LinAlgError):
             self.candidate = replace(self.candidate, status=Status.STALLED)
+        # Stages that end without convergence before the time is over leave the best that was seen.
+        if rung.barrier is not None and self.candidate.status is None and not self._is_over:
+            self.candidate = replace(self.candidate, status=Status.BEST_SEEN)
         is_unfinished = self._move.may_continue and self._budget.exhausted is StopReason.SECONDS
         if rung.barrier is not None and not self.candidate.has_left:
             if not is_unfinished:
@@ -403,6 +406,8 @@ class Climb:
         found = replace(found, slope=iterate.slope, status=iterate.status)
         is_stated = ground.task.system.variant.sample_factor == 1
         if step.mu:
+            if step.point is not None:
+                self._latest = step.control, step.point.cost
             if cost <= self._level_cost:
                 self._level_cost, found = cost, replace(found, control=step.control)
         elif step.is_inside:
@@ -470,16 +475,21 @@ class Climb:
             variant: Plant of the rung.
         """
         found, begun, cost = self.candidate, self._begin, self._grounds.cost
-        control = without_jumps(cost, found.over_horizon, variant.sample_factor)
+        last, level_cost = found, self._level_cost
+        # A limit that the last control violates by little is kept after scaling, or on the next rung.
+        if self._latest is not None and self._latest[1] < level_cost:
+            last, level_cost = replace(found, control=self._latest[0]), self._latest[1]
+        control = without_jumps(cost, last.over_horizon, variant.sample_factor)
         curves = found.curves if self._move.keeps_curves else None
         following = replace(
             found, control=control, curves=curves, repeats=1, first_weight=None, is_judged=True
         )
-        point = cost.point(control)
+        values = cost.values(control)
+        point = cost.point_along(values)
         if point is None:
             return replace(begun, history=found.history, steps=found.steps, is_judged=True)
 
-        if cost.keeps(control):
+        if cost.keeps_along(values):
             following = following.improved(control, point)
             return replace(following, rank=point.cost)
 
@@ -491,9 +501,13 @@ class Climb:
         ):
             if each is not None:
                 following = following.improved(each.control, each.point)
-        error = point.cost - self._level_cost
+        if last is not found:
+            point_inside = cost.inside(found.over_horizon)
+            if point_inside is not None:
+                following = following.improved(found.over_horizon, point_inside)
+        error = point.cost - level_cost
         if error <= LARGEST_ERROR * cost.level.problem.size(point):
-            return replace(following, rank=min(self._level_cost, following.cost))
+            return replace(following, rank=min(level_cost, following.cost))
         if begun.cost < point.cost:
             blunt = begun.first_weight
             following = replace(following, control=begun.over_horizon, first_weight=blunt)

@@ -128,7 +128,7 @@ def with_corrected_end(cost: LimitedCost, control: Array, budget: Budget) -> Ins
             if values is None or budget.stop.requested:
                 break
             if cost.constraints.is_feasible(values):
-                point = cost.point(candidate) if cost.keeps(candidate) else None
+                point = cost.point_along(values) if cost.keeps_along(values) else None
                 if point is not None and np.isfinite(point.cost):
                     deviation = candidate - centre
                     return InsideControl(about=centre, deviation=deviation, point=point)

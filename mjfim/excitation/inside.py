@@ -98,24 +98,26 @@ class LimitedCost:
 
     def keeps(self, control: Array) -> bool:
         """Check the limits on the unmodified model as well."""
-        values = self.values(control)
+        return self.keeps_along(self.values(control))
+
+    def keeps_along(self, values: ConstraintValues | None) -> bool:
+        """Check the limits along a motion, also on the unmodified model."""
         if values is None or not self.constraints.is_feasible(values):
             return False
         return verify(self.level.task, values.trajectory).is_feasible
 
-    def point(self, control: Array) -> DesignPoint | None:
-        """Evaluate a control: (N, nu), inside limits or not; None where it diverges."""
-        values = self.values(control)
+    def point_along(self, values: ConstraintValues | None) -> DesignPoint | None:
+        """Evaluate a motion, inside limits or not; None where it diverges."""
         if values is None:
             return None
         known = None if self.first is None else moved_alike(self.first, values.trajectory)
         point = self.level.problem.point(values.trajectory) if known is None else known
         return None if point.trajectory is None else point
 
-    def __call__(self, control: Array) -> float:
-        """J of a control: (N, nu); infinite where it violates a limit."""
-        point = self.point(control) if self.keeps(control) else None
-        return np.inf if point is None else point.cost
+    def inside(self, control: Array) -> DesignPoint | None:
+        """Evaluate a control: (N, nu); None where it violates a limit."""
+        values = self.values(control)
+        return self.point_along(values) if self.keeps_along(values) else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -286,8 +288,7 @@ class InsideSearch:
 
     def _evaluated(self, about: Array, deviation: Array, share: float) -> InsideControl | None:
         """A control with its cost; None where it violates a limit or tells nothing."""
-        control = about + deviation
-        point = self.cost.point(control) if self.cost.keeps(control) else None
+        point = self.cost.inside(about + deviation)
         if point is None or not np.isfinite(point.cost):
             return None
         return InsideControl(about=about, deviation=deviation, point=point, share=share)

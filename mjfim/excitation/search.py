@@ -27,7 +27,7 @@ from mjfim.excitation.climb import (
     move_in_worker,
     row_of,
 )
-from mjfim.excitation.descent import Barrier
+from mjfim.excitation.descent import MU_FACTOR, Barrier
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.inside import InsideControl, InsideSearch, is_progress
 from mjfim.excitation.levels import DescentLevel, coarse_level, coarser_levels, easier_level
@@ -89,6 +89,9 @@ ITERATIONS_OF_A_START = 50
 # Time of the iterations on a further rung below which it is not begun, in evaluations.
 FEWEST_ITERATIONS = 6.0
 
+# Number of iterations that a stage of the barrier takes at least, where there is time for few.
+ITERATIONS_OF_A_STAGE = 5.0
+
 # Shares of the time for random changes: where derivatives may mislead before a descent, where the
 # start is far outside the limits, between two descents, and at the end. The rest is for the report.
 PROBE_SHARE = 0.1
@@ -104,7 +107,7 @@ ENLARGING = 1.25
 MOVE_SECONDS = 8.0
 MOVE_EVALUATIONS = 60.0
 
-# Number of random changes without progress after which others moves follow.
+# Number of random changes without progress after which other moves follow.
 PATIENCE = 16
 
 
@@ -209,7 +212,7 @@ class Search:
         control, least = first.over_horizon, self.first.cost
         while self.budget.used < OUTSIDE_SHARE and self.budget.exhausted is None:
             larger = np.asarray(centre + ENLARGING * (control - centre))
-            point = cost.point(larger) if cost.keeps(larger) else None
+            point = cost.inside(larger)
             if point is None or not point.cost < least:
                 break
             control, least = larger, point.cost
@@ -273,15 +276,16 @@ class Search:
             is_last = number == len(ladder) - 1
             if number and not self._has_time_for(batch, rung):
                 break
+            if number:
+                rung = self._in_time(rung, ladder[number - 1], batch)
             batch = yield from self._moved(batch, (rung,), is_last=is_last)
             results.update({each.name: each for each in batch})
             if self.budget.exhausted is not None or is_last:
                 break
             ranked = sorted(batch, key=lambda each: each.rank)
             batch = ranked[: max(len(ranked) // HALVING_RATE, 1)]
-            chosen = {each.name for each in batch}
             for each in ranked[len(batch) :]:
-                if each.best is not None and each.name not in chosen:
+                if each.best is not None:
                     results[each.name] = replace(each, status=Status.LEFT)
         return list(results.values())
 
@@ -292,6 +296,26 @@ class Search:
         level = self.grounds.ground(rung.variant, batch[0]).level
         ratio = level.engine_steps / self.grounds.stated.engine_steps
         return self.budget.seconds_left > FEWEST_ITERATIONS * ratio * self.evaluation_seconds
+
+    def _in_time(self, rung: Rung, before: Rung, batch: list[Candidate]) -> Rung:
+        """A rung with as many stages of the barrier as there is time for.
+
+        The time of an iteration is that on the rung before, in proportion to the engine steps.
+        """
+        level = self.grounds.ground(before.variant, batch[0]).level
+        rows = [row for row in batch[0].history if row.rate == 1.0 / level.task.dt]
+        barrier = rung.barrier
+        if barrier is None or len(rows) < 2 or np.isinf(self.budget.seconds_left):
+            return rung
+        ratio = self.grounds.stated.engine_steps / level.engine_steps
+        each = ratio * (rows[-1].seconds - rows[0].seconds) / (len(rows) - 1)
+        iterations = self.budget.seconds_left / len(batch) / max(each, 1e-9)
+        stages = max(int(iterations / ITERATIONS_OF_A_STAGE), 1)
+        if stages >= len(barrier.weights):
+            return rung
+        last = barrier.first / MU_FACTOR ** (stages - 1)
+        short = replace(barrier, last=max(last, barrier.last), relaxation=Barrier.relaxation)
+        return replace(rung, barrier=short)
 
     def _helped_by_chance(
         self, done: list[Candidate], ladder: tuple[Rung, ...]
@@ -335,11 +359,7 @@ class Search:
         return self.budget.seconds_left > FEWEST_EVALUATIONS * self.evaluation_seconds
 
     def _by_chance(
-        self,
-        candidate: Candidate,
-        inside: InsideControl,
-        share: float,
-        patience: float,
+        self, candidate: Candidate, inside: InsideControl, share: float, patience: float
     ) -> Generator[DesignEvent, None, tuple[Candidate, InsideControl]]:
         """Improve a candidate by random changes of a control within the limits."""
         budget = self.budget.share(share)
@@ -388,9 +408,9 @@ class Search:
         stated = self.grounds.stated
         variant = stated.task.system.variant
         tolerance = stated.task.experiment.descent.tolerance
-        has_parts = any(each.repeats > 1 for each in candidates)
         if not stated.task.is_limited:
             return (Rung(variant=variant, barrier=Barrier(first=Barrier.last * 3.0)),)
+        has_parts = any(each.repeats > 1 for each in candidates)
         levels = () if has_parts else coarser_levels(stated, self.first)
         if levels:
             weights = LAST_WEIGHTS[len(levels)]

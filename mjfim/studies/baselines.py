@@ -181,7 +181,9 @@ def _search_at_random(
         if has_weights:
             scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
         control = np.asarray(task.centre + scale * deviation)
-        point = cost.point(control) if _keeps_share(cost, scale * deviation, 1.0) else None
+        values = cost.values(control)
+        is_inside = values is not None and cost.constraints.is_feasible(values)
+        point = cost.point_along(values) if is_inside or not task.is_limited else None
         J = np.inf if point is None else point.cost
 
         # Widen the local search after a success, narrow it after a failure.
