@@ -116,6 +116,15 @@ OtherDesign = Annotated[
     ),
 ]
 
+ExperimentOfDesign = Annotated[
+    Path | None,
+    typer.Option(
+        "--experiment",
+        metavar="EXPERIMENT",
+        help="Experiment file of the design; default: the one that its design.json names.",
+    ),
+]
+
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (MJCF or URDF).")]
 
 Verbose = Annotated[

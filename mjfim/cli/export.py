@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import Force, claim_file, claim_folder, keep_result, verb
+from mjfim.cli.common import ExperimentOfDesign, Force, claim_file, claim_folder, keep_result, verb
 from mjfim.cli.progress import progress, say
 from mjfim.output.robots import TARGETS
 
@@ -41,6 +41,7 @@ def export(
     unit: Annotated[
         str, typer.Option(help="Unit of angles in a LeRobot dataset: rad or deg.")
     ] = "rad",
+    experiment: ExperimentOfDesign = None,
     force: Force = False,
 ) -> None:
     """Write a design for ROS 2 or LeRobot, or as a stand-alone Python program that plays it."""
@@ -57,7 +58,7 @@ def export(
 
     require_options(to, positions, storage, unit)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
-    stated = mjfim.Experiment.from_file(find_experiment_file(file))
+    stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))
     inputs = input_files(stated, [design_folder])
     if is_folder(to):
         claim_folder(output, exported_files(to, output), inputs, force=force)

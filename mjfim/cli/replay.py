@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import Force, claim_file, verb
+from mjfim.cli.common import ExperimentOfDesign, Force, claim_file, verb
 from mjfim.cli.progress import say
 from mjfim.errors import RecordingError
 from mjfim.files import replacing
@@ -25,6 +25,7 @@ def replay(
         Path | None,
         typer.Option(metavar="FILE.rrd", help="Write a file instead of opening the viewer."),
     ] = None,
+    experiment: ExperimentOfDesign = None,
     force: Force = False,
 ) -> None:
     """Show a result in the Rerun viewer."""
@@ -41,7 +42,8 @@ def replay(
         inputs = sorted(source.iterdir()) if source.is_dir() else [source]
         claim_file(save, inputs, force=force)
     if source.suffix == ".npz":
-        system = System.resolve(mjfim.Experiment.from_file(find_experiment_file(source)))
+        stated = experiment or find_experiment_file(source)
+        system = System.resolve(mjfim.Experiment.from_file(stated))
         named = archive.read_design(source)
         for trajectory in named.values():
             archive.check_fits(source, trajectory, system)

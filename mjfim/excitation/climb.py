@@ -292,8 +292,8 @@ class Climb:
         self._begin = replace(move.candidate, is_judged=False, status=None)
         self.candidate = self._begin
         self._steps_before = grounds.steps - move.candidate.steps
-        # Cost of the best control on its own level, and the last control with its cost there, whether
-        # or not it keeps the limits.
+        # Cost of the best control on its own level, and the last control with its cost there, which
+        # need not keep the limits.
         self._level_cost = np.inf
         self._latest: tuple[Array, float] | None = None
         self._are_short: deque[bool] = deque(maxlen=SHORT_WINDOW)
@@ -476,7 +476,7 @@ class Climb:
         """
         found, begun, cost = self.candidate, self._begin, self._grounds.cost
         last, level_cost = found, self._level_cost
-        # A limit that the last control violates by little is kept after scaling, or on the next rung.
+        # A small violation of the last control ends after scaling, or on the next rung.
         if self._latest is not None and self._latest[1] < level_cost:
             last, level_cost = replace(found, control=self._latest[0]), self._latest[1]
         control = without_jumps(cost, last.over_horizon, variant.sample_factor)

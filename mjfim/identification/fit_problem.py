@@ -318,7 +318,7 @@ class FitProblem(SegmentSimulation):
         """Division of the rows into blocks."""
         return BlockDivision(segments=self.segments, row_count=self.row_count)
 
-    @cached_property
+    @property
     def whitened(self) -> WhitenedRows:
         """Comparison of simulated rows with the measured values that count."""
         return WhitenedRows(problem=self, masks=self.masks, noise=self.noise)
@@ -326,7 +326,13 @@ class FitProblem(SegmentSimulation):
     @cached_property
     def prior_rows(self) -> PriorRows:
         """Rows of priors and pins."""
-        return PriorRows(problem=self, pins=self.pins, with_priors=self.with_priors)
+        return PriorRows(
+            layout=self.layout,
+            segment_count=len(self.segments),
+            start_sizes=np.abs(self.start_directions).T @ self.system.plant.sizes.state,
+            pins=self.pins,
+            with_priors=self.with_priors,
+        )
 
     @property
     def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:

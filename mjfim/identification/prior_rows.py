@@ -10,7 +10,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.pins import Pins
-from mjfim.identification.segment_simulation import SegmentSimulation
+from mjfim.identification.unknowns import UnknownLayout
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 # Standard deviation of the prior on a free initial state, relative to the natural sizes of the
@@ -23,12 +23,16 @@ class PriorRows:
     """Rows of priors and pins on the unknowns of a simulation.
 
     Attributes:
-        problem: Simulation of the segments.
+        layout: Layout of the unknowns.
+        segment_count: Number of segments.
+        start_sizes: (n,) natural sizes of the private unknowns of a segment.
         pins: Combinations that no recording determines, and their values.
         with_priors: Whether priors of the parameters count.
     """
 
-    problem: SegmentSimulation
+    layout: UnknownLayout
+    segment_count: int
+    start_sizes: Array
     pins: Pins
     with_priors: bool
 
@@ -41,7 +45,7 @@ class PriorRows:
         Returns:
             (l, c+1) rows `[J, r]`.
         """
-        layout = self.problem.layout
+        layout = self.layout
         rows = np.zeros((0, layout.column_count + 1))
         if self.with_priors:
             rows = self.of_parameters(at)
@@ -61,7 +65,7 @@ class PriorRows:
         Returns:
             (l, c+1) rows `[J, r]`: the stated priors, then those from the model's inertias.
         """
-        layout = self.problem.layout
+        layout = self.layout
         rows = [layout.prior_rows(at)]
         is_own = np.zeros(len(layout.parameters), dtype=bool)
         is_own[layout.per_recording] = True
@@ -84,7 +88,7 @@ class PriorRows:
         Returns:
             (l, c+1) rows `[J, r]`; None where a body is not physical at the end.
         """
-        layout = self.problem.layout
+        layout = self.layout
         theta = np.array(at.theta)
         own = np.array(at.per_recording)
         count = len(layout.shared)
@@ -112,7 +116,7 @@ class PriorRows:
 
     def _cad_rows(self, prior: CadPrior, at: UnknownValues, recording: int) -> Array:
         """(l, c+1) rows of the priors on inertias, with the values of one recording."""
-        layout = self.problem.layout
+        layout = self.layout
         found = prior.rows(layout.theta_of_recording(at, recording))
         columns = layout.to_columns(found[:, :-1], recording)
         return np.column_stack([columns, found[:, -1]])
@@ -120,7 +124,7 @@ class PriorRows:
     @cached_property
     def _cad(self) -> CadPrior:
         """Priors from the model's inertias."""
-        return CadPrior.of(self.problem.system.parameters)
+        return CadPrior.of(self.layout.parameters)
 
     def private(self, at: UnknownValues) -> Array:
         """Rows on the private unknowns of every segment.
@@ -131,18 +135,15 @@ class PriorRows:
         Returns:
             (P, k, m) rows `[J_private, J_common, r]`.
         """
-        system = self.problem.system
-        layout = self.problem.layout
-        n = self.problem.private_count
+        layout, count = self.layout, self.segment_count
+        n = len(self.start_sizes)
         m = n + layout.column_count + 1
-        count = len(self.problem.segments)
         diagonal = np.arange(n)
 
         # A weak prior on a free initial state, for components that no output determines.
         if layout.free_starts:
             rows = np.zeros((count, n, m))
-            sizes = np.abs(self.problem.start_directions).T @ system.plant.sizes.state
-            sigma = FREE_START_SIGMA * sizes
+            sigma = FREE_START_SIGMA * self.start_sizes
             rows[:, diagonal, diagonal] = 1.0 / sigma
             rows[:, :, -1] = at.private / sigma
             return rows
@@ -150,8 +151,7 @@ class PriorRows:
             return np.zeros((count, 0, m))
 
         # Stated priors on the deviations of the initial state.
-        parameters = system.parameters
-        private = layout.private
+        parameters, private = layout.parameters, layout.private
         weight = parameters.prior_weight[private] * self.with_priors
         pin_count = len(self.pins.rows) if self._pins_involve_private else 0
         rows = np.zeros((count, n + pin_count, m))
@@ -168,4 +168,4 @@ class PriorRows:
     @cached_property
     def _pins_involve_private(self) -> bool:
         """True where pins involve private unknowns."""
-        return bool(self.pins.rows[:, self.problem.layout.private].any())
+        return bool(self.pins.rows[:, self.layout.private].any())

@@ -184,8 +184,8 @@ def find_experiment_file(source: Path) -> Path:
 
     if not isinstance(experiment, str):
         raise RecordingError(
-            f"{source}: no usable design.json beside it, which names the experiment; give the "
-            "folder of a design"
+            f"{source}: no design.json beside it names the experiment; give its file with "
+            "--experiment"
         )
     return source.parent.resolve() / experiment
 

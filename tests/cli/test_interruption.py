@@ -17,9 +17,10 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification import parameter_draws
-from mjfim.output import archive, plots
+from mjfim.output import archive
 from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.manifest import MANIFEST
+from mjfim.output.plots import draw
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, FitEvent, StudyEvent
@@ -66,7 +67,7 @@ def test_interrupted_while_writing(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The message does not deny files that are already written."""
-    monkeypatch.setattr(plots, "save", interrupt)
+    monkeypatch.setattr(draw, "save", interrupt)
     result = run("design", study, "-o", tmp_path / "out")
     assert "design.npz" in names(tmp_path / "out")
     assert "nothing was written" not in result.stderr

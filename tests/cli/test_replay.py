@@ -8,10 +8,8 @@ from pathlib import Path
 from typer.testing import Result
 
 from mjfim.output import rerun as rerun_log
-from tests.support.cli import (
-    misused,
-    run,
-)
+from tests.support.cli import misused, run
+from tests.support.paths import MODELS
 
 
 def test_replay_saves(home: Path, archived: Path, identified: Result, tmp_path: Path) -> None:
@@ -30,7 +28,9 @@ def test_replay_of_a_lonely_archive(archived: Path, tmp_path: Path) -> None:
     target = tmp_path / "x.rrd"
     result = run("replay", tmp_path / "design.npz", "--save", target)
     assert (result.exit_code, target.exists()) == (2, False)
-    assert "no usable design.json" in result.stderr
+    assert "give its file with --experiment" in result.stderr
+    stated = ("--experiment", MODELS / "cart_pendulum.toml")
+    assert run("replay", tmp_path / "design.npz", "--save", target, *stated).exit_code == 0
 
 
 def test_replay_into_a_folder(home: Path, designed: Result, tmp_path: Path) -> None:
