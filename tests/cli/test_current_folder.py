@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import mjfim
-from mjfim.output.rerun import viewer
+from mjfim.output.rerun import documents
 from tests.support.cli import PROCESS, write_experiment
 from tests.support.paths import ROOT
 
@@ -66,7 +66,7 @@ def test_the_viewer_is_not_searched_in_the_current_folder(
         def wait(self, timeout: float) -> int:
             return 0
 
-    monkeypatch.setattr(viewer.subprocess, "Popen", Started)
+    monkeypatch.setattr(documents.subprocess, "Popen", Started)
     (trap / "design.rrd").touch()
-    viewer.show(trap / "design.rrd")
+    documents.show(trap / "design.rrd")
     assert "-P" in commands[0][: commands[0].index("-m")]
