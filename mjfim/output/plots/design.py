@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,6 +44,7 @@ from mjfim.output.positions import shown_positions
 from mjfim.output.vocabulary import DESIGNED, INITIAL
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.labels import Labels
+from mjfim.records.trajectory import Trajectory
 
 # Number of panels of the trajectories, and of phase plots, side by side, and largest number of
 # phase plots.
@@ -50,6 +52,9 @@ PANEL_COLUMNS, PHASE_COLUMNS, MAX_PHASE_PLOTS = 4, 3, 6
 
 # Widths of the lines of the initial and of the designed trajectory [points].
 LINE_WIDTHS = (1.1, 1.6)
+
+# Distance from the motion, over its range, up to which a limit is drawn beside it.
+NEAR_LIMIT = 0.5
 
 # Largest number of rows of bars that have numbers.
 MAX_HIGH_ROWS = 12
@@ -78,56 +83,26 @@ MAX_ENVELOPES, MAX_ROWS, FULL_ROW = 2, 12, 0.86
 
 def trajectories(design: Design, labels: Labels) -> Picture:
     """Show states, controls and the information gathered up to each time (the paper's figure 2)."""
-    initial, designed = design.initial.trajectory, design.final.trajectory
-    labels.check(
-        qpos=initial.qpos.shape[1], velocities=initial.qvel.shape[1], controls=initial.ctrl.shape[1]
-    )
-    positions, qpos = shown_positions(labels, initial.qpos, designed.qpos)
-    velocities = [label.replace(" velocity [", " [") for label in labels.velocities]
-    controls = [label.replace(" (control)", " [model unit]") for label in labels.controls]
-    groups = (
-        ("positions", positions, qpos),
-        ("velocities", velocities, (initial.qvel, designed.qvel)),
-        ("controls", controls, (initial.ctrl, designed.ctrl)),
-    )
-    columns = min(PANEL_COLUMNS, max(len(names) for _, names, _ in groups))
+    both = {INITIAL.word: design.initial.trajectory, DESIGNED.word: design.final.trajectory}
+    groups = motion_panels(labels, both, design.usage)
+    columns = min(PANEL_COLUMNS, max(map(len, groups.values())))
     panels: list[Panel] = []
     row = 0
-    for group, names, values in groups:
-        shown = [
-            Panel(
-                title=name,
-                marks=_both(design, [each[:, k] for each in values]),
-                x=Axis(most=5),
-                y=Axis(label=group if k % columns == 0 else "", most=4),
-                is_shaded=group == "controls",
-            )
-            for k, name in enumerate(names)
+    for name, found in groups.items():
+        # The name of a group stands beside the first panel of each row.
+        named = [
+            replace(panel, y=replace(panel.y, label=name)) if k % columns == 0 else panel
+            for k, panel in enumerate(found)
         ]
-        panels += in_grid(shown, columns, row)
-        row += -(-len(names) // columns)
-
-    roots = [np.sqrt(np.maximum(e.min_eigenvalue, 0.0)) for e in (design.initial, design.final)]
-    ends = [
-        words([trajectory.t[-1]], [root[-1]], [format_number(float(root[-1]))], term.word)
-        for trajectory, root, term in zip(
-            (initial, designed), roots, (INITIAL, DESIGNED), strict=True
-        )
-    ]
-    information = Panel(
-        title="√λ_min up to each time  [√s / unit of θ]",
-        marks=[*_both(design, roots), *ends],
-        x=Axis(label="time [s]"),
-        y=Axis(label="information", most=4),
-        place=(row, 0),
-        is_wide=True,
-    )
+        panels += in_grid(named, columns, row)
+        row += -(-len(found) // columns)
     note = (
         "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the "
         "measurement rate. All horizontal axes: time [s]."
     )
-    if controls:
+    if groups["controls"]:
         note += " Grey background: controls."
+    information = replace(information_panel(design), place=(row, 0), is_wide=True)
     return Picture(
         title="Trajectories and the information that they gather",
         panels=[*panels, information],
@@ -137,17 +112,92 @@ def trajectories(design: Design, labels: Labels) -> Picture:
     )
 
 
-def _both(design: Design, values: Sequence[Array]) -> list[Mark]:
-    """Return the curves of one quantity along both trajectories; controls are held."""
+def motion_panels(
+    labels: Labels, trajectories: Mapping[str, Trajectory], usage: Sequence[LimitUsage] = ()
+) -> dict[str, list[Panel]]:
+    """Return panels of positions, velocities and controls of one or more trajectories.
+
+    Args:
+        labels: Names and units of all columns.
+        trajectories: The trajectories by their role.
+        usage: Limits, which are lines where the motion comes near them.
+    """
+    shown = list(trajectories.values())
+    labels.check(
+        qpos=shown[0].qpos.shape[1],
+        velocities=shown[0].qvel.shape[1],
+        controls=shown[0].ctrl.shape[1],
+    )
+    positions, qpos = shown_positions(labels, *(each.qpos for each in shown))
+    velocities = [label.replace(" velocity [", " [") for label in labels.velocities]
+    controls = [label.replace(" (control)", " [model unit]") for label in labels.controls]
+    groups = {
+        "positions": ("position", positions, qpos),
+        "velocities": ("velocity", velocities, [each.qvel for each in shown]),
+        "controls": ("control", controls, [each.ctrl for each in shown]),
+    }
+    bounds = {(used.kind, used.name): (used.lower, used.upper) for used in usage}
+    panels: dict[str, list[Panel]] = {}
+    for group, (kind, names, values) in groups.items():
+        panels[group] = []
+        for k, name in enumerate(names):
+            columns = [each[:, k] for each in values]
+            curves = [
+                _curve(trajectory.t, y, role, width)
+                for (role, trajectory), y, width in zip(
+                    trajectories.items(), columns, (*LINE_WIDTHS, *[1.3] * len(shown)), strict=False
+                )
+            ]
+            limits = bounds.get((kind, split_unit(name)[0]), ())
+            panels[group].append(
+                Panel(
+                    title=name,
+                    marks=[*curves, *_near_limits(limits, columns)],
+                    x=Axis(most=5),
+                    y=Axis(most=4),
+                    is_shaded=group == "controls",
+                )
+            )
+    return panels
+
+
+def _curve(t: Array, y: Array, role: str, width: float) -> Mark:
+    """Return a curve over time; a control is held from each time to the next."""
+    kind: Kind = "line" if len(y) == len(t) else "steps"
+    return mark(kind, t, y, role, width=width, label=role)
+
+
+def _near_limits(limits: Sequence[float], values: Sequence[Array]) -> list[Mark]:
+    """Return lines at the limits that are so near that they do not flatten the curves."""
+    every = np.concatenate(values)
+    low, high = np.nanmin(every), np.nanmax(every)
+    reach = NEAR_LIMIT * (high - low)
+    return [
+        hline(limit, "muted", dash="--", width=0.8, label="limit")
+        for limit in limits
+        if low - reach <= limit <= high + reach
+    ]
+
+
+def information_panel(design: Design) -> Panel:
+    """Return the root of the smallest eigenvalue of the information up to each time."""
     marks = []
-    evaluations = (design.initial, design.final)
-    for evaluation, y, term, width in zip(
-        evaluations, values, (INITIAL, DESIGNED), LINE_WIDTHS, strict=True
+    for evaluation, term, width in zip(
+        (design.initial, design.final), (INITIAL, DESIGNED), LINE_WIDTHS, strict=True
     ):
         t = evaluation.trajectory.t
-        kind: Kind = "line" if len(y) == len(t) else "steps"
-        marks.append(mark(kind, t, y, term.word, width=width, label=term.word))
-    return marks
+        root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
+        last = format_number(float(root[-1]))
+        marks += [
+            _curve(t, root, term.word, width),
+            words([t[-1]], [root[-1]], [last], term.word),
+        ]
+    return Panel(
+        title="√λ_min up to each time [√s / unit of θ]",
+        marks=marks,
+        x=Axis(label="time [s]"),
+        y=Axis(label="information", most=4),
+    )
 
 
 # ---- sensitivities
@@ -218,7 +268,7 @@ def convergence(design: Design) -> Picture:
     values = {
         "cost J [–]": np.array([row.cost for row in history], dtype=np.float64),
         "slope |DJ·ζ| [–]": np.abs([row.slope for row in history]),
-        "λ_min  [s / (unit of θ)²]": np.array(
+        "λ_min [s / (unit of θ)²]": np.array(
             [row.min_eigenvalue for row in history], dtype=np.float64
         ),
     }
@@ -336,19 +386,8 @@ def standard_deviations(design: Design, labels: Labels) -> Picture:
 
 def limits(design: Design, labels: Labels) -> Picture:
     """Show the used share of each limit; a joint has the same colour in all panels."""
-    by_kind = {
-        kind: curves
-        for kind in LIMIT_KINDS
-        if (curves := [usage for usage in design.usage if usage.kind == kind])
-    }
-    columns = 2 if len(by_kind) > MAX_WIDE_PANELS else 1
-    closest = closest_to_bounds(design.usage)[: len(SERIES)]
-    names = [name for name in dict.fromkeys(u.name for u in design.usage) if name in closest]
-    roles = {name: f"series{i}" for i, name in enumerate(names)}
-    panels = [
-        _limit_panel(curves, roles, _margin_in_words(design, kind, labels))
-        for kind, curves in by_kind.items()
-    ]
+    panels = limit_panels(design, labels)
+    columns = 2 if len(panels) > MAX_WIDE_PANELS else 1
     heights = [
         2.0 if panel.y.names is None else 0.7 + 0.27 * len(panel.y.names) for panel in panels
     ]
@@ -357,7 +396,7 @@ def limits(design: Design, labels: Labels) -> Picture:
         "All engine steps of the stated model. ±100 %: at the upper and at the lower bound; grey: "
         "beyond a bound."
     )
-    if "clearance" in by_kind:
+    if any(usage.kind == "clearance" for usage in design.usage):
         note += " Of a clearance: required over actual distance."
     if any(panel.y.names for panel in panels):
         note += (
@@ -379,13 +418,34 @@ def limits(design: Design, labels: Labels) -> Picture:
         note=note,
         heights=[max(heights[i : i + columns]) for i in range(0, len(heights), columns)],
         widths=[1.0] * columns,
-        keys=[
-            line([], [], role, width=2.0, label=shorten(name, 24)) for name, role in roles.items()
-        ],
     )
 
 
-def _limit_panel(curves: Sequence[LimitUsage], roles: dict[str, str], margin: str) -> Panel:
+def limit_panels(design: Design, labels: Labels, *, rows: bool = True) -> list[Panel]:
+    """Return a panel for each kind of limit; a joint has the same role in all of them.
+
+    Args:
+        design: The design.
+        labels: Labels with the units.
+        rows: Whether many curves that change fast have a row each.
+    """
+    by_kind = {
+        kind: curves
+        for kind in LIMIT_KINDS
+        if (curves := [usage for usage in design.usage if usage.kind == kind])
+    }
+    closest = closest_to_bounds(design.usage)[: len(SERIES)]
+    names = [name for name in dict.fromkeys(u.name for u in design.usage) if name in closest]
+    roles = {name: f"series{i}" for i, name in enumerate(names)}
+    return [
+        _limit_panel(curves, roles, _margin_in_words(design, kind, labels), rows=rows)
+        for kind, curves in by_kind.items()
+    ]
+
+
+def _limit_panel(
+    curves: Sequence[LimitUsage], roles: dict[str, str], margin: str, *, rows: bool
+) -> Panel:
     """Return the panel of one kind of limit; the curves closest to a bound are strong."""
     closest = sorted(curves, key=lambda usage: -largest_share(usage))
     shares = [
@@ -393,7 +453,7 @@ def _limit_panel(curves: Sequence[LimitUsage], roles: dict[str, str], margin: st
         for usage in closest[:NAMED_CURVES]
     ]
     solid = [usage for usage in curves if would_be_solid(usage)]
-    in_rows = len(solid) > MAX_ENVELOPES
+    in_rows = rows and len(solid) > MAX_ENVELOPES
     axis = Axis(label="share of the limit [%]")
     if in_rows:
         shown = [usage for usage in curves if usage in closest[:MAX_ROWS]]
@@ -428,13 +488,19 @@ def _curve_marks(usage: LimitUsage, rank: int, role: str) -> list[Mark]:
     """Return the curve of one limit, or the envelope of one that changes too fast to be seen."""
     strong, front = rank < NAMED_CURVES, 3.0 - 0.01 * rank
     if not would_be_solid(usage):
-        width = 1.4 if strong else 0.7
-        return [line(usage.t, 100.0 * usage.share, role, width=width, front=front)]
+        look = {"width": 1.4 if strong else 0.7, "front": front, "label": _name(usage, role)}
+        return [line(usage.t, 100.0 * usage.share, role, **look)]
     t, low, high = envelope(usage)
     return [
         area(t, low, high, role, opacity=0.25 if strong else 0.08, front=front),
-        *(line(t, end, role, width=0.9 if strong else 0.4, front=front) for end in (low, high)),
+        line(t, low, role, width=0.9 if strong else 0.4, front=front, label=_name(usage, role)),
+        line(t, high, role, width=0.9 if strong else 0.4, front=front),
     ]
+
+
+def _name(usage: LimitUsage, role: str) -> str:
+    """Return the entry of a limit in the legend; curves without an own colour have none."""
+    return "" if role == "muted" else shorten(usage.name, 24)
 
 
 def _row_marks(usage: LimitUsage, row: int, role: str) -> list[Mark]:
@@ -444,7 +510,7 @@ def _row_marks(usage: LimitUsage, row: int, role: str) -> list[Mark]:
     top = base - FULL_ROW * np.maximum(np.abs(low), np.abs(high)) / 100.0
     return [
         area(t, np.full(len(t), base), top, role, opacity=0.45),
-        line(t, top, role, width=0.9),
+        line(t, top, role, width=0.9, label=_name(usage, role)),
         hline(base - FULL_ROW, width=0.6),
     ]
 

@@ -1,4 +1,3 @@
-from .documents import log_design, log_estimate, log_trajectories
-from .viewer import show
+from .documents import log_design, log_estimate, log_trajectories, show
 
 __all__ = ["log_design", "log_estimate", "log_trajectories", "show"]

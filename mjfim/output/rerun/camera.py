@@ -17,9 +17,6 @@ from mjfim.output.rerun.scene import BodyPoses, moving_geoms
 # leaves a margin.
 FIELD_OF_VIEW = np.radians(50.0)
 
-# Times that a camera is centred on the picture of the motion, which its distance changes.
-CENTRINGS = 4
-
 # Samples of a motion from which the camera is placed.
 CAMERA_SAMPLES = 200
 
@@ -105,12 +102,11 @@ def place_camera(
 
     # Views are stacked if this draws the scene larger.
     slope = float(np.tan(FIELD_OF_VIEW / 2.0))
-    beside = fit_in_view(points, slope, aspect / views)
-    above = fit_in_view(points, slope, aspect * views)
-    stacked = views > 1 and above.distance * views < beside.distance
-    chosen = above if stacked else beside
-    target = chosen.target @ axes
-    position = target + chosen.distance * towards_camera
+    middle, beside = fit_in_view(points, slope, aspect / views)
+    _, above = fit_in_view(points, slope, aspect * views)
+    stacked = views > 1 and above * views < beside
+    target = middle @ axes
+    position = target + (above if stacked else beside) * towards_camera
     return Camera(
         position=tuple(map(float, position)),
         target=tuple(map(float, target)),
@@ -245,45 +241,15 @@ def seen_points(model: mujoco.MjModel, clouds: Sequence[Array]) -> Array:
     return np.asarray(model.stat.center + 0.5 * float(model.stat.extent) * signs)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class View:
-    """Place from which a camera has points in view, as near as possible.
-
-    Attributes:
-        target: (3,) point at which it looks, along its axes [m].
-        distance: Distance of the camera from there [m].
-    """
-
-    target: Array
-    distance: float
-
-
-def fit_in_view(points: Array, slope: float, aspect: float) -> View:
-    """Return the nearest place from which a camera has all points in view.
+def fit_in_view(points: Array, slope: float, aspect: float) -> tuple[Array, float]:
+    """Return the middle of points, and the nearest distance from which a camera has all in view.
 
     Args:
-        points: (n, 3) points along the axes of the camera: right, up, and towards it [m].
-        slope: Half of the height of the picture at distance 1.
-        aspect: Width of the picture over its height.
+        points: (n, 3) points in the axes of the camera [m].
+        slope: Tangent of half the vertical field of view.
+        aspect: Width over height of the picture.
     """
-    slopes = np.array([aspect * slope, slope])
-    target = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    for _ in range(CENTRINGS):
-        near = points - target
-        distance = _distance(near, slopes)
-
-        # Centre the picture: what is nearer to the camera is larger.
-        seen = near[:, :2] / (distance - near[:, 2:])
-        target[:2] += distance * (seen.min(axis=0) + seen.max(axis=0)) / 2.0
-    return View(target=target, distance=_distance(points - target, slopes))
-
-
-def _distance(points: Array, slopes: Array) -> float:
-    """Smallest distance at which all points are in the picture [m].
-
-    Args:
-        points: (n, 3) points relative to the target, along the axes of the camera [m].
-        slopes: (2,) half of the width and of the height of the picture at distance 1.
-    """
-    needed = points[:, 2:] + np.abs(points[:, :2]) / slopes
-    return float(needed.max())
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    near = points - middle
+    needed = near[:, 2:] + np.abs(near[:, :2]) / (slope * np.array([aspect, 1.0]))
+    return middle, float(needed.max())

@@ -1,10 +1,12 @@
-"""Designs, estimates and trajectories as Rerun recordings: the data that each file holds."""
+"""Designs, estimates and trajectories as Rerun recordings, and the viewer that opens them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -12,79 +14,66 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mjfim.arrays import evenly_spread_indices
+from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.errors import MjfimError, RecordingError
+from mjfim.files import replacing
 from mjfim.output import vocabulary
-from mjfim.output.rerun.camera import place_camera
-from mjfim.output.rerun.history import HistoryPlot, history_plots
-from mjfim.output.rerun.iterates import (
-    IterateCurves,
-    IteratePlot,
-    iterate_plots,
-    log_poses_of_iterates,
+from mjfim.output.panels import Panel, line
+from mjfim.output.plots.design import (
+    convergence,
+    information_panel,
+    limit_panels,
+    motion_panels,
+    sensitivity_phase,
 )
-from mjfim.output.rerun.layout import (
-    ASPECT_WITH_TEXT,
-    ASPECT_WITHOUT_TEXT,
-    arrange,
-    open_recording,
-    robot_views,
-    separate_and_overlaid,
+from mjfim.output.plots.estimate import fit, held_out
+from mjfim.output.positions import shown_positions
+from mjfim.output.rerun.camera import Camera, place_camera
+from mjfim.output.rerun.plots import (
+    Plane,
+    Tabs,
+    grid_tabs,
+    log_series,
+    planes_of,
+    rgb,
+    series_tabs,
 )
-from mjfim.output.rerun.limits import limits_of_design, limits_of_model, usage_plots
-from mjfim.output.rerun.outputs import held_out_plots, output_plots, recording_tabs
-from mjfim.output.rerun.panels import grid_tabs, pages_of
-from mjfim.output.rerun.phase_plots import PhasePlot, parameters_with_phase_plot
 from mjfim.output.rerun.scene import (
     BodyPoses,
+    EntityParts,
     body_poses,
     end_point,
     entity_path,
+    first_shape_parts,
+    has_floor,
     log_end_path,
+    log_pose,
     log_robot,
     pale_shapes,
+    strip_of_path,
 )
-from mjfim.output.rerun.series import Curve, SeriesPlot, views_of
 from mjfim.output.rerun.shapes import RobotStyle
-from mjfim.output.rerun.states import ShownTrajectory, StatePlots, state_plots
 from mjfim.output.rerun.text import design_text, estimate_text
-from mjfim.records.design import Design, Evaluation
+from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
 from mjfim.records.trajectory import Trajectory
 
-# Styles of the initial and the designed trajectory, and of the identified and the measured motion.
-INITIAL = RobotStyle(accent=vocabulary.INITIAL.rgb)
-DESIGNED = RobotStyle(accent=vocabulary.DESIGNED.rgb)
-IDENTIFIED = RobotStyle(accent=vocabulary.IDENTIFIED.rgb)
-MEASURED = RobotStyle(accent=vocabulary.MEASURED.rgb, outline=True)
+# Roles of trajectories whose name is no word of the vocabulary, one after the other.
+FURTHER_ROLES = ("series2", "series5", vocabulary.IDENTIFIED.word, "series4")
 
-# Styles of further trajectories and series, one after the other.
-FURTHER_STYLES = (
-    RobotStyle(accent=(60, 160, 90)),
-    RobotStyle(accent=(160, 90, 200)),
-    IDENTIFIED,
-    RobotStyle(accent=(20, 160, 170)),
-)
+# Largest number of samples of a motion in a file, and of recordings that have a tab each.
+MAX_SAMPLES, MAX_TABS = 20_000, 3
 
-# Styles of trajectories with a known name.
-STYLES_BY_NAME = {vocabulary.INITIAL.word: INITIAL, vocabulary.DESIGNED.word: DESIGNED}
+# Colour of the background of the 3D views (0..255); width over height of the region of the robots,
+# with text below it and without; heights of robots and text, and widths of the left and the right
+# side, relative to each other.
+BACKGROUND = (214, 219, 226)
+ASPECT_WITH_TEXT, ASPECT_WITHOUT_TEXT = 1.5, 0.75
+ROBOTS_TO_TEXT, LEFT_TO_RIGHT = [5, 4], [2, 3]
 
-# Entities of the robots of a design, and styles of the plots over the iterations.
-INITIAL_ROOT = ("robots", vocabulary.INITIAL.word)
-DESIGNED_ROOT = ("robots", vocabulary.DESIGNED.word)
-HISTORY_STYLES = (DESIGNED,) * 4
-
-# Colours of the curves over time on the timeline `iteration`.
-LEGEND_OF_ITERATES = {vocabulary.INITIAL.word: INITIAL.accent, "iterate": DESIGNED.accent}
-
-# Title of the view with several robots.
-OVERLAY = "overlay"
-
-# Largest number of samples of a motion in a file.
-MAX_SAMPLES = 20_000
-
-
-# ---- designs
+# Time after which a viewer that still runs counts as started [s].
+START_SECONDS = 3.0
 
 
 def log_design(
@@ -93,185 +82,48 @@ def log_design(
     """Write design.rrd: both robots, their signals, sensitivities, the search and a summary.
 
     Args:
-        path: The file.
-        model: The model.
+        path: File to write.
+        model: Model with the parameters of the design.
         design: The design.
-        labels: Labels of the model's columns, usually `labels_of_model(model)`.
-        addition: Markdown to append to the summary.
+        labels: Labels of its columns.
+        addition: Markdown below the summary.
     """
-    content = _DesignContent.of(model, design, labels)
-    titles = {
-        f"{term.word} ({term.colour_name})": ("robots", term.word)
-        for term in (vocabulary.INITIAL, vocabulary.DESIGNED)
+    both = {
+        vocabulary.INITIAL.word: design.initial.trajectory,
+        vocabulary.DESIGNED.word: design.final.trajectory,
     }
-    poses = list(content.poses.values())
-    robots = _robots(model, poses, titles, (INITIAL, DESIGNED), ASPECT_WITH_TEXT)
-    layout = arrange(robots, content.tabs(labels))
-
-    with open_recording(path, model, "design", layout) as rec:
-        _log_text(rec, design_text(design, addition))
-        content.log(rec, labels)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _DesignContent:
-    """Everything that design.rrd shows of a design, computed once for the layout and for the data.
-
-    Attributes:
-        model: The model.
-        evaluations: Both trajectories with their information, by name.
-        poses: Poses of the bodies along both trajectories.
-        states: Plots of states and controls.
-        series: Plots of the use of limits and of the information, by the name of their tab.
-        phase_plots: Phase plots of the sensitivities.
-        iterates: Motions of the iterates; None without any.
-        iterate_plots: Their curves.
-        history_plots: Plots over the iterations.
-    """
-
-    model: mujoco.MjModel
-    evaluations: Mapping[str, Evaluation]
-    poses: Mapping[str, BodyPoses]
-    states: StatePlots
-    series: Mapping[str, Sequence[SeriesPlot]]
-    phase_plots: Sequence[PhasePlot]
-    iterates: IterateCurves | None
-    iterate_plots: Sequence[IteratePlot]
-    history_plots: Sequence[HistoryPlot]
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, design: Design, labels: Labels) -> _DesignContent:
-        """Compute what is shown.
-
-        Args:
-            model: The model.
-            design: The design.
-            labels: Labels of the model's columns.
-        """
-        evaluations = {
-            vocabulary.INITIAL.word: design.initial,
-            vocabulary.DESIGNED.word: design.final,
-        }
-        shown = [
-            ShownTrajectory(name=name, trajectory=evaluation.trajectory, style=STYLES_BY_NAME[name])
-            for name, evaluation in evaluations.items()
-        ]
-        limits = limits_of_design(model, design)
-        iterates = IterateCurves.of(model, design)
-        states = state_plots(model, labels, shown, limits, iterates)
-        drawn: list[IteratePlot] = []
-        if iterates is not None:
-            drawn = iterate_plots(
-                iterates,
-                design.initial.trajectory,
-                states.titles_and_limits("positions"),
-                states.titles_and_limits("controls"),
-            )
-
-        return cls(
-            model=model,
-            evaluations=evaluations,
-            poses={
-                name: body_poses(model, evaluation.trajectory.t, evaluation.trajectory.qpos)
-                for name, evaluation in evaluations.items()
-            },
-            states=states,
-            series={
-                "limits": usage_plots(design, iterates),
-                "information": [_information_plot(design, evaluations)],
-            },
-            phase_plots=[
-                PhasePlot.of_most_sensitive(design, j, model.nv)
-                for j in parameters_with_phase_plot(design)
-            ],
-            iterates=iterates,
-            iterate_plots=drawn,
-            history_plots=history_plots(design.history, HISTORY_STYLES, design.found_by),
-        )
-
-    def tabs(self, labels: Labels) -> list[rrb.Container]:
-        """Return the tabs of all signals.
-
-        Args:
-            labels: Labels of the model's columns.
-        """
-        tabs = self.states.tabs()
-        for name, plots in self.series.items():
-            tabs += grid_tabs(name, views_of(plots))
-        tabs += grid_tabs("sensitivities ψ", [plot.view(labels) for plot in self.phase_plots])
-        tabs += grid_tabs("optimiser", [shown.plot.view() for shown in self.history_plots])
-        return tabs + grid_tabs("iterates", [shown.plot.view() for shown in self.iterate_plots])
-
-    def log(self, rec: rr.RecordingStream, labels: Labels) -> None:
-        """Log all data.
-
-        Args:
-            rec: The recording.
-            labels: Labels of the model's columns.
-        """
-        for series in (self.states.plots, *self.series.values()):
-            for plot in series:
-                plot.log(rec)
-        for history in self.history_plots:
-            history.log(rec)
-
-        for phase in self.phase_plots:
-            phase.log_axes(rec, labels)
-            for name, evaluation in self.evaluations.items():
-                style = STYLES_BY_NAME[name]
-                t = evaluation.trajectory.t
-                phase.log_curve(rec, t, evaluation.sensitivity, name=name, style=style)
-
-        for name, poses in self.poses.items():
-            style = STYLES_BY_NAME[name]
-            log_robot(rec, self.model, ("robots", name), poses, style)
-        self._log_iterates(rec)
-
-    def _log_iterates(self, rec: rr.RecordingStream) -> None:
-        """Log the paths of both robots and the motions of the iterates."""
-        initial, designed = self.poses.values()
-        log_end_path(rec, self.model, INITIAL_ROOT, initial, INITIAL)
-        if self.iterates is None:
-            log_end_path(rec, self.model, DESIGNED_ROOT, designed, DESIGNED)
-            return
-
-        end = end_point(self.model, designed)
-        path = None if end is None else end.path(designed)
-        log_poses_of_iterates(rec, DESIGNED_ROOT, self.iterates, DESIGNED, end, path)
-        trajectory = self.evaluations[vocabulary.INITIAL.word].trajectory
-        still = IterateCurves.of_one(self.model, trajectory)
-        log_poses_of_iterates(rec, INITIAL_ROOT, still, INITIAL, None)
-        first = {page.start for page in pages_of(len(self.iterate_plots))}
-        for k, plot in enumerate(self.iterate_plots):
-            plot.log(rec, self.iterates.iterations, INITIAL, DESIGNED)
-            if k in first:
-                plot.plot.log_legend(rec, LEGEND_OF_ITERATES)
-
-
-def _information_plot(design: Design, evaluations: Mapping[str, Evaluation]) -> SeriesPlot:
-    """Root of the smallest eigenvalue of the information up to each time.
-
-    On the timeline `iteration`, it is that of the whole motion of each iterate.
-    """
-    curves = []
-    for name, evaluation in evaluations.items():
-        root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-        colour = STYLES_BY_NAME[name].accent
-        curves.append(Curve(name=name, t=evaluation.trajectory.t, values=root, colour=colour))
-
-    eigenvalues = np.array([row.min_eigenvalue for row in design.history])
-    over_search = Curve(
-        name="iterates",
-        t=np.array([row.iteration for row in design.history], dtype=np.float64),
-        values=np.sqrt(np.maximum(eigenvalues, 0.0)),
-        colour=DESIGNED.accent,
-        timeline="iteration",
+    tabs: Tabs = motion_panels(labels, both, design.usage)
+    tabs |= {
+        "limits": limit_panels(design, labels, rows=False),
+        "information": [information_panel(design)],
+    }
+    named = replace(
+        labels,
+        parameters=design.parameters,
+        parameter_units=labels.parameter_units or ("",) * len(design.parameters),
     )
-    title = "√λ_min of the information up to each time [√s / θ-unit]"
-    return SeriesPlot(parts=("information",), title=title, curves=[*curves, over_search])
+    planes = {
+        "sensitivities ψ": planes_of("sensitivities ψ", sensitivity_phase(design, named).panels),
+        "optimiser": planes_of("optimiser", convergence(design).panels),
+    }
+    iterates = _iterate_plots(design, labels)
+    grids = [each for name, found in planes.items() for each in _plane_tabs(name, found)]
+    grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
 
-
-# ---- estimates
+    poses = {name: body_poses(model, each.t, each.qpos) for name, each in both.items()}
+    robots = _robots(model, poses, ASPECT_WITH_TEXT)
+    with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids]) as rec:
+        _log_text(rec, design_text(design, addition))
+        log_series(rec, tabs)
+        for found in planes.values():
+            for plane, panel in found:
+                plane.log(rec, panel.marks)
+        for name, each in poses.items():
+            log_robot(rec, model, ("robots", name), each, style_of(name))
+        initial = poses[vocabulary.INITIAL.word]
+        root = ("robots", vocabulary.INITIAL.word)
+        log_end_path(rec, model, root, initial, style_of(root[1]))
+        _log_iterates(rec, model, design, iterates)
 
 
 def log_estimate(
@@ -287,42 +139,106 @@ def log_estimate(
     """Write estimate.rrd: identified and measured robot and outputs, residuals and a summary.
 
     Args:
-        path: The file.
-        model: The identified model.
+        path: File to write.
+        model: Model with the identified parameters.
         estimate: The estimate.
-        measured: Measured motion, drawn as an outline; None where positions were not measured.
+        measured: Motion of the first recording, where its positions were measured.
         identified: Motion of the identified model.
-        labels: Labels of the model's columns.
-        addition: Markdown to append to the summary.
+        labels: Labels of their columns.
+        addition: Markdown below the summary.
     """
-    term = vocabulary.IDENTIFIED
-    shown = [ShownTrajectory(name=term.word, trajectory=_thinned(identified), style=IDENTIFIED)]
-    title = f"{term.word} robot ({term.colour_name})"
+    shown = {vocabulary.IDENTIFIED.word: _thinned(identified)}
+    title = f"{vocabulary.IDENTIFIED.word} robot ({vocabulary.IDENTIFIED.colour_name})"
     if measured is not None:
         term = vocabulary.MEASURED
-        shown.append(ShownTrajectory(name=term.word, trajectory=_thinned(measured), style=MEASURED))
+        shown[term.word] = _thinned(measured)
         title += f", {term.word} robot ({term.colour_name} outline)"
-
-    poses = {
-        each.name: body_poses(model, each.trajectory.t, each.trajectory.qpos) for each in shown
+    kept = sum(prediction.recording is not None for prediction in estimate.predictions)
+    fits = [fit(estimate, i, labels) for i in range(len(estimate.recordings))]
+    held = [held_out(estimate, i, labels) for i in range(kept)]
+    recordings: Tabs = {
+        f"{kind}{k}: {Path(name).name}": _pairs(picture.panels)
+        for kind, pictures, names in (
+            ("", fits, [each.name for each in estimate.recordings]),
+            ("held out ", held, [e.name for e in estimate.predictions if e.recording is not None]),
+        )
+        for k, (picture, name) in enumerate(zip(pictures, names, strict=True), start=1)
     }
-    camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
-    fitted, held_out = output_plots(model, estimate), held_out_plots(model, estimate)
-    states = state_plots(model, labels, shown, limits_of_model(model))
-    tabs = recording_tabs(fitted, held_out, list(states.groups))
-    followed = ("robots", vocabulary.IDENTIFIED.word)
-    view = robot_views(model, camera, {title: ("robots",)}, followed=followed)[0]
-    layout = arrange(view, [*tabs, *states.tabs()])
+    states: Tabs = motion_panels(labels, shown)
+    tabs = series_tabs(recordings)
+    if len(tabs) > MAX_TABS:
+        tabs = [rrb.Tabs(*tabs, name="recordings", active_tab=0)]
 
-    with open_recording(path, model, "estimate", layout) as rec:
+    poses = {name: body_poses(model, each.t, each.qpos) for name, each in shown.items()}
+    camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
+    root = ("robots", vocabulary.IDENTIFIED.word)
+    view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
+    tabs += series_tabs(states)
+    with open_recording(path, model, "estimate", view, tabs) as rec:
         _log_text(rec, estimate_text(estimate, addition))
-        outputs = (recording.plots for recording in (*fitted, *held_out))
-        for plot in chain(states.plots, *outputs):
-            plot.log(rec)
-        for each in shown:
-            log_robot(rec, model, ("robots", each.name), poses[each.name], each.style)
-        root = ("robots", vocabulary.IDENTIFIED.word)
-        log_end_path(rec, model, root, poses[vocabulary.IDENTIFIED.word], IDENTIFIED)
+        log_series(rec, recordings | states)
+        for name, each in poses.items():
+            log_robot(rec, model, ("robots", name), each, style_of(name))
+        log_end_path(rec, model, root, poses[vocabulary.IDENTIFIED.word], style_of(root[1]))
+
+
+def _pairs(panels: Sequence[Panel]) -> list[Panel]:
+    """Return outputs and residuals that were measured, with titles that differ."""
+    found = []
+    for curves, errors in zip(panels[::2], panels[1::2], strict=True):
+        if not errors.message:
+            title = f"{curves.title}: {errors.title.partition(':')[0]}"
+            found += [curves, replace(errors, title=title)]
+    return found
+
+
+def log_trajectories(
+    path: Path, model: mujoco.MjModel, trajectories: Mapping[str, Trajectory], labels: Labels
+) -> None:
+    """Write trajectories: one robot each, states and controls in shared plots.
+
+    Args:
+        path: File to write.
+        model: The model.
+        trajectories: Trajectories by name; "initial" and "final" are those of a design.
+        labels: Labels of their columns.
+    """
+    named = {vocabulary.shown_word(name): each for name, each in trajectories.items()}
+    poses = {name: body_poses(model, each.t, each.qpos) for name, each in named.items()}
+    roles = dict(zip(named, _roles(list(named)), strict=True))
+    states: Tabs = {
+        group: [
+            replace(
+                panel,
+                marks=[
+                    replace(mark, label=name) for mark, name in zip(panel.marks, named, strict=True)
+                ],
+            )
+            for panel in panels
+        ]
+        for group, panels in motion_panels(
+            labels, {roles[name]: each for name, each in named.items()}
+        ).items()
+    }
+    robots = _robots(model, poses, ASPECT_WITHOUT_TEXT, roles)
+    with open_recording(path, model, "replay", robots, series_tabs(states), text=False) as rec:
+        log_series(rec, states)
+        for name, each in poses.items():
+            style = style_of(roles[name])
+            log_robot(rec, model, ("robots", name), each, style)
+            log_end_path(rec, model, ("robots", name), each, style)
+
+
+def _roles(names: Sequence[str]) -> list[str]:
+    """Return a role for every name; names that are no words take the further ones in turn."""
+    known = (vocabulary.INITIAL.word, vocabulary.DESIGNED.word)
+    further = iter(FURTHER_ROLES * (1 + len(names) // len(FURTHER_ROLES)))
+    return [name if name in known else next(further) for name in names]
+
+
+def style_of(role: str) -> RobotStyle:
+    """Return the style of the robot of a role; a measured one is an outline."""
+    return RobotStyle(accent=rgb(role), outline=role == vocabulary.MEASURED.word)
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
@@ -337,91 +253,228 @@ def _thinned(trajectory: Trajectory) -> Trajectory:
     )
 
 
-# ---- trajectories
+# ---- iterates of the search
+
+# A plot of one quantity: its axes, the curve of the initial trajectory, and the curves of the
+# iterates, each with its times.
+IteratePlot = tuple[Plane, tuple[Array, Array], list[tuple[Array, Array]]]
 
 
-def log_trajectories(
-    path: Path, model: mujoco.MjModel, trajectories: Mapping[str, Trajectory], labels: Labels
+def _iterate_plots(design: Design, labels: Labels) -> list[IteratePlot]:
+    """Return a plot for each position and control of the iterates."""
+    motions = design.motions
+    if motions is None:
+        return []
+    initial = design.initial.trajectory
+    names, positions = shown_positions(labels, initial.qpos, *motions.qpos)
+    plots: list[IteratePlot] = []
+    for titles, first, values in (
+        (names, positions[0], positions[1:]),
+        (labels.controls, initial.ctrl, list(motions.ctrl)),
+    ):
+        for k, title in enumerate(titles):
+            start = initial.t[: len(first)], first[:, k]
+            curves = [
+                (np.asarray(t[: len(each)], dtype=np.float64), np.asarray(each[:, k]))
+                for t, each in zip(motions.t, values, strict=True)
+            ]
+            every = [line(*pair, "text") for pair in (start, *curves)]
+            plane = Plane.around(("iterates", title), f"{title} over time [s]", every, log=False)
+            plots.append((plane, start, curves))
+    return plots
+
+
+def _log_iterates(
+    rec: rr.RecordingStream, model: mujoco.MjModel, design: Design, plots: Sequence[IteratePlot]
 ) -> None:
-    """Write trajectories: one robot each, states and controls in shared plots.
+    """Log on the timeline `iteration` the curves, and the robot in the middle of its motion."""
+    for plane, start, _ in plots:
+        plane.log(rec)
+        still = plane.curve(*start, vocabulary.INITIAL.word, 0.6)
+        rec.log(entity_path((*plane.parts, "initial")), still, static=True, strict=True)
+    root, style = ("robots", vocabulary.DESIGNED.word), style_of(vocabulary.DESIGNED.word)
+    middle = design.initial.trajectory.qpos[len(design.initial.trajectory.t) // 2]
+    still_poses = body_poses(model, np.zeros(1), middle[None])
+    designed = body_poses(model, design.trajectory.t, design.trajectory.qpos)
+    end = end_point(model, designed)
+    if end is not None:
+        rec.set_time("sim_time", duration=0.0)
+        path = strip_of_path(end.path(designed), style)
+        rec.log(entity_path((*root, "path")), path, strict=True)
+        rec.reset_time()
+    motions = design.motions
+    if motions is None:
+        return
+    for i, iteration in enumerate(motions.iteration.tolist()):
+        rec.set_time("iteration", sequence=int(iteration))
+        qpos = np.asarray(motions.qpos[i], dtype=np.float64)
+        poses = body_poses(model, motions.t[i], qpos)
+        log_pose(rec, model, root, poses, len(qpos) // 2)
+        log_pose(rec, model, ("robots", vocabulary.INITIAL.word), still_poses, 0)
+        if end is not None:
+            path = strip_of_path(end.path(poses), style)
+            rec.log(entity_path((*root, "path")), path, strict=True)
+        for plane, _, curves in plots:
+            curve = plane.curve(*curves[i], vocabulary.DESIGNED.word)
+            rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
+    rec.reset_time()
+
+
+# ---- layout
+
+
+@contextmanager
+def open_recording(
+    path: Path,
+    model: mujoco.MjModel,
+    kind: str,
+    robots: rrb.Container | rrb.View,
+    tabs: Sequence[rrb.Container],
+    *,
+    text: bool = True,
+) -> Iterator[rr.RecordingStream]:
+    """Open a stream into a temporary file, which replaces `path` once it is complete.
 
     Args:
         path: The file.
-        model: The model.
-        trajectories: The trajectories by name; `final` is shown as `designed`.
-        labels: Labels of the model's columns.
+        model: The model, whose name the recording has.
+        kind: Kind of the recording.
+        robots: Views of the robots, on the left.
+        tabs: Tabs with signals, on the right.
+        text: Whether there is a summary below the robots.
+
+    Yields:
+        The stream.
     """
-    trajectories = {vocabulary.shown_word(name): found for name, found in trajectories.items()}
-    styles = _trajectory_styles(list(trajectories))
-    poses = {
-        name: body_poses(model, trajectory.t, trajectory.qpos)
-        for name, trajectory in trajectories.items()
-    }
-    shown = [
-        ShownTrajectory(name=name, trajectory=trajectory, style=styles[name])
-        for name, trajectory in trajectories.items()
-    ]
-    states = state_plots(model, labels, shown, limits_of_model(model))
-    titles = {name: ("robots", name) for name in trajectories}
-    shown_styles = [styles[name] for name in trajectories]
-    robots = _robots(model, list(poses.values()), titles, shown_styles, ASPECT_WITHOUT_TEXT)
-    layout = arrange(robots, states.tabs(), text=False)
-
-    with open_recording(path, model, "replay", layout) as rec:
-        for plot in states.plots:
-            plot.log(rec)
-        for name in trajectories:
-            log_robot(rec, model, ("robots", name), poses[name], styles[name])
-            log_end_path(rec, model, ("robots", name), poses[name], styles[name])
+    left = robots
+    if text:
+        document = rrb.TextDocumentView(origin=entity_path(("summary",)), name="summary")
+        left = rrb.Vertical(robots, document, row_shares=ROBOTS_TO_TEXT)
+    layout = rrb.Horizontal(left)
+    if tabs:
+        right = rrb.Tabs(*tabs, active_tab=0)
+        layout = rrb.Horizontal(left, right, column_shares=LEFT_TO_RIGHT)
+    time_panel = rrb.TimePanel(
+        state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"
+    )
+    # The names of a compiled model begin with that of the model.
+    name = model.names.split(b"\0", 1)[0].decode()
+    with (
+        replacing(path) as partial,
+        rr.RecordingStream(f"mjfim {kind} {name}".strip()) as rec,
+    ):
+        rec.set_log_time_enabled(False)
+        rec.save(partial, default_blueprint=blueprint_of(layout, time_panel))
+        yield rec
 
 
-def _trajectory_styles(names: Sequence[str]) -> dict[str, RobotStyle]:
-    """Return a style for every name; names without a fixed style take the further ones in turn."""
-    styles = {}
-    further = 0
-    for name in names:
-        if name in STYLES_BY_NAME:
-            styles[name] = STYLES_BY_NAME[name]
-            continue
-        styles[name] = FURTHER_STYLES[further % len(FURTHER_STYLES)]
-        further += 1
-    return styles
+def blueprint_of(layout: rrb.Container, time_panel: rrb.TimePanel) -> rrb.Blueprint:
+    """Return a blueprint whose other panels are collapsed."""
+    return rrb.Blueprint(
+        layout,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        time_panel,
+        auto_layout=False,
+        auto_views=False,
+    )
 
 
-# ---- parts of several recordings
+def _plane_tabs(name: str, planes: Sequence[tuple[Plane, Panel]]) -> list[rrb.Container]:
+    """Return the tab of plots of 2D lines."""
+    return grid_tabs(name, [plane.view() for plane, _ in planes])
+
+
+def robot_views(
+    model: mujoco.MjModel,
+    camera: Camera,
+    roots: Mapping[str, EntityParts],
+    followed: EntityParts | None = None,
+    overrides: Mapping[str, rrb.Visualizer] | None = None,
+) -> list[rrb.View]:
+    """Return 3D views of robots, all seen from the same camera.
+
+    Args:
+        model: The model.
+        camera: The camera.
+        roots: Entity of the robot of each view, by the title of the view.
+        followed: Entity of the robot that the camera follows; default: that of the view.
+        overrides: Looks of shapes that replace their own ones.
+    """
+    grid_helps = not has_floor(model) and not camera.edge_on
+    views: list[rrb.View] = []
+    for title, root in roots.items():
+        tracked = None
+        if camera.followed is not None:
+            tracked = entity_path(first_shape_parts(model, followed or root, camera.followed))
+        view = rrb.Spatial3DView(
+            origin=entity_path(root),
+            name=title,
+            eye_controls=camera.controls(tracked),
+            line_grid=rrb.LineGrid3D(visible=grid_helps),
+            background=BACKGROUND,
+            overrides=dict((overrides or {}).items()),
+        )
+        views.append(view)
+    return views
 
 
 def _robots(
     model: mujoco.MjModel,
-    motions: Sequence[BodyPoses],
-    titles: Mapping[str, tuple[str, ...]],
-    styles: Sequence[RobotStyle],
+    poses: Mapping[str, BodyPoses],
     aspect: float,
+    roles: Mapping[str, str] | None = None,
 ) -> rrb.Container:
-    """Return the views of several robots: separate, and in another tab overlaid.
-
-    Where they are overlaid, all but the last one are translucent, so that it is seen among them.
-
-    Args:
-        model: The model.
-        motions: Poses along each trajectory.
-        titles: Entity of each robot, by the title of its view.
-        styles: Style of each robot.
-        aspect: Width over height of the region of the robots.
-    """
+    """Return the views of several robots: separate, and in another tab overlaid."""
+    motions, names = list(poses.values()), list(poses)
     camera = place_camera(model, motions, views=len(motions), aspect=aspect)
-    views = robot_views(model, camera, titles)
-
+    words = {term.word: f"{term.word} ({term.colour_name})" for term in vocabulary.TERMS}
+    titles = {words.get(name, name): ("robots", name) for name in names}
+    arranged = rrb.Vertical if camera.stacked else rrb.Horizontal
+    separate = arranged(*robot_views(model, camera, titles), name="separate")
+    if len(names) < 2:
+        return separate
     # The camera of a view that is opened later, while a body flies, would begin in a wrong place.
     still = place_camera(model, motions, views=1, aspect=aspect, follow=False)
     pale: dict[str, rrb.Visualizer] = {}
-    for root, style in list(zip(titles.values(), styles, strict=True))[:-1]:
-        pale |= pale_shapes(model, root, style)
-    overlay = robot_views(model, still, {OVERLAY: ("robots",)}, overrides=pale)[0]
-    return separate_and_overlaid(views, camera, overlay)
+    for name in names[:-1]:
+        style = style_of((roles or {}).get(name, name))
+        pale |= pale_shapes(model, ("robots", name), style)
+    overlay = robot_views(model, still, {"overlay": ("robots",)}, overrides=pale)[0]
+    return rrb.Tabs(separate, overlay, active_tab=0)
 
 
 def _log_text(rec: rr.RecordingStream, markdown: str) -> None:
     """Log the text of the summary panel."""
     document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
     rec.log(entity_path(("summary",)), document, static=True, strict=True)
+
+
+# ---- the viewer
+
+
+def show(path: Path) -> None:
+    """Open the native viewer on a recording and return; the viewer stays open.
+
+    Args:
+        path: The recording.
+
+    Raises:
+        RecordingError: There is no such file.
+        MjfimError: The viewer cannot start.
+    """
+    if not Path(path).is_file():
+        raise RecordingError(f"there is no Rerun recording at {str(path)!r}")
+
+    # With -P, Python does not look for the viewer in the current folder.
+    command = [sys.executable, "-P", "-m", "rerun", "--new", str(path)]
+    viewer = subprocess.Popen(command, start_new_session=True)
+    try:
+        code = viewer.wait(timeout=START_SECONDS)
+    except subprocess.TimeoutExpired:
+        return
+    if code:
+        raise MjfimError(
+            f"the Rerun viewer ended with code {code}; it needs a display; the complete recording "
+            f"is in {str(path)!r}"
+        )

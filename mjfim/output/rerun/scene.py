@@ -19,9 +19,6 @@ from mjfim.output.rerun.shapes import GeomType, RobotStyle, drawn_shapes, transl
 # Parts of the path of an entity, not escaped.
 EntityParts = tuple[str, ...]
 
-# Entity below a capsule that holds its poses on the timeline `iteration`.
-CAPSULES = "poses"
-
 # Thickness of the path of a robot's end [points].
 PATH_THICKNESS = 1.0
 
@@ -208,8 +205,6 @@ def pale_shapes(
         for shape in drawn_shapes(model, body, style):
             found = translucent(shape)
             pale[entity_path((*parts, shape.name))] = found
-            if isinstance(shape.archetype, rr.Capsules3D):
-                pale[entity_path((*parts, shape.name, CAPSULES))] = found
     return pale
 
 
@@ -263,6 +258,22 @@ def _log_motion(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int)
     xyzw = np.roll(poses.quaternions[:, body], -1, axis=1)
     rows = rr.Transform3D.columns(translation=xyz, quaternion=xyzw)
     rec.send_columns(path, [time_column(poses.t)], rows, strict=True)
+
+
+def log_pose(
+    rec: rr.RecordingStream,
+    model: mujoco.MjModel,
+    root: EntityParts,
+    poses: BodyPoses,
+    sample: int,
+) -> None:
+    """Log the pose of a robot at one sample of a motion, at the time that is set."""
+    for body in filter(lambda b: is_moving(model, b), range(1, model.nbody)):
+        pose = rr.Transform3D(
+            translation=poses.positions[sample, body],
+            quaternion=rerun_quaternion(poses.quaternions[sample, body]),
+        )
+        rec.log(entity_path(body_parts(model, root, body)), pose, strict=True)
 
 
 def _log_shapes(

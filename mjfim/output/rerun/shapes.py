@@ -95,8 +95,6 @@ class DrawnShape:
         quaternion: (4,) its orientation, wxyz.
         archetype: The shape in its own frame.
         rgba: Its colour (0..255, with opacity).
-        length: Length of the straight part, for a capsule [m].
-        radius: Radius, for a capsule [m].
     """
 
     name: str
@@ -104,8 +102,6 @@ class DrawnShape:
     quaternion: Array
     archetype: rr.AsComponents
     rgba: list[int]
-    length: float = 0.0
-    radius: float = 0.0
 
 
 def translucent(shape: DrawnShape) -> rrb.Visualizer:
@@ -182,8 +178,6 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
             quaternion=model.geom_quat[geom],
             archetype=archetype,
             rgba=rgba,
-            length=2.0 * float(model.geom_size[geom, 1]),
-            radius=float(model.geom_size[geom, 0]),
         )
 
     if moving and not geoms:
@@ -285,8 +279,6 @@ def stick_figure(
             quaternion=turned,
             archetype=stick,
             rgba=rgba,
-            length=length,
-            radius=radius,
         )
 
 

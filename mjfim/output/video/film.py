@@ -294,22 +294,22 @@ def _camera(
     # The size of the picture in which a metre has the most pixels.
     slope = FILLED * float(np.tan(FIELD_OF_VIEW / 2.0))
     fits = [(size, fit_in_view(points, slope, size[0] / size[1])) for size in VIEW_SIZES]
-    size, view = max(fits, key=lambda each: each[0][1] / each[1].distance)
-    target = view.target @ axes
+    size, (middle, distance) = max(fits, key=lambda each: each[0][1] / each[1][1])
+    target = middle @ axes
     if has_floor(model) or direction[2] < EDGE_ON:
         return FilmCamera(
-            target=target, offset=view.distance * direction, floor=None, spacing=0.0, size=size
+            target=target, offset=distance * direction, floor=None, spacing=0.0, size=size
         )
 
     # The floor is below the whole motion.
     heights = np.concatenate([shift[:, 2] for shift in shifts])
     lowest = float((points @ axes)[:, 2].min())
-    height = float(target[2] + view.distance * direction[2] + np.ptp(heights)) - lowest
+    height = float(target[2] + distance * direction[2] + np.ptp(heights)) - lowest
     return FilmCamera(
         target=target,
-        offset=view.distance * direction,
+        offset=distance * direction,
         floor=lowest + float(heights.min()),
-        spacing=FLOOR_SPACING * max(view.distance, height),
+        spacing=FLOOR_SPACING * max(distance, height),
         size=size,
     )
 
