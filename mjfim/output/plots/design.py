@@ -170,7 +170,10 @@ def _curve(t: Array, y: Array, role: str, width: float) -> Mark:
 def _near_limits(limits: Sequence[float], values: Sequence[Array]) -> list[Mark]:
     """Return lines at the limits that are so near that they do not flatten the curves."""
     every = np.concatenate(values)
-    low, high = np.nanmin(every), np.nanmax(every)
+    every = every[np.isfinite(every)]
+    if not len(every):
+        return []
+    low, high = float(every.min()), float(every.max())
     reach = NEAR_LIMIT * (high - low)
     return [
         hline(limit, "muted", dash="--", width=0.8, label="limit")

@@ -17,6 +17,9 @@ from mjfim.output.rerun.scene import BodyPoses, moving_geoms
 # leaves a margin.
 FIELD_OF_VIEW = np.radians(50.0)
 
+# Times that a camera is centred on the picture of the motion, which its distance changes.
+CENTRINGS = 4
+
 # Samples of a motion from which the camera is placed.
 CAMERA_SAMPLES = 200
 
@@ -102,11 +105,12 @@ def place_camera(
 
     # Views are stacked if this draws the scene larger.
     slope = float(np.tan(FIELD_OF_VIEW / 2.0))
-    middle, beside = fit_in_view(points, slope, aspect / views)
-    _, above = fit_in_view(points, slope, aspect * views)
-    stacked = views > 1 and above * views < beside
+    beside = fit_in_view(points, slope, aspect / views)
+    above = fit_in_view(points, slope, aspect * views)
+    stacked = views > 1 and above[1] * views < beside[1]
+    middle, distance = above if stacked else beside
     target = middle @ axes
-    position = target + (above if stacked else beside) * towards_camera
+    position = target + distance * towards_camera
     return Camera(
         position=tuple(map(float, position)),
         target=tuple(map(float, target)),
@@ -242,14 +246,24 @@ def seen_points(model: mujoco.MjModel, clouds: Sequence[Array]) -> Array:
 
 
 def fit_in_view(points: Array, slope: float, aspect: float) -> tuple[Array, float]:
-    """Return the middle of points, and the nearest distance from which a camera has all in view.
+    """Return where a camera looks that has points in view, and its smallest distance from there.
 
     Args:
         points: (n, 3) points in the axes of the camera [m].
         slope: Tangent of half the vertical field of view.
         aspect: Width over height of the picture.
     """
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    near = points - middle
-    needed = near[:, 2:] + np.abs(near[:, :2]) / (slope * np.array([aspect, 1.0]))
-    return middle, float(needed.max())
+    slopes = slope * np.array([aspect, 1.0])
+    target = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    for _ in range(CENTRINGS):
+        near = points - target
+        distance = _distance(near, slopes)
+        # Centre the picture: what is nearer to the camera is larger.
+        seen = near[:, :2] / (distance - near[:, 2:])
+        target[:2] += distance * (seen.min(axis=0) + seen.max(axis=0)) / 2.0
+    return target, _distance(points - target, slopes)
+
+
+def _distance(points: Array, slopes: Array) -> float:
+    """Smallest distance from the origin at which all points are in the picture [m]."""
+    return float((points[:, 2:] + np.abs(points[:, :2]) / slopes).max())
