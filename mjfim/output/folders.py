@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -254,7 +254,11 @@ def write_result(
     if system is not None and isinstance(record, Design | Estimate):
         log = f"{record.file_stem}.rrd"
         write_optional(log, lambda: _write_log(folder / log, record, system))
-        write_optional("the video", lambda: _add_video(folder, record, system))
+
+        # Who has pressed Ctrl-C does not wait for a video.
+        interruption = current_interruption()
+        if interruption is None or not interruption.presses:
+            write_optional("the video", lambda: _add_video(folder, record, system))
     return remarks
 
 
@@ -303,9 +307,6 @@ def _write_log(file: Path, record: Design | Estimate, system: System) -> None:
 
 def _add_video(folder: Path, record: Design | Estimate, system: System) -> None:
     """Write the report once more, with its video or with the sentence why there is none."""
-    interruption = current_interruption()
-    if interruption is not None and interruption.presses:
-        return  # who has pressed Ctrl-C does not wait for a video
     begin_stage("drawing the video of the report")
     video, sentence = report_video(system, record)
     write_report(folder, record, Media(video, sentence))
@@ -321,8 +322,10 @@ def _write_figures(
     contents: dict[str, bytes] = {}
     write_optional("the pictures", lambda: contents.update(drawn()))
     if contents:
-        writers = {name: partial(_write_content, content) for name, content in contents.items()}
-        _write_picture_files(folder, writers, picture_format)
+        _clear_other_formats(folder, contents, picture_format)
+        for name, content in contents.items():
+            with replacing(folder / picture_format.file_of(name)) as temporary:
+                temporary.write_bytes(content)
         return
 
     # Matplotlib takes seconds to import, which nobody waits for who has pressed Ctrl-C twice.
@@ -371,31 +374,19 @@ def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureForm
     Returns:
         The files.
     """
-    writers = {name: partial(_write_picture, draw) for name, draw in pictures.items()}
-    return _write_picture_files(folder, writers, picture_format)
+    _clear_other_formats(folder, pictures, picture_format)
+    files = {name: folder / picture_format.file_of(name) for name in pictures}
+    for name, draw in pictures.items():
+        write_optional(files[name].name, partial(_write_picture, draw, files[name]))
+    return [file for file in files.values() if file.is_file()]
 
 
-def _write_picture_files(
-    folder: Path, writers: Mapping[str, Callable[[Path], None]], picture_format: PictureFormat
-) -> list[Path]:
-    """Write pictures by functions that get the name of the file, and return the files.
-
-    Those of an earlier run in another format are removed.
-    """
+def _clear_other_formats(
+    folder: Path, names: Collection[str], picture_format: PictureFormat
+) -> None:
+    """Remove pictures of an earlier run in other formats."""
     others = "|".join(other for other in PictureFormat if other is not picture_format)
-    clear(folder, rf"({'|'.join(re.escape(name) for name in writers)})\.({others})")
-
-    for name, write in writers.items():
-        file = folder / picture_format.file_of(name)
-        write_optional(file.name, partial(write, file))
-    files = [folder / picture_format.file_of(name) for name in writers]
-    return [file for file in files if file.is_file()]
-
-
-def _write_content(content: bytes, file: Path) -> None:
-    """Write a picture that is drawn."""
-    with replacing(file) as temporary:
-        temporary.write_bytes(content)
+    clear(folder, rf"({'|'.join(re.escape(name) for name in names)})\.({others})")
 
 
 def _write_picture(make: Callable[[], Picture], file: Path) -> None:

@@ -18,7 +18,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from multiprocessing import connection
 from pathlib import Path
@@ -81,7 +81,7 @@ class Pool(Executor):
             self._start()
         number = next(self._next_number)
         words = (number, fn, *args)
-        with _interrupts_blocked():
+        with _starting_processes():
             try:
                 future = self._processes.submit(run_task, *words, **kwargs)
             except BrokenExecutor:
@@ -155,9 +155,10 @@ class Pool(Executor):
 
         # The workers end when nobody holds the writing end of this pipe any more.
         lifeline, self._hold = context.Pipe(duplex=False)
-        self._processes = ProcessPoolExecutor(
-            self.max_workers, context, initialize_worker, (self._stop, lifeline, self._address)
-        )
+        with _starting_processes():
+            self._processes = ProcessPoolExecutor(
+                self.max_workers, context, initialize_worker, (self._stop, lifeline, self._address)
+            )
 
     def _end_if_broken(self, hold: connection.Connection, future: Future[Any]) -> None:
         """End the other processes at once after one of them was ended from outside."""
@@ -172,16 +173,19 @@ class Pool(Executor):
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C and SIGTERM in this thread, and thereby in processes that it starts."""
-    if not hasattr(signal, "pthread_sigmask"):
+def _starting_processes() -> Iterator[None]:
+    """Start processes that hear no Ctrl-C or SIGTERM and import nothing from the current folder.
+
+    Otherwise they would take a file `signal.py` or `socket.py` there for the module of this name.
+    """
+    with ExitStack() as restored:
+        if hasattr(signal, "pthread_sigmask"):
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+            restored.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
+        if "PYTHONSAFEPATH" not in os.environ:
+            os.environ["PYTHONSAFEPATH"] = "1"
+            restored.callback(os.environ.pop, "PYTHONSAFEPATH", None)
         yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _private_address() -> str:

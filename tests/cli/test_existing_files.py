@@ -57,7 +57,7 @@ def test_compare_keeps_controls_that_it_did_not_write(tmp_path: Path) -> None:
     (tmp_path / "control_other.csv").write_text("mine", encoding="utf-8")
     before = contents(tmp_path)
 
-    words = ("compare", study, "-o", tmp_path, "--steps", 1000)
+    words = ("compare", study, "-o", tmp_path, "--seconds", 1)
     for methods in ("chirp", "steps"):
         result = run(*words, "--methods", methods)
         assert "wrote" in result.stderr, result.stderr

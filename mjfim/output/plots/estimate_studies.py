@@ -306,8 +306,9 @@ def pairs(
     """
     std = np.sqrt(np.diagonal(covariance))
     known = np.isfinite(std) & (std > 0.0)
-    correlation = np.clip(covariance / np.outer(std, std), -1.0, 1.0)
-    shown = _most_correlated(np.where(np.outer(known, known), correlation, np.nan))
+    size = np.where(known, std, np.nan)
+    correlation = np.clip(covariance / np.outer(size, size), -1.0, 1.0)
+    shown = _most_correlated(correlation)
     offsets = np.full(len(std), np.inf) if guess is None else (guess - values) / std
     x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
     angle = np.linspace(0.0, 2.0 * np.pi, CURVE_POINTS)
