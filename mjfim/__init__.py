@@ -15,9 +15,8 @@ TYPE_CHECKING = False
 # seconds, in which the command line must be able to react to Ctrl-C.
 if TYPE_CHECKING:
     from mjfim.errors import MjfimError
-    from mjfim.excitation.design import design
+    from mjfim.excitation.design import design, design_jointly
     from mjfim.excitation.evaluation import evaluate
-    from mjfim.excitation.joint_design import design_jointly
     from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
     from mjfim.experiment.schema import Experiment
     from mjfim.experiment.simulate import simulate
@@ -101,7 +100,7 @@ MODULES = {
     "MjfimError": "mjfim.errors",
     "design": "mjfim.excitation.design",
     "evaluate": "mjfim.excitation.evaluation",
-    "design_jointly": "mjfim.excitation.joint_design",
+    "design_jointly": "mjfim.excitation.design",
     "ShortestExperiment": "mjfim.excitation.shortest_horizon",
     "shortest_experiment": "mjfim.excitation.shortest_horizon",
     "Experiment": "mjfim.experiment.schema",

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, UnidentifiableError
-from mjfim.excitation.designable import require_designable
-from mjfim.excitation.joint_design import _require_common_parameters
-from mjfim.excitation.target_accuracy import require_reachable
+from mjfim.excitation.design import _require_common_parameters
+from mjfim.excitation.evaluation import require_designable
+from mjfim.excitation.shortest_horizon import require_reachable
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.report import _warnings_of_bounds, _warnings_of_search

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design
+from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate

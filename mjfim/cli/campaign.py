@@ -127,7 +127,7 @@ class _Lab:
 
     def campaign(self, measure: Any, workers: Any) -> mjfim.Campaign:
         """Identify from the recordings in the folder, and make the further rounds."""
-        from mjfim.excitation.target_accuracy import target_accuracies
+        from mjfim.excitation.shortest_horizon import target_accuracies
         from mjfim.records.campaign import CampaignStatus
 
         done = list(self.folder.recorded_rounds())
@@ -182,7 +182,7 @@ class _Lab:
 
     def _show(self, event: Event) -> None:
         """Show the progress, and write and print the estimate of a complete round."""
-        from mjfim.excitation.target_accuracy import target_accuracies
+        from mjfim.excitation.shortest_horizon import target_accuracies
         from mjfim.output.campaign_folder import accuracy_sentence
         from mjfim.records.campaign import Round
 

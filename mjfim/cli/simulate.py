@@ -46,9 +46,8 @@ def simulate(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.excitation.stated_inputs import stated_motion
     from mjfim.excitation.task import DesignTask
-    from mjfim.excitation.task_parts import require_design_keys
+    from mjfim.excitation.task_parts import require_design_keys, stated_motion
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.simulate import simulate_system
     from mjfim.experiment.system import System

@@ -1,4 +1,4 @@
-from .constraints import ConstraintSet
+from .limits.constraints import ConstraintSet
 from .objective import DesignProblem
 from .task import DesignTask
 

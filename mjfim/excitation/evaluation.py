@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError, listed
-from mjfim.excitation.levels import DescentLevel, regulator_for
-from mjfim.excitation.limits import unsupported_ranges
+from mjfim.errors import SimulationDivergedError, UnidentifiableError, first_ones, listed
+from mjfim.excitation.limits.limits import unsupported_ranges
+from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, Verification, verify
+from mjfim.excitation.limits.violations import all_violations_of
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import SAME_STATE_TOLERANCE, Verification
+from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
+from mjfim.information.identifiability import PROBES, Identifiability
+from mjfim.information.marginal import shared
+from mjfim.information.smoothness import roughness
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.parallel import one_blas_thread
+from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.check import Roughness
-from mjfim.records.design import Evaluation
+from mjfim.records.check import GROUPS_TEXT, ParameterGroup, Roughness, groups_in_words
+from mjfim.records.design import (
+    Design,
+    Evaluation,
+    HistoryRow,
+    ScaledStart,
+    StartResult,
+    Status,
+    improvement_per_iteration,
+    without_motions,
+)
 from mjfim.records.trajectory import Trajectory
 
 # Growth of a disturbance along a trajectory without feedback above which the user is warned.
@@ -248,3 +264,254 @@ def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
                 "design: it may run into them"
             )
     yield from probable_degrees(experiment, task.system.source)
+
+
+def identifiability_along(task: DesignTask, begin: DesignPoint) -> Identifiability:
+    """Find the combinations of parameters that can be identified.
+
+    They are looked for along the control with which the search begins and along random controls.
+    """
+    require_evaluated(task, begin)
+    if begin.trajectory is None or begin.sensitivity is None:
+        raise SimulationDivergedError("the trajectory diverges")
+    return task.identifiability_test.along(begin.trajectory, begin.sensitivity)
+
+
+def require_evaluated(task: DesignTask, begin: DesignPoint) -> None:
+    """Raise SimulationDivergedError where the control with which a search begins diverges."""
+    values = (begin.information, begin.trajectory, begin.sensitivity)
+    if all(value is not None for value in values):
+        return
+
+    reason = "when the parameters change slightly along the initial control"
+    if task.samples_of_parameters is not None:
+        reason += (
+            ", or at a parameter sample of [robust]; state bounds within which the model is valid"
+        )
+    raise SimulationDivergedError(f"the simulation diverges {reason}")
+
+
+def designable(task: DesignTask) -> Identifiability:
+    """Find what can be identified, and require that a design can begin at the initial control.
+
+    Args:
+        task: The task.
+
+    Returns:
+        The combinations that are identifiable along the initial control and along random ones.
+
+    Raises:
+        UnidentifiableError: A parameter has no effect, or the initial control does not excite it.
+        SimulationDivergedError: The simulation diverges along the initial control.
+    """
+    first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
+    identifiability = identifiability_along(task, first)
+    require_designable(task, identifiability)
+    return identifiability
+
+
+def require_designable(task: DesignTask, identifiability: Identifiability) -> None:
+    """Require that every parameter has an effect, and that the initial control excites it.
+
+    The initial control has to excite every combination of parameters that a random control
+    excites. Members of a declared inertia may have no effect; the design then works on the
+    combinations that have one.
+
+    Args:
+        task: The task.
+        identifiability: The combinations that can be identified.
+
+    Raises:
+        UnidentifiableError: A parameter has no effect on the outputs, or the initial control does
+            not excite it.
+    """
+    along_all = identifiability.along_all
+    parameters = task.parameters
+    estimated = [parameters.parameters[j] for j in parameters.interest]
+
+    # Parameters without any effect.
+    tried = "control" if task.release is None else "release"
+    silent = [estimated[i].name for i in along_all.silent if not estimated[i].group]
+    if silent:
+        raise UnidentifiableError(
+            f"{_subject(silent)} nothing in the measured outputs, neither along the initial "
+            f"{tried} nor along {PROBES} random {tried}s; remove "
+            f"{'it' if len(silent) == 1 else 'them'}, or measure a quantity that shows the effect"
+        )
+
+    # A criterion for combinations that cannot be identified.
+    if task.contrast is not None:
+        information = replace(task.information, basis=identifiability.basis)
+        if not information.is_estimable(task.contrast).all():
+            raise UnidentifiableError(
+                "cost.combination or cost.subset states a combination that cannot be identified; "
+                "identifiable are: " + groups_in_words(identifiability.groups_along_all)
+            )
+
+    if not along_all.basis.shape[1]:
+        raise UnidentifiableError("no parameter has an effect on the measured outputs")
+
+    # Combinations that random controls excite, but not the initial one. A search over all releases
+    # does not need it.
+    if task.release is not None:
+        return
+    if identifiability.along_trajectory.count > along_all.count:
+        groups = identifiability.groups_along_trajectory
+        unexcited = first_ones([_unexcited_group(group) for group in groups], "; ", GROUPS_TEXT)
+        raise UnidentifiableError(
+            f"the initial control does not excite: {unexcited}. Other controls do: begin with one "
+            "that moves the joints of these parameters, for example a multisine"
+        )
+
+
+def _unexcited_group(group: ParameterGroup) -> str:
+    """Name of a group that has an effect, but not along the initial control."""
+    return group.short if group.combinations else group.short_names
+
+
+def _subject(names: Sequence[str]) -> str:
+    """Beginning of a sentence about some parameters."""
+    quoted = listed([f"parameters.{name}" for name in names])
+    return f"{quoted} {'changes' if len(names) == 1 else 'change'}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ending:
+    """How the search for a design has ended.
+
+    Attributes:
+        name: Name of the initial control from which the design was found.
+        status: Outcome of its descent.
+        slope: Slope of the cost at the last iterate.
+        history: Iterates.
+        starts: Result of every initial control.
+    """
+
+    name: str
+    status: Status
+    slope: float
+    history: tuple[HistoryRow, ...]
+    starts: tuple[StartResult, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DesignReport:
+    """Evaluation of a design, from which its record is made.
+
+    Attributes:
+        stage: The stated level.
+        identifiability: The combinations that can be identified.
+        initial: The initial control, evaluated.
+        final: The designed control, evaluated.
+        played: The task with the initial state of the design; None where it is the stated one.
+        remarks: Warnings that belong to the search.
+        scaled_start: The largest share of an initial control outside limits that keeps them.
+    """
+
+    stage: DescentLevel
+    identifiability: Identifiability
+    initial: DesignPoint
+    final: DesignPoint
+    played: DesignTask | None = None
+    remarks: tuple[str, ...] = ()
+    scaled_start: ScaledStart | None = None
+
+    def design(
+        self,
+        best: Ending,
+        seconds: float,
+        steps: int,
+        interrupted: bool,
+    ) -> Design:
+        """The design of the best run, with its warnings."""
+        task = self.stage.task
+        initial = evaluate_point(self.stage, self.initial)
+        final = evaluate_point(self.stage, self.final)
+
+        # The limits, on the model as the user wrote it.
+        found = verify(self.played or task, final.trajectory)
+        model = task.system.model_at(task.theta)
+        clamped = saturated_actuators(model, final.trajectory)
+
+        # Check that derivatives exist along the design; after Ctrl-C this would take too long.
+        rough = None
+        if not interrupted:
+            rough = roughness(
+                task.plant,
+                task.system.noise,
+                model,
+                task.theta,
+                final.trajectory,
+                self.final.sensitivity,
+            )
+
+        status = Status.INTERRUPTED if interrupted else best.status
+        if status.ended_as_planned and (rough is not None or clamped):
+            status = Status.ROUGH
+        if task.is_limited and not found.is_feasible and not interrupted:
+            status = Status.INFEASIBLE
+
+        warnings = (*design_warnings(final, found, task, clamped, rough), *self.remarks)
+        return self._record(
+            best=best,
+            seconds=seconds,
+            steps=steps,
+            status=status,
+            initial=initial,
+            final=final,
+            found=found,
+            warnings=warnings,
+        )
+
+    def _record(
+        self,
+        *,
+        best: Ending,
+        seconds: float,
+        steps: int,
+        status: Status,
+        initial: Evaluation,
+        final: Evaluation,
+        found: Verification,
+        warnings: tuple[str, ...],
+    ) -> Design:
+        """The record of the design."""
+        task = self.stage.task
+        information = self.stage.problem.information
+        parameters = task.parameters
+        combined = self.identifiability.combinations(
+            information, task.theta[parameters.interest], initial.information, final.information
+        )
+        data = shared(
+            information.without_round_off(final.information - task.prior),
+            parameters.prior_information,
+            parameters.recording_specific,
+        )
+        history, motions = without_motions(best.history)
+        return Design(
+            status=status,
+            parameters=parameters.names,
+            theta=task.theta,
+            initial=initial,
+            final=final,
+            history=history,
+            slope=best.slope,
+            steps=steps,
+            seconds=seconds,
+            limits=found.margins,
+            usage=found.usage,
+            initial_violations=all_violations_of(task, initial.trajectory),
+            scaled_start=self.scaled_start,
+            warnings=warnings,
+            found_by=best.name,
+            starts=best.starts,
+            nuisance=tuple(p.name for p in parameters.parameters if p.nuisance),
+            combinations=tuple(str(group) for group in self.identifiability.groups_along_all),
+            combined=combined,
+            prior=task.prior,
+            data=data,
+            labels=labels_of_system(task.system),
+            sizes=parameters.sizes(task.theta),
+            motions=motions,
+            improvement=improvement_per_iteration(history, self.stage.problem.size(self.final)),
+        )

@@ -17,17 +17,21 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.climb import row_of
-from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.design_report import DesignReport, Ending
-from mjfim.excitation.designable import identifiability_along, require_designable
-from mjfim.excitation.evaluation import UNSTABLE_GROWTH
-from mjfim.excitation.inside import LimitedCost
-from mjfim.excitation.levels import DescentLevel, require_coarse_factor
+from mjfim.excitation.evaluation import (
+    UNSTABLE_GROWTH,
+    DesignReport,
+    Ending,
+    identifiability_along,
+    require_designable,
+)
+from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.limits.verification import require_feasible_start
 from mjfim.excitation.objective import DIVERGED, DesignPoint
 from mjfim.excitation.release_space import ReleaseSpace
+from mjfim.excitation.search.climb import row_of
+from mjfim.excitation.search.inside import LimitedCost
+from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.excitation.limits import Limit
+from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import TangentComponent, unknown_coordinate
 from mjfim.plant.state_space import StateSpace

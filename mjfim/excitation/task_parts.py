@@ -2,20 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, listed, shortened, unknown
-from mjfim.excitation.limits import Limit
-from mjfim.excitation.robust import ParameterSamples
+from mjfim.errors import ExperimentError, RecordingError, listed, shortened, unknown
+from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.control_signal import generate
 from mjfim.experiment.packing import opened
+from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import Signal
+from mjfim.files import read_json
+from mjfim.information.marginal import marginal
+from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.parameter_ranges import sample_parameters
 from mjfim.recordings.control_table import read_control
+from mjfim.records.trajectory import Trajectory
+
+# Exponent q of the smooth maximum.
+POOLING_EXPONENT = 20.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParameterSamples:
+    """Parameter samples, and how the criterion is pooled over them.
+
+    Attributes:
+        thetas: (S, p) parameter values, the guess first [theta-unit].
+        over: "mean" or "worst".
+        logarithmic: True where phi is a logarithm, as for D-optimality.
+    """
+
+    thetas: Array
+    over: Literal["mean", "worst"]
+    logarithmic: bool = False
+
+    def value(self, phi: Sequence[float]) -> float:
+        """Pool the criterion over the samples.
+
+        Args:
+            phi: S values of the criterion.
+
+        Returns:
+            The pooled value; infinite where a value is not finite.
+        """
+        q = POOLING_EXPONENT
+        values = np.asarray(phi, dtype=np.float64)
+        if not np.isfinite(values).all():
+            return np.inf
+
+        if self.over == "mean":
+            return float(values.mean())
+        if self.logarithmic:
+            return float((scipy.special.logsumexp(q * values) - np.log(len(values))) / q)
+
+        # Divide by the largest value, so that powers neither overflow nor vanish.
+        largest = values.max()
+        return float(largest * np.mean((values / largest) ** q) ** (1.0 / q))
+
+    def weights(self, phi: Sequence[float]) -> Array:
+        """Differentiate the pooled criterion.
+
+        Args:
+            phi: S values of the criterion, all finite.
+
+        Returns:
+            (S,) derivative by each value.
+        """
+        q = POOLING_EXPONENT
+        values = np.asarray(phi, dtype=np.float64)
+
+        if self.over == "mean":
+            return np.full(len(values), 1.0 / len(values))
+        if self.logarithmic:
+            return np.asarray(np.exp(q * values - scipy.special.logsumexp(q * values)))
+
+        pooled = self.value(phi)
+        return np.asarray((values / pooled) ** (q - 1.0) / len(values))
+
 
 # Largest number of samples of a design, so that a mistyped horizon does not fill the memory.
 MAX_SAMPLES = 10_000_000
@@ -279,3 +351,136 @@ def parameter_samples_of(system: System) -> ParameterSamples | None:
     )
     logarithmic = experiment.cost.criterion == "D"
     return ParameterSamples(thetas=thetas, over=robust.over, logarithmic=logarithmic)
+
+
+def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
+    """Sum the information of earlier experiments about the named parameters, without their priors.
+
+    Further parameters of a file are marginalised, with the priors that the file states for them.
+    So are deviations of the initial state, which are parameters of one experiment only.
+
+    Args:
+        paths: Files design.json and estimate.json.
+        names: Names of the p parameters.
+
+    Returns:
+        (p, p) information [1 / (unit of theta_i times unit of theta_j)].
+
+    Raises:
+        ExperimentError: A file cannot be used; the message names it.
+    """
+    total = np.zeros((len(names), len(names)))
+    for path in paths:
+        try:
+            known, data, prior = _information_in(path)
+        except RecordingError as error:
+            raise ExperimentError(f"earlier: {error}") from None
+
+        # Deviations of the initial state have equal names in all experiments, but different values.
+        common = [
+            name for name in names if name in known and not name.startswith(INITIAL_STATE_PREFIX)
+        ]
+        if not common:
+            raise ExperimentError(
+                f"earlier: {path}: it has information about {listed(known)}, but not "
+                f"about any of the parameters {listed(names)}"
+            )
+
+        here = [list(names).index(name) for name in common]
+        there = np.array([known.index(name) for name in common])
+        total[np.ix_(here, here)] += marginal(data, prior, there)
+    return total
+
+
+def _information_in(path: Path) -> tuple[list[str], Array, Array]:
+    """Names of the p parameters of a design or an estimate, information and prior: (p, p).
+
+    Raises:
+        RecordingError: The file has another content, or numbers that are not finite.
+    """
+    values = read_json(path)
+    try:
+        names = [str(name) for name in values["parameters"]]
+        data, prior = (np.array(values[key], dtype=np.float64) for key in ("data", "prior"))
+    except (ValueError, KeyError, TypeError):
+        raise RecordingError(f"{path}: neither a design.json nor an estimate.json") from None
+
+    for matrix in (data, prior):
+        if matrix.shape != (len(names), len(names)) or not np.isfinite(matrix).all():
+            raise RecordingError(
+                f"{path}: its information is not {len(names)} x {len(names)} finite numbers"
+            )
+    return names, data, prior
+
+
+def stated_motion(system: System) -> Trajectory:
+    """Motion of a closed loop under the references that `initial.control` states.
+
+    Args:
+        system: The system, with control laws.
+
+    Returns:
+        The motion at theta.
+
+    Raises:
+        ExperimentError: The horizon, the signal or the file cannot be used.
+        SimulationDivergedError: The simulation diverges.
+    """
+    require_horizon_and_control(system, "simulate without a design")
+    try:
+        inputs = stated_inputs(system)
+    except ExperimentError as error:
+        raise ExperimentError(f"{system.experiment.source}: {error}") from None
+    return system.plant.simulate(system.theta, inputs)
+
+
+def stated_inputs(system: System) -> Array:
+    """Inputs of control laws over the stated horizon.
+
+    A table holds a column for each input. A generated signal is the reference of actuators with a
+    law, about the initial position of their joints, and the control of the others; the velocity of
+    the reference is its slope, there is no feed-forward, and all laws are on.
+
+    Args:
+        system: The system, with control laws.
+
+    Returns:
+        (N, w) inputs [unit of the input].
+
+    Raises:
+        ExperimentError: The horizon, the signal or the file cannot be used.
+    """
+    experiment, laws = system.experiment, system.laws
+    assert laws is not None
+    dt = system.stated_grid.dt
+    t = np.arange(sample_count(experiment, system.stated_grid.stride), dtype=np.float64) * dt
+
+    source = experiment.initial.control
+    if not isinstance(source, Signal):
+        names = tuple(name.removeprefix("ctrl:") for name in laws.columns)
+        with opened(experiment, str(source)) as file:
+            return read_control(file, t, dt, names)
+
+    rest = np.array(system.rest)
+    for law in laws.laws:
+        rest[law.control] = system.nominal_initial_state[law.q]
+    return _of_signal(laws, generate(source, t, system.controls, rest), dt)
+
+
+def _of_signal(laws: ControlLaws, signal: Array, dt: float) -> Array:
+    """(N, w) inputs from one signal for each actuator: (N, nu)."""
+    inputs = np.zeros((len(signal), len(laws.inputs)))
+    places, controls = laws.direct
+    inputs[:, places] = signal[:, controls]
+
+    for law in laws.laws:
+        reference = signal[:, law.control]
+        values = {
+            "reference": reference,
+            "reference_velocity": np.gradient(reference, dt),
+            "gain": np.ones(len(signal)),
+            "enable": np.ones(len(signal)),
+        }
+        for quantity, column in law.columns.items():
+            inputs[:, column] = values.get(quantity, 0.0)
+    return inputs

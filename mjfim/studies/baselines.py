@@ -14,12 +14,11 @@ from functools import partial
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.bandwidth import bandwidth_basis, boundary_splines
-from mjfim.excitation.climb import Candidate
 from mjfim.excitation.design import consume
-from mjfim.excitation.inside import LimitedCost, largest_share
-from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.search import Search
+from mjfim.excitation.search.climb import Candidate
+from mjfim.excitation.search.inside import LimitedCost, largest_share
+from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, boundary_splines
+from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.signals import fourier_basis, independent_curves

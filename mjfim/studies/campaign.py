@@ -19,7 +19,7 @@ from mjfim.errors import (
     listed,
 )
 from mjfim.excitation.design import design_budget, design_task
-from mjfim.excitation.target_accuracy import (
+from mjfim.excitation.shortest_horizon import (
     largest_ratio_to_target,
     require_reachable,
     target_accuracies,

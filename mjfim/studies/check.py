@@ -14,16 +14,20 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError
-from mjfim.excitation.designable import require_designable, require_evaluated
-from mjfim.excitation.evaluation import growth_along, growth_warning
+from mjfim.excitation.evaluation import (
+    growth_along,
+    growth_warning,
+    require_designable,
+    require_evaluated,
+)
 from mjfim.excitation.initial_controls import initial_controls_of
-from mjfim.excitation.levels import require_coarse_factor
+from mjfim.excitation.limits.verification import require_feasible_start
+from mjfim.excitation.limits.violations import all_violations_of
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.release_space import ReleaseSpace
+from mjfim.excitation.search.levels import require_coarse_factor
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
-from mjfim.excitation.verification import require_feasible_start
-from mjfim.excitation.violations import all_violations_of
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System

@@ -17,13 +17,16 @@ from mjfim.errors import (
     unknown,
 )
 from mjfim.excitation.design import design_budget, design_task
-from mjfim.excitation.designable import designable
-from mjfim.excitation.evaluation import point_at_stated_rate
-from mjfim.excitation.inside import InsideSearch, LimitedCost
-from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.evaluation import designable, point_at_stated_rate
+from mjfim.excitation.limits.verification import (
+    SAME_STATE_TOLERANCE,
+    require_feasible_start,
+    verify,
+)
+from mjfim.excitation.search.inside import InsideSearch, LimitedCost
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
-from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System

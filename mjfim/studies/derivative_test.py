@@ -15,8 +15,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, first_ones
-from mjfim.excitation.levels import regulator_for
 from mjfim.excitation.objective import DesignPoint, DesignProblem
+from mjfim.excitation.search.levels import regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.information.smoothness import roughness, visible_columns
 from mjfim.optimize.directions import LBFGS

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, listed
-from mjfim.excitation.limits import Limit, limits_of, limits_of_model, unsupported_ranges
+from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model, unsupported_ranges
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees

@@ -17,8 +17,8 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.constraints import SUBSTEP_KINDS, ConstraintSet, constraint_set_of
-from mjfim.excitation.limits import Limit
+from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, ConstraintSet, constraint_set_of
+from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import opened_file
 from mjfim.experiment.schema import Experiment

@@ -16,7 +16,7 @@ import scipy
 from threadpoolctl import threadpool_limits
 
 from mjfim.errors import NoResultError
-from mjfim.excitation.limits import Limit
+from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System

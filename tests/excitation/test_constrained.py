@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.design import design_task
+from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.signals import spline_basis

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraint_kinds import END_WEIGHT, ConstraintValues
-from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.interior_problem import InteriorProblem, values_of
+from mjfim.excitation.limits.constraint_kinds import END_WEIGHT, ConstraintValues
+from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.search.interior_problem import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.optimize.lq import TangentCurve

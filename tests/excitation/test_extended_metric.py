@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.excitation.extended_system import ExtendedDesignProblem, extend
+from mjfim.excitation.objective import ExtendedDesignProblem, extend
 from mjfim.excitation.task import DesignTask
 from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent

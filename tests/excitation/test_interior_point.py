@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import constraint_set_of
-from mjfim.excitation.interior_problem import DIVERGED_POINT, InteriorProblem, values_of
+from mjfim.excitation.limits.constraints import constraint_set_of
+from mjfim.excitation.search.interior_problem import DIVERGED_POINT, InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
 from tests.support.limits import directions_of

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
-from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import open_boundary_warnings
-from mjfim.excitation.interior_problem import InteriorProblem
-from mjfim.excitation.limits import limits_of
-from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
+from mjfim.excitation.limits.constraints import constraint_set_of
+from mjfim.excitation.limits.limits import limits_of
+from mjfim.excitation.limits.magnitudes import Magnitude, VectorBarrier
+from mjfim.excitation.limits.verification import require_feasible_start, verify
+from mjfim.excitation.limits.violations import violations_of
+from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import require_feasible_start, verify
-from mjfim.excitation.violations import violations_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
 from mjfim.output.labels import complete_labels

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.lq import TangentCurve, regulator
 from mjfim.optimize.projection_operator import Expansion

@@ -10,7 +10,7 @@ import pytest
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.prior_information import information_of
+from mjfim.excitation.task_parts import information_of
 from mjfim.output import archive
 from tests.support.numerics import Array, cart_task
 

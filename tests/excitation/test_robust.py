@@ -15,8 +15,8 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.excitation.robust import ParameterSamples
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import ParameterSamples
 from mjfim.model.parameter_ranges import sample_parameters
 from mjfim.model.parameters import Parameter, ParameterSet
 from tests.support.numerics import CART_PARAMETERS, Array, body_task, cart_task

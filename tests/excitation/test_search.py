@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation import search as search_module
-from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.climb import Candidate, Move, tightened, without_jumps
-from mjfim.excitation.descent import Barrier, Ground
 from mjfim.excitation.design import design_task
-from mjfim.excitation.inside import InsideControl, InsideSearch, LimitedCost, largest_share
-from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.limits.verification import verify
+from mjfim.excitation.search import search as search_module
+from mjfim.excitation.search.climb import Candidate, Move, tightened, without_jumps
+from mjfim.excitation.search.descent import Barrier, Ground
+from mjfim.excitation.search.inside import InsideControl, InsideSearch, LimitedCost, largest_share
+from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import verify
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent

@@ -14,8 +14,12 @@ import mjfim
 from mjfim.errors import ExperimentError, NoResultError, UnidentifiableError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.excitation.shortest_horizon import OutOfReachError, fitted
-from mjfim.excitation.target_accuracy import largest_ratio_to_target, target_accuracies
+from mjfim.excitation.shortest_horizon import (
+    OutOfReachError,
+    fitted,
+    largest_ratio_to_target,
+    target_accuracies,
+)
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Status

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.limits.constraints import constraint_set_of
+from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, _clearance_usage, verify
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import SAME_STATE_TOLERANCE, _clearance_usage, verify
 from mjfim.model.clearance.geom_distance import GeomDistances, SignedDistances
 from mjfim.output.playback import reference_columns, simulate_playback
 from tests.support.numerics import CART_PENDULUM, make_task

@@ -10,7 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
-from mjfim.excitation.stated_inputs import stated_inputs
+from mjfim.excitation.task_parts import stated_inputs
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import Quantity
 from mjfim.recordings.read import read_recording

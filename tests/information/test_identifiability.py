@@ -12,7 +12,7 @@ import pytest
 
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.designable import require_designable
+from mjfim.excitation.evaluation import require_designable
 from mjfim.excitation.task import DesignTask
 from mjfim.information.identifiability import (
     PROBES,

@@ -12,7 +12,7 @@ import pytest
 
 from mjfim.arrays import Array
 from mjfim.excitation.design import design_task
-from mjfim.excitation.levels import DescentLevel, first_point
+from mjfim.excitation.search.levels import DescentLevel, first_point
 from mjfim.excitation.task import DesignTask
 from mjfim.model.variants import RELAXED, SMOOTHING_SPEED_FRACTION, STATED
 from mjfim.plant.active_constraints import nothing_acts_along

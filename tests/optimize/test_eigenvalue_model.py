@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm, logm
 from scipy.optimize import minimize
 
-from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import smooth_e_optimality
 from mjfim.optimize.eigenvalue_model import (

@@ -371,8 +371,8 @@ def test_an_expansion_without_limits_is_refused() -> None:
 @pytest.mark.parametrize("based", [False, True])
 def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Path) -> None:
     """Its slope agrees with differences of simulated trials."""
-    from mjfim.excitation.constraints import constraint_set_of
-    from mjfim.excitation.interior_problem import InteriorProblem
+    from mjfim.excitation.limits.constraints import constraint_set_of
+    from mjfim.excitation.search.interior_problem import InteriorProblem
     from mjfim.experiment.signals import spline_basis
 
     task = cart_task(

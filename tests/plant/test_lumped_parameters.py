@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.plant.lumped_parameters import LumpedParameters
 from tests.support.numerics import cart_task
 

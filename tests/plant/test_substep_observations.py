@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import constraint_set_of
-from mjfim.excitation.limits import derivative_substeps_of
+from mjfim.excitation.limits.constraints import constraint_set_of
+from mjfim.excitation.limits.limits import derivative_substeps_of
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN

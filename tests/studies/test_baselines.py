@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.verification import verify
+from mjfim.excitation.limits.verification import verify
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.experiment.signals import fourier_basis
 from mjfim.parallel.budget import StopToken, measured_by
 from mjfim.studies.baselines import METHODS, BaselineSearch, reflected, run_baseline

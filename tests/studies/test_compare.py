@@ -19,8 +19,8 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation import design as design_module
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import verify
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.draw import save
 from mjfim.output.plots.studies import compare

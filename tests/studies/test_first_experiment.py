@@ -11,8 +11,8 @@ import pytest
 
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.excitation.design import design
+from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import verify
 from mjfim.experiment.schema import Experiment
 from mjfim.studies.check import check
 from mjfim.studies.first_experiment.document import experiment_text

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.excitation.constraints import constraint_set_of
-from mjfim.excitation.interior_problem import InteriorProblem
+from mjfim.excitation.limits.constraints import constraint_set_of
+from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from tests.support.numerics import Array, cart_task, directional_check, make_task
 

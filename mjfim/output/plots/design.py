@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraints import SUBSTEP_KINDS
+from mjfim.excitation.limits.constraints import SUBSTEP_KINDS
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
 from mjfim.output.limit_curves import (

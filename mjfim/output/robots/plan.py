@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.limits import limits_of
+from mjfim.excitation.limits.limits import limits_of
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind

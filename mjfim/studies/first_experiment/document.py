@@ -8,7 +8,7 @@ from typing import Any
 import tomlkit
 from tomlkit.items import InlineTable, Table
 
-from mjfim.excitation.limits import limits_of_model
+from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.model.limited_elements import QUATERNION_PLACE
 from mjfim.model.paths import unit_of
 from mjfim.studies.first_experiment.candidates import Candidate

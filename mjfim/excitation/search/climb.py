@@ -14,13 +14,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.descent import Barrier, FreeMemory, Ground, Step
-from mjfim.excitation.end_correction import with_corrected_end
-from mjfim.excitation.inside import InsideSearch, LimitedCost
-from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.search.descent import Barrier, FreeMemory, Ground, Step
+from mjfim.excitation.search.inside import InsideSearch, LimitedCost, with_corrected_end
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import verify
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
 from mjfim.parallel import (

@@ -16,14 +16,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.constraint_kinds import ConstraintValues
-from mjfim.excitation.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
-from mjfim.excitation.extended_system import ExtendedDesignProblem
-from mjfim.excitation.inside import largest_share
-from mjfim.excitation.interior_problem import InteriorPoint, InteriorProblem, values_of
-from mjfim.excitation.levels import DescentLevel, regulator_for
-from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
+from mjfim.excitation.limits.constraint_kinds import ConstraintValues
+from mjfim.excitation.limits.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
+from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem, ExtendedDesignProblem
+from mjfim.excitation.search.inside import largest_share
+from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProblem, values_of
+from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.signals import independent_curves
 from mjfim.information.criteria import Criterion

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mjfim.excitation.constraints import FORCE_KINDS, constraint_set_of
-from mjfim.excitation.limits import Limit
+from mjfim.excitation.limits.constraints import FORCE_KINDS, constraint_set_of
+from mjfim.excitation.limits.limits import Limit
+from mjfim.excitation.limits.verification import Verification, usage_within_samples, verify
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import Verification, usage_within_samples, verify
 from mjfim.model.units import LENGTH
 from mjfim.records.design import LimitUsage, LimitViolation
 from mjfim.records.trajectory import Trajectory

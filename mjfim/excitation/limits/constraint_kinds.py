@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
+from mjfim.excitation.limits.magnitudes import Magnitude, VectorBarrier
 from mjfim.model.clearance.geom_distance import GeomDistances
 from mjfim.optimize.barrier import BarrierDerivatives, Bounds
 from mjfim.optimize.lq import TangentCurve, Weights

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraint_kinds import ConstraintValues
-from mjfim.excitation.constraints import ConstraintSet
+from mjfim.excitation.limits.constraint_kinds import ConstraintValues
+from mjfim.excitation.limits.constraints import ConstraintSet
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve

@@ -16,10 +16,10 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.constraint_kinds import ClearanceConstraint
-from mjfim.excitation.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
-from mjfim.excitation.limits import Limit
+from mjfim.excitation.limits.constraint_kinds import ClearanceConstraint
+from mjfim.excitation.limits.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
+from mjfim.excitation.limits.limits import Limit
+from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
 from mjfim.model.variants import unconstrained
 from mjfim.optimize.barrier import Bounds

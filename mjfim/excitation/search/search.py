@@ -17,7 +17,9 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.climb import (
+from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.search.climb import (
     Candidate,
     Climb,
     Grounds,
@@ -27,11 +29,9 @@ from mjfim.excitation.climb import (
     move_in_worker,
     row_of,
 )
-from mjfim.excitation.descent import MU_FACTOR, Barrier
-from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.inside import InsideControl, InsideSearch, is_progress
-from mjfim.excitation.levels import DescentLevel, coarse_level, coarser_levels, easier_level
-from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.search.descent import MU_FACTOR, Barrier
+from mjfim.excitation.search.inside import InsideControl, InsideSearch, is_progress
+from mjfim.excitation.search.levels import DescentLevel, coarse_level, coarser_levels, easier_level
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import for_workers
 from mjfim.information.smoothness import roughness

@@ -2,33 +2,191 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.excitation.barrier_curvature import CurvatureOfLimits
-from mjfim.excitation.constraint_kinds import (
+from mjfim.excitation.limits.constraint_kinds import (
     ClearanceConstraint,
     Constraint,
     ConstraintValues,
     ControlConstraint,
     ControlRateConstraint,
     EndStateConstraint,
+    ExpansionSums,
+    LimitedQuantities,
     SubstepConstraint,
 )
-from mjfim.excitation.limits import Limit, derivative_substeps_of, has_constant_forces
-from mjfim.excitation.observed_numbers import observed_numbers
+from mjfim.excitation.limits.limits import Limit, derivative_substeps_of, has_constant_forces
 from mjfim.excitation.task import DesignTask
 from mjfim.model.clearance.geom_distance import GeomDistances
 from mjfim.model.clearance.pair_distance import find_geom_pairs
 from mjfim.model.elements import is_rk4
+from mjfim.model.limited_elements import (
+    actuators_of_tendon,
+    quaternion_address,
+    quaternion_joints,
+    tilt_weights,
+    turn_weights,
+)
 from mjfim.model.sizes import model_length
-from mjfim.optimize.barrier import BarrierExpansion, Bounds
+from mjfim.optimize.barrier import (
+    BarrierExpansion,
+    Bounds,
+    CurvatureAlong,
+    StepCurvature,
+    curvature_factors,
+)
+from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
+
+# Attribute of `SubstepObservations` to which each kind of limit belongs; angles are turns.
+SOURCES = {
+    "position": "positions",
+    "velocity": "velocities",
+    "angular_velocity": "velocities",
+    "acceleration": "accelerations",
+    "force": "actuator_forces",
+    "joint_force": "joint_forces",
+    "tendon_force": "tendon_forces",
+    "tendon_length": "tendon_lengths",
+}
+
+# The attributes in the order of the observed numbers.
+ORDER = (
+    "positions",
+    "velocities",
+    "accelerations",
+    "turns",
+    "actuator_forces",
+    "joint_forces",
+    "tendon_forces",
+    "tendon_lengths",
+)
+
+
+def observed_numbers(
+    model: Any, limits: tuple[Limit, ...]
+) -> tuple[SubstepObservations, tuple[tuple[int, ...], ...]]:
+    """Choose the numbers that have to be observed for some limits.
+
+    Args:
+        model: MjModel.
+        limits: n limits on quantities within samples.
+
+    Returns:
+        The observations of a single engine step without further rows, and for each of the n limits
+        the places of its numbers among them.
+    """
+    sources = [_source(limit) for limit in limits]
+    places: dict[int, tuple[int, ...]] = {}
+    begin = 0
+    for source in ORDER:
+        for i, limit in enumerate(limits):
+            if sources[i] == source:
+                places[i] = tuple(range(begin, begin + limit.count))
+                begin += limit.count
+
+    chosen = {
+        source: [limit for limit, each in zip(limits, sources, strict=True) if each == source]
+        for source in ORDER
+    }
+    turns = [np.arange(x.index, x.index + 4) for x in chosen["turns"] for _ in range(x.count)]
+    weights = [_turn_weights(model, limit) for limit in chosen["turns"]]
+    observations = SubstepObservations(
+        positions=_addresses(chosen["positions"]),
+        velocities=_addresses(chosen["velocities"]),
+        accelerations=_addresses(chosen["accelerations"]),
+        actuator_forces=_addresses(chosen["actuator_forces"]),
+        joint_forces=_addresses(chosen["joint_forces"]),
+        turns=np.array(turns, dtype=np.intp).reshape(-1, 4),
+        turn_weights=np.concatenate([np.zeros((0, 4)), *weights]),
+        tendon_forces=tuple(actuators_of_tendon(model, x.index) for x in chosen["tendon_forces"]),
+        tendon_lengths=_addresses(chosen["tendon_lengths"]),
+        derivative_substeps=(1,),
+        timestep=float(model.opt.timestep),
+    )
+    return observations, tuple(places[i] for i in range(len(limits)))
+
+
+def _source(limit: Limit) -> str:
+    """The attribute of `SubstepObservations` that holds the numbers of a limit."""
+    return "turns" if limit.is_angle else SOURCES[limit.kind]
+
+
+def _addresses(limits: Iterable[Limit]) -> np.ndarray:
+    """Addresses of all numbers of some limits."""
+    each = [limit.index + i for limit in limits for i in range(limit.count)]
+    return np.array(each, dtype=np.intp)
+
+
+def _turn_weights(model: Any, limit: Limit) -> Array:
+    """(count, 4) weights of the quaternion of a limited angle."""
+    joint = next(j for j in quaternion_joints(model) if quaternion_address(model, j) == limit.index)
+    return tilt_weights(model, joint) if limit.kind == "tilt" else turn_weights(model, joint)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CurvatureOfLimits(StepCurvature):
+    """The barrier about a trajectory, from which its curvature along steps follows.
+
+    It can be pickled with the state of a search.
+
+    Attributes:
+        members: The kinds of limited quantities.
+        values: The quantities along the trajectory, with their derivatives.
+        delta: Relaxation of the barrier, a relative margin.
+        nu: Number of controls.
+        mu: Weight of the barrier.
+    """
+
+    members: tuple[LimitedQuantities, ...]
+    values: ConstraintValues
+    delta: float
+    nu: int
+    mu: float = 1.0
+
+    def along(self, step: TangentCurve, factors: Sequence[Array] | None) -> CurvatureAlong:
+        """See `StepCurvature.along`."""
+        found: list[Array] = []
+        growth = 1.0
+        for i, member in enumerate(self.members):
+            slacks = member.slacks(self.values)
+            old = np.ones(slacks.shape) if factors is None else factors[i]
+            changes = member.slack_changes(self.values, step)
+            new = curvature_factors(slacks, changes, old, self.delta)
+            growth = max(growth, float((new / old).max(initial=1.0)))
+            found.append(new)
+
+        return CurvatureAlong(
+            weights=self.sums(found).weights.scaled(self.mu), factors=tuple(found), growth=growth
+        )
+
+    def sums(self, factors: Sequence[Array] | None = None) -> ExpansionSums:
+        """Gradient and Gauss-Newton Hessian of the barrier, without its weight.
+
+        Args:
+            factors: Factors of the curvature, by kind; default: 1.
+        """
+        jacobian = self.values.observation_jacobian
+        if jacobian is None:
+            raise ValueError("the observations have no derivatives")
+
+        sums = ExpansionSums.zero(len(jacobian), jacobian.shape[-1] - self.nu, self.nu)
+        for i, member in enumerate(self.members):
+            each = None if factors is None else factors[i]
+            member.add_expansion(self.values, self.delta, sums, each)
+        return sums
+
+    def scaled(self, mu: float) -> CurvatureOfLimits:
+        """See `StepCurvature.scaled`."""
+        return replace(self, mu=mu * self.mu)
+
 
 # Distance beyond the stated clearance up to which distances are measured, relative to the length of
 # the model; it is at least the clearance itself.

@@ -1,0 +1,1 @@
+"""Limits: what is stated, constraints at samples, and their verification on the model."""
