@@ -7,19 +7,19 @@ import sys
 
 import pytest
 
-from mjfim.parallel import threads
+from mjfim.parallel import pool
 from tests.support.paths import ROOT
 
 
 def test_windows_waits_for_at_most_61_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Python refuses pools of more processes there; other systems have no such bound."""
-    monkeypatch.setattr(threads, "cores", lambda: 128)
-    assert threads.process_count(None) == 128
+    monkeypatch.setattr(pool, "cores", lambda: 128)
+    assert pool.process_count(None) == 128
 
     monkeypatch.setattr(sys, "platform", "win32")
-    assert threads.process_count(None) == 61
-    assert threads.process_count(100) == 61
-    assert threads.process_count(3) == 3
+    assert pool.process_count(None) == 61
+    assert pool.process_count(100) == 61
+    assert pool.process_count(3) == 3
 
 
 @pytest.mark.slow

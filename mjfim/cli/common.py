@@ -31,10 +31,9 @@ from mjfim.errors import (
     UnfinishedError,
 )
 from mjfim.files import observed_by, remove_temporary_files
+from mjfim.output.drawing import PictureFormat, write_optional
 from mjfim.output.live import ADDRESS, HERE
-from mjfim.output.optional_files import write_optional
 from mjfim.output.page import Page
-from mjfim.output.picture_format import PictureFormat
 from mjfim.output.report import REPORT
 from mjfim.output.terminal import render
 from mjfim.output.video.video import NoVideoError, require_format, write_video

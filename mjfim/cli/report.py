@@ -9,7 +9,7 @@ import typer
 
 from mjfim.cli.common import Force, Pictures, claim_file, keep_result, verb
 from mjfim.cli.progress import say
-from mjfim.output.picture_format import PictureFormat
+from mjfim.output.drawing import PictureFormat
 from mjfim.output.report import REPORT
 
 

@@ -13,7 +13,7 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, listed, shortened, unknown
 from mjfim.excitation.limits.limits import Limit
-from mjfim.experiment.control_signal import generate
+from mjfim.experiment.initial_state import generate
 from mjfim.experiment.packing import opened
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.experiment.schema import Experiment, by_name

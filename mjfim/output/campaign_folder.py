@@ -24,6 +24,7 @@ from mjfim.experiment.system import System
 from mjfim.files import as_json, read_json, replacing, write_json
 from mjfim.output.archive import check_fits, origin_of
 from mjfim.output.campaign_parameters import CampaignParameters
+from mjfim.output.drawing import PictureFormat, write_optional
 from mjfim.output.folders import (
     DESIGN_ARCHIVE,
     IDENTIFIED,
@@ -32,8 +33,6 @@ from mjfim.output.folders import (
 )
 from mjfim.output.manifest import fingerprint
 from mjfim.output.models.mjcf import write_identified
-from mjfim.output.optional_files import write_optional
-from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots import studies
 from mjfim.output.plots.pictures import Pictures
 from mjfim.output.plots.words import format_with_uncertainty

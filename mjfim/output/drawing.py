@@ -8,15 +8,84 @@ treated as everywhere else.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from enum import StrEnum
 from typing import TYPE_CHECKING
 
+from mjfim.errors import MjfimError, UndrawnWarning
+from mjfim.parallel.budget import run_optional
+
 if TYPE_CHECKING:
-    from mjfim.output.picture_format import PictureFormat
     from mjfim.parallel import Pool
     from mjfim.records.base import ShownRecord
+
+
+class PictureFormat(StrEnum):
+    """Format of pictures; the value is also the ending of their files."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
+
+    def file_of(self, picture: str) -> str:
+        """Return the name of a picture's file.
+
+        Args:
+            picture: Name of the picture, without an ending.
+        """
+        return f"{picture}.{self.value}"
+
+    def files(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the names of files, where all pictures have this format.
+
+        Args:
+            names: Names of files; those of pictures end in .png.
+        """
+        return tuple(
+            name.removesuffix("png") + self.value if name.endswith(".png") else name
+            for name in names
+        )
+
+
+def write_guarded(name: str, write: Callable[[], object]) -> None:
+    """Write a file; a fault of the program while it is drawn is a warning.
+
+    The command line shows the warning as one sentence. Tests make an error of it, and
+    `python -W error -m mjfim` shows where the fault is.
+
+    Args:
+        name: Name of the file.
+        write: Draws and writes it.
+
+    Raises:
+        MjfimError: The file may not be written.
+        OSError: The file cannot be written.
+    """
+    try:
+        write()
+    except (MjfimError, OSError):
+        raise
+    except Exception as error:
+        fault = ": ".join(part for part in (type(error).__name__, str(error)) if part)
+        message = (
+            f"could not draw {name}, because of a fault in mjfim ({fault}); the result stands, and "
+            "its data are written (python -W error -m mjfim shows the place of the fault)"
+        )
+        warnings.warn(message, UndrawnWarning, stacklevel=2)
+
+
+def write_optional(name: str, write: Callable[[], object]) -> None:
+    """Write a file as `write_guarded` does, and leave it out when the user presses Ctrl-C twice.
+
+    Args:
+        name: Name of the file.
+        write: Draws and writes it.
+    """
+    run_optional(lambda: write_guarded(name, write))
+
 
 # Messages for developers, which a user does not see.
 _log = logging.getLogger(__name__)

@@ -16,11 +16,9 @@ from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.output import archive
 from mjfim.output import rerun as rerun_log
-from mjfim.output.drawing import begin_pictures
+from mjfim.output.drawing import PictureFormat, begin_pictures, write_optional
 from mjfim.output.models.mjcf import identified_files, write_identified
-from mjfim.output.optional_files import write_optional
 from mjfim.output.panels import Picture
-from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import (
     Pictures,
     fit_names,

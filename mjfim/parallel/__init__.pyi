@@ -1,6 +1,14 @@
 from .dispatch import LostWorkError, Outcome, carry_out, results, results_or_here
-from .pool import LOST_SENTENCE, Pool, offer_result, pool_stop_token
-from .threads import cores, one_blas_thread, process_count, require_threads
+from .pool import (
+    LOST_SENTENCE,
+    Pool,
+    cores,
+    offer_result,
+    one_blas_thread,
+    pool_stop_token,
+    process_count,
+    require_threads,
+)
 from .workers import ExecutorLike, Workers
 
 __all__ = [

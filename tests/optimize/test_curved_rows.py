@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 
 from mjfim.optimize.condensed_least_squares import Condensed
-from mjfim.optimize.curved_rows import step_over_curved_rows
+from mjfim.optimize.levenberg_marquardt import step_over_curved_rows
 from tests.support.numerics import Array
 
 COUNT = 3

@@ -14,8 +14,7 @@ import pytest
 
 from mjfim.errors import MjfimError
 from mjfim.output import drawing
-from mjfim.output.drawing import begin_pictures, drawing_elsewhere
-from mjfim.output.picture_format import PictureFormat
+from mjfim.output.drawing import PictureFormat, begin_pictures, drawing_elsewhere
 from mjfim.output.plots.draw import content
 from mjfim.output.plots.pictures import pictures_of
 from tests.support import results

@@ -10,8 +10,7 @@ import pytest
 
 from mjfim.errors import OutputError, UndrawnWarning
 from mjfim.output import folders
-from mjfim.output.optional_files import write_optional
-from mjfim.output.picture_format import PictureFormat
+from mjfim.output.drawing import PictureFormat, write_optional
 from tests.support import results
 
 

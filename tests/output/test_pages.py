@@ -12,11 +12,11 @@ import pytest
 import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
-from mjfim.output.markdown import as_markdown
 from mjfim.output.page import Emphasis, Level, Listing, Row, Table, named, number
 from mjfim.output.pages import page_of
 from mjfim.output.pages.accuracy import improvement, relative
-from mjfim.output.pages.selection import selection_parts
+from mjfim.output.pages.estimate_parts import selection_parts
+from mjfim.output.rerun.text import as_markdown
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.design import CombinationAccuracy, Status

@@ -18,6 +18,7 @@ from mjfim.errors import MjfimError
 from mjfim.files import replacing
 from mjfim.output import plots
 from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals
+from mjfim.output.playback import rotation_vectors
 from mjfim.output.plots import words
 from mjfim.output.plots.design import (
     convergence,
@@ -31,7 +32,6 @@ from mjfim.output.plots.estimate import fit, parameter_intervals
 from mjfim.output.plots.estimate_studies import selection
 from mjfim.output.plots.pictures import draw, picture_names
 from mjfim.output.plots.studies import histogram
-from mjfim.output.positions import rotation_vectors
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import Decision, Selection, SelectionStep

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.signal import welch as reference
 
-from mjfim.output import welch
+from mjfim.output.plots import estimate
 
 
 @pytest.mark.parametrize(("count", "length"), [(1000, 100), (999, 101), (256, 256), (300, 257)])
 def test_parts_give_the_density_of_the_whole(
     count: int, length: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(welch, "SEGMENTS_AT_ONCE", 3)
+    monkeypatch.setattr(estimate, "SEGMENTS_AT_ONCE", 3)
     x = np.random.default_rng(0).normal(size=count)
-    frequencies, density = welch.density_of(x, 10.0, length)
+    frequencies, density = estimate.power_density(x, 10.0, length)
     expected, wanted = reference(x, 10.0, nperseg=length, detrend=False)
     np.testing.assert_array_equal(frequencies, expected)
     np.testing.assert_allclose(density, wanted, rtol=1e-12)

@@ -27,8 +27,12 @@ from mjfim.output.page import (
 )
 from mjfim.output.pages.accuracy import NOT_ALONE, relative
 from mjfim.output.pages.equation import equation_parts
-from mjfim.output.pages.estimate_parts import horizon_parts, recording_parts, sample_parts
-from mjfim.output.pages.selection import selection_parts
+from mjfim.output.pages.estimate_parts import (
+    horizon_parts,
+    recording_parts,
+    sample_parts,
+    selection_parts,
+)
 from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
 from mjfim.records.estimate import Estimate, Prediction
 

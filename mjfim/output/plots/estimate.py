@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices
@@ -36,11 +37,39 @@ from mjfim.output.plots.words import (
     without_zeros,
 )
 from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
-from mjfim.output.welch import density_of
 from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
 from mjfim.records.labels import Labels, with_unit
 from mjfim.records.trajectory import Recording
+
+# Number of segments that are transformed at once.
+SEGMENTS_AT_ONCE = 64
+
+
+def power_density(x: Array, rate: float, length: int) -> tuple[Array, Array]:
+    """Average the densities of segments that overlap by half; the mean is not subtracted.
+
+    Args:
+        x: (M,) series.
+        rate: Its rate [Hz].
+        length: Number of values of a segment, at most M.
+
+    Returns:
+        Frequencies [Hz], and the one-sided density [unit of x squared / Hz].
+    """
+    step = length - length // 2
+    count = max((len(x) - length) // step + 1, 1)
+
+    # A part begins where the next segment would begin, so that no segment is left out.
+    total: Array = np.zeros(length // 2 + 1)
+    frequencies: Array = np.zeros(0)
+    for first in range(0, count, SEGMENTS_AT_ONCE):
+        segments = min(SEGMENTS_AT_ONCE, count - first)
+        part = x[first * step : (first + segments - 1) * step + length]
+        frequencies, density = scipy.signal.welch(part, rate, nperseg=length, detrend=False)
+        total += segments * density
+    return frequencies, total / count
+
 
 # Largest numbers of outputs over time, of outputs with a spectrum, of predicted recordings, of
 # parameters over the iterations, and of equations; of more, those that say most are drawn.
@@ -456,7 +485,7 @@ def _smoothed_density(estimate: Estimate, column: int, sigma: float) -> tuple[Ar
     wanted = 2 * sum(map(len, parts)) // (SEGMENTS + 1)
     length = min(int(np.clip(wanted, SHORTEST_SEGMENT, LONGEST_SEGMENT)), *map(len, parts))
     weights = [max(2 * len(part) // length - 1, 1) for part in parts]
-    densities = [density_of(part, float(np.mean(rates)), length) for part in parts]
+    densities = [power_density(part, float(np.mean(rates)), length) for part in parts]
     frequencies = densities[0][0]
     mean = np.average([density for _, density in densities], axis=0, weights=weights)
     count = sum(weights)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.output.campaign_parameters import CampaignParameters
-from mjfim.output.correlation_colours import SCALE_IN_WORDS, colour_strength
 from mjfim.output.distributions import normal_density
 from mjfim.output.pages.accuracy import BEST_CASE
 from mjfim.output.pages.studies import budget_in_words
@@ -61,6 +60,21 @@ from mjfim.records.labels import Labels, with_unit
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
+
+# What a picture says of it.
+SCALE_IN_WORDS = "strength of the colour: root of its size"
+
+
+def colour_strength(correlation: Array) -> Array:
+    """Return how strong the colour of each correlation is: the root of its size, with its sign.
+
+    Most correlations of a good experiment are small, and would be as pale as 0 otherwise.
+
+    Args:
+        correlation: Correlations of any shape, -1 to 1; NaN stays.
+    """
+    return np.asarray(np.sign(correlation) * np.sqrt(np.abs(correlation)))
+
 
 # Largest numbers of parameters of a Monte Carlo study, of two robots and of a campaign; of more,
 # those that say most are drawn.

@@ -9,21 +9,21 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from html import unescape
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjfim.errors import RecordingError, first_ones, listed
 from mjfim.files import read_json, replacing
-from mjfim.output.html import template
-from mjfim.output.page import Page, Plot, Text
+from mjfim.output.page import Emphasis, Page, Plot, Text, as_sentence, capitalised
 from mjfim.output.pages import page_of
-from mjfim.output.panels import Picture
+from mjfim.output.panels import ROLES, Picture
 from mjfim.output.plots.pictures import pictures_of
 from mjfim.output.report import REPORT
-from mjfim.output.report.palette import palettes
 from mjfim.output.report.plotly import Group, group_of
 from mjfim.output.video import Video
+from mjfim.output.vocabulary import OTHER, TERMS
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -33,6 +33,125 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+    from markupsafe import Markup
+
+
+# Colours of page and plots that belong to no term of the vocabulary, by their role.
+LIGHT = {
+    "page": "#ffffff",
+    "card": "#f6f7f8",
+    "text": "#222222",
+    "muted": "#5c6268",
+    "grid": "#e2e5e8",
+    "band": "#d9dcdf",
+    "white": "#ffffff",
+    "good": "#1a7f4b",
+    "doubtful": "#9a6700",
+    "bad": "#c0281a",
+    "link": "#0a5fa5",
+}
+DARK = {
+    "page": "#16191d",
+    "card": "#20252b",
+    "text": "#e6e8ea",
+    "muted": "#a3abb3",
+    "grid": "#333a42",
+    "band": "#3a424b",
+    "white": "#16191d",
+    "good": "#4fc78a",
+    "doubtful": "#e0b04c",
+    "bad": "#ff8072",
+    "link": "#7dbdf5",
+}
+
+# Colours of negative, small and positive values of cells.
+CELLS_LIGHT = ("#2166ac", "#f7f7f7", "#b2182b")
+CELLS_DARK = ("#2a73b5", "#262b31", "#c2412f")
+
+# How much lighter the colours of curves without a role are on a dark page.
+LIGHTER = 0.35
+
+
+def palettes() -> dict[str, dict[str, Any]]:
+    """Return the colours by theme, `light` and `dark`, and role."""
+    places = (0.0, 0.5, 1.0)
+    light: dict[str, Any] = {
+        **ROLES,
+        **LIGHT,
+        "diverging": list(zip(places, CELLS_LIGHT, strict=True)),
+    }
+    dark: dict[str, Any] = {
+        **{role: _lighter(colour) for role, colour in ROLES.items()},
+        **{term.word: term.colour_on_dark for term in (*TERMS, OTHER)},
+        **DARK,
+        "diverging": list(zip(places, CELLS_DARK, strict=True)),
+    }
+    return {"light": light, "dark": dark}
+
+
+def _lighter(colour: str) -> str:
+    """A colour that can be read on a dark page."""
+    channels = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return "#" + "".join(f"{round(c + LIGHTER * (255 - c)):02x}" for c in channels)
+
+
+# Folder of the templates, beside this module.
+PACKAGE, TEMPLATES = "mjfim.output", "templates"
+
+# Names of commands, keys and files in sentences.
+CODE = re.compile(r"`([^`\n]+)`")
+
+# Space between a number and its sign of percent or of a standard deviation.
+UNIT_SPACE = re.compile(r"(?<=\d) (?=[%σ])|(?<=±) (?=\d)")
+
+# Style of every emphasis in a notebook, which keeps no style sheets.
+STYLES = {
+    Emphasis.NORMAL: "",
+    Emphasis.STRONG: "font-weight: bold",
+    Emphasis.WEAK: "opacity: 0.7",
+    Emphasis.WARNING: "border-left: 0.25em solid #cc8800; padding-left: 0.5em",
+    Emphasis.DERIVED: "font-style: italic",
+}
+
+
+def as_html(record: ShownRecord) -> str:
+    """Write the page of a record for a notebook: verdict and warnings first, then its parts."""
+    html: str = template("notebook.html.j2").render(page=page_of(record), styles=STYLES)
+    return html
+
+
+@cache
+def template(file: str) -> Template:
+    """Return a template of this package; to compile one takes longer than to fill it."""
+    # Slow to import, and only reports and notebooks need it.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader(PACKAGE, TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters.update(
+        capital=capitalised,
+        kind_of=lambda part: type(part).__name__,
+        prose=_prose,
+        sentence=as_sentence,
+    )
+    return environment.get_template(file)
+
+
+def _prose(text: str) -> Markup:
+    """A sentence as HTML: words in backquotes are code, and numbers stay with their units."""
+    from markupsafe import Markup, escape
+
+    spaced = UNIT_SPACE.sub("\u00a0", str(escape(text)))
+    return Markup(CODE.sub(r"<code>\1</code>", spaced))
+
 
 # Results that have a report; of several in a folder, the first one stands at the top.
 KINDS: tuple[type[ShownRecord], ...] = (

@@ -19,6 +19,7 @@ from mjfim.errors import MjfimError, RecordingError
 from mjfim.files import replacing
 from mjfim.output import vocabulary
 from mjfim.output.panels import Panel, line
+from mjfim.output.playback import shown_positions
 from mjfim.output.plots.design import (
     convergence,
     information_panel,
@@ -27,7 +28,6 @@ from mjfim.output.plots.design import (
     sensitivity_phase,
 )
 from mjfim.output.plots.estimate import fit, held_out
-from mjfim.output.positions import shown_positions
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.plots import (
     Plane,

@@ -16,7 +16,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.experiment.labels import labels_of_model
 from mjfim.output import vocabulary
 from mjfim.output.panels import line
-from mjfim.output.positions import shown_positions
+from mjfim.output.playback import shown_positions
 from mjfim.output.progress_text import design_stage, design_text, progress_line
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.documents import (
