@@ -80,7 +80,7 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
     model = channels.model
     for column, u in zip(channels.control_columns, ctrl.T, strict=True):
         # References of control laws jump where the user commands it, and have no range.
-        if not column.startswith("ctrl:") or not _moves(u):
+        if not (column.startswith("ctrl:") and _moves(u[1:]) and _moves(u[:-1])):
             continue
         name = column.removeprefix("ctrl:")
         i = channels.controls.index(name)
