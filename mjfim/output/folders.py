@@ -20,10 +20,13 @@ from mjfim.output.drawing import PictureFormat, begin_pictures, write_optional
 from mjfim.output.models.mjcf import identified_files, write_identified
 from mjfim.output.panels import Picture
 from mjfim.output.plots.pictures import (
+    DESIGN_PICTURES,
+    ESTIMATE_PICTURES,
     Pictures,
     fit_names,
     held_out_names,
     histogram_name,
+    picture_files,
     pictures_of,
 )
 from mjfim.output.report import REPORT
@@ -44,8 +47,8 @@ IDENTIFIED = "identified.xml"
 ENDINGS = "|".join(PictureFormat)
 STALE: dict[type[ShownRecord], str] = {
     Comparison: r"control_[\w-]+\.csv",
-    Estimate: r"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection|horizons|inverse_dynamics"
-    rf"|samples|recordings)\.({ENDINGS})|identified(_.*)?\.(xml|urdf)",
+    Estimate: rf"((fit|held_out)(_\d+)?|{'|'.join(ESTIMATE_PICTURES)})\.({ENDINGS})"
+    r"|identified(_.*)?\.(xml|urdf)",
 }
 
 # Further entries of a JSON file: none.
@@ -60,11 +63,7 @@ DESIGN_FILES = (
     *DESIGN_ARCHIVE,
     REPORT,
     "design.rrd",
-    "trajectories.png",
-    "sensitivity_phase.png",
-    "convergence.png",
-    "standard_deviations.png",
-    "limits.png",
+    *picture_files(DESIGN_PICTURES),
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
@@ -95,21 +94,11 @@ def estimate_files(
         select: Whether terms of the model are selected.
         samples: Whether robots are drawn, whose models `sample_files` lists.
     """
-    names = [
-        "parameters",
-        "spectra",
-        "inverse_dynamics",
-        "trace",
-        "pairs",
-        "predictions",
-        "horizons",
-    ]
-    chosen = {"selection": select, "samples": samples, "recordings": recordings > 1}
-    names += [name for name, is_wanted in chosen.items() if is_wanted]
-    figures = tuple(f"{name}.png" for name in names)
-    fits = tuple(f"{name}.png" for name in (*fit_names(recordings), *held_out_names(held_out)))
+    unwanted = {"selection": not select, "samples": not samples, "recordings": recordings < 2}
+    names = [name for name in ESTIMATE_PICTURES if not unwanted.get(name)]
+    names += [*fit_names(recordings), *held_out_names(held_out)]
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
-    return (*data, *figures, *fits)
+    return (*data, *picture_files(names))
 
 
 def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
@@ -118,7 +107,7 @@ def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
     Args:
         parameters: Names of the parameters.
     """
-    histograms = tuple(f"{histogram_name(name)}.png" for name in parameters)
+    histograms = picture_files(map(histogram_name, parameters))
     return ("montecarlo.json", "montecarlo.npz", REPORT, "overview.png", *histograms)
 
 

@@ -7,34 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.model.terms.base import SWEVERS_2007, Payload, Tilt
-from mjfim.model.terms.drives import KRAUSE_2013, ActuatorLag, BackEmf
-from mjfim.model.terms.elasticity import SPONG_1987, Backlash, JointElasticity
-from mjfim.model.terms.friction import (
-    ARMSTRONG_1994,
-    OLSSON_1998,
-    AsymmetricFriction,
-    LuGre,
-    Stribeck,
-)
-from mjfim.model.terms.load_friction import LoadDependentFriction
+from mjfim.model.terms import base, drives, elasticity, friction, load_friction
 from mjfim.model.terms.term import FieldDescription, Term, TermTable
 
 # All kinds of terms, by the name that the experiment file gives them.
 KINDS: dict[str, type[Term]] = {
     kind.kind: kind
-    for kind in (
-        Stribeck,
-        LuGre,
-        AsymmetricFriction,
-        LoadDependentFriction,
-        BackEmf,
-        ActuatorLag,
-        JointElasticity,
-        Backlash,
-        Tilt,
-        Payload,
-    )
+    for module in (friction, load_friction, drives, elasticity, base)
+    for kind in vars(module).values()
+    if isinstance(kind, type) and issubclass(kind, Term) and "kind" in vars(kind)
 }
 
 
@@ -108,7 +89,7 @@ NUMBERS = (
         equation="F = -f sgn(v)",
         elements="frictionloss",
         paths=("joint/<name>:frictionloss", "tendon/<name>:frictionloss"),
-        sources=(OLSSON_1998,),
+        sources=(friction.OLSSON_1998,),
     ),
     CatalogueEntry(
         name="viscous friction",
@@ -116,7 +97,7 @@ NUMBERS = (
         equation="F = -b0 v",
         elements="damping",
         paths=("joint/<name>:damping", "tendon/<name>:damping"),
-        sources=(ARMSTRONG_1994,),
+        sources=(friction.ARMSTRONG_1994,),
     ),
     CatalogueEntry(
         name="drag",
@@ -124,7 +105,7 @@ NUMBERS = (
         equation="F = -(b0 v + b1 v |v| + b2 v³)",
         elements="damping of a joint with two or three numbers",
         paths=("joint/<name>:damping[1]", "joint/<name>:damping[2]"),
-        sources=(BATCHELOR_1967, ARMSTRONG_1994),
+        sources=(BATCHELOR_1967, friction.ARMSTRONG_1994),
     ),
     CatalogueEntry(
         name="rotor inertia",
@@ -132,7 +113,7 @@ NUMBERS = (
         equation="F = -J q̈",
         elements="armature",
         paths=("joint/<name>:armature", "tendon/<name>:armature"),
-        sources=(SPONG_1987,),
+        sources=(elasticity.SPONG_1987,),
     ),
     CatalogueEntry(
         name="spring",
@@ -148,7 +129,7 @@ NUMBERS = (
         equation="τ = gain · control",
         elements="gainprm of a motor",
         paths=("actuator/<name>:gainprm[0]",),
-        sources=(KRAUSE_2013,),
+        sources=(drives.KRAUSE_2013,),
     ),
     CatalogueEntry(
         name="gravity",
@@ -156,7 +137,7 @@ NUMBERS = (
         equation="F = m g",
         elements="option/gravity",
         paths=("option:gravity[i]",),
-        sources=(SWEVERS_2007,),
+        sources=(base.SWEVERS_2007,),
     ),
     CatalogueEntry(
         name="air or water",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial, singledispatch
 from typing import TYPE_CHECKING
 
@@ -34,8 +34,34 @@ from mjfim.records.robustness import Robustness
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Pictures of a design, and of an estimate beside those of its fits and predictions.
+DESIGN_PICTURES = (
+    "trajectories",
+    "sensitivity_phase",
+    "convergence",
+    "standard_deviations",
+    "limits",
+)
+ESTIMATE_PICTURES = (
+    "parameters",
+    "spectra",
+    "inverse_dynamics",
+    "trace",
+    "pairs",
+    "predictions",
+    "horizons",
+    "selection",
+    "samples",
+    "recordings",
+)
+
 # Functions that make the pictures of a record, by their names.
 Pictures = dict[str, Callable[[], Picture]]
+
+
+def picture_files(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the files of pictures; `PictureFormat.files` has those of another format than PNG."""
+    return tuple(f"{name}.png" for name in names)
 
 
 def fit_names(count: int) -> tuple[str, ...]:
