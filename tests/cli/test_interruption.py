@@ -23,8 +23,7 @@ from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import NOTHING_SENTENCE
-from mjfim.records.design import Status
-from mjfim.records.events import DesignEvent, FitEvent, StudyEvent
+from mjfim.records.events import FitEvent, StudyEvent
 from mjfim.studies import derivative_test
 from mjfim.studies import monte_carlo as trials
 from tests.support.cli import (
@@ -199,22 +198,6 @@ def test_a_press_while_the_program_or_a_verb_starts(module: str) -> None:
     assert ended.returncode == 1
     assert ended.stderr == f"mjfim: {NOTHING_SENTENCE}\n"
     assert not ended.stdout
-
-
-def test_interrupted_on_the_coarse_level() -> None:
-    """The best iterate is returned, also before the stated sample rate is reached."""
-    rates = []
-
-    def interrupt_fifth(event: DesignEvent) -> None:
-        rates.append(event.row.rate)
-        if event.row.iteration == 5:
-            interrupt()
-
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    result = mjfim.design(experiment, callback=interrupt_fifth)
-    assert set(rates) == {25.0}
-    assert result.status is Status.INTERRUPTED
-    assert result.final.cost < 0.1 * result.initial.cost
 
 
 @pytest.mark.slow

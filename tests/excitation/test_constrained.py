@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.signals import spline_basis
 from mjfim.output.pages import page_of
-from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Design, HistoryRow, Status
-from mjfim.records.events import DesignEvent
 from tests.support.limits import ARM, HARD, cart_inside
 from tests.support.numerics import (
     CART_PARAMETERS,
@@ -176,37 +173,6 @@ SWINGING = CART_PENDULUM.format(integrator="RK4").replace(
 )
 
 
-def swinging_task(folder: Path, amplitude: float = 2.0, **tables: Any) -> DesignTask:
-    """A pendulum that swings at first and has to hang still elsewhere after 1.5 s."""
-    control = {"kind": "sine", "amplitude": amplitude, "frequency": 0.7}
-    first = {"qpos": (0.0, 2.6), "qvel": (0.4, 1.0), "control": control}
-    defaults: dict[str, Any] = {
-        "horizon": 1.5,
-        "rate": 50.0,
-        "parameters": {"m": {"target": "body/bob:mass"}, "c": {"target": "joint/hinge:damping"}},
-        "noise": {"state": 0.05},
-        "initial": first,
-        "cost": {"control": 0.0},
-        "limits": {"control": {"force": (-25.0, 25.0)}, "position": {"slide": (-1.0, 1.0)}},
-        "boundary": {"end": "rest", "keyframe": "rest", "position": 0.02, "velocity": 0.05},
-        "descent": {"max_iterations": 40, "coarse": 1},
-    }
-    return make_task(SWINGING, folder, **{**defaults, **tables})
-
-
-@pytest.mark.slow
-def test_limits_that_no_control_can_keep_end_as_infeasible(tmp_path: Path) -> None:
-    """The pendulum falls faster than allowed, whatever the weak motor does; a warning says so."""
-    weak = {**HARD, "control": {"force": (-0.05, 0.05)}, "velocity": {"hinge": 0.41}}
-    task = cart_inside(tmp_path, horizon=0.3, limits=weak, descent={"max_iterations": 15})
-    design = design_task(task)
-    assert design.status is Status.INFEASIBLE
-    assert not design.success
-    assert design.limits["velocity"] < 0.0
-    assert any("velocity limits are exceeded by" in sentence for sentence in design.warnings)
-    assert not any("checked, not enforced" in sentence for sentence in design.warnings)
-
-
 @pytest.mark.slow
 def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> None:
     """The design equals that without limits.
@@ -259,29 +225,6 @@ def test_a_design_does_not_use_a_clamp(weight: Any, tmp_path: Path) -> None:
     assert not any("clamp" in sentence for sentence in design.warnings)
 
 
-@pytest.mark.slow
-def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
-    tmp_path: Path,
-) -> None:
-    tables = {
-        "limits": {
-            "position": {"slide": (-0.01, 1.0)},
-            "control": {"force": (-3.0, 3.0)},
-            "enforce": False,
-        }
-    }
-    task = swinging_task(
-        tmp_path, **tables, cost={"control": 1e-4}, descent={"max_iterations": 6, "coarse": 1}
-    )
-    design = design_task(task)
-    assert design.status is not Status.INFEASIBLE
-    assert min(design.limits["end_position"], design.limits["end_velocity"]) >= 0.0
-    assert design.limits["control"] < 0.0
-    assert not design.success
-    said = [sentence for sentence in design.warnings if "control limits are exceeded" in sentence]
-    assert len(said) == 1 and "checked, not enforced" in said[0]
-
-
 # ---- more iterations
 
 
@@ -304,67 +247,6 @@ def test_more_iterations_never_give_less(tmp_path: Path) -> None:
 
 
 # ---- several starts
-
-
-def several(folder: Path, **tables: Any) -> DesignTask:
-    """Four starts on a short cart-pendulum."""
-    descent = {"max_iterations": 8, "starts": 4, "seed": 2}
-    return cart_inside(folder, **{"horizon": 0.6, "descent": descent, **tables})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("criterion", ["E", "D"])
-def test_starts_in_parallel_give_the_results_of_a_sequential_search(
-    criterion: str, tmp_path: Path
-) -> None:
-    task = several(tmp_path, horizon=0.4, cost={"control": 0.0, "criterion": criterion})
-    alone = design_task(task)
-    with ThreadPoolExecutor(2) as executor:
-        together = design_task(task, executor=executor)
-    assert together.found_by == alone.found_by
-    assert [(s.name, s.status, s.iterations) for s in together.starts] == [
-        (s.name, s.status, s.iterations) for s in alone.starts
-    ]
-    assert [s.cost for s in together.starts] == pytest.approx(
-        [s.cost for s in alone.starts], rel=1e-9
-    )
-    np.testing.assert_allclose(together.trajectory.ctrl, alone.trajectory.ctrl, rtol=0, atol=1e-9)
-    assert together.limits == pytest.approx(alone.limits, abs=1e-9)
-    # one of four starts survives, the others are discarded; the best one wins
-    names = {"initial control", *(f"multisine {i} of 3" for i in (1, 2, 3))}
-    assert {s.name for s in alone.starts} == names
-    assert sum(s.status is Status.LEFT for s in alone.starts) == 3
-    assert alone.final.cost == min(s.cost for s in alone.starts)
-    assert_inside(task, alone.trajectory.ctrl)
-
-
-@pytest.mark.slow
-def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None:
-    """It is no worse than any reported iterate, in both rounds."""
-    task = several(tmp_path, descent={"max_iterations": 16, "starts": 4, "seed": 2})
-    reported: list[HistoryRow] = []
-
-    def interrupted(mu: float | None = None) -> Design:
-        """Ask to stop at the first feasible iterate with a small mu, or with the given one."""
-        stop = StopToken()
-
-        def callback(event: DesignEvent) -> None:
-            row = event.row if mu is None else replace(event.row, mu=mu, margin=1.0)
-            reported.append(row)
-            if row.mu < 0.01 and row.margin > 0.0:
-                stop.request()
-
-        return design_task(task, callback=callback, budget=Budget(stop=stop))
-
-    design = interrupted()
-    assert design.status is Status.INTERRUPTED
-    feasible = [row.cost for row in reported if row.margin >= 0.0]
-    assert design.final.cost <= reported[-1].cost * (1 + 1e-6)
-    assert design.final.cost < 1.2 * min(feasible)
-    assert_inside(task, design.trajectory.ctrl)
-    early = interrupted(mu=0.0)
-    assert early.status is Status.INTERRUPTED
-    assert len(early.starts) == 1
 
 
 # ---- how a design begins, ends and moves

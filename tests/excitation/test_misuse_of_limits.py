@@ -308,16 +308,6 @@ def test_limits_that_no_control_can_keep_end_with_exit_code_one(
     assert "checked, not enforced" not in result.stderr
 
 
-def test_a_fourier_series_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
-    path = write_experiment(
-        tmp_path, max_iterations="3\nfourier = [7.0]\n[limits]\nbandwidth = 5.0"
-    )
-    misused(
-        run("design", path, "-o", tmp_path / "out"),
-        "study.toml: descent.fourier: 7 Hz is above the bandwidth of 5 Hz",
-    )
-
-
 def test_a_coarse_level_that_does_not_divide_the_samples_is_refused(tmp_path: Path) -> None:
     """A level may have a longer timestep or longer samples."""
     hard = "[limits]\ncontrol = { force = [-5.0, 5.0] }\ncontrol_rate = 100.0"
@@ -355,12 +345,6 @@ def test_ranges_of_the_mjcf_that_are_no_limits_are_named() -> None:
 # A ball on a free joint with a thruster.
 BALL = """<mujoco><worldbody><body><freejoint name="free"/><geom size="0.1"/></body></worldbody>
 <actuator><motor name="push" joint="free" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
-
-
-def test_a_speed_of_all_joints_holds_for_a_free_body() -> None:
-    model = mujoco.MjModel.from_xml_string(BALL)
-    (found,) = limits_of(model, control_names(model), Limits(velocity=1.0), 0.01)
-    assert (found.kind, found.name, found.lower, found.upper) == ("velocity", "free", 0.0, 1.0)
 
 
 @pytest.mark.parametrize(

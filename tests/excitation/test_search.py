@@ -177,16 +177,6 @@ def test_a_control_of_long_samples_has_no_steps_where_its_rate_is_limited(tmp_pa
 # ---- several starts, here and on workers
 
 
-@pytest.mark.slow
-def test_starts_on_workers_give_the_designs_of_one_process(tmp_path: Path) -> None:
-    task = cart_inside(tmp_path, descent={"max_iterations": 12, "starts": 3})
-    alone = design_task(task)
-    with ThreadPoolExecutor(2) as executor:
-        found = design_task(task, executor=executor)
-    assert found.final.cost == pytest.approx(alone.final.cost, rel=1e-6)
-    assert [s.name for s in found.starts] == [s.name for s in alone.starts]
-
-
 def test_a_start_whose_worker_is_lost_is_optimised_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

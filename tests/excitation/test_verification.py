@@ -9,11 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.arrays import Array
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, _clearance_usage, verify
 from mjfim.excitation.task import DesignTask
-from mjfim.model.clearance.geom_distance import GeomDistances, SignedDistances
 from mjfim.output.playback import reference_columns, simulate_playback
 from tests.support.numerics import CART_PENDULUM, make_task
 
@@ -99,14 +97,6 @@ def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
     assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.1, abs=1e-4)
     assert not found.is_feasible
     assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).is_feasible
-
-
-def test_a_limit_just_above_the_amplitude_holds_and_one_just_below_does_not(tmp_path: Path) -> None:
-    """The limit is just above the amplitude, or just below it."""
-    for edge, kept in ((1.001, True), (0.999, False)):
-        limits = {"position": {"slide": (-edge * SWING, 1.0)}}
-        task = spring_task(tmp_path, limits=limits)
-        assert verify(task, task.initial).is_feasible is kept
 
 
 @pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
@@ -394,26 +384,6 @@ def test_a_control_that_makes_the_model_diverge_violates_every_limit(tmp_path: P
     assert not found.is_feasible
     assert found.deviation == np.inf
     assert set(found.margins.values()) == {-np.inf}
-
-
-def test_distances_are_measured_once_where_both_solvers_give_the_same_motion(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The model has a stop, which the ball does not reach."""
-    measured: list[int] = []
-    measure = GeomDistances.__call__
-
-    def counted(self: GeomDistances, qpos: Array, slopes: bool) -> SignedDistances:
-        """Count the configurations."""
-        measured.append(len(qpos))
-        return measure(self, qpos, slopes)
-
-    monkeypatch.setattr(GeomDistances, "__call__", counted)
-    stop = f'limited="true" range="-1 {2.0 * SWING}"'
-    task = spring_task(tmp_path, joint=stop, limits={"clearance": 0.035})
-    found = verify(task, task.initial)
-    assert measured == [task.samples * task.system.grid.substeps]
-    assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.035, abs=1e-4)
 
 
 def test_a_clearance_beyond_the_reach_of_distances_is_measured_too(tmp_path: Path) -> None:

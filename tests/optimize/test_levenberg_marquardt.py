@@ -407,27 +407,6 @@ def test_a_requested_stop_returns_the_best_so_far(stop: int) -> None:
     assert p.cost(found.unknowns) == found.cost
 
 
-def test_a_stop_requested_by_the_callback_keeps_the_reported_iteration() -> None:
-    stop = StopToken()
-    costs: list[float] = []
-
-    def callback(report: IterationReport) -> None:
-        if report.iteration == 3:
-            costs.append(report.cost)
-            stop.request()
-
-    found = minimise(
-        problem(rosenbrock, lower=[-5.0, -5.0]),
-        alone(-1.2, 1.0),
-        SHARP,
-        Budget(stop=stop),
-        callback,
-    )
-    assert found is not None
-    assert found.interrupted
-    assert found.cost == costs[0]
-
-
 def test_an_exhausted_time_is_not_an_interruption() -> None:
     """The first point is returned with the reason, and nothing is raised."""
     found = minimise(

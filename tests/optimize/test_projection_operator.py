@@ -198,14 +198,6 @@ DIRECTIONS: dict[str, Callable[[], Direction]] = {
 }
 
 
-@pytest.mark.parametrize("method", [pytest.param("metric", marks=pytest.mark.slow), "lbfgs"])
-def test_the_optimum_agrees_with_scipy(method: str, optimum: float) -> None:
-    iterates = run(Pendulum(), DIRECTIONS[method]())
-    assert iterates[-1].status is Status.CONVERGED
-    assert iterates[-1].value == pytest.approx(optimum, rel=1e-7)
-    assert iterates[0].value > 2.0 * optimum
-
-
 @pytest.mark.parametrize("method", DIRECTIONS)
 @pytest.mark.parametrize("period", [1, 7, 1000])
 def test_the_optimum_does_not_depend_on_how_often_the_regulator_is_renewed(

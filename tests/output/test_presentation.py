@@ -173,15 +173,6 @@ def test_figures_have_the_names_of_the_files_that_verbs_write(
     assert drawn - pictures == {"limits.png", "horizons.png", "inverse_dynamics.png"}
 
 
-def test_labels_of_the_model_are_kept_in_the_file(design: Design, tmp_path: Path) -> None:
-    design.save(tmp_path)
-    loaded = mjfim.Design.load(tmp_path)
-    assert loaded.labels == design.labels
-    assert design.labels is not None
-    assert design.labels.qpos == ("slide [m]", "hinge [rad]")
-    assert loaded._repr_html_() == design._repr_html_()
-
-
 @pytest.mark.parametrize("name", ["design", "estimate", "study"])
 def test_records_of_earlier_versions_are_drawn_without_names(
     name: str, request: pytest.FixtureRequest

@@ -448,30 +448,6 @@ def test_headers_that_announce_too_much(tmp_path: Path) -> None:
         Design.load(tmp_path)
 
 
-def test_single_array_instead_of_an_archive(tmp_path: Path) -> None:
-    with (tmp_path / "design.npz").open("wb") as opened:
-        np.save(opened, np.arange(3.0))
-    with pytest.raises(
-        RecordingError, match=r"not a design archive \(npz of named arrays .*numpy\.savez"
-    ):
-        Design.load(tmp_path)
-
-
-def test_a_failing_disk_keeps_the_old_files(
-    design: Design, saved: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither file is half written."""
-    before = {path.name: path.read_bytes() for path in saved.iterdir()}
-
-    def fail(*args: Any, **kwargs: Any) -> None:
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", fail)
-    with pytest.raises(OSError, match="no space"):
-        dataclasses.replace(design, seconds=1.0).save(saved)
-    assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
-
-
 def test_records_may_be_moved(saved: Path, design: Design, tmp_path: Path) -> None:
     """The npz file alone is enough, under any name."""
     shutil.copy(saved / "design.npz", tmp_path / "best.npz")

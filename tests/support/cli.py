@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -18,7 +16,7 @@ from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from mjfim.cli import main as cli
-from tests.support.paths import MODELS, ROOT, SCRIPTS
+from tests.support.paths import MODELS
 
 # Files that `mjfim design` writes.
 DESIGN = {
@@ -69,15 +67,6 @@ def run(*words: object, answers: str | None = None) -> Result:
     """
     with patch.object(typer.testing, "_get_command", command_of):
         return CliRunner().invoke(cli.app, [str(word) for word in words], input=answers)
-
-
-def run_script(name: str, *words: object) -> subprocess.CompletedProcess[str]:
-    """Run a file of scripts/ in a new process that finds this package, installed or not."""
-    command = [sys.executable, str(SCRIPTS / name), *(str(word) for word in words)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        command, capture_output=True, text=True, env=environment, check=False, timeout=300
-    )
 
 
 def write_experiment(home: Path, **lines: str) -> Path:

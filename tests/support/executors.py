@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -33,30 +32,6 @@ class LosingThreads(ThreadPoolExecutor):
         lost: Future[Any] = Future()
         lost.set_exception(BrokenExecutor("killed"))
         return lost
-
-
-class LosingExecutor(Executor):
-    """Does each task at once, and loses some of them.
-
-    Args:
-        is_lost: Given the order and the number of tasks so far, whether it is lost.
-    """
-
-    _max_workers = 2
-
-    def __init__(self, is_lost: Callable[[Any, int], bool]) -> None:
-        self.is_lost = is_lost
-        self.count = 0
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        self.count += 1
-        (order,) = args
-        if self.is_lost(order, self.count):
-            future.set_exception(BrokenExecutor())
-        else:
-            future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
-        return future
 
 
 def processes(kind: str) -> AbstractContextManager[Any]:
