@@ -65,16 +65,6 @@ def test_combinations_of_parameters_are_named_and_the_exit_code_is_1(
     assert "M + a" in result.stdout
 
 
-@pytest.mark.slow
-def test_combinations_of_a_double_pendulum_are_named_and_the_exit_code_is_1() -> None:
-    result = run("check", MODELS / "double_pendulum.toml")
-    assert result.exit_code == 1
-    assert "m1r1 + 0.3 m2" in result.stdout
-    assert "I1 + 0.09 m2" in result.stdout
-    assert "Not smooth" in result.stdout
-    assert "dry friction of" in result.stdout
-
-
 def test_designs_and_recordings_are_checked(study: Path, archived: Path, recorded: Path) -> None:
     sigma = read(archived.parent / "design.json")["final"]["std"]
 
@@ -117,14 +107,3 @@ def test_a_wrong_horizon_is_refused_with_its_file(tmp_path: Path) -> None:
     """The initial control is made before the check, and its faults name the file as well."""
     wrong = write_experiment(tmp_path, horizon="1.005", start='{ kind = "sine" }')
     misused(run("check", wrong), f"{wrong}: horizon: 1.005 s is not a whole number")
-
-
-@pytest.mark.slow
-def test_the_format_of_the_picture_is_stated(study: Path, tmp_path: Path) -> None:
-    assert run("check", study, "-o", tmp_path, "--format", "svg").exit_code == 0
-    assert {n for n in names(tmp_path) if n.startswith("check.")} == {
-        "check.json",
-        "check.npz",
-        "check.svg",
-    }
-    assert run("check", study, "-o", tmp_path, "--format", "bmp").exit_code == 2

@@ -18,24 +18,6 @@ from tests.support.cli import (
 )
 
 
-@pytest.mark.usefixtures("no_files")
-@pytest.mark.slow
-def test_reports_name_the_parameters(
-    study: Path, recorded: Path, archived: Path, tmp_path: Path
-) -> None:
-    """Without --json, standard output is for people; no number is cut off."""
-    for words in (
-        ("design", study),
-        ("identify", study, recorded),
-        ("montecarlo", study, archived, "--trials", 4),
-    ):
-        result = run(*words, "-o", tmp_path / "nothing")
-        assert result.exit_code == 0
-        assert "N m s/rad" in result.stdout
-        assert "parameter" in result.stdout
-        assert not re.search(r"\d[.e-]*…", result.stdout), result.stdout  # a number cut off
-
-
 def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
     """Files that do not exist or are of another kind are named."""
     out = tmp_path / "out"

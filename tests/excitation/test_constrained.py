@@ -168,11 +168,6 @@ def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path
     assert Design.load(tmp_path).initial_violations == design.initial_violations
 
 
-SWINGING = CART_PENDULUM.format(integrator="RK4").replace(
-    "</mujoco>", '<keyframe><key name="rest" qpos="0.3 3.141592653589793"/></keyframe></mujoco>'
-)
-
-
 @pytest.mark.slow
 def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> None:
     """The design equals that without limits.

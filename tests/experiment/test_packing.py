@@ -20,7 +20,7 @@ from mjfim.experiment.system import System
 from mjfim.model import loading
 from mjfim.parallel.kept import Kept
 from tests.support.mesh_model import write_mesh_model
-from tests.support.paths import MODELS, SHARED_MODELS
+from tests.support.paths import SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
 
 # An experiment with a model of several files and with the table of a control.
@@ -36,9 +36,6 @@ STATED: dict[str, Any] = {
     "noise": {"angle": 0.01},
     "cost": {"control": 1e-3},
 }
-
-# Shipped experiments of designs, with models of different kinds.
-SHIPPED = ["double_pendulum", "filtered_drive", "four_bar", "muscle_arm", "quadrotor", "servo_arm"]
 
 
 def stated(folder: Path) -> Experiment:
@@ -155,14 +152,6 @@ def test_a_design_runs_in_a_process_without_any_file_of_the_caller(
 
     assert elsewhere.final.cost == alone.final.cost
     assert np.array_equal(elsewhere.trajectory.ctrl, alone.trajectory.ctrl)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_experiments_have_the_same_cost(name: str) -> None:
-    experiment = Experiment.from_file(MODELS / f"{name}.toml").replace(horizon=0.5)
-
-    assert cost_of(sent(experiment)) == cost_of(experiment)
 
 
 @pytest.mark.slow

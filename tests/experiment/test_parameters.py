@@ -353,21 +353,6 @@ def test_deviations_and_biases_by_name(tmp_path: Path) -> None:
     assert parameters["delay"].scale == 0.01
 
 
-def test_biases_of_all_outputs(tmp_path: Path) -> None:
-    task = cart_task(tmp_path, noise={"qpos:hinge": 0.1, "acc": 0.2}, nuisance={"bias": True})
-    assert task.parameters.names[3:] == (
-        "bias qpos:hinge",
-        "bias acc[0]",
-        "bias acc[1]",
-        "bias acc[2]",
-    )
-    np.testing.assert_array_equal(task.parameters.bias_derivative(4)[:, 3:], np.eye(4))
-    y, _ = task.plant.measure(np.array([task.theta, task.theta + np.eye(7)[4]]), task.control)
-    np.testing.assert_allclose(
-        y[1] - y[0], np.broadcast_to([0.0, 1.0, 0.0, 0.0], (51, 4)), rtol=0, atol=1e-12
-    )
-
-
 NUISANCE: dict[str, tuple[dict[str, Any], str]] = {
     "joint": (
         {"initial": {"qpos:hing": True}},

@@ -125,20 +125,6 @@ def test_a_complete_model_has_no_misfit(estimate: mjfim.Estimate) -> None:
     assert not estimate.misfit
 
 
-@pytest.mark.slow
-def test_an_error_that_no_parameter_explains_is_a_misfit(
-    task: DesignTask, recording: Recording
-) -> None:
-    drag = np.array(recording.y)
-    drag[:, 0] += 0.1 * np.sin(3 * recording.t)  # a structured error that no parameter explains
-    wrong = identify_system(
-        task.system,
-        [Recording(t=recording.t, ctrl=recording.ctrl, y=drag, outputs=recording.outputs)],
-    )
-    assert wrong.misfit
-    assert any("not the accuracy" in sentence for sentence in wrong.warnings)
-
-
 def test_overstated_noise_is_a_warning(task: DesignTask, recording: Recording) -> None:
     estimate = identify_system(task.system, [noiseless(task, recording)])
     assert any("stated σ is too large" in sentence for sentence in estimate.warnings)

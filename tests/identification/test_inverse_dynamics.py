@@ -216,21 +216,6 @@ def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_p
     assert not System.resolve(experiment).impossible(fit.theta)
 
 
-@pytest.mark.slow
-def test_seven_joints_with_friction(tmp_path: Path) -> None:
-    joints = 7
-    log, _ = arm_log(joints, 8.0, np.random.default_rng(2), friction=True, sigma=2e-5)
-    experiment = arm_experiment(tmp_path, joints, friction=True)
-    true = System.resolve(experiment).parameters.guess
-    fit = inverse_dynamics(experiment, [log])
-    expected = arm_forces(joints, true, experiment)
-    error = np.sqrt(np.mean((arm_forces(joints, fit.theta, experiment) - expected) ** 2, axis=0))
-    assert (error < 0.03 * np.abs(expected).max(axis=0)).all()
-    friction = [i for i, name in enumerate(fit.parameters) if name.startswith("friction")]
-    assert errors(fit, true)[friction].max() < 0.05
-    assert max(each.share for each in fit.equations) < 0.05
-
-
 def test_measured_torques_take_the_place_of_unknown_motors(tmp_path: Path) -> None:
     joints = 2
     log, _ = arm_log(joints, 15.0, np.random.default_rng(3), sigma=2e-5, torque_sigma=0.02)

@@ -22,8 +22,6 @@ from tests.identification.test_robust_covariance import FINE, Linear, noise, wav
 from tests.support.numerics import Array
 from tests.support.paths import MODELS
 
-NO_OWN = np.zeros(0, dtype=int)
-
 
 def compared(model: Linear, y: Array, length: float = 1.0) -> RecordingComparison:
     """Compare the recordings y: (K, N) of a linear model."""

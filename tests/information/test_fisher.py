@@ -11,8 +11,6 @@ import pytest
 
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.identify import identify_system
 from mjfim.information.criteria import CRITERIA
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.marginal import standard_deviations
@@ -226,27 +224,6 @@ def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_covarian
 def test_criterion_c_without_a_contrast_is_refused() -> None:
     with pytest.raises(ValueError, match="contrast"):
         information(criterion="c").evaluate(np.eye(4))
-
-
-EXACT = {"initial": 1e-9, "bias": 1e-9, "delay": 1e-9}
-VAGUE = {"initial": 0.1, "bias": 0.1, "delay": 0.01}
-
-
-@pytest.mark.slow
-def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tmp_path) -> None:
-    plain, exact, vague = (
-        cart_task(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE})
-    )
-    here = [evaluate_task(s, s.initial) for s in (plain, exact, vague)]
-    assert here[1].criterion == pytest.approx(here[0].criterion, rel=1e-6)
-    np.testing.assert_allclose(here[1].std[:3], here[0].std, rtol=1e-6)
-    np.testing.assert_allclose(here[1].std[3:], 1e-9, rtol=1e-6)
-    assert here[2].criterion > 1.1 * here[0].criterion
-    recording = simulate_system(plain.system, plain.initial, seed=4)
-    found = [identify_system(s.system, [recording]) for s in (plain, exact, vague)]
-    np.testing.assert_allclose(found[1].theta[:3], found[0].theta, atol=1e-4 * found[0].std.min())
-    np.testing.assert_allclose(found[1].std[:3], found[0].std, rtol=1e-5)
-    assert (found[2].std[:3] > 1.01 * found[0].std).all()
 
 
 @pytest.mark.parametrize(("criterion", "rank"), [("E", 1), ("A", 4), ("D", 4)])

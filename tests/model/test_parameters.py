@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.errors import ExperimentError, MjfimError
+from mjfim.errors import ExperimentError
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource, decoration
 from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
@@ -805,21 +805,6 @@ def test_mass_beside_first_moments_keeps_them() -> None:
     np.testing.assert_array_equal(alone.body("a").ipos, base.body("a").ipos)
 
 
-def test_a_change_of_the_layout_is_refused(tmp_path) -> None:
-    """Functions and parameters that change the layout are caught before MuJoCo writes past the end
-    of its data.
-    """
-
-    def add_geoms(spec: Any, value: float) -> None:
-        for _ in range(3):
-            geom = spec.body("b").add_geom()
-            geom.size, geom.mass = [value, 0.0, 0.0], 0.1
-
-    table = {"theta": {"function": add_geoms, "guess": 0.1}}
-    with pytest.raises(MjfimError, match=r"changes ngeom of the model.*numbers only"):
-        make_task(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
-
-
 def test_measurement_and_initial_state_are_outside_the_model() -> None:
     """Linear maps of theta outside the model, by the scale of their targets."""
     paths = ["initial/k:qvel", "initial/j:qpos", "output/b:bias", "output:delay", "body/a:mass"]
@@ -943,37 +928,6 @@ def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
         -np.inf,
         1.0,
     )
-
-
-HINGED = TENDON.replace('type="ball"', 'axis="0 1 0"').replace('springlength=".3"', "")
-FULL = '<inertial pos=".1 0 .2" mass="1" fullinertia=".1 .12 .11 .01 .02 .01"/><site name="s"/>'
-
-# Models whose compiler would resolve something anew, or undo the edit, when the identified values
-# are compiled again.
-AWKWARD = {
-    "nothing awkward": (ARM, "body/b:mass", 2.0),
-    "springref in degrees, which is the default of MJCF": (
-        ARM.replace('angle="radian"', 'angle="degree"').replace("<joint", '<joint springref="20"'),
-        "joint/j:springref",
-        0.7,
-    ),
-    "damping ratio of a servo": (ARM.replace('kv="0.5"', 'dampratio="1"'), "body/b:mass", 2.0),
-    "spring and damper by time constant": (
-        ARM.replace('stiffness="2"', 'springdamper=".3 1"'),
-        "body/a:mass",
-        2.0,
-    ),
-    "inertia always from geoms": (
-        ARM.replace("<compiler ", '<compiler inertiafromgeom="true" '),
-        "body/b:mass",
-        2.0,
-    ),
-    "size of a geom that also makes inertia": (ARM, "geom/h:size[1]", 0.25),
-    "place of a geom that also makes inertia": (ARM, "geom/h:pos[2]", 0.25),
-    "place of a geom given by its end points": (ARM, "geom/g:pos[2]", 0.3),
-    "full inertia matrix": (ARM.replace('<site name="s"/>', FULL), "body/a:inertia[0]", 0.13),
-    "rest length of a tendon left to the compiler": (HINGED, "site/hook:pos[2]", 0.3),
-}
 
 
 def in_arm(folder: Path, tables: dict) -> Any:

@@ -33,14 +33,6 @@ SHOWN = [
 ]
 
 
-def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
-    """(N, substeps, 9) values that SHOWN names at every engine step under ctrl: (N, nu), by a plain
-    loop around mj_step.
-    """
-    rows, _ = played_with_forces(model, state, ctrl, substeps)
-    return rows
-
-
 def played_with_forces(model: Any, state: Array, ctrl: Array, substeps: int) -> tuple[Array, Array]:
     """Values that SHOWN names at every engine step, and the forces about these steps.
 

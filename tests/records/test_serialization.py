@@ -417,17 +417,6 @@ def test_missing_files_are_named(saved: Path, tmp_path: Path) -> None:
         Design.load(tmp_path / "notes.txt")
 
 
-def test_files_of_others_are_refused(tmp_path: Path) -> None:
-    """A text, and an archive with pickles, which are not even looked at."""
-    path = tmp_path / "design.npz"
-    path.write_text("hello", encoding="utf-8")
-    with pytest.raises(RecordingError, match=r"design\.npz: not a design archive"):
-        Design.load(path)
-    np.savez(path, record=np.array([{}], dtype=object))
-    with pytest.raises(RecordingError, match=r"design\.npz: not a design archive .*pickles"):
-        Design.load(path)
-
-
 def test_archives_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are refused before memory is allocated, as logs are."""
     path = tmp_path / "design.npz"

@@ -4,26 +4,21 @@ self-test must catch.
 
 from __future__ import annotations
 
-import gzip
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.fisher import FisherInformation
 from mjfim.plant.derivatives import Derivatives
 from mjfim.records.trajectory import Recording
-from mjfim.studies.check import check, check_recordings, check_task
+from mjfim.studies.check import check_recordings, check_task
 from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task, relative_error
-from tests.support.paths import MODELS, SHARED_DATA
 
-RECORDED = SHARED_DATA / "dfki_double_pendulum"
 PRODUCT = {
     "gear": {"target": "actuator/force:gear[0]"},
     "gain": {"target": "actuator/force:gainprm[0]"},
@@ -198,50 +193,3 @@ def test_a_wrong_gradient_is_caught_by_the_slope(tmp_path, monkeypatch) -> None:
     tested = check_task(cart_task(tmp_path)).self_test
     assert 0.02 < tested.slope < 0.1
     assert not tested.passed
-
-
-def double_pendulum_groups(found: mjfim.Check) -> dict[str, dict[str, float]]:
-    """Combinations of the one group that is expected, by their first member."""
-    assert [set(group.members) for group in found.not_separable] == [{"m1r1", "I1", "m2"}]
-    return {
-        c.members[0]: dict(zip(c.members, c.coefficients, strict=True))
-        for c in found.not_separable[0].combinations
-    }
-
-
-@pytest.mark.slow
-def test_the_double_pendulum_names_its_base_parameters() -> None:
-    found = check(mjfim.Experiment.from_file(MODELS / "double_pendulum.toml"))
-    combinations = double_pendulum_groups(found)
-    assert combinations["m1r1"]["m2"] == pytest.approx(0.3, rel=1e-4)  # l1
-    assert combinations["I1"]["m2"] == pytest.approx(0.09, rel=1e-4)  # l1²
-    assert all(np.isfinite(row.std) for row in found.rows if row.name in ("m2r2", "I2", "d1", "d2"))
-
-
-@pytest.mark.slow
-def test_recordings_of_the_real_double_pendulum_give_the_same_combinations() -> None:
-    file = RECORDED / "A0_00.csv.gz"
-    if not file.is_file():
-        pytest.skip("the recordings of the double pendulum are not here")
-    with gzip.open(file, "rt", encoding="utf-8") as stream:
-        columns = dict(
-            zip(
-                stream.readline().strip().split(","),
-                np.loadtxt(stream, delimiter=",").T,
-                strict=True,
-            )
-        )
-    experiment = mjfim.Experiment.from_file(MODELS / "double_pendulum.toml")
-    task = DesignTask.resolve(experiment)
-    every = round(500 / experiment.rate)
-    count = 1 + round(2.0 * experiment.rate)  # two seconds; later the motion is chaotic
-    picked = {name: column[::every][:count] for name, column in columns.items()}
-    names = ("shoulder_angle", "elbow_angle", "shoulder_velocity", "elbow_velocity")
-    y = np.column_stack([picked[n] for n in ("pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2")])
-    ctrl = np.column_stack([picked["tau_meas1"], picked["tau_meas2"]])[:-1]
-    recording = Recording(
-        t=np.arange(count) / experiment.rate, ctrl=ctrl, y=y, outputs=names, name=file.name
-    )
-    combinations = double_pendulum_groups(check_recordings(task.system, [recording]))
-    assert combinations["m1r1"]["m2"] == pytest.approx(0.3, rel=1e-3)
-    assert combinations["I1"]["m2"] == pytest.approx(0.09, rel=1e-3)

@@ -67,17 +67,6 @@ def test_long_sums_are_not_divided_among_threads(tmp_path: Path) -> None:
     assert 2 in after
 
 
-@pytest.mark.slow
-def test_searches_in_workers_give_the_same_files(tmp_path: Path) -> None:
-    """Searches in two worker processes and in this process."""
-    descent = {"max_iterations": 6, "starts": 3, "seed": 2}
-    experiment = cart_inside(tmp_path, horizon=0.3, descent=descent).experiment
-    alone = study(experiment, tmp_path / "alone", threads=1)
-
-    with mjfim.Pool(2) as pool:
-        assert study(experiment, tmp_path / "workers", threads=2, executor=pool) == alone
-
-
 def clearance(folder: Path) -> Experiment:
     """An arm that keeps its distance from the floor and a post, within limits of its servos."""
     initial = {"qpos": (0.2, 0.3), "control": {"kind": "sine", "amplitude": 0.3, "frequency": 1.0}}

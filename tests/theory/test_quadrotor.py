@@ -93,13 +93,3 @@ def test_psi_of_a_tumbling_flight_agrees_with_re_simulation(name: str) -> None:
     assert (
         np.abs(1.00001 * found.psi[..., j] - reference) / size
     ).max() > 1e-6  # an error of 1e-5 would be seen
-
-
-@pytest.mark.slow
-def test_the_shipped_experiment_is_identifiable_and_can_be_designed() -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "quadrotor.toml")
-    looked = mjfim.check(experiment)
-    assert looked.self_test.passed
-    assert not looked.not_separable
-    design = mjfim.design(experiment.replace(descent={"max_iterations": 12}))
-    assert design.final.eigenvalues[0] > 2.0 * design.initial.eigenvalues[0]
