@@ -5,11 +5,8 @@ from __future__ import annotations
 import gc
 import os
 import signal
-from pathlib import Path
 
 import pytest
-
-from mjfim.files import replacing
 
 # The tests run side by side on all cores, so one thread of BLAS per process is enough.
 # BLAS reads the variable when NumPy is imported, which is later than this line.
@@ -50,16 +47,8 @@ def drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write empty files in place of figures, which take seconds to draw.
+    """Write empty files in place of figures, for tests that look at the names of the files."""
+    # Imported here, because most tests call no verb.
+    from tests.support.cli import write_empty_figures
 
-    For tests that look at the names of the files alone.
-    """
-
-    def touch(figure: object, path: Path, dpi: float = 0.0) -> Path:
-        with replacing(path):
-            return path
-
-    # Imported here, because most tests draw nothing and matplotlib takes a while to import.
-    from mjfim.output.plots import draw
-
-    monkeypatch.setattr(draw, "save", touch)
+    write_empty_figures(monkeypatch)

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import Result
 
 from mjfim.output import folders
-from tests.support.cli import run, write_experiment
+from tests.support.cli import run, write_empty_figures, write_experiment
 
 
 @pytest.fixture(scope="session")
@@ -50,8 +50,10 @@ def recorded(home: Path, study: Path, archived: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def identified(home: Path, study: Path, recorded: Path) -> Result:
-    """Result of `mjfim identify --json` into home/fit."""
-    return run("identify", study, recorded, "-o", home / "fit", "--json")
+    """Result of `mjfim identify --json` into home/fit, with empty figures."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        write_empty_figures(monkeypatch)
+        return run("identify", study, recorded, "-o", home / "fit", "--json")
 
 
 @pytest.fixture

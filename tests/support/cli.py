@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import pytest
 import typer.testing
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from mjfim.cli import main as cli
+from mjfim.files import replacing
 from tests.support.paths import MODELS
 
 # Files that `mjfim design` writes.
@@ -132,3 +134,16 @@ def misused(result: Result, *fragments: str) -> None:
     assert len(result.stderr.strip().splitlines()) == 1, result.stderr
     assert "Traceback" not in result.stderr
     assert [f for f in fragments if f not in result.stderr] == []
+
+
+def write_empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write empty files in place of figures, which take seconds to draw."""
+
+    def touch(figure: object, path: Path, dpi: float = 0.0) -> Path:
+        with replacing(path):
+            return path
+
+    # Imported here, because most tests draw nothing and matplotlib takes a while to import.
+    from mjfim.output.plots import draw
+
+    monkeypatch.setattr(draw, "save", touch)
