@@ -58,9 +58,10 @@ INITIAL_STATES = replace(SHORT_SEARCH, tolerance=0.1, rough_share=0.01)
 INITIAL_STATE_ITERATIONS = 2
 INITIAL_STATE_SHARE = 0.2
 
-# Largest number of times that the noise is estimated, and relative change of a standard deviation
-# below which it stays.
+# Largest number of times that the noise is estimated, and relative changes of a standard deviation
+# below which the search converges, and below which the noise stays.
 MAX_NOISE_ROUNDS = 10
+NEAR_NOISE = 0.02
 NOISE_TOLERANCE = 5e-4
 
 # Smallest estimated standard deviation, as a share of the stated one.
@@ -211,19 +212,25 @@ class FitSearch:
             return problem, self._found(problem, begin, settings, phase)
 
         # The stated noise is only the first guess: its minimum is left as soon as it is near. The
-        # noise of the residuals weights them in the next search, until it stays the same.
-        first = replace(settings, relinearise_at_end=False, rough_share=ROUGH_SHARE)
-        solution = self._found(problem, begin, first, phase)
-        settings = replace(settings, begins_near=True)
+        # noise of the residuals weights them in the next search, which ends likewise until the
+        # noise hardly changes.
+        rough = replace(settings, relinearise_at_end=False, rough_share=ROUGH_SHARE)
+        solution = self._found(problem, begin, rough, phase)
+        complete, rough = (replace(each, begins_near=True) for each in (settings, rough))
+        is_complete = False
         for number in range(MAX_NOISE_ROUNDS):
             sigma = self._residual_sigma(problem, solution.unknowns)
             change = np.abs(sigma / problem.noise.sigma - 1.0).max()
-            if solution.interrupted or (number and change < NOISE_TOLERANCE):
+            if solution.interrupted or (is_complete and change < NOISE_TOLERANCE):
                 break
+            is_complete = bool(change < NEAR_NOISE) or number == MAX_NOISE_ROUNDS - 1
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
             reweighted = problem.with_noise(noise)
             found = self.minimise(
-                reweighted, solution.unknowns, settings, f"{phase}, noise estimated"
+                reweighted,
+                solution.unknowns,
+                complete if is_complete else rough,
+                f"{phase}, noise estimated",
             )
             if found is None:
                 status = "stopped: the simulation diverges next to the estimate"

@@ -13,7 +13,6 @@ from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.files import read_json, remove_earlier_result, replacing, write_json
-from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.output import archive
 from mjfim.output import rerun as rerun_log
 from mjfim.output.drawing import PictureFormat, begin_pictures, write_optional
@@ -286,6 +285,8 @@ def _write_log(file: Path, record: Design | Estimate, system: System) -> None:
     if isinstance(record, Design):
         rerun_log.log_design(file, system.model_at(system.theta), record, labels)
     elif record.motion is not None:
+        from mjfim.identification.aligned_recording import measured_trajectory
+
         end = float(record.motion.t[-1])
         measured = measured_trajectory(system, record.recordings[0], end)
         model = system.model_at(record.theta)

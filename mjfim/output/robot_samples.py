@@ -11,7 +11,6 @@ import numpy as np
 from mjfim.errors import ModelError
 from mjfim.experiment.system import System
 from mjfim.files import remove_earlier_result
-from mjfim.identification.parameter_draws import complete_theta
 from mjfim.output.archive import write_table
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.models.mjcf import identified_files, write_identified
@@ -68,10 +67,12 @@ def write_samples(folder: Path, estimate: Estimate, system: System) -> list[str]
 
     # Robots differ in their numbers alone, so that a remark stands for all of them.
     remarks: Counter[str] = Counter()
+    theta = np.array(estimate.theta)
     for i in range(len(draws)):
         path = folder / SAMPLES_FOLDER / f"{ROBOT.format(i + 1)}.xml"
+        theta[~system.parameters.initial_deviations] = draws.values[i]
         try:
-            found = write_identified(path, system, complete_theta(system, estimate, draws, i))
+            found = write_identified(path, system, theta)
         except ModelError as error:
             _clear_models(folder / SAMPLES_FOLDER)
             return [f"no models of drawn robots were written: {error}"]

@@ -121,11 +121,23 @@ def test_a_wrong_key_is_said_before_the_engine_is_imported(tmp_path: Path) -> No
 def test_a_design_imports_only_the_parts_of_scipy_that_it_needs(tmp_path: Path) -> None:
     words = ["design", str(MODELS / "cart_pendulum.toml"), "-o", str(tmp_path / "out")]
     unused = ("scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.stats", "pandas")
+    unused = (*unused, "mjfim.identification")
 
     # On several processors, another process draws the pictures.
     if cores() > 1:
         unused = (*unused, "matplotlib")
     assert [found for _, _, found in imported([words], unused)] == [[], []]
+
+
+@pytest.mark.slow
+def test_a_fit_imports_nothing_of_a_design(tmp_path: Path) -> None:
+    experiment, log = str(MODELS / "cart_pendulum.toml"), str(tmp_path / "log.csv")
+    assert run("simulate", experiment, "-o", log).exit_code == 0
+    lines = Path(log).read_text().splitlines(keepends=True)
+    Path(log).write_text("".join(lines[:80]))
+    words = ["identify", experiment, log, "-o", str(tmp_path / "out")]
+    report = imported([words], ("mjfim.excitation", "mjfim.identification"))
+    assert report[1][1:] == (0, ["mjfim.identification"])
 
 
 @pytest.mark.slow

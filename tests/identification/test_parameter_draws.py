@@ -19,7 +19,6 @@ from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.honest_covariance import honest_covariance
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.identification.parameter_draws import (
-    complete_theta,
     draw_parameters,
     draw_parameters_system,
 )
@@ -171,9 +170,7 @@ def test_initial_states_are_no_properties_of_a_robot() -> None:
     estimate = estimated(system, covariance)
     draws = draw_parameters_system(system, estimate, 4, np.random.default_rng(0))
     assert draws.parameters == ("m", "l", "c", "delay")
-    theta = complete_theta(system, estimate, draws, 2)
-    np.testing.assert_array_equal(theta[3:-1], estimate.theta[3:-1])
-    np.testing.assert_array_equal(theta[[0, 1, 2, -1]], draws.values[2])
+    assert draws.values.shape == (4, 4)
 
 
 def test_unphysical_inertias_are_replaced() -> None:

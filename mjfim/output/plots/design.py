@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.limits.constraints import SUBSTEP_KINDS
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
 from mjfim.output.pages.accuracy import BEST_CASE, improvement, relative, size_sentence
@@ -115,9 +114,6 @@ NEAR_LIMIT = 0.5
 
 # Largest number of rows of bars that have numbers.
 MAX_HIGH_ROWS = 12
-
-# Kinds of limits in the order of their panels.
-LIMIT_KINDS = (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
 
 # Unit of the force of an actuator or joint, by the unit of its control or of its position.
 FORCE_OF_CONTROL = {
@@ -489,9 +485,12 @@ def limit_panels(design: Design, labels: Labels, *, rows: bool = True) -> list[P
         labels: Labels with the units.
         rows: Whether many curves that change fast have a row each.
     """
+    # A fit draws pictures as well, and needs nothing of the excitation.
+    from mjfim.excitation.limits.constraints import SUBSTEP_KINDS
+
     by_kind = {
         kind: curves
-        for kind in LIMIT_KINDS
+        for kind in (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
         if (curves := [usage for usage in design.usage if usage.kind == kind])
     }
     closest = closest_to_bounds(design.usage)[: len(SERIES)]

@@ -11,7 +11,6 @@ import scipy.ndimage
 
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.output import vocabulary
 from mjfim.output.rerun.camera import (
     EDGE_ON,
@@ -181,6 +180,8 @@ def film_of(system: System, result: Filmed) -> Film:
 
     if result.motion is None:
         raise NoVideoError("the estimate holds no motion of a recording")
+    from mjfim.identification.aligned_recording import measured_trajectory
+
     recording = result.recordings[0]
     measured = measured_trajectory(system, recording, float(result.motion.t[-1]))
     view = [(vocabulary.IDENTIFIED, result.motion)]
