@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
     from mjfim.experiment.schema import Experiment
     from mjfim.experiment.simulate import simulate
+    from mjfim.identification.assessment.parameter_draws import draw_parameters
+    from mjfim.identification.assessment.predictions import predict
     from mjfim.identification.identify import identify
     from mjfim.identification.inverse_dynamics import inverse_dynamics
-    from mjfim.identification.parameter_draws import draw_parameters
-    from mjfim.identification.predictions import predict
     from mjfim.output.live import live
     from mjfim.output.models.sysid import export_sysid
     from mjfim.output.robots.export import export_design
@@ -105,10 +105,10 @@ MODULES = {
     "shortest_experiment": "mjfim.excitation.shortest_horizon",
     "Experiment": "mjfim.experiment.schema",
     "simulate": "mjfim.experiment.simulate",
-    "predict": "mjfim.identification.predictions",
+    "predict": "mjfim.identification.assessment.predictions",
     "identify": "mjfim.identification.identify",
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",
-    "draw_parameters": "mjfim.identification.parameter_draws",
+    "draw_parameters": "mjfim.identification.assessment.parameter_draws",
     "export_design": "mjfim.output.robots.export",
     "export_sysid": "mjfim.output.models.sysid",
     "live": "mjfim.output.live",

@@ -16,7 +16,7 @@ from mjfim.excitation.evaluation import require_designable
 from mjfim.excitation.shortest_horizon import require_reachable
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.identification.report import _warnings_of_bounds, _warnings_of_search
+from mjfim.identification.assessment.report import _warnings_of_bounds, _warnings_of_search
 from mjfim.identification.starts import divergence_at_start
 from mjfim.identification.task import _start
 from mjfim.output.campaign_folder import accuracy_sentence

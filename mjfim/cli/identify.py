@@ -142,7 +142,7 @@ def _with_draws(result: Estimate, system: System, count: int, seed: int) -> tupl
     """
     import numpy as np
 
-    from mjfim.identification.parameter_draws import draw_parameters_system
+    from mjfim.identification.assessment.parameter_draws import draw_parameters_system
     from mjfim.parallel.budget import run_optional
 
     # Many bodies and robots take long, and Ctrl-C must not lose the fit.

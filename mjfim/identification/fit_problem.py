@@ -18,13 +18,12 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
-from mjfim.identification.pins import Pins
-from mjfim.identification.prior_rows import PriorRows
-from mjfim.identification.residual_blocks import BlockDivision
 from mjfim.identification.segment_simulation import (
+    BlockDivision,
     SegmentBatch,
     SegmentRows,
     SegmentSimulation,
+    WhitenedRows,
 )
 from mjfim.identification.segments import (
     free_segments,
@@ -32,8 +31,7 @@ from mjfim.identification.segments import (
     recorded_release,
     stated_segments,
 )
-from mjfim.identification.unknowns import UnknownLayout
-from mjfim.identification.whitened_rows import WhitenedRows
+from mjfim.identification.unknowns import Pins, PriorRows, UnknownLayout
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues

@@ -15,8 +15,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
+from mjfim.identification.assessment.honest_covariance import jackknife_std, student_quantile
+from mjfim.identification.assessment.report import FitResult
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.jackknife import jackknife_std, student_quantile
 from mjfim.identification.left_out import (
     BLOCKS,
     MAX_FOLDS,
@@ -27,7 +28,6 @@ from mjfim.identification.left_out import (
     losses_by_block,
     with_initial_states,
 )
-from mjfim.identification.report import FitResult
 from mjfim.identification.search import FitSearch
 from mjfim.identification.segments import spread_over_data
 from mjfim.identification.starts import segment_lengths

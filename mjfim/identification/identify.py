@@ -17,13 +17,13 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.cad_prior import CadPrior
+from mjfim.identification.assessment.fit_quality import fit_quality
+from mjfim.identification.assessment.report import FitResult, estimate_from
+from mjfim.identification.assessment.residual_tests import misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states
-from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.horizons import choose_length
-from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.residual_tests import misfit_reasons
+from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import NEWTON, FitSearch, first_subset, of_subset, quick_subset
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.starts import SPREAD_STARTS, begin_fit, start_from_segments

@@ -16,8 +16,8 @@ from typing import TypeVar
 import numpy as np
 
 from mjfim.arrays import Array, evenly_spread_indices, freeze
+from mjfim.identification.assessment.honest_covariance import jackknife_std
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
-from mjfim.identification.jackknife import jackknife_std
 from mjfim.optimize.levenberg_marquardt import (
     WEAK_DAMPING,
     SearchSettings,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,10 +15,12 @@ from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.segments import Segment, batches
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.plant.laws.running_law import InputContext
+from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of engine steps of a batch. On small models it takes about 0.2 s on two threads. At
@@ -442,3 +445,183 @@ class SegmentSimulation:
             if is_delayed:
                 common = common + interpolation.derivative(y)[..., None] * delay_derivative
         return interpolation.apply(y), common, private
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinearisedRows:
+    """The values of some rows that count, row by row.
+
+    Attributes:
+        row: (n,) place of the row of every value among the simulated rows.
+        r: (n,) whitened residuals [standard deviations].
+        J: (n, n_private + c) derivatives by the private, then by the common unknowns.
+    """
+
+    row: np.ndarray
+    r: Array
+    J: Array
+
+    def weighted(self, loss: RobustLoss) -> Array:
+        """(n, m) rows `[J_private, J_common, r]`, each with the weight that linearises a loss.
+
+        Their squares are those of iteratively reweighted least squares.
+
+        Args:
+            loss: The loss of a whitened residual.
+        """
+        return np.column_stack([self.J, self.r]) * loss.weight(self.r)[:, None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WhitenedRows:
+    """Comparison of simulated rows with the measured values that count.
+
+    Attributes:
+        problem: Simulation of the segments.
+        masks: (M, ny) for every recording, True for the measured values that count.
+        noise: Noise of the outputs.
+    """
+
+    problem: SegmentSimulation
+    masks: tuple[np.ndarray, ...]
+    noise: Noise
+
+    def residual(self, rows: SegmentRows) -> Array:
+        """Whitened residuals of some rows.
+
+        Args:
+            rows: Predictions.
+
+        Returns:
+            (n,) residuals of the values that count, row by row [standard deviations].
+        """
+        mask = self._mask_of(rows)
+        segment = self.problem.segments[rows.segment]
+        measured = self.problem.recordings[segment.recording].y[rows.rows]
+
+        # Values that do not count may be NaN.
+        residual = np.where(mask, rows.y - measured, 0.0)
+        return self.noise.whiten_present(residual, mask)
+
+    def linearised(self, rows: SegmentRows) -> LinearisedRows:
+        """Whitened residuals of some rows and their derivatives by the unknowns.
+
+        Args:
+            rows: Predictions with derivatives.
+        """
+        mask = self._mask_of(rows)
+        segment = self.problem.segments[rows.segment]
+        common, private = rows.jacobians
+        columns = self.problem.layout.to_columns(common, segment.recording)
+        G = np.concatenate([private, columns], axis=2)
+
+        return LinearisedRows(
+            row=np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)[mask],
+            r=self.residual(rows),
+            J=self.noise.whiten_present(G, mask),
+        )
+
+    def sensitivity(self, rows: SegmentRows) -> Array:
+        """Whitened derivatives, by the initial state where that is free, then by theta.
+
+        Args:
+            rows: Predictions with derivatives.
+
+        Returns:
+            (k, n+p) derivatives of the values that count.
+        """
+        common, private = rows.jacobians
+        G = common
+        if self.problem.layout.free_starts:
+            G = np.concatenate([private, common], axis=2)
+        return self.noise.whiten_present(G, self._mask_of(rows))
+
+    def _mask_of(self, rows: SegmentRows) -> np.ndarray:
+        """(k, ny) True for the values of k rows that count."""
+        recording = self.problem.segments[rows.segment].recording
+        return np.asarray(self.masks[recording][rows.rows])
+
+
+# Smallest number of rows of a block.
+MIN_BLOCK_ROWS = 8
+
+# Approximate largest number of blocks into which all rows are divided.
+MAX_BLOCKS = 1024
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockDivision:
+    """Blocks of rows; every segment is divided evenly into its blocks.
+
+    Attributes:
+        segments: The P segments.
+        row_count: Number of rows of all recordings, on which the length of a block depends.
+    """
+
+    segments: Sequence[Segment]
+    row_count: int
+
+    @property
+    def count(self) -> int:
+        """Number of blocks B."""
+        return int(self._offsets[-1])
+
+    @property
+    def segment_of_block(self) -> np.ndarray:
+        """(B,) index of the segment of every block."""
+        return np.repeat(np.arange(len(self.segments)), np.diff(self._offsets))
+
+    @property
+    def recording_of_block(self) -> np.ndarray:
+        """(B,) index of the recording of every block."""
+        recordings = [segment.recording for segment in self.segments]
+        return np.repeat(recordings, np.diff(self._offsets))
+
+    @property
+    def mean_rows(self) -> np.ndarray:
+        """(B,) mean number of rows of every block."""
+        counts = np.diff(self._offsets)
+        return np.repeat(self._rows_per_segment / counts, counts)
+
+    def of_rows(self, rows: SegmentRows) -> np.ndarray:
+        """Blocks of some rows of a segment.
+
+        Args:
+            rows: The k rows.
+
+        Returns:
+            (k,) index of the block of every row.
+        """
+        begin = self.segments[rows.segment].rows.start
+        return self._block_of_row(rows.segment, rows.rows - begin)
+
+    def containing(self, masks: Sequence[np.ndarray]) -> np.ndarray:
+        """(B,) True for the blocks that contain a marked value.
+
+        Args:
+            masks: (M, ny) for every recording, True for the marked values.
+        """
+        found = np.zeros(self.count, dtype=bool)
+        for index, segment in enumerate(self.segments):
+            rows = np.flatnonzero(masks[segment.recording][segment.rows].any(axis=1))
+            found[self._block_of_row(index, rows)] = True
+        return found
+
+    def _block_of_row(self, segment: int, rows: np.ndarray) -> np.ndarray:
+        """(k,) index of the block of some rows, which are counted from the begin of a segment."""
+        first = self._offsets[segment]
+        count = self._offsets[segment + 1] - first
+        return np.asarray(first + rows * count // self._rows_per_segment[segment])
+
+    @cached_property
+    def _rows_per_segment(self) -> np.ndarray:
+        """(P,) number of rows of every segment."""
+        return np.array([segment.rows.stop - segment.rows.start for segment in self.segments])
+
+    @cached_property
+    def _offsets(self) -> np.ndarray:
+        """(P+1,) first block of every segment, and the number of all blocks."""
+        block_rows = max(MIN_BLOCK_ROWS, math.ceil(self.row_count / MAX_BLOCKS))
+        counts = np.rint(self._rows_per_segment / block_rows).astype(int)
+        counts = np.maximum(counts, 1)
+        return np.concatenate([[0], np.cumsum(counts)])

@@ -19,9 +19,9 @@ from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import ExperimentError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.honest_covariance import honest_covariance
+from mjfim.identification.assessment.honest_covariance import honest_covariance
+from mjfim.identification.assessment.report import FitResult, estimate_from
 from mjfim.identification.identify import Callback, fit_task, identify_system
-from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask, with_length
 from mjfim.model.terms.base import AXES

@@ -15,11 +15,11 @@ import scipy
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import ExperimentError, first_ones
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
-from mjfim.identification.honest_covariance import (
+from mjfim.identification.assessment.honest_covariance import (
     agreeing_covariance,
     stretched_formal_covariance,
 )
-from mjfim.identification.random_effects import between_variance, f_tail, satterthwaite
+from mjfim.identification.assessment.random_effects import between_variance, f_tail, satterthwaite
 from mjfim.records.check import join_names
 from mjfim.records.estimate import Estimate
 from mjfim.records.robots import RobotComparison

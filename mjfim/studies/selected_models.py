@@ -12,10 +12,12 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.honest_covariance import with_honest_covariance
-from mjfim.identification.jackknife import student_quantile
+from mjfim.identification.assessment.honest_covariance import (
+    student_quantile,
+    with_honest_covariance,
+)
+from mjfim.identification.assessment.report import FitResult
 from mjfim.identification.left_out import HeldOutLosses
-from mjfim.identification.report import FitResult
 from mjfim.identification.terms import TermTests
 from mjfim.model.parameters import Parameter, ParameterSet
 from mjfim.model.paths import ParameterPath

@@ -53,10 +53,10 @@ import mjfim
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.experiment.system import System
 from mjfim.files import replacing
+from mjfim.identification.assessment.residual_tests import misfit_reasons
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import fit_task, identify_system
 from mjfim.identification.linear_coordinates import LinearCoordinates
-from mjfim.identification.residual_tests import misfit_reasons
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, barycentric_of, logcholesky_factor

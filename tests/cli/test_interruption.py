@@ -17,7 +17,7 @@ from mjfim.cli.progress import ProgressDisplay
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
-from mjfim.identification import parameter_draws
+from mjfim.identification.assessment import parameter_draws
 from mjfim.output import archive
 from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.manifest import MANIFEST

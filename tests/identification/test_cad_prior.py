@@ -12,13 +12,13 @@ import scipy
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.identification.cad_prior import CadPrior
+from mjfim.identification.assessment.accuracy import prior_directions
+from mjfim.identification.assessment.honest_covariance import interval_std
+from mjfim.identification.assessment.parameter_draws import draw_parameters_system
+from mjfim.identification.assessment.report import _implausible_estimates
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.honest_covariance import interval_std
 from mjfim.identification.identify import _unseen_directions
-from mjfim.identification.parameter_draws import draw_parameters_system
-from mjfim.identification.prior_share import prior_directions
-from mjfim.identification.report import _implausible_estimates
+from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.task import FitTask
 from mjfim.model.inertia import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step

@@ -8,7 +8,8 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import left_out, predictions
+from mjfim.identification import left_out
+from mjfim.identification.assessment import predictions
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
 from mjfim.parallel.budget import Budget

@@ -18,10 +18,10 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import (
     fit_workers,
     left_out,
-    predictions,
     search,
     segment_simulation,
 )
+from mjfim.identification.assessment import predictions
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import least_squares

@@ -12,7 +12,7 @@ import mjfim
 from mjfim.arrays import NORMAL_95
 from mjfim.excitation import DesignTask
 from mjfim.experiment.system import System
-from mjfim.identification.honest_covariance import (
+from mjfim.identification.assessment.honest_covariance import (
     AGREEMENT,
     agreeing_covariance,
     between_covariance,

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.identification.jackknife import jackknife_deviations, jackknife_std, student_quantile
+from mjfim.identification.assessment.honest_covariance import (
+    jackknife_deviations,
+    jackknife_std,
+    student_quantile,
+)
 
 
 def test_the_deviations_and_the_standard_error_of_means() -> None:

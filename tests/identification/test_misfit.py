@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mjfim.identification.residual_tests import (
+from mjfim.identification.assessment.residual_tests import (
     LargestResidual,
     autocorrelated,
     is_larger_than_noise,

@@ -15,13 +15,12 @@ import mjfim
 from mjfim.arrays import scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
-from mjfim.identification.cad_prior import CadPrior
-from mjfim.identification.honest_covariance import honest_covariance
-from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
-from mjfim.identification.parameter_draws import (
+from mjfim.identification.assessment.honest_covariance import honest_covariance
+from mjfim.identification.assessment.parameter_draws import (
     draw_parameters,
     draw_parameters_system,
 )
+from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unknown_bodies
 from mjfim.model.inertia import barycentric_of, logcholesky_derivatives
 from mjfim.records.events import stages_observed_by
 from tests.support.hinged_arm import arm_experiment

@@ -10,12 +10,12 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.independent_blocks import (
+from mjfim.identification.assessment.recording_comparison import compare_evidence
+from mjfim.identification.assessment.robust_covariance import (
     block_length,
     independent_blocks,
     recording_evidence,
 )
-from mjfim.identification.recording_comparison import compare_evidence
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves

@@ -12,8 +12,8 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
+from mjfim.identification.assessment.report import FitResult, estimate_from
 from mjfim.identification.identify import fit_task, refit_task
-from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.identification.terms import TermTests
@@ -98,7 +98,7 @@ def test_known_tests_of_terms_are_not_repeated(
         """Fail where terms are tested."""
         raise AssertionError("terms were tested again")
 
-    monkeypatch.setattr("mjfim.identification.report.find_missing_terms", fail)
+    monkeypatch.setattr("mjfim.identification.assessment.report.find_missing_terms", fail)
     assert estimate_from(fitted, Budget(), tests=TermTests()).missing_terms == ()
     with pytest.raises(AssertionError, match="again"):
         estimate_from(fitted, Budget())

@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, chi2
 
-from mjfim.identification import lagged_products, residual_tests
-from mjfim.identification.residual_tests import LAGS, whiteness_of
+from mjfim.identification.assessment import residual_tests
+from mjfim.identification.assessment.residual_tests import LAGS, whiteness_of
 from mjfim.records.estimate import Whiteness
 from tests.support.numerics import Array
 
@@ -184,7 +184,7 @@ def test_lagged_products_do_not_depend_on_the_parts(monkeypatch: pytest.MonkeyPa
     whole = [whiteness_of("y", [series]) for series in (slow, quick)]
 
     monkeypatch.setattr(residual_tests, "FIRST_LAGS", 5)
-    monkeypatch.setattr(lagged_products, "VALUES_AT_ONCE", 100)
+    monkeypatch.setattr(residual_tests, "VALUES_AT_ONCE", 100)
     for expected, series in zip(whole, (slow, quick), strict=True):
         found = whiteness_of("y", [series])
         assert found.time == pytest.approx(expected.time, rel=1e-9)

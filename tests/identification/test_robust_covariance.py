@@ -14,8 +14,12 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from mjfim.identification.independent_blocks import block_length, merge_blocks
-from mjfim.identification.robust_covariance import covering_covariance, robust_uncertainty
+from mjfim.identification.assessment.robust_covariance import (
+    block_length,
+    covering_covariance,
+    merge_blocks,
+    robust_uncertainty,
+)
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 from tests.support.numerics import Array

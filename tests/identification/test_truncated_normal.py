@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import ks_2samp, kstest, norm, truncnorm
 
-from mjfim.identification import truncated_normal
-from mjfim.identification.truncated_normal import (
+from mjfim.identification.assessment import truncated_normal
+from mjfim.identification.assessment.truncated_normal import (
     MIN_SWEEPS,
     SWEEPS,
     MatrixBound,

@@ -13,7 +13,7 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.identification.parameter_draws import draw_parameters_system
+from mjfim.identification.assessment.parameter_draws import draw_parameters_system
 from mjfim.output import robot_samples
 from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
 from mjfim.output.models.mjcf import same_dynamics, write_identified

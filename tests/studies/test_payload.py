@@ -12,8 +12,8 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
-from mjfim.identification.cad_prior import CadPrior
-from mjfim.identification.honest_covariance import honest_covariance
+from mjfim.identification.assessment.honest_covariance import honest_covariance
+from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.studies.payload import PayloadTask
 from mjfim.studies.payload_experiment import RobotExperiment
 from tests.identification.test_parameter_draws import estimated

@@ -12,13 +12,13 @@ from scipy.stats import t as student
 import mjfim
 from mjfim.arrays import NORMAL_95
 from mjfim.errors import ExperimentError
-from mjfim.identification.independent_blocks import (
+from mjfim.identification.assessment.recording_comparison import compare_evidence
+from mjfim.identification.assessment.robust_covariance import (
     block_length,
     independent_blocks,
     recording_evidence,
+    robust_uncertainty,
 )
-from mjfim.identification.recording_comparison import compare_evidence
-from mjfim.identification.robust_covariance import robust_uncertainty
 from mjfim.output.page import Level
 from mjfim.output.pages import page_of
 from mjfim.records.estimate import PriorDirections

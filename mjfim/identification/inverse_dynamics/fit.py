@@ -21,10 +21,10 @@ from mjfim.errors import ExperimentError, MjfimError, RecordingError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
+from mjfim.identification.assessment.residual_tests import whiteness_of
 from mjfim.identification.inverse_dynamics.equations import MotionEquations
 from mjfim.identification.inverse_dynamics.forces import measured_forces
 from mjfim.identification.inverse_dynamics.search import EquationSearch, FoundEquations
-from mjfim.identification.residual_tests import whiteness_of
 from mjfim.parallel import one_blas_thread
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
 from mjfim.records.trajectory import Recording

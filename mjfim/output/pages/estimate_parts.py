@@ -10,7 +10,7 @@ import tomlkit
 
 from mjfim.arrays import NORMAL_95
 from mjfim.errors import first_ones, listed
-from mjfim.identification.accuracy import POORLY_KNOWN_SHARE
+from mjfim.identification.assessment.accuracy import POORLY_KNOWN_SHARE
 from mjfim.output.page import (
     Emphasis,
     Listing,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,33 +15,36 @@ from mjfim.arrays import Array
 from mjfim.errors import first_ones, listed
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.identification.accuracy import Accuracy, accuracy_of
+from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import changes_within_samples
-from mjfim.identification.cad_prior import CadPrior
-from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.fit_quality import FitQuality
-from mjfim.identification.flipped_signs import (
+from mjfim.identification.assessment.accuracy import Accuracy, accuracy_of
+from mjfim.identification.assessment.fit_quality import FitQuality
+from mjfim.identification.assessment.flipped_signs import (
     POOR_FIT,
     flipped_signs,
     sentence_about_signs,
     sufficient_squares,
 )
-from mjfim.identification.honest_covariance import with_honest_covariance
-from mjfim.identification.laws_in_loop import laws_in_loop
-from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
-from mjfim.identification.predictions import predict_unfitted
-from mjfim.identification.recording_comparison import compare_recordings
-from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
+from mjfim.identification.assessment.honest_covariance import with_honest_covariance
+from mjfim.identification.assessment.predictability import UnpredictableMotion, unpredictable_motion
+from mjfim.identification.assessment.predictions import predict_unfitted
+from mjfim.identification.assessment.recording_comparison import compare_recordings
+from mjfim.identification.assessment.residual_tests import is_smaller_than_noise, misfit_reasons
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.starts import values_of_start
 from mjfim.identification.task import FitTask
 from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.information.null_space import NullSpace
+from mjfim.model.control_laws import FIELDS, ControlLaw, law_unit
 from mjfim.model.parameters import ParameterSet
+from mjfim.model.units import FORCE_UNITS, control_unit
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.parallel.budget import Budget
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
+    ControlLawInLoop,
     Estimate,
     HorizonStudy,
     Prediction,
@@ -51,6 +54,69 @@ from mjfim.records.events import begin_stage
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
+
+# Numbers with which a law is more than a position servo, unless they have no effect.
+BEYOND_SERVOS = (
+    "ki",
+    "slew",
+    "latency",
+    "time_constant",
+    "feedback_latency",
+    "velocity_time_constant",
+)
+
+
+def laws_in_loop(
+    system: System, theta: Array, clipped: Mapping[str, float]
+) -> tuple[ControlLawInLoop, ...]:
+    """Describe the laws at some parameters.
+
+    Args:
+        system: The system.
+        theta: (p,) parameters [theta-unit].
+        clipped: Share of the samples at which the limits of a law clip its control, by actuator.
+
+    Returns:
+        The laws; none where logs hold the controls themselves.
+    """
+    if system.laws is None:
+        return ()
+    return tuple(
+        _law_in_loop(system, law, theta, clipped.get(law.actuator, 0.0)) for law in system.laws.laws
+    )
+
+
+def _law_in_loop(system: System, law: ControlLaw, theta: Array, clipped: float) -> ControlLawInLoop:
+    """Describe one law."""
+    assert system.laws is not None
+    model = system.plant.model(theta)
+    values = law.numbers(model)
+
+    numbers: dict[str, float] = {}
+    units: dict[str, str] = {}
+    for field, names in FIELDS.items():
+        for i, name in enumerate(names):
+            key = field if len(names) == 1 else f"{field}[{i}]"
+            is_end = len(names) > 1
+            if np.isfinite(values[name]) and (is_end or values[name] != 0.0):
+                numbers[key] = values[name]
+                units[key] = law_unit(model, law.actuator, field)
+
+    paths = {target.path for p in system.parameters.parameters for target in p.targets}
+    plain = not any(name in numbers for name in BEYOND_SERVOS) and not law.differences
+    is_force = control_unit(model, int(model.actuator(law.actuator).id)) in FORCE_UNITS.values()
+    return ControlLawInLoop(
+        actuator=law.actuator,
+        joint=law.joint,
+        rate=1.0 / (law.tick * float(model.opt.timestep)),
+        columns=tuple(system.laws.columns[i] for i in law.columns.values()),
+        numbers=numbers,
+        units=units,
+        estimated=tuple(key for key in numbers if f"controller/{law.actuator}:{key}" in paths),
+        clipped=clipped,
+        is_servo=plain and is_force and set(law.columns) == {"reference"},
+    )
+
 
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
 IMPLAUSIBLE_PRIOR_DISTANCE = 4.0

@@ -6,21 +6,122 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
-from mjfim.arrays import NORMAL_95, Array
+from mjfim.arrays import NORMAL_95, Array, scaled_to_unit_diagonal
 from mjfim.experiment.system import System
-from mjfim.identification.cad_prior import CadPrior
+from mjfim.identification.assessment.honest_covariance import between_covariance
+from mjfim.identification.assessment.robust_covariance import (
+    block_length,
+    inverse_root,
+    robust_uncertainty,
+)
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.honest_covariance import between_covariance
-from mjfim.identification.independent_blocks import block_length
-from mjfim.identification.prior_share import prior_directions
-from mjfim.identification.robust_covariance import inverse_root, robust_uncertainty
+from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
+from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.check import ParameterGroup
 from mjfim.records.estimate import PriorDirections, Uncertainty
+
+# A combination is determined by the recordings where these leave at most this share of the standard
+# deviation of the prior.
+DETERMINED_SHARE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InertiaCombinations:
+    """Combinations of the k inertial coordinates with a CAD prior, by how well they are determined.
+
+    Attributes:
+        columns: (k,) indices in theta of the coordinates.
+        left: (k,) share of the standard deviation of the prior that the recordings leave.
+        axes: (k, k) directions of the coordinates, one in each column, in which recordings and
+            prior are uncorrelated and the prior has the standard deviation 1 [theta-unit].
+        prior_std: (k,) standard deviations of the prior [theta-unit].
+    """
+
+    columns: np.ndarray
+    left: Array
+    axes: Array
+    prior_std: Array
+
+    @staticmethod
+    def of(parameters: ParameterSet, theta: Array, data: Array) -> InertiaCombinations | None:
+        """Compare the information of the recordings about inertias with that of their CAD prior.
+
+        Args:
+            parameters: The p parameters.
+            theta: (p,) estimate [theta-unit].
+            data: (p, p) information of the recordings alone about the parameters that they share.
+
+        Returns:
+            The combinations; None without a CAD prior.
+        """
+        is_shared = ~parameters.recording_specific
+        prior = CadPrior.of(parameters).of_bodies(is_shared)
+        columns = prior.columns
+        if not len(columns):
+            return None
+
+        # Other parameters are estimated as well, so that their uncertainty counts.
+        others = np.setdiff1d(np.flatnonzero(is_shared), columns)
+        kept = np.concatenate([columns, others])
+        stated = parameters.prior_information[np.ix_(kept, kept)]
+        about = marginal(data[np.ix_(kept, kept)], stated, np.arange(len(columns)))
+
+        # Eigenvalues of the information relative to the prior do not depend on the coordinates.
+        information = prior.information(theta)[np.ix_(columns, columns)]
+        known, scale = scaled_to_unit_diagonal(information)
+        ratios, vectors = scipy.linalg.eigh(about / np.outer(scale, scale), known)
+        return InertiaCombinations(
+            columns=columns,
+            left=1.0 / np.sqrt(1.0 + np.maximum(ratios, 0.0)),
+            axes=vectors / scale[:, None],
+            prior_std=np.sqrt(np.diag(np.linalg.inv(known))) / scale,
+        )
+
+    @property
+    def is_determined(self) -> np.ndarray:
+        """(k,) True for the combinations that the recordings determine."""
+        return np.asarray(self.left <= DETERMINED_SHARE)
+
+    @property
+    def undetermined(self) -> Array:
+        """(m, k) weights of the coordinates in the combinations that the prior determines."""
+        return np.asarray(np.linalg.inv(self.axes)[~self.is_determined])
+
+
+def prior_directions(
+    parameters: ParameterSet, theta: Array, data: Array, std: Array
+) -> PriorDirections | None:
+    """Count the combinations of inertias that the recordings determine.
+
+    Args:
+        parameters: The p parameters.
+        theta: (p,) estimate [theta-unit].
+        data: (p, p) information of the recordings alone about the parameters that they share.
+        std: (p,) standard deviations with the priors [theta-unit].
+
+    Returns:
+        The combinations; None without a CAD prior, or where the recordings determine all of them.
+    """
+    found = InertiaCombinations.of(parameters, theta, data)
+    if found is None or found.is_determined.all():
+        return None
+
+    columns = found.columns
+    is_prior = std[columns] > DETERMINED_SHARE * found.prior_std
+    groups = [parameters.parameters[j].group for j in columns.tolist()]
+    return PriorDirections(
+        bodies=tuple(dict.fromkeys(groups)),
+        count=len(columns),
+        determined=int(found.is_determined.sum()),
+        parameters=tuple(parameters.names[j] for j in columns[is_prior].tolist()),
+    )
+
 
 # Half width of an interval over the size of the value (an entry of a vector or tensor has the size
 # of the whole), above which a parameter is poorly known.

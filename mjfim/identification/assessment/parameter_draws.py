@@ -1,7 +1,7 @@
 """Draws of the parameters from the uncertainty of an estimate, for domain randomisation.
 
 The distribution is normal about the estimate, with its honest covariance
-(`mjfim/identification/honest_covariance.py`), and truncated at the bounds. Inertias of whole bodies
+(`honest_covariance.py`), and truncated at the bounds. Inertias of whole bodies
 move along straight lines of their barycentric coordinates, along which forces are linear, so that
 combinations that the recordings know well stay known in the drawn robots. Combinations that only
 the CAD prior determines stay at the estimate. Draws with an unphysical inertia are replaced: where
@@ -19,13 +19,13 @@ from mjfim.arrays import Array
 from mjfim.errors import MAX_SAMPLES, ExperimentError, first_ones, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.honest_covariance import (
+from mjfim.identification.assessment.accuracy import InertiaCombinations
+from mjfim.identification.assessment.honest_covariance import (
     covariance_root,
     honest_covariance,
 )
+from mjfim.identification.assessment.truncated_normal import MatrixBound, draw_truncated_normal
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
-from mjfim.identification.prior_share import InertiaCombinations
-from mjfim.identification.truncated_normal import MatrixBound, draw_truncated_normal
 from mjfim.model.inertia import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import ModelField

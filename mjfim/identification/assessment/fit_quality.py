@@ -10,8 +10,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
+from mjfim.identification.assessment.residual_tests import LargestResidual, whiteness_of
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.residual_tests import LargestResidual, whiteness_of
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Whiteness, WorstResidual
 

@@ -1,7 +1,7 @@
 """One covariance of all parameters that agrees with the intervals of single ones.
 
-It begins with the robust covariance of a fit (`mjfim/identification/robust_covariance.py`), which
-is right for combinations of parameters, and adds what the intervals contain besides:
+It begins with the robust covariance of a fit (`robust_covariance.py`), which is right for
+combinations of parameters, and adds what the intervals contain besides:
 
 - the scatter between recordings that disagree;
 - the estimates over other lengths of segments that chance does not explain;
@@ -22,12 +22,47 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from mjfim.arrays import NORMAL_95, Array
-from mjfim.identification.jackknife import jackknife_deviations, student_quantile
-from mjfim.identification.robust_covariance import LEVEL, covering_covariance
+from mjfim.identification.assessment.robust_covariance import LEVEL, covering_covariance
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate, HorizonStudy, Uncertainty
+
+
+def jackknife_deviations(without_parts: Array) -> Array:
+    """(K, p) deviations whose sum of squares is the variance; zero with fewer than two parts.
+
+    Args:
+        without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
+    """
+    K = len(without_parts)
+    if K < 2:
+        return np.zeros_like(without_parts)
+    scatter = without_parts - without_parts.mean(axis=0)
+    return np.asarray(np.sqrt((K - 1) / K) * scatter)
+
+
+def jackknife_std(without_parts: Array) -> Array:
+    """(p,) standard errors of the estimates [theta-unit]; NaN with fewer than two parts.
+
+    Args:
+        without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
+    """
+    if len(without_parts) < 2:
+        return np.full(without_parts.shape[1], np.nan)
+    return np.asarray(np.linalg.norm(jackknife_deviations(without_parts), axis=0))
+
+
+def student_quantile(parts: int, confidence: float) -> float:
+    """Half width of an interval in standard errors that K parts have given.
+
+    Args:
+        parts: Number K of parts, at least 2.
+        confidence: Probability that the interval holds the true value.
+    """
+    return float(scipy.special.stdtrit(parts - 1, 0.5 + 0.5 * confidence))
+
 
 # Distance of the end of an interval from a bound, relative to the width of the interval, at which
 # the bound has cut the interval off.

@@ -1,0 +1,528 @@
+"""Comparison of recordings: what each suggests alone, their scatter, and which of them is odd.
+
+Each recording suggests values of its own, one Gauss-Newton step from the common estimate, by its
+part of the last linearisation; nothing is simulated. Whether recordings agree is tested with
+information matrices, so that recordings may determine some directions of the parameters only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array, scaled_to_unit_diagonal
+from mjfim.identification.assessment.accuracy import independent_rows
+from mjfim.identification.assessment.random_effects import (
+    Information,
+    between_variance,
+    difference,
+    f_tail,
+    random_effects,
+    satterthwaite,
+    t_quantile,
+    total_of,
+)
+from mjfim.identification.assessment.robust_covariance import (
+    RecordingEvidence,
+    independent_blocks,
+    recording_evidence,
+)
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.information.marginal import standard_deviations
+from mjfim.model.parameters import ParameterSet
+from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.records.estimate import Uncertainty
+from mjfim.records.robots import OddParameter, OddRecording, RecordingComparison
+
+# Eigenvalues of the scaled information of all recordings below this share of the largest one, and
+# of one recording over that of all, count as zero.
+TOTAL_TOLERANCE, TOLERANCE = 1e-12, 1e-9
+
+# Share of a parameter in directions about which nothing is known, up to which it is known.
+UNKNOWN_SHARE = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordingViews:
+    """Evidence of single recordings, in coordinates z in which all of them have unit information.
+
+    Attributes:
+        theta: (s,) estimate from all recordings, where z = 0; NaN for unknowns that they do not
+            determine.
+        directions: (s, r) derivative of theta by z.
+        parts: What each of K recordings says about z.
+        values: (K, s) values that each recording alone suggests; NaN where it determines none.
+        std: (K, s) their standard deviations; infinite where there is none.
+        freedom: Degrees of freedom of the scatter within the recordings.
+    """
+
+    theta: Array
+    directions: Array
+    parts: list[Information]
+    values: Array
+    std: Array
+    freedom: float
+
+    def scatter(self, tau2: Array) -> Array:
+        """(r, r) covariance of z between recordings.
+
+        Args:
+            tau2: (s,) variances of theta between recordings.
+        """
+        inverse = np.linalg.pinv(self.directions)
+        return np.asarray(inverse * tau2 @ inverse.T)
+
+    def mean(self, chosen: Sequence[int], tau2: Array) -> tuple[Array, Array]:
+        """(s,) mean of theta over recordings that scatter, and (s,) its standard deviations.
+
+        Args:
+            chosen: Indices of the recordings.
+            tau2: (s,) variances of theta between recordings.
+        """
+        scatter = self.scatter(tau2)
+        total = total_of([self.parts[k].with_scatter(scatter) for k in chosen])
+        return _estimate(self.theta, self.directions, total)
+
+
+def recording_views(theta: Array, evidence: RecordingEvidence) -> RecordingViews:
+    """Find what single recordings say about the unknowns that they share.
+
+    Args:
+        theta: (s,) estimate from all recordings [theta-unit].
+        evidence: What each of K recordings says.
+    """
+    equations = [evidence.normal_equations(k) for k in range(evidence.count)]
+    H = np.sum([information for information, _ in equations], axis=0)
+    directions, is_determined = _unit_information(H)
+
+    # Each recording in the coordinates z, and its estimate.
+    informations = [directions.T @ each @ directions for each, _ in equations]
+    steps = [
+        -_inverse(each) @ (directions.T @ g)
+        for each, (_, g) in zip(informations, equations, strict=True)
+    ]
+    inflation, own = _inflation(evidence, directions, informations, steps)
+
+    # Scores of a recording scatter more than its information says by these factors.
+    parts = []
+    for information, step, factor in zip(informations, steps, own, strict=True):
+        root = _root(information)
+        matrix = root @ np.linalg.inv(inflation) @ root / factor
+        parts.append(Information(matrix=0.5 * (matrix + matrix.T), vector=matrix @ step))
+
+    known_theta = np.where(is_determined, theta, np.nan)
+    found = [_estimate(known_theta, directions, part) for part in parts]
+    return RecordingViews(
+        theta=known_theta,
+        directions=directions,
+        parts=parts,
+        values=np.array([value for value, _ in found]),
+        std=np.array([std for _, std in found]),
+        freedom=block_freedom(evidence),
+    )
+
+
+def block_freedom(evidence: RecordingEvidence) -> float:
+    """Degrees of freedom of the scatter within recordings.
+
+    Args:
+        evidence: What the recordings say.
+    """
+    return float(max(len(evidence.scores) - evidence.count, 1))
+
+
+def _unit_information(H: Array) -> tuple[Array, np.ndarray]:
+    """(s, r) directions W with `W' H W = 1`, and (s,) True for the determined unknowns.
+
+    Args:
+        H: (s, s) information of rank r.
+    """
+    scaled, scale = scaled_to_unit_diagonal(H)
+    eigenvalues, vectors = np.linalg.eigh(scaled)
+    is_known = eigenvalues > TOTAL_TOLERANCE * eigenvalues.max(initial=0.0)
+    directions = vectors[:, is_known] / np.sqrt(eigenvalues[is_known]) / scale[:, None]
+
+    # Unknowns that a direction without information moves are not determined.
+    is_determined = np.linalg.norm(vectors[:, ~is_known], axis=1) <= UNKNOWN_SHARE
+    return directions, is_determined
+
+
+def _inflation(
+    evidence: RecordingEvidence,
+    directions: Array,
+    informations: Sequence[Array],
+    steps: Sequence[Array],
+) -> tuple[Array, list[float]]:
+    """Scatter of the scores within recordings, over what the information says.
+
+    Args:
+        evidence: What the recordings say.
+        directions: (s, r) directions with unit information.
+        informations: (r, r) information of each recording in these directions.
+        steps: (r,) step of each recording to its own estimate.
+
+    Returns:
+        (r, r) covariance of the scores of all recordings together, whose eigenvalues are at least
+        1, and for each recording a factor of at least 1 by which its scores scatter more.
+    """
+    scatters = []
+    for k, step in enumerate(steps):
+        # Scores at the estimate of the recording, so that differences between recordings do not
+        # count as scatter within one.
+        of_recording = evidence.recording == k
+        scores = evidence.scores[of_recording] @ directions
+        moved = evidence.information[of_recording] @ directions
+        scores = scores + np.einsum("sr,bsq,q->br", directions, moved, step)
+
+        # An interrupted fit may have used no segment of a recording.
+        count = len(scores)
+        centred = scores - scores.sum(axis=0) / max(count, 1)
+        scatters.append(centred.T @ centred * (count / max(count - 1, 1)))
+
+    # A few blocks often scatter little by chance.
+    eigenvalues, vectors = np.linalg.eigh(np.sum(scatters, axis=0))
+    pooled = vectors * np.maximum(eigenvalues, 1.0) @ vectors.T
+
+    factors = []
+    for k, (scatter, information) in enumerate(zip(scatters, informations, strict=True)):
+        root, inverse = _root(information), _inverse(information)
+        expected = float(np.sum(inverse * (root @ pooled @ root)))
+        found = float(np.sum(inverse * scatter))
+        usable = np.sum(evidence.recording == k) > 1 and expected > 0.0
+        factors.append(max(found / expected, 1.0) if usable else 1.0)
+    return pooled, factors
+
+
+def _estimate(theta: Array, directions: Array, part: Information) -> tuple[Array, Array]:
+    """(s,) estimate of a part, and (s,) standard deviations; NaN and infinite where it has none."""
+    eigenvalues, vectors = np.linalg.eigh(part.matrix)
+    is_known = eigenvalues > TOLERANCE
+    along = vectors[:, is_known]
+    inverse = along / eigenvalues[is_known] @ along.T
+
+    # A parameter is known if no unknown direction moves it.
+    size = np.linalg.norm(directions, axis=1)
+    unknown = np.linalg.norm(directions @ vectors[:, ~is_known], axis=1)
+    determined = np.isfinite(theta) & (size > 0.0) & (unknown <= UNKNOWN_SHARE * size)
+    value = theta + directions @ (inverse @ part.vector)
+    variance = np.einsum("sr,rq,sq->s", directions, inverse, directions)
+    return (
+        np.where(determined, value, np.nan),
+        np.where(determined, np.sqrt(np.maximum(variance, 0.0)), np.inf),
+    )
+
+
+def _inverse(information: Array) -> Array:
+    """Pseudo-inverse of an information in directions in which that of all recordings is 1."""
+    eigenvalues, vectors = np.linalg.eigh(information)
+    is_known = eigenvalues > TOLERANCE
+    along = vectors[:, is_known]
+    return np.asarray(along / eigenvalues[is_known] @ along.T)
+
+
+def _root(information: Array) -> Array:
+    """Symmetric square root of an information."""
+    eigenvalues, vectors = np.linalg.eigh(information)
+    return np.asarray(vectors * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T)
+
+
+# Probability to name an odd recording where all are equal.
+ODD_LEVEL = 0.01
+
+# Corrected p-value up to which a parameter of an odd recording is named, and most of them.
+NAMED_LEVEL, MAX_NAMED = 0.05, 3
+
+# Fewest recordings among which one can be odd.
+FEWEST = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Difference:
+    """Difference of one recording from others.
+
+    Attributes:
+        index: Index of the recording.
+        p: p-value, corrected for the number of tests of all recordings.
+        each: (s,) p-values of single parameters, corrected likewise.
+        others: (s,) mean of the others.
+        others_std: (s,) its standard deviation, without the scatter between them.
+    """
+
+    index: int
+    p: float
+    each: Array
+    others: Array
+    others_std: Array
+
+
+def odd_recordings(
+    views: RecordingViews,
+    recordings: Sequence[str],
+    parameters: Sequence[str],
+    units: Sequence[str],
+    is_single: np.ndarray,
+) -> list[OddRecording]:
+    """Find the recordings that differ from the others; at most a minority can.
+
+    Args:
+        views: What each of K recordings says about s parameters.
+        recordings: Their K names.
+        parameters: Names of the s parameters.
+        units: Units of the s parameters; may be empty.
+        is_single: (s,) True for single numbers, False for entries of vectors and tensors.
+
+    Returns:
+        The odd recordings, the most significant one first.
+    """
+    remaining = list(range(len(views.parts)))
+    most = (len(remaining) - 1) // 2
+    found: list[OddRecording] = []
+
+    while len(remaining) >= FEWEST and len(found) < most:
+        worst = min((_left_out(views, k, remaining) for k in remaining), key=lambda each: each.p)
+        if worst.p > ODD_LEVEL:
+            break
+        remaining.remove(worst.index)
+        order = np.argsort(worst.each, kind="stable")[:MAX_NAMED]
+        named = [
+            OddParameter(
+                name=parameters[j],
+                unit=units[j],
+                value=float(views.values[worst.index, j]),
+                std=float(views.std[worst.index, j]),
+                others=float(worst.others[j]),
+                others_std=float(worst.others_std[j]),
+                p=float(worst.each[j]),
+                is_single=bool(is_single[j]),
+            )
+            for j in order
+            if worst.each[j] <= NAMED_LEVEL
+        ]
+        found.append(
+            OddRecording(
+                index=worst.index,
+                name=recordings[worst.index],
+                p=worst.p,
+                parameters=tuple(named),
+            )
+        )
+    return found
+
+
+def _left_out(views: RecordingViews, k: int, remaining: Sequence[int]) -> _Difference:
+    """Test whether recording k differs from the other remaining ones."""
+    others = [i for i in remaining if i != k]
+    values, variances = views.values[others], views.std[others] ** 2
+    tau2 = between_variance(values, variances)
+    effects = random_effects(values, variances, views.freedom)
+
+    # Single parameters, by Student's distribution. The scatter between the others is known from
+    # few of them.
+    gap = views.values[k] - effects.mean
+    variance = views.std[k] ** 2 + effects.variance + tau2
+    is_known = np.isfinite(gap) & np.isfinite(variance)
+    variance = np.where(is_known, variance, 1.0)
+    share = np.where(is_known, tau2 / variance, 0.0)
+    freedom = satterthwaite(share, views.freedom, len(others) - 1)
+    t = np.where(is_known, np.abs(gap), 0.0) / np.sqrt(variance)
+    each = 2.0 * scipy.special.stdtr(freedom, -t)
+
+    # All parameters together.
+    scatter = views.scatter(tau2)
+    parts = [views.parts[i].with_scatter(scatter) for i in others]
+    squares, dof = difference([views.parts[k].with_scatter(scatter), total_of(parts)], TOLERANCE)
+    mean_share = np.array([share[is_known].mean() if is_known.any() else 0.0])
+    (joint_freedom,) = satterthwaite(mean_share, views.freedom, len(others) - 1)
+    joint = f_tail(squares, dof, float(joint_freedom))
+
+    # Two kinds of tests of every remaining recording.
+    tests = 2.0 * len(remaining)
+    each = np.minimum(tests * max(int(is_known.sum()), 1) * each, 1.0)
+    p = min(tests * joint, float(each.min(initial=1.0)), 1.0)
+    return _Difference(
+        index=k, p=p, each=each, others=effects.mean, others_std=np.sqrt(effects.variance)
+    )
+
+
+def compare_recordings(
+    problem: FitProblem,
+    solution: Solution,
+    correlation_rows: Sequence[float],
+    robust: Uncertainty | None,
+) -> RecordingComparison | None:
+    """Compare the recordings of a fit with each other.
+
+    Args:
+        problem: The least-squares problem.
+        solution: Its solution.
+        correlation_rows: Autocorrelation time of the residuals of every output [rows].
+        robust: Robust uncertainty of the common unknowns, or None.
+
+    Returns:
+        The comparison; None for a single recording, and where the recordings have no parameter of
+        the robot in common.
+    """
+    layout = problem.layout
+    parameters = problem.system.parameters
+    recordings = tuple(PurePath(recording.name).name for recording in problem.recordings)
+    if len(recordings) < 2 or not len(layout.shared):
+        return None
+
+    condensed = solution.condensed
+    recording_of_block = problem.blocks.recording_of_block
+    min_rows = independent_rows(problem, correlation_rows)
+    blocks = independent_blocks(condensed, recording_of_block, problem.blocks.mean_rows, min_rows)
+    evidence = recording_evidence(condensed, blocks, recording_of_block, layout.own_columns)
+    shared = compare_evidence(
+        solution.unknowns.theta[layout.shared],
+        evidence,
+        recordings=recordings,
+        parameters=tuple(parameters.names[j] for j in layout.shared),
+        units=tuple(problem.system.units[j] for j in layout.shared),
+        is_single=is_single(parameters, solution.unknowns.theta)[layout.shared],
+    )
+
+    # Parameters of the robot that are stated to differ have their values already.
+    stated = [i for i, j in enumerate(layout.per_recording) if parameters.changes_model[j]]
+    if not stated:
+        return _inside_bounds(shared, parameters)
+    columns = layout.own_columns[:, stated]
+    std = standard_deviations(condensed.information())
+    if robust is not None:
+        std = np.maximum(std, robust.sandwich)
+    complete = _with_stated(
+        shared,
+        names=[parameters.names[layout.per_recording[i]] for i in stated],
+        units=[problem.system.units[layout.per_recording[i]] for i in stated],
+        values=solution.unknowns.per_recording[:, stated],
+        std=std[columns],
+        freedom=block_freedom(evidence),
+    )
+    return _inside_bounds(complete, parameters)
+
+
+def is_single(parameters: ParameterSet, theta: Array) -> np.ndarray:
+    """(p,) True for single numbers, such as masses, False for entries of vectors and tensors.
+
+    Args:
+        parameters: The parameters.
+        theta: (p,) values [theta-unit].
+    """
+    return np.asarray(parameters.sizes(theta) == np.abs(theta))
+
+
+def _inside_bounds(
+    comparison: RecordingComparison, parameters: ParameterSet
+) -> RecordingComparison:
+    """The comparison with intervals that end at the bounds of the parameters."""
+    index = [parameters.names.index(name) for name in comparison.parameters]
+    low = np.fmin(parameters.lower[index], comparison.mean)[:, None]
+    high = np.fmax(parameters.upper[index], comparison.mean)[:, None]
+    return replace(
+        comparison,
+        interval=np.clip(comparison.interval, low, high),
+        prediction=np.where(
+            np.isfinite(comparison.prediction),
+            np.clip(comparison.prediction, low, high),
+            comparison.prediction,
+        ),
+    )
+
+
+def compare_evidence(
+    theta: Array,
+    evidence: RecordingEvidence,
+    *,
+    recordings: Sequence[str],
+    parameters: Sequence[str],
+    units: Sequence[str],
+    is_single: np.ndarray,
+) -> RecordingComparison:
+    """Compare recordings by what they say about the unknowns that they share.
+
+    Args:
+        theta: (s,) estimate from all recordings [theta-unit].
+        evidence: What each of K recordings says.
+        recordings: Their K names.
+        parameters: Names of the s unknowns.
+        units: Units of the s unknowns; may be empty.
+        is_single: (s,) True for single numbers, False for entries of vectors and tensors.
+    """
+    views = recording_views(theta, evidence)
+    effects = random_effects(views.values, views.std**2, views.freedom)
+
+    everyone = list(range(evidence.count))
+    squares, dof = difference(views.parts, TOLERANCE)
+    joint_p = f_tail(squares, dof, views.freedom)
+    mean, std = views.mean(everyone, effects.tau2)
+    share = effects.tau2 / np.where(std > 0.0, std**2 * evidence.count, 1.0)
+    reach = t_quantile(satterthwaite(share, views.freedom, evidence.count - 1)) * std
+
+    count = len(parameters)
+    return RecordingComparison(
+        recordings=tuple(recordings),
+        parameters=tuple(parameters),
+        units=tuple(units),
+        is_stated=np.zeros(count),
+        values=views.values,
+        std=views.std,
+        mean=mean,
+        interval=np.column_stack([mean - reach, mean + reach]),
+        tau=np.sqrt(effects.tau2),
+        share=effects.share,
+        p=np.minimum(count * effects.p, 1.0),
+        prediction=effects.prediction,
+        joint_p=joint_p,
+        odd=tuple(odd_recordings(views, recordings, parameters, units, is_single)),
+    )
+
+
+# ---- parameters that are stated to differ
+
+
+def _with_stated(
+    shared: RecordingComparison,
+    *,
+    names: Sequence[str],
+    units: Sequence[str],
+    values: Array,
+    std: Array,
+    freedom: float,
+) -> RecordingComparison:
+    """The comparison with parameters that are stated to differ, whose scatter is no surprise.
+
+    Args:
+        shared: Comparison of the other parameters.
+        names: Names of the e parameters.
+        units: Their units.
+        values: (K, e) values of each recording.
+        std: (K, e) their standard deviations.
+        freedom: Degrees of freedom of these.
+    """
+    effects = random_effects(values, std**2, freedom)
+    deviation = np.sqrt(effects.variance)
+    between = effects.tau2 / np.where(deviation > 0.0, deviation**2 * len(values), 1.0)
+    reach = t_quantile(satterthwaite(between, freedom, len(values) - 1)) * deviation
+    count = len(names)
+    return RecordingComparison(
+        recordings=shared.recordings,
+        parameters=(*shared.parameters, *names),
+        units=(*shared.units, *units),
+        is_stated=np.concatenate([shared.is_stated, np.ones(count)]),
+        values=np.column_stack([shared.values, values]),
+        std=np.column_stack([shared.std, std]),
+        mean=np.concatenate([shared.mean, effects.mean]),
+        interval=np.concatenate(
+            [shared.interval, np.column_stack([effects.mean - reach, effects.mean + reach])]
+        ),
+        tau=np.concatenate([shared.tau, np.sqrt(effects.tau2)]),
+        share=np.concatenate([shared.share, effects.share]),
+        p=np.concatenate([shared.p, np.ones(count)]),
+        prediction=np.concatenate([shared.prediction, effects.prediction]),
+        joint_p=shared.joint_p,
+        odd=shared.odd,
+    )
