@@ -23,7 +23,6 @@ from mjfim.identification.segment_simulation import (
     SegmentBatch,
     SegmentRows,
     SegmentSimulation,
-    WhitenedRows,
 )
 from mjfim.identification.segments import (
     free_segments,
@@ -316,11 +315,6 @@ class FitProblem(SegmentSimulation):
         """Division of the rows into blocks."""
         return BlockDivision(segments=self.segments, row_count=self.row_count)
 
-    @property
-    def whitened(self) -> WhitenedRows:
-        """Comparison of simulated rows with the measured values that count."""
-        return WhitenedRows(problem=self, masks=self.masks, noise=self.noise)
-
     @cached_property
     def prior_rows(self) -> PriorRows:
         """Rows of priors and pins."""
@@ -526,7 +520,7 @@ class FitProblem(SegmentSimulation):
         for rows in self.rows_of_batch(at, batch):
             if rows is None:
                 return None
-            losses.append(self.loss.value(self.whitened.residual(rows)))
+            losses.append(self.loss.value(self.residual(rows)))
         return losses
 
     def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array] | None:
@@ -546,17 +540,43 @@ class FitProblem(SegmentSimulation):
             if rows is None:
                 return None
 
-            found = self.whitened.linearised(rows)
-            weighted = found.weighted(self.loss)
+            # The weights are those of iteratively reweighted least squares.
+            place, r, J = self.linearised(rows)
+            weighted = np.column_stack([J, r]) * self.loss.weight(r)[:, None]
 
             # Values are added to the triangle of the block of their row.
-            block = self.blocks.of_rows(rows)[found.row]
+            block = self.blocks.of_rows(rows)[place]
             edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
             for first, last in pairwise(edges):
                 index = int(block[first])
                 joined = np.concatenate([blocks.get(index, empty), weighted[first:last]])
                 blocks[index] = triangle(joined)
         return blocks
+
+    def mask_of(self, rows: SegmentRows) -> np.ndarray:
+        """(k, ny) True for the values of k rows that count."""
+        return np.asarray(self.masks[self.segments[rows.segment].recording][rows.rows])
+
+    def residual(self, rows: SegmentRows) -> Array:
+        """(n,) whitened residuals of the values of some rows that count [standard deviations]."""
+        mask = self.mask_of(rows)
+        measured = self.recordings[self.segments[rows.segment].recording].y[rows.rows]
+
+        # Values that do not count may be NaN.
+        return self.noise.whiten_present(np.where(mask, rows.y - measured, 0.0), mask)
+
+    def linearised(self, rows: SegmentRows) -> tuple[np.ndarray, Array, Array]:
+        """Whitened residuals of some rows and their derivatives, value by value.
+
+        Returns:
+            (n,) place of the row of every value among the rows, (n,) residuals [standard
+            deviations], and (n, n_private + c) derivatives by the private and the common unknowns.
+        """
+        mask = self.mask_of(rows)
+        common, private = rows.jacobians
+        columns = self.layout.to_columns(common, self.segments[rows.segment].recording)
+        J = self.noise.whiten_present(np.concatenate([private, columns], axis=2), mask)
+        return np.nonzero(mask)[0], self.residual(rows), J
 
     def of_batches(
         self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues

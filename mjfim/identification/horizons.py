@@ -19,14 +19,14 @@ from mjfim.identification.assessment.honest_covariance import jackknife_std, stu
 from mjfim.identification.assessment.report import FitResult
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.left_out import (
-    BLOCKS,
     MAX_FOLDS,
     HeldOutLosses,
     LeftOutPart,
+    blocks_of,
     fit_without,
+    joined_losses,
     left_out_parts,
-    losses_by_block,
-    with_initial_states,
+    losses_of,
 )
 from mjfim.identification.search import FitSearch
 from mjfim.identification.segments import spread_over_data
@@ -102,7 +102,19 @@ def choose_length(
 
     # Losses of each fit over each horizon.
     sigma = system.noise.sigma
-    losses = [[_losses(search, fit, each.problem, parts, sigma) for each in fits] for fit in fits]
+    blocks, budget = blocks_of(parts), search.budget
+    losses = [
+        [
+            joined_losses(
+                [
+                    losses_of(each.problem, theta, part, blocks, sigma, budget)
+                    for part, theta in zip(parts, fit.without, strict=True)
+                ]
+            )
+            for each in fits
+        ]
+        for fit in fits
+    ]
     if search.interrupted:
         return None
     chosen = _chosen([_over_all_horizons(losses, i) for i in range(len(fits))])
@@ -160,30 +172,6 @@ def _fitted(
         problem=problem,
         theta=weighted.theta(solution.unknowns),
         without=np.array(without),
-    )
-
-
-def _losses(
-    search: FitSearch,
-    fit: _LengthFit,
-    problem: FitProblem,
-    parts: Sequence[LeftOutPart],
-    sigma: Array,
-) -> HeldOutLosses:
-    """Losses of a fit over one horizon: that of a problem."""
-    pieces = sum(len(part.recordings) for part in parts)
-    blocks = -(-BLOCKS // max(pieces, 1))
-    found = []
-    for part, theta in zip(parts, fit.without, strict=True):
-        masks = part.masks(problem)
-        predicted, at = with_initial_states(problem, theta, masks, search.budget)
-        y = predicted.predict(at)
-        found.append(losses_by_block(problem, y, masks, part.recordings, blocks, sigma))
-    return HeldOutLosses(
-        losses=np.concatenate([losses for losses, _ in found]),
-        counts=np.concatenate([counts for _, counts in found]),
-        parts=np.repeat(np.arange(len(found)), [len(losses) for losses, _ in found]),
-        estimates=fit.without,
     )
 
 

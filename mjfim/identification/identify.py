@@ -24,7 +24,7 @@ from mjfim.identification.fit_problem import FitProblem, have_same_initial_state
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.horizons import choose_length
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.search import NEWTON, FitSearch, first_subset, of_subset, quick_subset
+from mjfim.identification.search import FitSearch, first_subset, of_subset, quick_subset
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.starts import SPREAD_STARTS, begin_fit, start_from_segments
 from mjfim.identification.task import FitTask, Method, with_length
@@ -104,10 +104,16 @@ def identify(
         SimulationDivergedError: The model diverges at the start.
     """
     with shown_progress("identifying", callback, progress) as show:
-        task = FitTask.resolve(
-            experiment, recordings, method=method, start=start, held_out=held_out, threads=threads
+        return identify_system(
+            System.resolve(experiment, threads=threads),
+            recordings,
+            method=method,
+            start=start,
+            held_out=held_out,
+            callback=show,
+            stop=stop,
+            executor=executor,
         )
-        return identify_task(task, callback=show, stop=stop, executor=executor)
 
 
 def identify_system(
@@ -142,31 +148,6 @@ def identify_system(
         SimulationDivergedError: The model diverges at the start.
     """
     task = FitTask.of(system, recordings, method=method, start=start, held_out=held_out)
-    return identify_task(task, callback=callback, stop=stop, executor=executor)
-
-
-def identify_task(
-    task: FitTask,
-    *,
-    callback: Callback | None = None,
-    stop: StopToken | None = None,
-    executor: ExecutorLike | None = None,
-) -> Estimate:
-    """Estimate the parameters of a task. See `identify`.
-
-    Args:
-        task: System, recordings and settings.
-        callback: Called with every iterate.
-        stop: Token that ends the search with the best result so far.
-        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process.
-
-    Returns:
-        The estimate with its accuracy and warnings.
-
-    Raises:
-        RecordingError: A recording cannot be used.
-        SimulationDivergedError: The model diverges at the start.
-    """
     begun = time.perf_counter()
     steps_before = task.system.plant.engine_steps
 
@@ -424,26 +405,6 @@ def least_squares(
     if found is None:
         raise SimulationDivergedError("the simulation diverges at the start of the fit")
     return found
-
-
-def newton_raphson(problem: FitProblem, start: Array, budget: Budget | None = None) -> Solution:
-    """The paper's iteration `theta - (J'J)^-1 J'r` without bounds.
-
-    A step is halved while it would raise the cost. The iteration ends when a step is below 1e-5
-    standard deviations.
-
-    Args:
-        problem: Residuals as functions of the unknowns.
-        start: (p,) parameters at which the search starts.
-        budget: Time and stop token; default: no limit.
-
-    Returns:
-        The solution.
-
-    Raises:
-        SimulationDivergedError: The simulation diverges at the start.
-    """
-    return least_squares(problem.unbounded(), start, NEWTON, budget)
 
 
 def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:

@@ -380,21 +380,12 @@ def held_out_losses(
     """
     problem, solution = affordable_part(problem, solution)
     parts = _parts(problem)
-    pieces = sum(len(part.recordings) for part in parts)
-    blocks = -(-BLOCKS // max(pieces, 1))
-    works = [
-        partial(_losses_of_part, solution=solution, part=part, blocks=blocks, sigma=sigma)
-        for part in parts
-    ]
+    work = partial(_losses_of_part, solution=solution, blocks=blocks_of(parts), sigma=sigma)
+    works = [partial(work, part=part) for part in parts]
     found = [losses for losses in of_parts(problem, works, budget) if losses is not None]
     if budget.exhausted is not None or not found:
         return None
-    return HeldOutLosses(
-        losses=np.concatenate([each.losses for each in found]),
-        counts=np.concatenate([each.counts for each in found]),
-        parts=np.repeat(np.arange(len(found)), [len(each.losses) for each in found]),
-        estimates=np.concatenate([each.estimates for each in found]),
-    )
+    return joined_losses(found)
 
 
 def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
@@ -433,45 +424,47 @@ def _losses_of_part(
     others = fit_without(problem, budget, solution=solution, part=part)
     if others is None:
         return None
-    masks = part.masks(problem)
-    predicted, at = with_initial_states(problem, others.theta, masks, budget)
-    y = predicted.predict(at)
+    found = losses_of(problem, others.theta, part, blocks, sigma, budget)
     if budget.exhausted is not None:
         return None
-    losses, counts = losses_by_block(problem, y, masks, part.recordings, blocks, sigma)
+    return replace(found, estimates=problem.theta(others)[None])
+
+
+def joined_losses(found: Sequence[HeldOutLosses]) -> HeldOutLosses:
+    """The losses of all left-out parts."""
     return HeldOutLosses(
-        losses=losses,
-        counts=counts,
-        parts=np.zeros(len(counts), dtype=np.intp),
-        estimates=problem.theta(others)[None],
+        losses=np.concatenate([each.losses for each in found]),
+        counts=np.concatenate([each.counts for each in found]),
+        parts=np.repeat(np.arange(len(found)), [len(each.losses) for each in found]),
+        estimates=np.concatenate([each.estimates for each in found]),
     )
 
 
-def losses_by_block(
-    problem: FitProblem,
-    predicted: Sequence[Array] | None,
-    masks: Sequence[np.ndarray],
-    recordings: Sequence[int],
-    blocks: int,
-    sigma: Array,
-) -> tuple[Array, Array]:
-    """Losses of predictions, summed over blocks of rows.
+def blocks_of(parts: Sequence[LeftOutPart]) -> int:
+    """Number of blocks into which each recording of each part is divided."""
+    pieces = sum(len(part.recordings) for part in parts)
+    return -(-BLOCKS // max(pieces, 1))
+
+
+def losses_of(
+    problem: FitProblem, theta: Array, part: LeftOutPart, blocks: int, sigma: Array, budget: Budget
+) -> HeldOutLosses:
+    """Losses of the prediction of one part at theta, summed over blocks of rows.
 
     Args:
         problem: Problem with the recordings.
-        predicted: (M, ny) predicted outputs of every recording [y-unit]; None where the simulation
-            diverges.
-        masks: (M, ny) for every recording, True for the predicted values.
-        recordings: Indices of the recordings.
+        theta: (p,) parameters.
+        part: The part.
         blocks: Number of blocks into which each recording is divided.
         sigma: (ny,) noise by which errors are divided [y-unit].
-
-    Returns:
-        (n,) sums of the loss, infinite where the simulation diverges, and (n,) numbers of values.
+        budget: Ends the search for initial states early.
     """
+    masks = part.masks(problem)
+    predicting, at = with_initial_states(problem, theta, masks, budget)
+    predicted = predicting.predict(at)
     losses: list[float] = []
     counts: list[float] = []
-    for i in recordings:
+    for i in part.recordings:
         rows = np.flatnonzero(masks[i].any(axis=1))
         for block in np.array_split(rows, min(blocks, len(rows)) or 1):
             counted = masks[i][block]
@@ -481,4 +474,9 @@ def losses_by_block(
                 continue
             error = (predicted[i][block] - problem.recordings[i].y[block]) / sigma
             losses.append(problem.loss.value(error[counted]))
-    return np.array(losses), np.array(counts)
+    return HeldOutLosses(
+        losses=np.array(losses),
+        counts=np.array(counts),
+        parts=np.zeros(len(counts), dtype=np.intp),
+        estimates=theta[None],
+    )

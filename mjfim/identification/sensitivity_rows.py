@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import zip_longest
 
 import numpy as np
@@ -45,7 +46,19 @@ def sensitivity_rows(
     """
     if wanted is None:
         wanted = np.ones(len(problem.system.parameters), dtype=bool)
-    condensed = _condensed_sensitivity(problem, at, with_error, wanted)
+    work: BatchWork[dict[int, Array]] = partial(_of_batch, with_error=with_error)
+    batches = list(
+        problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)
+    )
+    condensed: dict[int, Array] = {}
+    for batch, of_batch in zip(batches, problem.of_batches(work, batches, at), strict=True):
+        if of_batch is None:
+            recordings = {problem.segments[segment].recording for segment in batch.segments}
+            names = [problem.recordings[index].name for index in sorted(recordings)]
+            raise SimulationDivergedError(
+                f"{' or '.join(names)}: the simulation diverges under the recorded control"
+            )
+        condensed.update(of_batch)
     n = problem.private_count if problem.layout.free_starts else 0
 
     found = []
@@ -62,85 +75,37 @@ def sensitivity_rows(
     return found
 
 
-def _condensed_sensitivity(
-    problem: FitProblem, at: UnknownValues, with_error: bool, wanted: np.ndarray
-) -> dict[int, Array]:
-    """Triangle of the whitened sensitivity and its change with a longer step, by segment.
-
-    Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes.
-    """
-    work: BatchWork[dict[int, Array]] = sensitivities_without_error
-    if with_error:
-        work = sensitivities_of_batch
-    batches = list(
-        problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)
-    )
-    condensed: dict[int, Array] = {}
-    results = problem.of_batches(work, batches, at)
-    for batch, found in zip(batches, results, strict=True):
-        if found is None:
-            raise SimulationDivergedError(
-                f"{_names(problem, batch)}: the simulation diverges under the recorded control"
-            )
-        condensed.update(found)
-    return condensed
-
-
-def _names(problem: FitProblem, batch: SegmentBatch) -> str:
-    """Names of the recordings of a batch, one of which diverges."""
-    recordings = {problem.segments[segment].recording for segment in batch.segments}
-    return " or ".join(problem.recordings[index].name for index in sorted(recordings))
-
-
-def sensitivities_of_batch(
-    problem: FitProblem, at: UnknownValues, batch: SegmentBatch
+def _of_batch(
+    problem: FitProblem, at: UnknownValues, batch: SegmentBatch, *, with_error: bool
 ) -> dict[int, Array] | None:
     """Condense the whitened sensitivity of a batch, and its change with a longer step.
 
-    Args:
-        problem: The problem.
-        at: The unknowns.
-        batch: The batch, with derivatives.
-
     Returns:
         (k, 2 (n+p)) triangle of each segment by its index; None where a perturbed simulation
-        diverges.
+        diverges. Changes are zero without an error.
     """
-    longer = replace(batch, step=COARSER_STEP_FACTOR * batch.step)
-    coarse = problem.rows_of_batch(at, longer)
-    return _condensed_batch(problem, problem.rows_of_batch(at, batch), coarse)
+    fine = problem.rows_of_batch(at, batch)
+    coarse: Iterator[SegmentRows | None] = iter(())
+    if with_error:
+        coarse = problem.rows_of_batch(at, replace(batch, step=COARSER_STEP_FACTOR * batch.step))
 
+    def sensitivity(rows: SegmentRows) -> Array:
+        """(k, n+p) derivatives by the initial state where that is free, then by theta."""
+        common, private = rows.jacobians
+        both = [private, common] if problem.layout.free_starts else [common]
+        G = np.concatenate(both, axis=2)
+        return problem.noise.whiten_present(G, problem.mask_of(rows))
 
-def sensitivities_without_error(
-    problem: FitProblem, at: UnknownValues, batch: SegmentBatch
-) -> dict[int, Array] | None:
-    """Condense the whitened sensitivity of a batch. See `sensitivities_of_batch`.
-
-    Its change with a longer step is not computed, and zero.
-    """
-    return _condensed_batch(problem, problem.rows_of_batch(at, batch), ())
-
-
-def _condensed_batch(
-    problem: FitProblem, fine: Iterable[SegmentRows | None], coarse: Iterable[SegmentRows | None]
-) -> dict[int, Array] | None:
-    """(k, 2 (n+p)) triangle of each segment by its index; None where a simulation diverges.
-
-    Args:
-        problem: The problem.
-        fine: Simulated rows of a batch.
-        coarse: Those with a longer step of the differences, as far as they were simulated.
-    """
     condensed: dict[int, Array] = {}
     for rows, coarse_rows in zip_longest(fine, coarse):
         if rows is None:
             return None
 
         # Without a simulation with the longer step, the change is unknown.
-        J = problem.whitened.sensitivity(rows)
+        J = sensitivity(rows)
         change = np.zeros_like(J)
         if coarse_rows is not None:
-            change = problem.whitened.sensitivity(coarse_rows) - J
+            change = sensitivity(coarse_rows) - J
 
         both = np.concatenate([J, change], axis=1)
         earlier = condensed.get(rows.segment, both[:0])

@@ -11,7 +11,6 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, listed, unknown
-from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.fit_problem import FitProblem
@@ -48,39 +47,6 @@ class FitTask:
     method: Method
     start: Array
     settings: FitSpec
-
-    @classmethod
-    def resolve(
-        cls,
-        experiment: Experiment,
-        recordings: Sequence[Recording],
-        *,
-        method: Method = "least_squares",
-        start: Array | None = None,
-        held_out: Sequence[Recording] = (),
-        threads: int | None = None,
-    ) -> FitTask:
-        """Resolve an experiment into the task of fitting its parameters.
-
-        Args:
-            experiment: Model, parameters and noise; nothing else needs to be stated.
-            recordings: Recordings to which the parameters are fitted.
-            method: Method of the search.
-            start: (p,) parameters at which the search starts; default: the guess.
-            held_out: Recordings that are predicted, not fitted.
-            threads: Threads for the engine; default: one per core.
-
-        Returns:
-            The task.
-
-        Raises:
-            ExperimentError: Something is wrong in the experiment or in the arguments; the message
-                names it.
-            ModelError: The model cannot be used.
-            RecordingError: Two recordings hold the same data.
-        """
-        system = System.resolve(experiment, threads=threads)
-        return cls.of(system, recordings, method=method, start=start, held_out=held_out)
 
     @classmethod
     def of(

@@ -261,12 +261,12 @@ def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Reco
 def test_no_data_are_simulated_to_test_inertias_with_a_prior(
     tmp_path: Path, log: Recording
 ) -> None:
-    task = FitTask.resolve(arm(tmp_path), [log], threads=1)
+    task = FitTask.of(System.resolve(arm(tmp_path), threads=1), [log])
     problem = task.problem()
     steps = problem.system.plant.engine_steps
     assert _unseen_directions(task, problem).count == 0
     assert problem.system.plant.engine_steps == steps
 
     # Without the prior, hardly any single inertia is determined.
-    task = FitTask.resolve(arm(tmp_path, cad_prior=False), [log], threads=1)
+    task = FitTask.of(System.resolve(arm(tmp_path, cad_prior=False), threads=1), [log])
     assert _unseen_directions(task, task.problem()).count > 5

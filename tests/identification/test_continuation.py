@@ -167,7 +167,9 @@ def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Pa
 def test_segments_share_the_system_and_the_recordings_of_the_whole_problem(tmp_path: Path) -> None:
     """Workers then receive them once."""
     system = pendulum(tmp_path, 4.0)
-    problem = FitTask.resolve(system.experiment, [swings(system, 4.0)], threads=1).problem()
+    problem = FitTask.of(
+        System.resolve(system.experiment, threads=1), [swings(system, 4.0)]
+    ).problem()
     part = problem.cut(1.0)
     assert part is not None
     assert len(part.segments) == 4

@@ -12,6 +12,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
@@ -34,7 +35,7 @@ def task() -> FitTask:
     recording = simulate_system(design.system, design.initial, 0)
     y = np.array(recording.y)
     y[:, 0] += DRIFT * recording.t
-    return FitTask.resolve(experiment, [replace(recording, y=y)], threads=1)
+    return FitTask.of(System.resolve(experiment, threads=1), [replace(recording, y=y)])
 
 
 @pytest.fixture(scope="module")

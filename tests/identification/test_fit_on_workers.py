@@ -15,6 +15,7 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification import (
     fit_workers,
     left_out,
@@ -59,7 +60,7 @@ def problem_of(
     experiment: mjfim.Experiment, recordings: Sequence[mjfim.Recording], fit: dict[str, Any]
 ) -> FitProblem:
     """The problem of a fit."""
-    return FitTask.resolve(experiment.replace(fit=fit), recordings, threads=1).problem()
+    return FitTask.of(System.resolve(experiment.replace(fit=fit), threads=1), recordings).problem()
 
 
 @pytest.mark.parametrize("fit", [WHOLE, SEGMENTS], ids=["whole", "segments"])

@@ -21,7 +21,8 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import identify, identify_system, least_squares, newton_raphson
+from mjfim.identification.identify import identify, identify_system, least_squares
+from mjfim.identification.search import NEWTON
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.output.pages import page_of
@@ -49,6 +50,11 @@ def design(task: DesignTask) -> mjfim.Design:
 @pytest.fixture(scope="module")
 def recording(task: DesignTask, design: mjfim.Design) -> Recording:
     return simulate_system(task.system, design.trajectory, seed=3)
+
+
+def newton_raphson(problem: FitProblem, start: np.ndarray) -> Solution:
+    """The iteration of the paper, without bounds."""
+    return least_squares(problem.unbounded(), start, NEWTON)
 
 
 @pytest.fixture(scope="module")

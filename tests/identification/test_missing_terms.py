@@ -162,7 +162,7 @@ def test_a_candidate_that_diverges_or_is_invalid_is_named_and_hides_no_other(
 ) -> None:
     """Without it, the same terms are found."""
     stated = experiment_of(tmp_path, "tilt", terms={}, parameters=DAMPED)
-    task = FitTask.resolve(stated, [rubbing_pendulum(tmp_path)], threads=1)
+    task = FitTask.of(System.resolve(stated, threads=1), [rubbing_pendulum(tmp_path)])
     problem = task.problem()
     at = problem.begin(task.start)
     usual = find_missing_terms(problem, task.recordings, at)

@@ -82,8 +82,8 @@ def test_a_model_with_more_states_begins_at_its_own_initial_states(tmp_path: Pat
         parameters={**known, "gap": {"target": "term/extra:gap", "true": 0.06, "guess": 0.03}},
     )
     recording = recorded(System.resolve(plain), motor_torque(2.0, 100.0), 0)
-    fitted = fit_task(searched(FitTask.resolve(plain, [recording])))
-    task = FitTask.resolve(richer, [recording])
+    fitted = fit_task(searched(FitTask.of(System.resolve(plain), [recording])))
+    task = FitTask.of(System.resolve(richer), [recording])
     widths = [each.private_count for each in (fitted.problem, task.problem())]
     assert widths == [2, 4]
     again = refit_task(searched(task), fitted, other_start=np.array([0.01, 0.01]))

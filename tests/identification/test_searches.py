@@ -12,6 +12,7 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch, first_subset
@@ -130,7 +131,7 @@ def test_longer_differences_are_two_sided_also_with_much_data(
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.2)
     design = DesignTask.resolve(experiment, threads=1)
     recording = simulate_system(design.system, design.initial, 0)
-    problem = FitTask.resolve(experiment, [recording], threads=1).problem()
+    problem = FitTask.of(System.resolve(experiment, threads=1), [recording]).problem()
     linearised = []
 
     def recorded(self: FitProblem, at: UnknownValues, batch: SegmentBatch) -> None:

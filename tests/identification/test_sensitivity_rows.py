@@ -14,6 +14,7 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import _unseen_directions
@@ -28,7 +29,7 @@ def cart_pendulum(horizon: float) -> FitTask:
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=horizon)
     design = DesignTask.resolve(experiment, threads=1)
     recording = simulate_system(design.system, design.initial, 0)
-    return FitTask.resolve(experiment, [recording], threads=1)
+    return FitTask.of(System.resolve(experiment, threads=1), [recording])
 
 
 def test_the_recordings_of_the_batch_that_diverges_are_named(
@@ -41,7 +42,7 @@ def test_the_recordings_of_the_batch_that_diverges_are_named(
         replace(simulate_system(design.system, design.initial, seed), name=f"log{seed}")
         for seed in range(3)
     ]
-    problem = FitTask.resolve(experiment, recordings, threads=1).problem()
+    problem = FitTask.of(System.resolve(experiment, threads=1), recordings).problem()
     last: list[str] = []
 
     def diverging(_: FitProblem, work: Any, batches: Sequence[SegmentBatch], at: Any) -> Iterator:
@@ -63,7 +64,7 @@ def test_rows_without_error_are_those_of_one_sided_differences() -> None:
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
     design = DesignTask.resolve(experiment, threads=1)
     recordings = [simulate_system(design.system, design.initial, seed) for seed in range(2)]
-    problem = FitTask.resolve(experiment, recordings, threads=1).problem()
+    problem = FitTask.of(System.resolve(experiment, threads=1), recordings).problem()
     at = problem.begin(problem.system.parameters.guess)
     steps = problem.system.plant.engine_steps
     full = sensitivity_rows(problem, at)

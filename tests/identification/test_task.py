@@ -13,7 +13,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.identify import identify_task
+from mjfim.identification.identify import identify_system
 from mjfim.identification.task import FitTask
 from mjfim.parallel.budget import StopToken
 from mjfim.records.trajectory import Recording
@@ -96,9 +96,9 @@ def test_the_start_is_moved_inside_the_bounds_of_a_bounded_method(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:
     start = np.array([50.0, -1.0])
-    bounded = FitTask.resolve(experiment, [recording], start=start)
+    bounded = FitTask.of(System.resolve(experiment), [recording], start=start)
     np.testing.assert_array_equal(bounded.start, [10.0, 0.0])
-    unbounded = FitTask.resolve(experiment, [recording], start=start, method="newton")
+    unbounded = FitTask.of(System.resolve(experiment), [recording], start=start, method="newton")
     np.testing.assert_array_equal(unbounded.start, start)
 
 
@@ -107,8 +107,8 @@ def test_a_stop_token_ends_the_search_with_the_best_result_so_far(
 ) -> None:
     stop = StopToken()
     stop.request()
-    task = FitTask.resolve(experiment, [recording])
-    estimate = identify_task(task, stop=stop)
+    task = FitTask.of(System.resolve(experiment), [recording])
+    estimate = identify_system(task.system, [recording], stop=stop)
     assert estimate.interrupted and not estimate.success
     assert estimate.predictions == ()
     np.testing.assert_array_equal(estimate.theta, task.start)
@@ -118,7 +118,7 @@ def test_variants_of_a_problem_leave_the_problem_unchanged(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:
     """Variants share unchanged parts; the original problem does not change."""
-    task = FitTask.resolve(experiment.replace(fit={"segments": 0.5}), [recording])
+    task = FitTask.of(System.resolve(experiment.replace(fit={"segments": 0.5})), [recording])
     problem = task.problem()
     begin = problem.begin(task.start)
     cost, lower = problem.cost(begin), np.array(problem.lower)

@@ -45,9 +45,9 @@ def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
         for rows in problem.rows_of_batch(at, batch):
             if rows is None:
                 return None
-            found = problem.whitened.linearised(rows)
-            residuals.append(found.r)
-            jacobians.append(_wide_jacobian(problem, found.J[:, n:], found.J[:, :n], rows.segment))
+            _, r, J = problem.linearised(rows)
+            residuals.append(r)
+            jacobians.append(_wide_jacobian(problem, J[:, n:], J[:, :n], rows.segment))
 
     common_rows = problem.prior_rows.common(at)
     no_private = np.zeros((len(common_rows), n))

@@ -33,7 +33,6 @@ from mjfim.identification.assessment.robust_covariance import (
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.marginal import standard_deviations
-from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Uncertainty
 from mjfim.records.robots import OddParameter, OddRecording, RecordingComparison
@@ -122,17 +121,8 @@ def recording_views(theta: Array, evidence: RecordingEvidence) -> RecordingViews
         parts=parts,
         values=np.array([value for value, _ in found]),
         std=np.array([std for _, std in found]),
-        freedom=block_freedom(evidence),
+        freedom=float(max(len(evidence.scores) - evidence.count, 1)),
     )
-
-
-def block_freedom(evidence: RecordingEvidence) -> float:
-    """Degrees of freedom of the scatter within recordings.
-
-    Args:
-        evidence: What the recordings say.
-    """
-    return float(max(len(evidence.scores) - evidence.count, 1))
 
 
 def _unit_information(H: Array) -> tuple[Array, np.ndarray]:
@@ -377,59 +367,31 @@ def compare_recordings(
     min_rows = independent_rows(problem, correlation_rows)
     blocks = independent_blocks(condensed, recording_of_block, problem.blocks.mean_rows, min_rows)
     evidence = recording_evidence(condensed, blocks, recording_of_block, layout.own_columns)
-    shared = compare_evidence(
-        solution.unknowns.theta[layout.shared],
-        evidence,
-        recordings=recordings,
-        parameters=tuple(parameters.names[j] for j in layout.shared),
-        units=tuple(problem.system.units[j] for j in layout.shared),
-        is_single=is_single(parameters, solution.unknowns.theta)[layout.shared],
-    )
-
     # Parameters of the robot that are stated to differ have their values already.
     stated = [i for i, j in enumerate(layout.per_recording) if parameters.changes_model[j]]
-    if not stated:
-        return _inside_bounds(shared, parameters)
-    columns = layout.own_columns[:, stated]
     std = standard_deviations(condensed.information())
     if robust is not None:
         std = np.maximum(std, robust.sandwich)
-    complete = _with_stated(
-        shared,
-        names=[parameters.names[layout.per_recording[i]] for i in stated],
-        units=[problem.system.units[layout.per_recording[i]] for i in stated],
-        values=solution.unknowns.per_recording[:, stated],
-        std=std[columns],
-        freedom=block_freedom(evidence),
+    index = [*layout.shared.tolist(), *layout.per_recording[stated].tolist()]
+    theta = solution.unknowns.theta
+    found = compare_evidence(
+        theta[layout.shared],
+        evidence,
+        recordings=recordings,
+        parameters=tuple(parameters.names[j] for j in index),
+        units=tuple(problem.system.units[j] for j in index),
+        is_single=(parameters.sizes(theta) == np.abs(theta))[layout.shared],
+        stated=(solution.unknowns.per_recording[:, stated], std[layout.own_columns[:, stated]]),
     )
-    return _inside_bounds(complete, parameters)
 
-
-def is_single(parameters: ParameterSet, theta: Array) -> np.ndarray:
-    """(p,) True for single numbers, such as masses, False for entries of vectors and tensors.
-
-    Args:
-        parameters: The parameters.
-        theta: (p,) values [theta-unit].
-    """
-    return np.asarray(parameters.sizes(theta) == np.abs(theta))
-
-
-def _inside_bounds(
-    comparison: RecordingComparison, parameters: ParameterSet
-) -> RecordingComparison:
-    """The comparison with intervals that end at the bounds of the parameters."""
-    index = [parameters.names.index(name) for name in comparison.parameters]
-    low = np.fmin(parameters.lower[index], comparison.mean)[:, None]
-    high = np.fmax(parameters.upper[index], comparison.mean)[:, None]
+    # Intervals end at the bounds of the parameters.
+    low = np.fmin(parameters.lower[index], found.mean)[:, None]
+    high = np.fmax(parameters.upper[index], found.mean)[:, None]
+    is_known = np.isfinite(found.prediction)
     return replace(
-        comparison,
-        interval=np.clip(comparison.interval, low, high),
-        prediction=np.where(
-            np.isfinite(comparison.prediction),
-            np.clip(comparison.prediction, low, high),
-            comparison.prediction,
-        ),
+        found,
+        interval=np.clip(found.interval, low, high),
+        prediction=np.where(is_known, np.clip(found.prediction, low, high), found.prediction),
     )
 
 
@@ -441,6 +403,7 @@ def compare_evidence(
     parameters: Sequence[str],
     units: Sequence[str],
     is_single: np.ndarray,
+    stated: tuple[Array, Array] | None = None,
 ) -> RecordingComparison:
     """Compare recordings by what they say about the unknowns that they share.
 
@@ -448,81 +411,37 @@ def compare_evidence(
         theta: (s,) estimate from all recordings [theta-unit].
         evidence: What each of K recordings says.
         recordings: Their K names.
-        parameters: Names of the s unknowns.
-        units: Units of the s unknowns; may be empty.
-        is_single: (s,) True for single numbers, False for entries of vectors and tensors.
+        parameters: Names of the s unknowns, and of e parameters that are stated to differ.
+        units: Their units; may be empty.
+        is_single: (s,) True for single numbers, such as masses, False for entries of vectors and
+            tensors.
+        stated: (K, e) values of the parameters that are stated to differ, whose scatter is no
+            surprise, and (K, e) their standard deviations; default: none.
     """
     views = recording_views(theta, evidence)
-    effects = random_effects(views.values, views.std**2, views.freedom)
-
-    everyone = list(range(evidence.count))
+    count, values, std = len(theta), views.values, views.std
+    if stated is not None:
+        values, std = np.column_stack([values, stated[0]]), np.column_stack([std, stated[1]])
+    effects = random_effects(values, std**2, views.freedom)
+    mean, deviation = effects.mean, np.sqrt(effects.variance)
+    mean[:count], deviation[:count] = views.mean(range(evidence.count), effects.tau2[:count])
+    share = effects.tau2 / np.where(deviation > 0.0, deviation**2 * evidence.count, 1.0)
+    reach = t_quantile(satterthwaite(share, views.freedom, evidence.count - 1)) * deviation
     squares, dof = difference(views.parts, TOLERANCE)
-    joint_p = f_tail(squares, dof, views.freedom)
-    mean, std = views.mean(everyone, effects.tau2)
-    share = effects.tau2 / np.where(std > 0.0, std**2 * evidence.count, 1.0)
-    reach = t_quantile(satterthwaite(share, views.freedom, evidence.count - 1)) * std
-
-    count = len(parameters)
+    is_stated = np.arange(len(parameters)) >= count
     return RecordingComparison(
         recordings=tuple(recordings),
         parameters=tuple(parameters),
         units=tuple(units),
-        is_stated=np.zeros(count),
-        values=views.values,
-        std=views.std,
+        is_stated=is_stated.astype(np.float64),
+        values=values,
+        std=std,
         mean=mean,
         interval=np.column_stack([mean - reach, mean + reach]),
         tau=np.sqrt(effects.tau2),
         share=effects.share,
-        p=np.minimum(count * effects.p, 1.0),
+        p=np.where(is_stated, 1.0, np.minimum(count * effects.p, 1.0)),
         prediction=effects.prediction,
-        joint_p=joint_p,
+        joint_p=f_tail(squares, dof, views.freedom),
         odd=tuple(odd_recordings(views, recordings, parameters, units, is_single)),
-    )
-
-
-# ---- parameters that are stated to differ
-
-
-def _with_stated(
-    shared: RecordingComparison,
-    *,
-    names: Sequence[str],
-    units: Sequence[str],
-    values: Array,
-    std: Array,
-    freedom: float,
-) -> RecordingComparison:
-    """The comparison with parameters that are stated to differ, whose scatter is no surprise.
-
-    Args:
-        shared: Comparison of the other parameters.
-        names: Names of the e parameters.
-        units: Their units.
-        values: (K, e) values of each recording.
-        std: (K, e) their standard deviations.
-        freedom: Degrees of freedom of these.
-    """
-    effects = random_effects(values, std**2, freedom)
-    deviation = np.sqrt(effects.variance)
-    between = effects.tau2 / np.where(deviation > 0.0, deviation**2 * len(values), 1.0)
-    reach = t_quantile(satterthwaite(between, freedom, len(values) - 1)) * deviation
-    count = len(names)
-    return RecordingComparison(
-        recordings=shared.recordings,
-        parameters=(*shared.parameters, *names),
-        units=(*shared.units, *units),
-        is_stated=np.concatenate([shared.is_stated, np.ones(count)]),
-        values=np.column_stack([shared.values, values]),
-        std=np.column_stack([shared.std, std]),
-        mean=np.concatenate([shared.mean, effects.mean]),
-        interval=np.concatenate(
-            [shared.interval, np.column_stack([effects.mean - reach, effects.mean + reach])]
-        ),
-        tau=np.concatenate([shared.tau, np.sqrt(effects.tau2)]),
-        share=np.concatenate([shared.share, effects.share]),
-        p=np.concatenate([shared.p, np.ones(count)]),
-        prediction=np.concatenate([shared.prediction, effects.prediction]),
-        joint_p=shared.joint_p,
-        odd=shared.odd,
     )
