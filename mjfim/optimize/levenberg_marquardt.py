@@ -348,8 +348,6 @@ class SearchSettings:
             linearisation: the search ends when the next step is expected to be below the tolerance.
         rough_share: Predicted decrease of the cost, as a share of the cost, below which a step is
             the last one. It serves searches that need not converge; 0 for the others.
-        next_step_length: Estimates the length of the next step [standard deviations] at the end
-            of a complete one, at less cost than a linearisation of all data. None without it.
         curved_rows: The common rows at the end of a step from given unknowns, where they are not
             linear along a step (`step_over_curved_rows`); None where they are.
         begins_near: Whether the search begins near the minimum, with hardly any damping. Damping
@@ -371,7 +369,6 @@ class SearchSettings:
     damped: bool = True
     relinearise_at_end: bool = True
     rough_share: float = 0.0
-    next_step_length: NextStepLength | None = None
     curved_rows: Callable[[UnknownValues, Array], Array | None] | None = None
     begins_near: bool = False
     in_true_deviations: bool = False
@@ -381,10 +378,6 @@ class SearchSettings:
 
 
 Callback = Callable[[IterationReport], None]
-
-# Length of the step that follows, from a linearisation, the step that was taken from there, and the
-# unknowns at its end.
-NextStepLength = Callable[[Condensed, Step, UnknownValues], float]
 
 
 def minimise(
@@ -545,12 +538,6 @@ class _Search:
             return replace(solution, rough=True, slow=not near)
         if futile:
             return self._solution("stopped: another minimum costs less", success=False)
-        if self._needs_no_relinearisation(trial, predicted):
-            self.condensed = self.condensed.after(trial.step)
-            return self._solution(
-                "converged: a part of the data shows that the next step would vanish", success=True
-            )
-
         self._relax_damping(trial.ratio)
         return self._linearise()
 
@@ -754,21 +741,6 @@ class _Search:
             return False
         left = max(trial.cost - (self.cost - predicted.predicted_decrease), 0.0)
         return trial.cost - FUTILE_FACTOR * left > self.settings.cost_to_beat
-
-    def _needs_no_relinearisation(self, trial: _Trial, predicted: Step) -> bool:
-        """Whether the linearisation, although it is one long step old, still holds at its end.
-
-        The cost must have fallen as predicted by a complete step, and the step that follows must be
-        below the tolerance.
-        """
-        estimate = self.settings.next_step_length
-        if estimate is None or trial.fraction != 1.0 or self.budget.exhausted is not None:
-            return False
-        as_predicted = abs(trial.ratio - 1.0) < LINEAR_RATIO_TOLERANCE
-        complete = predicted.common_length < COMPLETE_STEP * trial.step.common_length
-        if not (as_predicted and complete):
-            return False
-        return estimate(self.condensed, trial.step, trial.unknowns) < self._tolerance
 
     def _keep(self, at: UnknownValues) -> None:
         """Keep an iterate, with the private unknowns of the first segment only."""

@@ -32,14 +32,15 @@ from mjfim.identification.assessment.recording_comparison import compare_recordi
 from mjfim.identification.assessment.residual_tests import is_smaller_than_noise, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.search import of_subset
 from mjfim.identification.starts import values_of_start
 from mjfim.identification.task import FitTask
 from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.information.null_space import NullSpace
-from mjfim.model.control_laws import FIELDS, ControlLaw, law_unit
+from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
-from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
@@ -81,41 +82,39 @@ def laws_in_loop(
     """
     if system.laws is None:
         return ()
-    return tuple(
-        _law_in_loop(system, law, theta, clipped.get(law.actuator, 0.0)) for law in system.laws.laws
-    )
-
-
-def _law_in_loop(system: System, law: ControlLaw, theta: Array, clipped: float) -> ControlLawInLoop:
-    """Describe one law."""
-    assert system.laws is not None
     model = system.plant.model(theta)
-    values = law.numbers(model)
-
-    numbers: dict[str, float] = {}
-    units: dict[str, str] = {}
-    for field, names in FIELDS.items():
-        for i, name in enumerate(names):
-            key = field if len(names) == 1 else f"{field}[{i}]"
-            is_end = len(names) > 1
-            if np.isfinite(values[name]) and (is_end or values[name] != 0.0):
-                numbers[key] = values[name]
-                units[key] = law_unit(model, law.actuator, field)
-
     paths = {target.path for p in system.parameters.parameters for target in p.targets}
-    plain = not any(name in numbers for name in BEYOND_SERVOS) and not law.differences
-    is_force = control_unit(model, int(model.actuator(law.actuator).id)) in FORCE_UNITS.values()
-    return ControlLawInLoop(
-        actuator=law.actuator,
-        joint=law.joint,
-        rate=1.0 / (law.tick * float(model.opt.timestep)),
-        columns=tuple(system.laws.columns[i] for i in law.columns.values()),
-        numbers=numbers,
-        units=units,
-        estimated=tuple(key for key in numbers if f"controller/{law.actuator}:{key}" in paths),
-        clipped=clipped,
-        is_servo=plain and is_force and set(law.columns) == {"reference"},
-    )
+    found = []
+    for law in system.laws.laws:
+        values = law.numbers(model)
+        numbers: dict[str, float] = {}
+        units: dict[str, str] = {}
+        for field, names in FIELDS.items():
+            is_end = len(names) > 1
+            for i, name in enumerate(names):
+                key = f"{field}[{i}]" if is_end else field
+                if np.isfinite(values[name]) and (is_end or values[name] != 0.0):
+                    numbers[key] = values[name]
+                    units[key] = law_unit(model, law.actuator, field)
+
+        plain = not any(name in numbers for name in BEYOND_SERVOS) and not law.differences
+        unit = control_unit(model, int(model.actuator(law.actuator).id))
+        is_servo = plain and unit in FORCE_UNITS.values() and set(law.columns) == {"reference"}
+        estimated = (key for key in numbers if f"controller/{law.actuator}:{key}" in paths)
+        found.append(
+            ControlLawInLoop(
+                actuator=law.actuator,
+                joint=law.joint,
+                rate=1.0 / (law.tick * float(model.opt.timestep)),
+                columns=tuple(system.laws.columns[i] for i in law.columns.values()),
+                numbers=numbers,
+                units=units,
+                estimated=tuple(estimated),
+                clipped=clipped.get(law.actuator, 0.0),
+                is_servo=is_servo,
+            )
+        )
+    return tuple(found)
 
 
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
@@ -177,6 +176,11 @@ class FitResult:
         """(p,) estimate, with the values of the first recording."""
         return self.problem.theta(self.solution.unknowns)
 
+    @property
+    def quick(self) -> tuple[FitProblem, UnknownValues]:
+        """The problem of the segments that are quick to simulate, and its unknowns."""
+        return self.problem.of_segments(self.subset), of_subset(self.solution.unknowns, self.subset)
+
     @cached_property
     def accuracy(self) -> Accuracy:
         """Accuracy of the estimate."""
@@ -191,8 +195,6 @@ class _Findings:
 
     Attributes:
         result: The fit.
-        quality: Size and whiteness of the residuals.
-        accuracy: Accuracy of theta.
         comparison: Comparison of the recordings, or None.
         tests: Tests of terms that the model may lack.
         reasons: Reasons for a misfit, in sentences; empty where there is none.
@@ -204,8 +206,6 @@ class _Findings:
     """
 
     result: FitResult
-    quality: FitQuality
-    accuracy: Accuracy
     comparison: RecordingComparison | None
     tests: TermTests
     reasons: tuple[str, ...]
@@ -241,79 +241,111 @@ def estimate_from(
     Raises:
         SimulationDivergedError: The simulation diverges at the estimate.
     """
-    task, quality = result.task, result.quality
+    task, quality, problem, solution = result.task, result.quality, result.problem, result.solution
+    system, parameters = task.system, task.system.parameters
 
-    # Optional parts, each of which takes about as long as a search.
+    # Optional parts, each of which takes about as long as a search. There are no tests of terms
+    # where the fit is too poor for them.
     if tests is None:
         begin_stage("looking for terms that the model lacks")
-        tests = _term_tests(result, quality, budget)
+        tests = TermTests()
+        if not (budget.stop.requested or quality.unexplained):
+            found = find_missing_terms(problem, task.recordings, solution.unknowns)
+            tests = TermTests() if budget.stop.requested else found
     tests = tests.without(refuted)
     predictions = _predictions(result, budget)
-
     reasons = misfit_reasons(
         quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, tests.named
     )
+
     begin_stage("computing the intervals")
     accuracy = result.accuracy
-    comparison = compare_recordings(
-        result.problem,
-        result.solution,
-        quality.correlation_rows(result.problem.row_count),
-        accuracy.robust,
-    )
-    at_bound, outside = _at_bounds(task.system.parameters, result.theta, task.settings.hold)
+    rows = quality.correlation_rows(problem.row_count)
+    at_bound, outside = _at_bounds(parameters, result.theta, task.settings.hold)
 
+    # A good fit needs no advice.
+    is_poor = bool(reasons or quality.unexplained) or not solution.success
+    unpredictable = None
+    if is_poor and not solution.interrupted:
+        unpredictable = unpredictable_motion(problem, solution.unknowns)
     findings = _Findings(
         result=result,
-        quality=quality,
-        accuracy=accuracy,
-        comparison=comparison,
+        comparison=compare_recordings(problem, solution, rows, accuracy.robust),
         tests=tests,
         reasons=reasons,
         at_bound=at_bound,
         outside=outside,
         interrupted=budget.stop.requested,
-        unpredictable=_unpredictable(result, bool(reasons or quality.unexplained)),
-        flipped=_flipped_signs(result, quality, budget),
+        unpredictable=unpredictable,
+        flipped=_flipped_signs(result, budget),
     )
-    return _estimate(findings, predictions)
+    undetermined = accuracy.singular or accuracy.single_unidentifiable
+    per_recording = zip(
+        problem.layout.per_recording, solution.unknowns.per_recording.T.tolist(), strict=True
+    )
+    quick, at = result.quick
+    interval = accuracy.interval
+    if result.horizons is not None:
+        interval = result.horizons.widened(interval)
+    estimate = Estimate(
+        parameters=parameters.names,
+        units=system.units,
+        prior=parameters.prior_information + CadPrior.of(parameters).information(result.theta),
+        theta=result.theta,
+        std=accuracy.std,
+        covariance=accuracy.covariance,
+        initial_theta=task.start,
+        chi2=quality.chi2,
+        dof=quality.dof,
+        status=solution.status,
+        success=solution.success and not (undetermined or outside),
+        misfit=bool(reasons),
+        iterations=solution.iterations,
+        residual_rms=quality.rms,
+        at_bound=at_bound,
+        predicted=quality.predicted,
+        recordings=_as_aligned(problem, task.recordings),
+        warnings=tuple(_warnings(findings)),
+        combinations=tuple(str(group) for group in accuracy.groups),
+        data=accuracy.data_information,
+        std_sandwich=accuracy.sandwich,
+        interval=interval,
+        between_recordings=accuracy.between,
+        sigma=dict(zip(system.outputs.names, problem.noise.sigma.tolist(), strict=True)),
+        reasons=reasons,
+        whiteness=quality.whiteness,
+        sloppy=tuple(name for name, _ in accuracy.poorly_known),
+        missing_terms=tests.named,
+        tested_data=tests.data,
+        per_recording={parameters.names[j]: tuple(values) for j, values in per_recording},
+        worst_residual=quality.worst_residual if reasons else None,
+        predictions=predictions,
+        robust_uncertainty=accuracy.robust,
+        motion=problem.motion(solution.unknowns, 0, MAX_MOTION_SAMPLES),
+        interrupted=findings.interrupted,
+        labels=labels_of_system(system),
+        trace=np.array([task.start, *(problem.theta(each) for each in solution.iterates)]),
+        nominal=_nominal_outputs(result),
+        segments=_beginnings(problem),
+        sizes=parameters.sizes(result.theta),
+        restart=result.restart,
+        controllers=laws_in_loop(system, result.theta, quick.clipped_shares(at)),
+        horizons=result.horizons,
+        held=task.settings.hold,
+        inverse_dynamics=result.inverse_dynamics,
+        recording_comparison=findings.comparison,
+        prior_directions=accuracy.prior_directions,
+    )
+    return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
 
 
-def _unpredictable(result: FitResult, is_poor: bool) -> UnpredictableMotion | None:
-    """A motion that is too unstable for the segments; None for a good fit, which needs no advice.
-
-    Args:
-        result: The fit.
-        is_poor: True where the fit does not explain the data, although it may have converged.
-    """
-    solution = result.solution
-    if solution.interrupted or not (is_poor or not solution.success):
-        return None
-    return unpredictable_motion(result.problem, solution.unknowns)
-
-
-def _term_tests(result: FitResult, quality: FitQuality, budget: Budget) -> TermTests:
-    """Tests of terms that the model may lack.
-
-    There are none where the fit is too poor for the test, and none after a request to stop.
-    """
-    if budget.stop.requested or quality.unexplained:
-        return TermTests()
-
-    tests = find_missing_terms(result.problem, result.task.recordings, result.solution.unknowns)
-    return TermTests() if budget.stop.requested else tests
-
-
-def _flipped_signs(result: FitResult, quality: FitQuality, budget: Budget) -> tuple[str, ...]:
+def _flipped_signs(result: FitResult, budget: Budget) -> tuple[str, ...]:
     """Signals whose sign looks flipped; only a very poor fit can have any."""
-    noise_is_stated = result.task.noise_is_stated
+    quality, noise_is_stated = result.quality, result.task.noise_is_stated
     is_poor = noise_is_stated and quality.chi2 > POOR_FIT * quality.dof
     if budget.stop.requested or not (is_poor or quality.unexplained):
         return ()
-
-    unknowns = result.solution.unknowns
-    at = replace(unknowns, private=unknowns.private[result.subset])
-    problem = result.problem.of_segments(result.subset)
+    problem, at = result.quick
     squares = 2.0 * problem.cost(at)
     enough = sufficient_squares(squares, problem.value_count, noise_is_stated=noise_is_stated)
     return flipped_signs(
@@ -355,96 +387,6 @@ def _at_bounds(
     at_bound = np.flatnonzero(np.minimum(distance_below, distance_above) < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
     return names, bool((below | above).any())
-
-
-def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estimate:
-    """The record that a user gets."""
-    result = findings.result
-    quality = findings.quality
-    accuracy = findings.accuracy
-    problem = result.problem
-    solution = result.solution
-    system = result.task.system
-    parameters = system.parameters
-
-    undetermined = accuracy.singular or accuracy.single_unidentifiable
-    sigma = problem.noise.sigma.tolist()
-
-    per_recording = {}
-    for column, j in enumerate(problem.layout.per_recording):
-        values = solution.unknowns.per_recording[:, column]
-        per_recording[parameters.names[j]] = tuple(values.tolist())
-
-    estimate = Estimate(
-        parameters=parameters.names,
-        units=system.units,
-        prior=parameters.prior_information + CadPrior.of(parameters).information(result.theta),
-        theta=result.theta,
-        std=accuracy.std,
-        covariance=accuracy.covariance,
-        initial_theta=result.task.start,
-        chi2=quality.chi2,
-        dof=quality.dof,
-        status=solution.status,
-        success=solution.success and not (undetermined or findings.outside),
-        misfit=bool(findings.reasons),
-        iterations=solution.iterations,
-        residual_rms=quality.rms,
-        at_bound=findings.at_bound,
-        predicted=quality.predicted,
-        recordings=_as_aligned(result.problem, result.task.recordings),
-        warnings=tuple(_warnings(findings)),
-        combinations=tuple(str(group) for group in accuracy.groups),
-        data=accuracy.data_information,
-        std_sandwich=accuracy.sandwich,
-        interval=_covering(accuracy.interval, result),
-        between_recordings=accuracy.between,
-        sigma=dict(zip(system.outputs.names, sigma, strict=True)),
-        reasons=findings.reasons,
-        whiteness=quality.whiteness,
-        sloppy=tuple(name for name, _ in accuracy.poorly_known),
-        missing_terms=findings.tests.named,
-        tested_data=findings.tests.data,
-        per_recording=per_recording,
-        worst_residual=quality.worst_residual if findings.reasons else None,
-        predictions=predictions,
-        robust_uncertainty=accuracy.robust,
-        motion=problem.motion(solution.unknowns, 0, MAX_MOTION_SAMPLES),
-        interrupted=findings.interrupted,
-        labels=labels_of_system(system),
-        trace=_trace(result),
-        nominal=_nominal_outputs(result),
-        segments=_beginnings(problem),
-        sizes=parameters.sizes(result.theta),
-        restart=result.restart,
-        controllers=laws_in_loop(system, result.theta, _clipped_shares(result)),
-        horizons=result.horizons,
-        held=result.task.settings.hold,
-        inverse_dynamics=result.inverse_dynamics,
-        recording_comparison=findings.comparison,
-        prior_directions=accuracy.prior_directions,
-    )
-    return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
-
-
-def _clipped_shares(result: FitResult) -> dict[str, float]:
-    """Share of the samples at which limits of control laws act, by actuator."""
-    unknowns = result.solution.unknowns
-    at = replace(unknowns, private=unknowns.private[result.subset])
-    return result.problem.of_segments(result.subset).clipped_shares(at)
-
-
-def _covering(interval: Array, result: FitResult) -> Array:
-    """(p, 2) intervals that also hold what segments of other lengths tell differently."""
-    if result.horizons is None:
-        return interval
-    return result.horizons.widened(interval)
-
-
-def _trace(result: FitResult) -> Array:
-    """(n, p) the initial guess and the iterates of the search over all data [theta-unit]."""
-    iterates = [result.problem.theta(at) for at in result.solution.iterates]
-    return np.array([result.task.start, *iterates])
 
 
 def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:
@@ -497,8 +439,8 @@ def _warnings(findings: _Findings) -> Iterator[str]:
     yield from probable_degrees(result.task.system.experiment, result.task.system.source)
 
     # Where the misfit is, and where it may come from.
-    if findings.reasons and findings.quality.worst_residual is not None:
-        yield str(findings.quality.worst_residual)
+    if findings.reasons and findings.result.quality.worst_residual is not None:
+        yield str(findings.result.quality.worst_residual)
     if findings.reasons:
         yield from _warnings_of_rate(result)
     for term in findings.tests.named:
@@ -509,7 +451,7 @@ def _warnings(findings: _Findings) -> Iterator[str]:
         yield f"terms that the model may lack: {findings.tests.data.impossible_sentence}"
 
     yield from _implausible_estimates(result.task.system.parameters, result.theta)
-    yield from _warnings_of_poorly_known(findings.accuracy.poorly_known)
+    yield from _warnings_of_poorly_known(findings.result.accuracy.poorly_known)
     yield from _warnings_of_data(findings)
 
 
@@ -534,7 +476,7 @@ def _warnings_of_data(findings: _Findings) -> Iterator[str]:
     channels = result.task.system.channels
     names: dict[str, list[str]] = {}
     for recording, predicted in zip(
-        result.task.recordings, findings.quality.predicted, strict=True
+        result.task.recordings, findings.result.quality.predicted, strict=True
     ):
         for remark in plausibility_remarks(channels, recording, predicted):
             names.setdefault(remark, []).append(Path(recording.name).name)
@@ -571,9 +513,8 @@ def _dividing_timestep(period: float, timestep: float) -> float:
 
 def _warnings_of_search(findings: _Findings) -> Iterator[str]:
     """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
-    quality = findings.quality
-    accuracy = findings.accuracy
     result = findings.result
+    quality, accuracy = result.quality, result.accuracy
     if result.begun_instead:
         yield (
             f"the model diverges at the start ({values_of_start(result.task)}): the search began "
@@ -605,7 +546,7 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
 
 def _warnings_of_misfit(findings: _Findings) -> Iterator[str]:
     """Warnings about residuals that differ from the stated noise."""
-    quality = findings.quality
+    quality = findings.result.quality
     noise_is_stated = findings.result.task.noise_is_stated
     if findings.reasons:
         wrong = "The model or the noise is" if noise_is_stated else "The model is"
@@ -623,7 +564,7 @@ def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:
     for odd in () if findings.comparison is None else findings.comparison.odd:
         yield str(odd)
 
-    robust = findings.accuracy.robust
+    robust = findings.result.accuracy.robust
     if robust is None or not robust.apart:
         return
 
