@@ -22,7 +22,7 @@ from mjfim.optimize.levenberg_marquardt import (
     UnknownValues,
     minimise,
 )
-from mjfim.parallel.budget import Budget
+from mjfim.parallel.budget import Budget, StopReason
 from mjfim.plant.noise import Noise
 from mjfim.records.events import FitEvent, begin_stage
 
@@ -219,9 +219,14 @@ class FitSearch:
         complete, rough = (replace(each, begins_near=True) for each in (settings, rough))
         is_complete = False
         for number in range(MAX_NOISE_ROUNDS):
+            if self.interrupted and not solution.interrupted:
+                status = f"{StopReason.REQUESTED.value}; the best estimate so far"
+                solution = replace(solution, success=False, interrupted=True, status=status)
+            if solution.interrupted:
+                break
             sigma = self._residual_sigma(problem, solution.unknowns)
             change = np.abs(sigma / problem.noise.sigma - 1.0).max()
-            if solution.interrupted or (is_complete and change < NOISE_TOLERANCE):
+            if is_complete and change < NOISE_TOLERANCE:
                 break
             is_complete = bool(change < NEAR_NOISE) or number == MAX_NOISE_ROUNDS - 1
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)

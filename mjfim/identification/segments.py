@@ -210,7 +210,23 @@ def cut_into_segments(
     segments = []
     ticks = system.plant.tick_samples
     for i, recording in enumerate(recordings):
-        bounds = _on_ticks(_segment_bounds(recording, length), ticks)
+        N = len(recording.ctrl)
+        bounds = np.array([0, N])
+        if length is not None:
+            count = max(round(N * recording.dt / length), 1)
+            if N // count < MIN_SAMPLES:
+                raise RecordingError(
+                    f"{recording.name}: fit.segments = {length:g} s is too short; "
+                    f"a segment needs at least {MIN_SAMPLES} samples of {recording.dt:g} s"
+                )
+            bounds = np.linspace(0, N, count + 1).astype(int)
+
+        # Segments begin at evaluations of all control laws. Those that are shorter than the time
+        # between two evaluations go into their neighbours.
+        if ticks > 1:
+            at_ticks = np.unique(np.rint(bounds[:-1] / ticks).astype(int) * ticks)
+            kept = (at_ticks == 0) | (at_ticks <= N - MIN_SAMPLES)
+            bounds = np.append(at_ticks[kept], N)
 
         # The simulation of a segment begins earlier than its rows by the delay of the outputs.
         lead_samples = ticks * int(np.ceil(lead / (ticks * recording.dt) - 1e-9))
@@ -236,36 +252,6 @@ def cut_into_segments(
                 )
             )
     return tuple(segments)
-
-
-def _segment_bounds(recording: AlignedRecording, length: float | None) -> np.ndarray:
-    """Samples at which segments of nearly equal length [s] begin, and the last sample."""
-    N = len(recording.ctrl)
-    if length is None:
-        return np.array([0, N])
-
-    count = max(round(N * recording.dt / length), 1)
-    if N // count < MIN_SAMPLES:
-        raise RecordingError(
-            f"{recording.name}: fit.segments = {length:g} s is too short; "
-            f"a segment needs at least {MIN_SAMPLES} samples of {recording.dt:g} s"
-        )
-    return np.linspace(0, N, count + 1).astype(int)
-
-
-def _on_ticks(bounds: np.ndarray, ticks: int) -> np.ndarray:
-    """Samples at which segments begin, moved to evaluations of all control laws.
-
-    Segments that are shorter than the time between two evaluations go into their neighbours.
-
-    Args:
-        bounds: Samples at which segments begin, and the last sample.
-        ticks: Samples after which the evaluations repeat; 1 without laws.
-    """
-    if ticks == 1:
-        return bounds
-    begins = np.unique(np.rint(bounds[:-1] / ticks).astype(int) * ticks)
-    return np.append(begins[(begins == 0) | (begins <= bounds[-1] - MIN_SAMPLES)], bounds[-1])
 
 
 def _max_delay(parameters: ParameterSet, duration: float) -> float:

@@ -170,10 +170,6 @@ COMPLETE_STEP = 1.1
 MIN_RATIO_TO_LENGTHEN = 1.2
 MAX_LENGTHENING = 3.0
 
-# Difference of the ratio of the actual to the predicted decrease from 1, below which the cost falls
-# as the linearisation predicts.
-LINEAR_RATIO_TOLERANCE = 0.1
-
 # Decrease of the cost, relative to the cost, below which a search is near enough to its minimum for
 # its residuals to show how much they are autocorrelated.
 NEAR_DECREASE = 1e-2

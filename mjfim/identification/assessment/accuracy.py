@@ -21,7 +21,6 @@ from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.model.parameters import ParameterSet
-from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.check import ParameterGroup
 from mjfim.records.estimate import PriorDirections, Uncertainty
@@ -198,9 +197,24 @@ def accuracy_of(
     Returns:
         The accuracy.
     """
-    parameters = problem.system.parameters
-    theta = problem.theta(solution.unknowns)
-    covariance, std = _formal_covariance(problem, solution)
+    system, layout = problem.system, problem.layout
+    parameters, theta = system.parameters, problem.theta(solution.unknowns)
+    columns = layout.first_columns
+    index = layout.parameter_of_column[columns]
+
+    # The formal covariance; unknowns of each recording have the values of the first one.
+    H = solution.condensed.information()
+    common_std = standard_deviations(H)
+    is_regular = bool(np.isfinite(common_std).all())
+    common: Array = np.full_like(H, np.inf)
+    if is_regular:
+        root = inverse_root(H)
+        common = root @ root.T
+    formal = _of_parameters(problem, solution, common)
+    std = np.zeros(len(formal))
+    std[index] = common_std[columns]
+    if not layout.free_starts:
+        std[layout.private] = np.sqrt(np.diag(formal)[layout.private])
 
     # Members of a group are not identifiable separately, though pins make their information
     # regular.
@@ -209,50 +223,67 @@ def accuracy_of(
     members = [name for group in groups for name in group.members]
     in_group = np.isin(parameters.names, members)
     std = np.where(in_group, np.inf, std)
-    covariance = np.where(np.logical_or.outer(in_group, in_group), np.inf, covariance)
+    formal = np.where(np.logical_or.outer(in_group, in_group), np.inf, formal)
     declared_alone = np.array([not parameter.group for parameter in parameters.parameters])
 
-    data = _data_information(problem, solution)
-    robust = _robust(problem, solution, correlation_rows, inflation)
-    sandwich, interval, between = _intervals(problem, theta, std, robust)
+    # Robust values, from the blocks of the last linearisation; formal ones where there are none.
+    robust = None
+    covariance, sandwich, between = np.array(formal), np.array(std), np.zeros(len(std))
+    interval = np.column_stack([theta - NORMAL_95 * std, theta + NORMAL_95 * std])
+    if is_regular:
+        settings = system.experiment.fit
+        robust = robust_uncertainty(
+            solution.condensed,
+            problem.common_values(solution.unknowns),
+            problem.blocks.recording_of_block,
+            problem.blocks.mean_rows,
+            min_rows=independent_rows(problem, correlation_rows),
+            draws=settings.bootstrap,
+            rng=np.random.default_rng(settings.seed),
+            own=layout.own_columns,
+            inflation=inflation,
+        )
+        covariance = _of_parameters(
+            problem, solution, robust.covariance + between_covariance(robust)
+        )
+        is_known = np.isfinite(std[index])
+        known, places = index[is_known], columns[is_known]
+        sandwich[known] = robust.sandwich[places]
+        between[known] = robust.between[places]
+        interval[known] = robust.interval[places]
+    is_unknown = ~np.isfinite(std) | ~np.isfinite(np.diag(covariance))
+    covariance[is_unknown] = 0.0
+    covariance[:, is_unknown] = 0.0
+    covariance[is_unknown, is_unknown] = np.inf
+
+    # Intervals end at the bounds. An estimate beyond its bounds, which the method newton allows,
+    # stays inside its interval.
+    low = np.maximum(interval[:, 0], np.minimum(parameters.lower, theta))
+    high = np.minimum(interval[:, 1], np.maximum(parameters.upper, theta))
+    interval = np.column_stack([low, high])
+
+    # Information of the recordings alone about the parameters that they share. Only the priors on
+    # the other unknowns, which are marginalised, count.
+    J = problem.prior_rows.of_parameters(solution.unknowns)[:, :-1]
+    of_data = solution.condensed.information(with_common_rows=False)
+    data = np.zeros_like(formal)
+    shared = np.arange(len(layout.shared))
+    data[np.ix_(layout.shared, layout.shared)] = marginal(of_data, J.T @ J, shared)
     return Accuracy(
         std=std,
-        covariance=covariance,
-        robust_covariance=_robust_covariance(problem, solution, covariance, std, robust),
+        covariance=formal,
+        robust_covariance=covariance,
         sandwich=sandwich,
         interval=interval,
         between=between,
         groups=groups,
         singular=not np.isfinite(std[~in_group]).all(),
         single_unidentifiable=bool((in_group & declared_alone).any()),
-        poorly_known=tuple(_poorly_known(problem.system, theta, interval, covariance)),
+        poorly_known=tuple(_poorly_known(system, theta, interval, formal)),
         data_information=data,
         robust=robust,
         prior_directions=prior_directions(parameters, theta, data, std),
     )
-
-
-def _formal_covariance(problem: FitProblem, solution: Solution) -> tuple[Array, Array]:
-    """(p, p) formal covariance and (p,) standard deviations.
-
-    Unknowns of each recording have the values of the first recording.
-    """
-    layout = problem.layout
-    H = solution.condensed.information()
-    common_std = standard_deviations(H)
-    is_singular = not np.isfinite(common_std).all()
-    common: Array = np.full_like(H, np.inf)
-    if not is_singular:
-        root = inverse_root(H)
-        common = root @ root.T
-
-    covariance = _of_parameters(problem, solution, common)
-    std = np.zeros(len(covariance))
-    columns = layout.first_columns
-    std[layout.parameter_of_column[columns]] = common_std[columns]
-    if not layout.free_starts:
-        std[layout.private] = np.sqrt(np.diag(covariance)[layout.private])
-    return covariance, std
 
 
 def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Array:
@@ -269,87 +300,21 @@ def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Ar
     covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
 
     private = layout.private
-    if len(private) and not layout.free_starts:
-        of_private, cross = _private_covariance(solution.condensed, common, columns)
-        covariance[np.ix_(private, private)] = of_private
-        covariance[np.ix_(private, index)] = cross
-        covariance[np.ix_(index, private)] = cross.T
-    return covariance
+    if not len(private) or layout.free_starts:
+        return covariance
 
-
-def _private_covariance(
-    condensed: Condensed, common: Array, columns: np.ndarray
-) -> tuple[Array, Array]:
-    """(n, n) covariance of the first segment's private unknowns, and (n, k) with k common ones.
-
-    Both are infinite where an unknown is not determined.
-
-    Args:
-        condensed: Linearisation at the solution.
-        common: (c, c) covariance of the common unknowns.
-        columns: (k,) indices of the k common unknowns.
-    """
-    n = condensed.private_count
+    # The private unknowns follow the common ones linearly; both are infinite where an unknown is
+    # not determined.
+    condensed, n = solution.condensed, solution.condensed.private_count
     R = condensed.triangles[0, :n, :n]
-    if np.linalg.matrix_rank(R) < n or not np.isfinite(common).all():
-        return np.full((n, n), np.inf), np.full((n, len(columns)), np.inf)
-
-    # The private unknowns follow the common ones linearly.
-    response = condensed.private_response[0]
-    of_private = np.linalg.inv(R.T @ R) + response @ common @ response.T
-    cross = (response @ common)[:, columns]
-    return of_private, cross
-
-
-def _robust(
-    problem: FitProblem,
-    solution: Solution,
-    correlation_rows: Sequence[float],
-    inflation: float,
-) -> Uncertainty | None:
-    """Robust uncertainty from the blocks of the last linearisation.
-
-    None where a common unknown is not determined.
-    """
-    settings = problem.system.experiment.fit
-    information = solution.condensed.information()
-    if not np.isfinite(standard_deviations(information)).all():
-        return None
-
-    return robust_uncertainty(
-        solution.condensed,
-        problem.common_values(solution.unknowns),
-        problem.blocks.recording_of_block,
-        problem.blocks.mean_rows,
-        min_rows=independent_rows(problem, correlation_rows),
-        draws=settings.bootstrap,
-        rng=np.random.default_rng(settings.seed),
-        own=problem.layout.own_columns,
-        inflation=inflation,
-    )
-
-
-def _robust_covariance(
-    problem: FitProblem, solution: Solution, formal: Array, std: Array, robust: Uncertainty | None
-) -> Array:
-    """(p, p) robust covariance of the parameters, with the scatter between recordings.
-
-    Args:
-        problem: The least-squares problem.
-        solution: Its solution.
-        formal: (p, p) formal covariance, which counts where there is no robust one.
-        std: (p,) formal standard deviations, infinite where a parameter is not determined.
-        robust: Robust uncertainty of the common unknowns, or None.
-    """
-    covariance = np.array(formal)
-    if robust is not None:
-        common = robust.covariance + between_covariance(robust)
-        covariance = _of_parameters(problem, solution, common)
-
-    is_unknown = ~np.isfinite(std) | ~np.isfinite(np.diag(covariance))
-    covariance[is_unknown] = 0.0
-    covariance[:, is_unknown] = 0.0
-    covariance[is_unknown, is_unknown] = np.inf
+    of_private, cross = np.full((n, n), np.inf), np.full((n, len(columns)), np.inf)
+    if np.linalg.matrix_rank(R) == n and np.isfinite(common).all():
+        response = condensed.private_response[0]
+        of_private = np.linalg.inv(R.T @ R) + response @ common @ response.T
+        cross = (response @ common)[:, columns]
+    covariance[np.ix_(private, private)] = of_private
+    covariance[np.ix_(private, index)] = cross
+    covariance[np.ix_(index, private)] = cross.T
     return covariance
 
 
@@ -368,54 +333,6 @@ def independent_rows(problem: FitProblem, correlation_rows: Sequence[float]) -> 
         return block_length(correlation_rows, rows)
     duration = sum(float(recording.t[-1]) for recording in problem.recordings)
     return stated * rows / duration
-
-
-def _intervals(
-    problem: FitProblem, theta: Array, std: Array, robust: Uncertainty | None
-) -> tuple[Array, Array, Array]:
-    """(p,) sandwich deviations, (p, 2) intervals and (p,) deviations between recordings.
-
-    Formal values replace robust ones that are not available.
-    """
-    parameters = problem.system.parameters
-    sandwich = np.array(std)
-    between = np.zeros(len(std))
-    interval = np.column_stack([theta - NORMAL_95 * std, theta + NORMAL_95 * std])
-
-    if robust is not None:
-        columns = problem.layout.first_columns
-        index = problem.layout.parameter_of_column[columns]
-        is_known = np.isfinite(std[index])
-        index, columns = index[is_known], columns[is_known]
-
-        sandwich[index] = robust.sandwich[columns]
-        between[index] = robust.between[columns]
-        interval[index] = robust.interval[columns]
-
-    # Intervals end at the bounds. An estimate beyond its bounds, which the method newton allows,
-    # stays inside its interval.
-    low = np.maximum(interval[:, 0], np.minimum(parameters.lower, theta))
-    high = np.minimum(interval[:, 1], np.maximum(parameters.upper, theta))
-    return sandwich, np.column_stack([low, high]), between
-
-
-def _data_information(problem: FitProblem, solution: Solution) -> Array:
-    """(p, p) information of the recordings alone about the parameters that they share.
-
-    All other unknowns are marginalised.
-    """
-    parameters = problem.system.parameters
-    layout = problem.layout
-
-    # Only the priors on the marginalised unknowns count.
-    H = solution.condensed.information(with_common_rows=False)
-    J = problem.prior_rows.of_parameters(solution.unknowns)[:, :-1]
-    prior = J.T @ J
-    kept = np.arange(len(layout.shared))
-
-    information = np.zeros((len(parameters), len(parameters)))
-    information[np.ix_(layout.shared, layout.shared)] = marginal(H, prior, kept)
-    return information
 
 
 def _poorly_known(

@@ -101,7 +101,10 @@ def draw_parameters_system(
         )
 
     lower, upper = system.parameters.lower[drawn], system.parameters.upper[drawn]
-    centre = _centre(estimate)[drawn]
+    centre = np.array(estimate.theta)
+    for name, of_recordings in estimate.per_recording.items():
+        centre[names.index(name)] = np.mean(of_recordings)
+    centre = centre[drawn]
     outside = [names[j] for j in drawn[(centre < lower) | (centre > upper)]]
     if outside:
         raise ExperimentError(
@@ -110,7 +113,14 @@ def draw_parameters_system(
         )
 
     combinations = _undetermined(system.parameters, estimate, drawn)
-    covariance = _with_held(covariance, combinations)
+    if len(combinations):
+        # The distribution given that these combinations stay as they are. What is known of sums,
+        # such as a moment of inertia and the armature of its joint, is known of the parameters that
+        # are still drawn. Roots orthogonal to the combinations lose no digits of it.
+        root = covariance_root(covariance)
+        _, _, axes = np.linalg.svd(combinations @ root)
+        kept = root @ axes[len(combinations) :].T
+        covariance = np.asarray(kept @ kept.T)
     values, replaced = _physical_draws(
         system, estimate, drawn, centre, covariance, count=count, rng=rng
     )
@@ -143,35 +153,6 @@ def _undetermined(parameters: ParameterSet, estimate: Estimate, drawn: np.ndarra
     weights = np.zeros((len(of_inertias), len(drawn)))
     weights[:, np.searchsorted(drawn, found.columns)] = of_inertias
     return weights
-
-
-def _with_held(covariance: Array, combinations: Array) -> Array:
-    """(q, q) covariance of a normal distribution given that some combinations stay as they are.
-
-    What is known of sums, such as a moment of inertia and the armature of its joint, is known of
-    the parameters that are still drawn.
-
-    Args:
-        covariance: (q, q) covariance.
-        combinations: (m, q) weights of the combinations.
-    """
-    if not len(combinations):
-        return covariance
-    root = covariance_root(covariance)
-    weights = combinations @ root
-
-    # Roots orthogonal to the combinations, which lose no digits of what is known well.
-    _, _, axes = np.linalg.svd(weights)
-    kept = root @ axes[len(combinations) :].T
-    return np.asarray(kept @ kept.T)
-
-
-def _centre(estimate: Estimate) -> Array:
-    """(p,) estimates, with the means of parameters that differ between recordings."""
-    centre = np.array(estimate.theta)
-    for name, values in estimate.per_recording.items():
-        centre[estimate.parameters.index(name)] = np.mean(values)
-    return centre
 
 
 def _physical_draws(
@@ -284,15 +265,10 @@ def _is_physical(system: System, estimate: Estimate, drawn: np.ndarray, values: 
 
     # Principal moments that are parameters of their own need a test: of a rigid body, no moment
     # exceeds the sum of the others, and MuJoCo refuses an MJCF in which one does.
-    bodies = _bodies_with_moments(system)
+    fields = [target.field for p in system.parameters.parameters for target in p.targets]
+    moments_of = [f for f in fields if isinstance(f, ModelField) and f.array == "body_inertia"]
+    bodies = sorted({field.rows[0] for field in moments_of})
     if not bodies:
         return True
     moments = np.sort(system.model_at(theta).body_inertia[bodies], axis=1)
     return bool((moments[:, 2] <= moments[:, 0] + moments[:, 1]).all())
-
-
-def _bodies_with_moments(system: System) -> list[int]:
-    """Numbers of the bodies of which principal moments of inertia are parameters."""
-    fields = [target.field for p in system.parameters.parameters for target in p.targets]
-    moments = [f for f in fields if isinstance(f, ModelField) and f.array == "body_inertia"]
-    return sorted({field.rows[0] for field in moments})

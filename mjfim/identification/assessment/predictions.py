@@ -63,7 +63,7 @@ def predict(
     problem = FitProblem.of(system, recordings)
     values = np.asarray(theta)
     return tuple(
-        _errors(problem, values, masks_of(problem.masks, [i]), recording.name, Budget())
+        _predicted(problem, values, masks_of(problem.masks, [i]), recording.name, Budget())[0]
         for i, recording in enumerate(problem.recordings)
     )
 
@@ -85,12 +85,9 @@ def predict_unfitted(
     Returns:
         The predictions.
     """
-    found = (
-        _cross_validate(problem, solution, budget)
-        if held_out is None
-        else _predict_held_out(held_out, solution.unknowns.theta, budget)
-    )
-    return tuple(found)
+    if held_out is None:
+        return tuple(_cross_validate(problem, solution, budget))
+    return tuple(_predict_held_out(held_out, solution.unknowns.theta, budget))
 
 
 def _predict_held_out(held_out: FitProblem, theta: Array, budget: Budget) -> Iterator[Prediction]:
@@ -146,8 +143,8 @@ def _prediction_by_others(
     guess, masks = problem.system.parameters.guess, part.masks(problem)
     return Prediction(
         name=part.name,
-        identified=_errors(problem, others.theta, masks, part.name, budget),
-        nominal=_errors(problem, guess, masks, part.name, budget),
+        identified=_predicted(problem, others.theta, masks, part.name, budget)[0],
+        nominal=_predicted(problem, guess, masks, part.name, budget)[0],
         held_out=False,
     )
 
@@ -161,14 +158,6 @@ def _note_of_subset(recordings: Sequence[int], subset: FitProblem, whole: FitPro
     return "" if tested == count else f" ({tested} of {count} segments)"
 
 
-def _errors(
-    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget
-) -> PredictionErrors:
-    """Errors of the values in some masks: (M, ny) for every recording, at theta: (p,)."""
-    part, at = with_initial_states(problem, theta, masks, budget)
-    return _errors_of(problem, part.masked(masks).errors_at(at), name)
-
-
 def _predicted(
     problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget
 ) -> tuple[PredictionErrors, list[Array]]:
@@ -179,19 +168,12 @@ def _predicted(
     """
     part, at = with_initial_states(problem, theta, masks, budget)
     predicted = part.predict(at)
-    if predicted is None:
-        diverged = [np.full(mask.shape, np.nan) for mask in masks]
-        return _errors_of(problem, None, name), diverged
-    return _errors_of(problem, part.masked(masks).errors(predicted), name), predicted
-
-
-def _errors_of(problem: FitProblem, errors: Sequence[Array] | None, name: str) -> PredictionErrors:
-    """Sizes of the errors of every output; NaN without any, or where the model diverges."""
-    outputs = problem.system.outputs.names
-    rms = np.full(len(outputs), np.nan)
-    mae = np.full(len(outputs), np.nan)
-    for j, of_output in enumerate(errors or []):
+    errors = [] if predicted is None else part.masked(masks).errors(predicted)
+    names = problem.system.outputs.names
+    rms, mae = np.full((2, len(names)), np.nan)
+    for j, of_output in enumerate(errors):
         if len(of_output):
             rms[j] = np.sqrt(np.mean(of_output**2))
             mae[j] = np.mean(np.abs(of_output))
-    return PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
+    found = PredictionErrors(name=name, outputs=names, rms=rms, mae=mae)
+    return found, predicted or [np.full(mask.shape, np.nan) for mask in masks]

@@ -239,28 +239,6 @@ MAX_CONDITION_OF_DRAW = 1e14
 SMALLEST_VARIANCE = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SingleEstimates:
-    """Separate estimates from each of K recordings.
-
-    Attributes:
-        theta: (K, c) estimates, NaN where a recording does not determine all unknowns.
-        formal_variance: (K, c) formal variances.
-        variance: (K, c) variances from the scatter of the scores within the recording, infinite
-            where there is no estimate.
-        information: (c, c) information of the recordings with an estimate.
-        scores: (b, c) scores of these recordings, less the mean of the recording.
-        count: Number of recordings with an estimate.
-    """
-
-    theta: Array
-    formal_variance: Array
-    variance: Array
-    information: Array
-    scores: Array
-    count: int
-
-
 def robust_uncertainty(
     condensed: Condensed,
     theta: Array,
@@ -471,58 +449,19 @@ def _compare_recordings(
         (K, s) estimates, (s,) standard deviations between recordings, and the indices of unknowns
         on which they disagree.
     """
-    single = _single_estimates(theta, evidence)
-
-    # The relative scatter within each recording is at least that of all recordings together,
-    # because a few blocks often scatter little by chance.
-    inflation, freedom = _inflation(single)
-    variance = np.maximum(single.variance, single.formal_variance * inflation)
-
-    between = np.zeros(len(theta))
-    apart = []
-    for j in range(len(theta)):
-        estimated = np.isfinite(single.theta[:, j])
-        if estimated.sum() < 2:
-            continue
-
-        # Compare the weighted scatter of the estimates with the scatter that their variances
-        # explain.
-        y = single.theta[estimated, j]
-        w = 1.0 / variance[estimated, j]
-        mean = np.sum(w * y) / w.sum()
-        scatter = float(np.sum(w * (y - mean) ** 2))
-        others = int(estimated.sum()) - 1
-        if scipy.special.fdtrc(others, freedom, scatter / others) < SIGNIFICANCE:
-            apart.append(j)
-            excess = max(scatter - others, 0.0)
-            between[j] = np.sqrt(excess / (w.sum() - np.sum(w**2) / w.sum()))
-    return single.theta, between, tuple(apart)
-
-
-def _single_estimates(theta: Array, evidence: RecordingEvidence) -> _SingleEstimates:
-    """Separate estimates from each recording, one Gauss-Newton step away from theta: (c,).
-
-    Args:
-        theta: (c,) estimate from all recordings.
-        evidence: What single recordings say about these unknowns.
-    """
-    c = len(theta)
-    count = evidence.count
-    each = np.full((count, c), np.nan)
-    variance = np.full((count, c), np.inf)
-    formal = np.ones((count, c))
+    c, K = len(theta), evidence.count
+    each = np.full((K, c), np.nan)
+    variance = np.full((K, c), np.inf)
+    formal = np.ones((K, c))
     total = np.zeros((c, c))
     centred_scores = [np.zeros((0, c))]
-
-    for k in range(count):
-        # Normal equations of the recording and of the priors on its private unknowns.
+    for k in range(K):
+        # Normal equations of the recording and of the priors on its private unknowns, one
+        # Gauss-Newton step away from the common estimate.
         of_recording = evidence.recording == k
-        scores = evidence.scores[of_recording]
-        information = evidence.information[of_recording]
         H, g = evidence.normal_equations(k)
         if _condition_number(H) > MAX_CONDITION_OF_RECORDING:
             continue
-
         inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
         step = -inverse @ g
         each[k] = theta + step
@@ -530,42 +469,40 @@ def _single_estimates(theta: Array, evidence: RecordingEvidence) -> _SingleEstim
 
         # Scores at the estimate from this recording, so that differences between recordings do not
         # count as scatter within one.
-        scores = scores + information @ step
+        scores = evidence.scores[of_recording] + evidence.information[of_recording] @ step
         centred = scores - scores.mean(axis=0)
-        blocks_of_recording = len(centred)
-        correction = blocks_of_recording / max(blocks_of_recording - 1, 1)
-        scatter = centred.T @ centred * correction
-        variance[k] = np.diag(inverse @ scatter @ inverse)
-
+        correction = len(centred) / max(len(centred) - 1, 1)
+        variance[k] = np.diag(inverse @ (centred.T @ centred * correction) @ inverse)
         total += H
         centred_scores.append(centred)
 
-    return _SingleEstimates(
-        theta=each,
-        formal_variance=formal,
-        variance=variance,
-        information=total,
-        scores=np.concatenate(centred_scores),
-        count=len(centred_scores) - 1,
-    )
+    # The relative scatter within each recording is at least that of all recordings together,
+    # because a few blocks often scatter little by chance.
+    joined = np.concatenate(centred_scores)
+    freedom = max(len(joined) - (len(centred_scores) - 1), 1)
+    inverse = scaled_pseudo_inverse(total, INVERSE_TOLERANCE)
+    scatter = joined.T @ joined * (len(joined) / freedom)
+    expected = np.maximum(np.diag(inverse), SMALLEST_VARIANCE)
+    inflation = np.maximum(np.diag(inverse @ scatter @ inverse) / expected, 1.0)
+    variance = np.maximum(variance, formal * inflation)
 
+    between = np.zeros(c)
+    apart = []
+    for j in range(c):
+        estimated = np.isfinite(each[:, j])
+        others = int(estimated.sum()) - 1
+        if others < 1:
+            continue
 
-def _inflation(single: _SingleEstimates) -> tuple[Array, int]:
-    """(c,) ratio of the variances from the scatter within recordings to the formal variances.
-
-    The ratio is at least 1. The number of degrees of freedom of the scatter is returned as well.
-    """
-    scores = single.scores
-    count = len(scores)
-    freedom = max(count - single.count, 1)
-    S = scores.T @ scores * (count / freedom)
-
-    inverse = scaled_pseudo_inverse(single.information, INVERSE_TOLERANCE)
-    formal = np.maximum(np.diag(inverse), SMALLEST_VARIANCE)
-    variance = np.diag(inverse @ S @ inverse)
-
-    ratio = np.maximum(variance / formal, 1.0)
-    return np.asarray(ratio), freedom
+        # Compare the weighted scatter of the estimates with the scatter that their variances
+        # explain.
+        y, w = each[estimated, j], 1.0 / variance[estimated, j]
+        mean = np.sum(w * y) / w.sum()
+        found = float(np.sum(w * (y - mean) ** 2))
+        if scipy.special.fdtrc(others, freedom, found / others) < SIGNIFICANCE:
+            apart.append(j)
+            between[j] = np.sqrt(max(found - others, 0.0) / (w.sum() - np.sum(w**2) / w.sum()))
+    return each, between, tuple(apart)
 
 
 def _condition_number(H: Array) -> Array:

@@ -162,41 +162,36 @@ def _record(
     fits = tuple(_equation_fits(search, found, longest))
     times = {fit.name: fit.correlation for fit in fits}
     correlation = np.array([times.get(each.name, 1.0) for each in search.equations.equations])
-    accuracy = search.accuracy(found, correlation)
+    covariance, unknown, determined, condition = search.accuracy(found, correlation)
 
-    std = np.sqrt(np.maximum(np.diag(accuracy.covariance), 0.0))
-    unknown = accuracy.undetermined.tolist()
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     without_prior = [j for j in unknown if parameters.parameters[j].prior is None]
     std[without_prior] = np.inf
     absent = np.setdiff1d(np.arange(len(parameters)), [*search.active, *unknown])
     std[absent] = np.nan
+    status = f"converged after {found.count} linearisations"
+    if found.count == 1:
+        status = "converged: the equation of motion is linear in the parameters"
+    if not found.success:
+        status = "not converged: no step lowers the residuals of the equation of motion any more"
     return InverseDynamicsFit(
         parameters=parameters.names,
         units=tuple(parameter.unit for parameter in parameters.parameters),
         theta=search.coordinates.theta(found.x),
         std=std,
-        covariance=accuracy.covariance,
+        covariance=covariance,
         start=search.coordinates.theta(search.start),
         equations=fits,
-        determined=accuracy.determined,
+        determined=determined,
         undetermined=tuple(parameters.names[j] for j in unknown),
         absent=tuple(parameters.names[j] for j in absent),
-        condition=accuracy.condition,
+        condition=condition,
         iterations=found.count,
         success=found.success,
-        status=_status(found),
+        status=status,
         recording=recordings[longest].name,
         sizes=parameters.magnitude,
     )
-
-
-def _status(found: FoundEquations) -> str:
-    """How a search ended, in words."""
-    if not found.success:
-        return "not converged: no step lowers the residuals of the equation of motion any more"
-    if found.count == 1:
-        return "converged: the equation of motion is linear in the parameters"
-    return f"converged after {found.count} linearisations"
 
 
 def _equation_fits(

@@ -113,23 +113,6 @@ class FoundEquations:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EquationAccuracy:
-    """Accuracy of parameters that were fitted to the equations.
-
-    Attributes:
-        covariance: (p, p) covariance of the parameters [theta-unit²].
-        undetermined: Indices of the parameters that the recordings do not determine.
-        determined: Number of combinations that they determine.
-        condition: Condition number of these.
-    """
-
-    covariance: Array
-    undetermined: np.ndarray
-    determined: int
-    condition: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class EquationSearch:
     """The least-squares problem of the equations.
 
@@ -413,12 +396,19 @@ class EquationSearch:
 
     # ---- accuracy
 
-    def accuracy(self, found: FoundEquations, correlation: Array) -> EquationAccuracy:
+    def accuracy(
+        self, found: FoundEquations, correlation: Array
+    ) -> tuple[Array, list[int], int, float]:
         """Accuracy of the parameters at a solution.
 
         Args:
             found: The solution.
             correlation: (E,) number of correlated rows that count as one, by equation.
+
+        Returns:
+            (p, p) covariance of the parameters [theta-unit²], indices of those that the recordings
+            do not determine, the number of combinations that they determine, and the condition
+            number of these.
         """
         weights = found.weights / np.sqrt(correlation)[self.of_row]
         D = self.coordinates.derivative(found.x)
@@ -441,12 +431,8 @@ class EquationSearch:
         scaled, _ = scaled_to_unit_diagonal(of_data[np.ix_(self.active, self.active)])
         singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled)[::-1], 0.0))
         least = max(float(singular[max(known, 1) - 1]), np.finfo(float).tiny)
-        return EquationAccuracy(
-            covariance=D @ _inverse(of_data + held + stated.T @ stated, self.active) @ D.T,
-            undetermined=np.flatnonzero(is_wide),
-            determined=known,
-            condition=float(singular[0]) / least,
-        )
+        covariance = D @ _inverse(of_data + held + stated.T @ stated, self.active) @ D.T
+        return covariance, np.flatnonzero(is_wide).tolist(), known, float(singular[0]) / least
 
 
 def _shapes(
