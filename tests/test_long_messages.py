@@ -29,8 +29,8 @@ from mjfim.records.check import (
     Roughness,
     SelfTest,
     groups_in_words,
+    verdict_of_check,
 )
-from mjfim.studies.check_verdict import verdict_of_check
 
 # Longest message [characters].
 LONGEST_MESSAGE = 600

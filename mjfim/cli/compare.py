@@ -10,7 +10,6 @@ import mjfim
 from mjfim.cli.common import ExperimentFile, Run, verb
 from mjfim.cli.progress import progress
 from mjfim.errors import NoResultError
-from mjfim.studies.baseline_titles import TITLES
 
 
 @verb()
@@ -21,7 +20,9 @@ def compare(
     methods: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME,...", help=f"Baselines to run before the design: {', '.join(TITLES)}."
+            metavar="NAME,...",
+            help="Baselines to run before the design: chirp, multisine, steps, fourier5, "
+            "fourier15, splines.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
@@ -32,28 +33,29 @@ def compare(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.excitation.task import DesignTask
     from mjfim.experiment.packing import input_files
+    from mjfim.experiment.system import System
     from mjfim.output.folders import comparison_files
-    from mjfim.studies.compare import chosen_methods, compare_task
+    from mjfim.studies.compare import chosen_methods
 
-    task = DesignTask.resolve(stated, threads=run.threads)
+    system = System.resolve(stated, threads=run.threads)
     chosen = None
     if methods is not None:
         chosen = [name.strip() for name in methods.split(",") if name.strip()]
-    run.claim(comparison_files(chosen_methods(task.system, chosen)), input_files(stated))
+    run.claim(comparison_files(chosen_methods(system, chosen)), input_files(stated))
 
     with run.workers() as workers, progress("comparing") as show:
-        result = compare_task(
-            task,
+        result = mjfim.compare(
+            stated,
             seconds=seconds,
             seed=seed,
             methods=chosen,
             callback=show,
             executor=workers,
+            threads=run.threads,
         )
     if not result.rows:
         raise NoResultError
 
-    run.finish(result, task.system, verdict="" if result.ok else " ".join(result.verdict))
+    run.finish(result, system, verdict="" if result.ok else " ".join(result.verdict))
     raise typer.Exit(0 if result.ok else 1)

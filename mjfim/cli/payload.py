@@ -89,10 +89,11 @@ def payload(
     with progress("reading"):
         logs = [read_log(path, system.channels).recording for path in (*paths, *unloaded)]
     with progress("fitting the payload") as display:
-        found = task.identify(logs[: len(paths)], without=logs[len(paths) :], callback=display)
+        result, loaded = task.identify(
+            logs[: len(paths)], without=logs[len(paths) :], callback=display
+        )
 
-    result = found.estimate
-    run.finish(result, found.system)
+    run.finish(result, loaded)
     is_good = result.success and not result.misfit and not result.interrupted
     is_seen = result.payload is not None and result.payload.is_seen
     raise typer.Exit(0 if is_good and is_seen else 1)

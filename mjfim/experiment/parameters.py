@@ -60,7 +60,7 @@ class Measured:
         if target.term is not None:
             return target.term.size
         if isinstance(field, OutputBiasField):
-            return float(self.sigma[field.output])
+            return float(self.sigma[field.row])
         if isinstance(field, OutputDelayField):
             return self.period
         return field.magnitude(model)

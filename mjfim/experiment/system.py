@@ -27,6 +27,7 @@ from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
+from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.terms.library import resolve_terms
 from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
@@ -137,7 +138,7 @@ class System:
             friction=parameters.changes_friction,
             mocap=mocap,
         )
-        parameters.writer.require_physical_bodies(private)
+        ParameterWriter(parameters).require_physical_bodies(private)
         plant = Plant(
             source=private,
             parameters=parameters,
@@ -410,7 +411,7 @@ class System:
         Returns:
             A new MjModel, which the caller may change.
         """
-        model = self.parameters.writer.model(self._whole_model, theta)
+        model = ParameterWriter(self.parameters).model(self._whole_model, theta)
         if self.mocap is not None and not at_keyframe:
             self.mocap.put(model, self.mocap.compiled)
         return model
@@ -439,7 +440,7 @@ class System:
     def impossible(self, theta: Array) -> list[int]:
         """Indices of parameters whose values at theta: (p,) give a body an unphysical inertia."""
         try:
-            faults = self.parameters.writer.unphysical_bodies(self.plant.source, theta)
+            faults = ParameterWriter(self.parameters).unphysical_bodies(self.plant.source, theta)
         except ModelError:
             return np.flatnonzero(self.parameters.needs_compile).tolist()
 

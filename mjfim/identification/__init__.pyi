@@ -1,5 +1,5 @@
 from .fit_problem import FitProblem
-from .parameter_draws import complete_theta
+from .assessment.parameter_draws import complete_theta
 from .task import FitTask
 
 __all__ = [

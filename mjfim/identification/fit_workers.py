@@ -29,7 +29,7 @@ from mjfim.parallel import (
     carry_out,
     one_blas_thread,
     pool_stop_token,
-    results_or_here,
+    results,
 )
 from mjfim.parallel.budget import Budget, StopToken, hurried
 from mjfim.parallel.kept import KeptPerThread
@@ -170,7 +170,7 @@ class FitWorkers:
             return order.work(alone, budget), 0
 
         orders = self._orders(problem, works)
-        for found in results_or_here(self._executor, _carry_out, orders, budget, here):
+        for found in results(_carry_out, orders, self._executor, budget, here):
             yield self._counted(problem, found)
 
     def _orders(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> list[_Order[T]]:

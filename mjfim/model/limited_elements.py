@@ -151,7 +151,19 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
                 stated=_range(model.jnt_actfrclimited, model.jnt_actfrcrange, joint),
             )
 
-    _add_controls(found, model, controls, time)
+    widths = control_sizes(model, time)
+    actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
+    for i, name in enumerate(controls):
+        size, unit = float(widths[i]), control_unit(model, actuators[i])
+        found.by_kind["control"][name] = LimitedElement(
+            index=i,
+            unit=unit,
+            size=size,
+            stated=_range(model.actuator_ctrllimited, model.actuator_ctrlrange, i),
+        )
+        found.by_kind["control_rate"][name] = LimitedElement(
+            index=i, unit=per_second(unit) if unit else "", size=size / time
+        )
     _add_actuators(found, model, time)
     _add_tendons(found, model, time)
     return found
@@ -208,21 +220,17 @@ def _add_joint(
                 moving = LimitedElement(index=v + i, unit=per_time, size=typical, is_part=True)
                 kinds[rate][each] = moving
     else:
-        # The range of a ball joint in the MJCF is its largest angle of rotation.
+        # The range of a ball joint in the MJCF is its largest angle of rotation, which is no limit
+        # where it is half a turn or more.
+        if kind == BALL and stated is not None and stated[1] >= np.pi:
+            stated = None
         kinds["position"][name] = LimitedElement(
-            index=q, count=count, unit=unit, size=size, stated=_below_half_turn(stated, kind)
+            index=q, count=count, unit=unit, size=size, stated=stated
         )
 
-    if kind in (BALL, FREE):
-        _add_rotation(found, model, joint, name, time)
-
-
-def _add_rotation(found: LimitedElements, model: Any, joint: int, name: str, time: float) -> None:
-    """Enter the angular velocity and the tilt of a ball joint or a free joint."""
-    kinds = found.by_kind
-    is_free = int(model.jnt_type[joint]) == FREE
-    first = int(model.jnt_dofadr[joint]) + (3 if is_free else 0)
-
+    if kind not in (BALL, FREE):
+        return
+    first = v + (3 if kind == FREE else 0)
     speed = LimitedElement(index=first, count=3, unit=per_second(ANGLE), size=1.0 / time)
     kinds["angular_velocity"][name] = speed
     for i, part in enumerate(ROTATION_VECTOR):
@@ -231,24 +239,6 @@ def _add_rotation(found: LimitedElements, model: Any, joint: int, name: str, tim
 
     address = quaternion_address(model, joint)
     kinds["tilt"][name] = LimitedElement(index=address, count=TILT_COMPONENTS, unit=ANGLE)
-
-
-def _add_controls(
-    found: LimitedElements, model: Any, controls: tuple[str, ...], time: float
-) -> None:
-    """Enter the controls and their rates."""
-    sizes = control_sizes(model, time)
-    actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
-    for i, name in enumerate(controls):
-        stated = _range(model.actuator_ctrllimited, model.actuator_ctrlrange, i)
-        size, unit = float(sizes[i]), control_unit(model, actuators[i])
-        per_time = per_second(unit) if unit else ""
-        found.by_kind["control"][name] = LimitedElement(
-            index=i, unit=unit, size=size, stated=stated
-        )
-        found.by_kind["control_rate"][name] = LimitedElement(
-            index=i, unit=per_time, size=size / time
-        )
 
 
 def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:
@@ -283,7 +273,7 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
         found.by_kind["tendon_length"][name] = LimitedElement(
             index=i,
             unit=LENGTH if _is_spatial(model, i) else "",
-            size=_tendon_size(model, i),
+            size=float(abs(model.tendon_length0[i])) or model_length(model),
             stated=_range(model.tendon_limited, model.tendon_range, i),
         )
         pulling = actuators_of_tendon(model, i)
@@ -309,18 +299,6 @@ def _is_spatial(model: Any, tendon: int) -> bool:
     """Whether a tendon is a path in space, and not a sum of joint coordinates."""
     first = int(model.tendon_adr[tendon])
     return int(model.wrap_type[first]) != int(mujoco.mjtWrap.mjWRAP_JOINT)
-
-
-def _tendon_size(model: Any, tendon: int) -> float:
-    """Natural size of the length of a tendon, where only one bound is stated."""
-    return float(abs(model.tendon_length0[tendon])) or model_length(model)
-
-
-def _below_half_turn(stated: Range | None, kind: int) -> Range | None:
-    """The range of a joint; None for a ball joint that may turn by half a turn or more."""
-    if kind == BALL and stated is not None and stated[1] >= np.pi:
-        return None
-    return stated
 
 
 def _range(limited: Any, ranges: Any, index: int) -> Range | None:
@@ -369,7 +347,8 @@ def turn_weights(model: Any, joint: int) -> Array:
         (3, 4) matrix that makes of the quaternion of the joint the vector part of its rotation from
         `qpos0`, in the frame of the body.
     """
-    reference = _reference(model, joint)
+    address = quaternion_address(model, joint)
+    reference = np.array(model.qpos0[address : address + 4])
     reference[1:] *= -1.0
 
     weights = np.zeros((4, 4))
@@ -423,9 +402,3 @@ def quaternion_address(model: Any, joint: int) -> int:
     """
     place = QUATERNION_PLACE[int(model.jnt_type[joint])]
     return int(model.jnt_qposadr[joint]) + place
-
-
-def _reference(model: Any, joint: int) -> Array:
-    """(4,) quaternion of a joint in the reference position."""
-    address = quaternion_address(model, joint)
-    return np.array(model.qpos0[address : address + 4])

@@ -110,7 +110,8 @@ def sample_parameters(
     free = [
         j
         for j, parameter in enumerate(parameters.parameters)
-        if _has_distribution(parameter) and not parameters.outside_model[j]
+        if (parameter.prior is not None or np.isfinite(parameter.bounds).all())
+        and not parameters.outside_model[j]
     ]
     if not free:
         raise ExperimentError(
@@ -129,11 +130,6 @@ def sample_parameters(
         for sample in samples[1:]:
             make_physical(sample, theta, unphysical)
     return samples
-
-
-def _has_distribution(parameter: Parameter) -> bool:
-    """Whether a parameter has a prior or finite bounds."""
-    return parameter.prior is not None or bool(np.isfinite(parameter.bounds).all())
 
 
 def _values(parameter: Parameter, value: float, quantiles: Array) -> Array:

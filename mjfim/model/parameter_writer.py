@@ -8,7 +8,7 @@ Tests compare both ways.
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,36 +19,22 @@ from mjfim.errors import ExperimentError, listed
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.loading import silence_mujoco_log
+from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TermField
 from mjfim.model.variants import PlantModel
-
-if TYPE_CHECKING:
-    from mjfim.model.parameters import ParameterSet
 
 # Relative amount by which the largest principal moment of inertia may exceed the sum of the other
 # two, because the moments of a plate or rod are often stated with few digits.
 MOMENT_ROUNDING = 1e-6
 
 
-class Workspace:
-    """Memory in which MuJoCo computes derived constants of a model.
-
-    Attributes:
-        data: MjData of the models that are written; None until it is needed.
-    """
-
-    def __init__(self) -> None:
-        self.data: Any = None
-
-
 class ParameterWriter:
     """Writes values theta: (p,) of a set of parameters into models."""
 
-    def __init__(self, parameters: ParameterSet, workspace: Workspace) -> None:
-        """Prepare the writer for a set of parameters and the memory in which it works."""
+    def __init__(self, parameters: ParameterSet) -> None:
+        """Set the parameters."""
         self._parameters = parameters
-        self._workspace = workspace
 
     def model(self, base: PlantModel | Any, theta: Array) -> Any:
         """A private copy of the base model with theta written into it.
@@ -92,16 +78,33 @@ class ParameterWriter:
         if mocap is not None:
             mocap.put(model, mocap.compiled)
 
+        same_frame = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         for (kind, row), values in self._write_numbers(model, theta).items():
-            if kind in INERTIA_PARAMETRISATIONS:
-                _write_inertia(model, row, kind, values)
-            else:
-                self._write_orientation(model, kind, row, values)
+            if kind not in INERTIA_PARAMETRISATIONS:
+                # A body or site is turned from its nominal orientation. MuJoCo skips the
+                # orientation of sites whose frame coincides with their body's.
+                turns = scipy.spatial.transform.Rotation
+                nominal = turns.from_quat(self._parameters.nominal[kind, row], scalar_first=True)
+                turned = nominal * turns.from_rotvec(values)
+                getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
+                if kind == "site_quat":
+                    model.site_sameframe[row] = same_frame
+                continue
 
-        if self._workspace.data is None:
-            self._workspace.data = mujoco.MjData(model)
+            # With the central parametrisation, mass and centre of mass are written separately, as
+            # numbers of their fields. MuJoCo skips inertial frames that coincide with the body's.
+            inertia = INERTIA_PARAMETRISATIONS[kind].inertia(values)
+            model.body_inertia[row], model.body_iquat[row] = inertia.principal_axes()
+            if kind != "central":
+                model.body_mass[row] = inertia.mass
+                model.body_ipos[row] = inertia.com
+            model.body_sameframe[row] = same_frame
+
+        workspace = self._parameters.workspace
+        if not workspace:
+            workspace.append(mujoco.MjData(model))
         with silence_mujoco_log():
-            mujoco.mj_setConst(model, self._workspace.data)
+            mujoco.mj_setConst(model, workspace[0])
 
         if mocap is not None:
             mocap.put(model, mocap.start)
@@ -191,18 +194,6 @@ class ParameterWriter:
             term.write(model, terms[term.name])
         return whole
 
-    def _write_orientation(self, model: Any, array: str, row: int, vector: Array) -> None:
-        """Turn a body or site from its nominal orientation by a rotation vector: (3,) [rad]."""
-        nominal = scipy.spatial.transform.Rotation.from_quat(
-            self._parameters.nominal[array, row], scalar_first=True
-        )
-        turned = nominal * scipy.spatial.transform.Rotation.from_rotvec(vector)
-        getattr(model, array)[row] = turned.as_quat(scalar_first=True)
-
-        # MuJoCo skips the orientation of sites whose frame coincides with their body's.
-        if array == "site_quat":
-            model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-
     def _edit(self, spec: Any, source: PlantModel, theta: Array) -> None:
         """Write into an MjSpec, in place, what needs a compile."""
         p = self._parameters
@@ -220,25 +211,6 @@ class ParameterWriter:
                 if isinstance(target.field, SpecField):
                     number = target.scale * float(theta[j]) + target.offset
                     write_element(spec, source.model, source.model, target.path, number)
-
-
-def _write_inertia(model: Any, body: int, kind: str, values: Array) -> None:
-    """Set the inertia of a body from its coordinates: (10,) in a parametrisation, in place.
-
-    With the central parametrisation, mass and centre of mass are written separately, as numbers of
-    their fields.
-    """
-    inertia = INERTIA_PARAMETRISATIONS[kind].inertia(values)
-    moments, quaternion = inertia.principal_axes()
-
-    model.body_inertia[body] = moments
-    model.body_iquat[body] = quaternion
-    if kind != "central":
-        model.body_mass[body] = inertia.mass
-        model.body_ipos[body] = inertia.com
-
-    # MuJoCo skips the inertial frame of bodies where it coincides with the body's.
-    model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> str:
@@ -311,7 +283,15 @@ def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float
 
     element = spec.option if path.kind == "option" else getattr(spec, path.kind)(path.name)
     if path.field in ("pos", "rot") and element.frame is not None:
-        leave_frame(element, getattr(compiled, path.kind)(path.name), text)
+        if getattr(element, "meshname", ""):
+            raise ExperimentError(
+                f"{text!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame"
+            )
+        # The pose is stated in the coordinates of the body instead of those of the `<frame>`.
+        found = getattr(compiled, path.kind)(path.name)
+        element.set_frame(element.parent.add_frame())
+        element.pos, element.quat = found.pos, found.quat
+        element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
     if path.field in INERTIAL_FIELDS:
         state_inertia(element, wanted)
@@ -336,7 +316,10 @@ def _write_number(
         state_inertia(element, compiled)
 
     if path.kind == "geom" and np.isfinite(element.fromto[0]):
-        state_geom(element, compiled)
+        # Its end points are replaced by the place and size that they compile to.
+        found = compiled.geom(element.id)
+        element.fromto = np.full(6, np.nan)
+        element.pos, element.quat, element.size = found.pos, found.quat, found.size
 
     # The compiler adds the offset of a mesh to the position.
     if path.kind == "geom" and path.field == "pos" and element.meshname:
@@ -347,38 +330,11 @@ def _write_number(
     if in_degrees and element.type == mujoco.mjtJoint.mjJNT_HINGE:
         value = float(np.rad2deg(value))
 
-    _assign(element, path.field, path.component, value)
-
-
-def _assign(element: Any, field: str, index: int, value: float) -> None:
-    """Set a field of an element of a spec: the scalar, or one entry of the array."""
-    old = np.array(getattr(element, field), dtype=np.float64)
+    # A scalar, or one entry of an array.
+    old = np.array(getattr(element, path.field), dtype=np.float64)
     if old.ndim:
-        old[index] = value
-        setattr(element, field, old)
-    else:
-        setattr(element, field, value)
-
-
-def leave_frame(element: Any, found: Any, text: str) -> None:
-    """State the pose of an element in the coordinates of its body instead of those of a `<frame>`.
-
-    Args:
-        element: The element of the spec, changed in place.
-        found: The element in the compiled model.
-        text: The parameter path, for the message.
-
-    Raises:
-        ExperimentError: The element is a mesh geom.
-    """
-    if getattr(element, "meshname", ""):
-        raise ExperimentError(
-            f"{text!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame"
-        )
-    element.set_frame(element.parent.add_frame())
-    element.pos = found.pos
-    element.quat = found.quat
-    element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        old[path.component] = value
+    setattr(element, path.field, old if old.ndim else value)
 
 
 def state_inertia(body: Any, compiled: Any) -> None:
@@ -390,12 +346,3 @@ def state_inertia(body: Any, compiled: Any) -> None:
     body.inertia = found.inertia
     body.fullinertia = np.full(6, np.nan)
     body.explicitinertial = True
-
-
-def state_geom(geom: Any, compiled: Any) -> None:
-    """Replace the end points of a geom of a spec by the place and size that they compile to."""
-    found = compiled.geom(geom.id)
-    geom.fromto = np.full(6, np.nan)
-    geom.pos = found.pos
-    geom.quat = found.quat
-    geom.size = found.size

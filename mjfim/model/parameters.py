@@ -13,7 +13,6 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
-from mjfim.model.parameter_writer import ParameterWriter, Workspace
 from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath
 from mjfim.model.targets import (
     InertiaField,
@@ -22,6 +21,7 @@ from mjfim.model.targets import (
     OutputBiasField,
     OutputDelayField,
     OutputScaleField,
+    OutsideField,
     RotationField,
     SpecField,
     TargetField,
@@ -34,9 +34,6 @@ from mjfim.model.variants import MocapPlacement
 # "simple". Mass and principal inertias are not among them: a body stays simple whatever they are,
 # and MuJoCo gives a body that only slides another constraint weight if it is not simple.
 FRAME_FIELDS = {"pos", "ipos", "rot", *INERTIAL_FIELDS}
-
-# Fields that are outside the model: the initial state and the measurement.
-FIELDS_OUTSIDE_MODEL = (InitialStateField, OutputBiasField, OutputScaleField, OutputDelayField)
 
 # Parametrisation of a body's inertia -> arrays of MjModel that may be varied together with it.
 ARRAYS_BESIDE_INERTIA = {
@@ -179,19 +176,10 @@ class ParameterSet:
     def __len__(self) -> int:
         return len(self.parameters)
 
-    @property
-    def writer(self) -> ParameterWriter:
-        """Writes values of the parameters into models.
-
-        It refers to these parameters and is not kept, because the two would refer to each other,
-        and the memory of both would wait for Python's garbage collector.
-        """
-        return ParameterWriter(self, self._workspace)
-
     @cached_property
-    def _workspace(self) -> Workspace:
-        """Memory in which the writer works."""
-        return Workspace()
+    def workspace(self) -> list[Any]:
+        """The MjData of the models that are written; empty until it is needed."""
+        return []
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -272,41 +260,33 @@ class ParameterSet:
 
     def initial_state_derivative(self, nx: int) -> Array:
         """(nx, p) derivative of the initial state, in the tangent space."""
-        matrix = np.zeros((nx, len(self)))
-        for j, target in self._targets():
-            if isinstance(target.field, InitialStateField):
-                matrix[target.field.tangent, j] += target.scale
-        return matrix
+        return self._derivative(InitialStateField, nx)
 
     def bias_derivative(self, ny: int) -> Array:
         """(ny, p) derivative of every output by constant biases."""
-        matrix = np.zeros((ny, len(self)))
-        for j, target in self._targets():
-            if isinstance(target.field, OutputBiasField):
-                matrix[target.field.output, j] += target.scale
-        return matrix
+        return self._derivative(OutputBiasField, ny)
 
     def scale_derivative(self, ny: int) -> Array:
         """(ny, p) derivative of the relative scale error of every output."""
-        matrix = np.zeros((ny, len(self)))
-        for j, target in self._targets():
-            if isinstance(target.field, OutputScaleField):
-                matrix[target.field.output, j] += target.scale
-        return matrix
+        return self._derivative(OutputScaleField, ny)
 
     @cached_property
     def delay_derivative(self) -> Array:
         """(p,) derivative of the time by which outputs lag [s / theta-unit]."""
-        derivative = np.zeros(len(self))
+        return np.asarray(self._derivative(OutputDelayField, 1)[0])
+
+    def _derivative(self, kind: type[OutsideField], rows: int) -> Array:
+        """(rows, p) derivative of what fields outside the model stand for."""
+        matrix = np.zeros((rows, len(self)))
         for j, target in self._targets():
-            if isinstance(target.field, OutputDelayField):
-                derivative[j] += target.scale
-        return derivative
+            if isinstance(target.field, kind):
+                matrix[target.field.row, j] += target.scale
+        return matrix
 
     @cached_property
     def outside_model(self) -> np.ndarray:
         """(p,) True where a parameter concerns the initial state or the measurement."""
-        return self._has_field(FIELDS_OUTSIDE_MODEL)
+        return self._has_field(OutsideField)
 
     @cached_property
     def initial_deviations(self) -> np.ndarray:

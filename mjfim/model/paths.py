@@ -230,7 +230,9 @@ def resolve(
         )
 
     if path.kind == "option":
-        return _option_field(model, path)
+        array = MODEL_ARRAYS["option"][path.field]
+        width = int(np.size(getattr(model.opt, array)))
+        return ModelField(array=array, rows=(path.component_of(width),), in_options=True)
     if path.kind == "output":
         return _output_field(path, outputs)
     if path.kind == "controller":
@@ -315,13 +317,6 @@ def _term_field(model: Any, path: ParameterPath, terms: Mapping[str, Term]) -> T
         followers.append((other.array, other.rows[0], other.column or 0, other_factor))
     assert isinstance(field, ModelField)
     return replace(field, factor=factor * field.factor, followers=tuple(followers))
-
-
-def _option_field(model: Any, path: ParameterPath) -> ModelField:
-    """A number of the model's options, such as gravity."""
-    array = MODEL_ARRAYS["option"][path.field]
-    width = int(np.size(getattr(model.opt, array)))
-    return ModelField(array=array, rows=(path.component_of(width),), in_options=True)
 
 
 def _output_field(path: ParameterPath, outputs: Sequence[str]) -> TargetField:
@@ -414,25 +409,18 @@ def _element_field(model: Any, path: ParameterPath, decoration: Collection[str])
         return RotationField(f"{path.kind}_quat", number, path.component_of(3))
 
     if path.field in COMPILED_FIELDS.get(path.kind, ()):
-        return _geom_field(model, path, number, decoration)
+        # Place, size, mass or density of a geom need a compile unless the geom is decoration.
+        index = path.component_of(3 if path.field in ("size", "pos") else 1)
+        if path.field == "size" and int(model.geom_dataid[number]) >= 0:
+            raise path.error("the size of a mesh or height field is not a number of the geom")
+        if path.field in ("size", "pos") and path.name in decoration:
+            return ModelField(array=f"geom_{path.field}", rows=(number,), column=index)
+        return SpecField(path.kind, path.name, path.field, index)
 
     if path.kind == "actuator" and path.field in SERVO_FIELDS:
         return _servo_field(model, path, number)
 
     return _array_field(model, path, number)
-
-
-def _geom_field(
-    model: Any, path: ParameterPath, geom: int, decoration: Collection[str]
-) -> TargetField:
-    """Place, size, mass or density of a geom: it needs a compile unless the geom is decoration."""
-    index = path.component_of(3 if path.field in ("size", "pos") else 1)
-    if path.field == "size" and int(model.geom_dataid[geom]) >= 0:
-        raise path.error("the size of a mesh or height field is not a number of the geom")
-
-    if path.field in ("size", "pos") and path.name in decoration:
-        return ModelField(array=f"geom_{path.field}", rows=(geom,), column=index)
-    return SpecField(path.kind, path.name, path.field, index)
 
 
 def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:

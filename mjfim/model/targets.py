@@ -17,7 +17,7 @@ with which a change of it is compared.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -153,21 +153,15 @@ class InertiaField:
 
 
 class DeviationField:
-    """A difference from the stated model, so that its value there is zero.
-
-    Attributes:
-        natural_magnitude: Size with which a change is compared, in the unit of the number.
-    """
-
-    natural_magnitude: ClassVar[float] = 1.0
+    """A difference from the stated model, so that its value there is zero."""
 
     def read(self, model: Any) -> float:
         """Zero."""
         return 0.0
 
     def magnitude(self, model: Any) -> float:
-        """The natural magnitude."""
-        return self.natural_magnitude
+        """Size with which a change is compared, in the unit of the number."""
+        return 1.0
 
 
 @dataclass(frozen=True)
@@ -242,14 +236,19 @@ class TermField:
 
 
 @dataclass(frozen=True)
-class InitialStateField(DeviationField):
-    """Deviation of one component of the initial state.
+class OutsideField(DeviationField):
+    """A number outside the model, of the initial state or of the measurement.
 
     Attributes:
-        tangent: Its place in the tangent space (dq, dv, da).
+        row: Place of what it changes, in the tangent space (dq, dv, da) or among the measured
+            outputs.
     """
 
-    tangent: int
+    row: int = 0
+
+
+class InitialStateField(OutsideField):
+    """Deviation of one component of the initial state."""
 
     def magnitude(self, model: Any) -> float:
         """Natural size of the component: 1 rad, the length of the model, or such a size per time.
@@ -259,33 +258,18 @@ class InitialStateField(DeviationField):
         sizes = position_sizes(model)
         speeds = LEAST_MOVE_PER_SAMPLE * sizes / float(model.opt.timestep)
         both = np.concatenate([sizes, speeds])
-        return float(both[self.tangent]) if self.tangent < len(both) else 1.0
+        return float(both[self.row]) if self.row < len(both) else 1.0
 
 
-@dataclass(frozen=True)
-class OutputBiasField(DeviationField):
-    """Constant bias of one measured output.
-
-    Attributes:
-        output: Place of the output among the measured ones.
-    """
-
-    output: int
+class OutputBiasField(OutsideField):
+    """Constant bias of one measured output."""
 
 
-@dataclass(frozen=True)
-class OutputScaleField(DeviationField):
-    """Relative error s of the scale of one measured output, which reads (1 + s) times its value.
-
-    Attributes:
-        output: Place of the output among the measured ones.
-    """
-
-    output: int
+class OutputScaleField(OutsideField):
+    """Relative error s of the scale of one measured output, which reads (1 + s) times its value."""
 
 
-@dataclass(frozen=True)
-class OutputDelayField(DeviationField):
+class OutputDelayField(OutsideField):
     """Time by which all outputs lag [s]."""
 
 

@@ -350,23 +350,6 @@ MIN_IMPEDANCE = 1e-4
 MIN_DAMPING = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _FrictionArrays:
-    """Arrays of MjModel with the friction constraints of n degrees of freedom or of n tendons.
-
-    Attributes:
-        loss: (n,) friction loss [N or N m].
-        inverse_weight: (n,) inverse inertia at the constraint.
-        impedance: (n, 5) `solimp`.
-        reference: (n, 2) `solref`.
-    """
-
-    loss: Array
-    inverse_weight: Array
-    impedance: Array
-    reference: Array
-
-
 def has_dry_friction(model: Any) -> bool:
     """Whether any joint or tendon has dry friction."""
     return bool(model.dof_frictionloss.any() or model.tendon_frictionloss.any())
@@ -382,11 +365,19 @@ def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
         fastest: (nv,) fastest speeds of the degrees of freedom [m/s or rad/s].
     """
     step = float(model.opt.timestep)
-    sticking = np.concatenate(
-        [_sticking_speeds(arrays, step) for arrays in _friction_arrays(model)]
-    )
+    sticking = []
+    for loss, weight, solimp, reference in _friction_arrays(model):
+        # Below such a speed, friction brakes with less than its full force: the constraint asks for
+        # a deceleration of damping times speed, and its force cannot exceed the friction loss. In
+        # MuJoCo's standard form the first number of `solref` is positive and is a time constant.
+        # Otherwise the second number is the damping itself.
+        impedance = np.maximum(solimp[:, 1], MIN_IMPEDANCE)
+        standard = reference[:, 0] > 0.0
+        time_constant = np.where(standard, impedance * reference[:, 0], 1.0)
+        damping = np.where(standard, 2.0 / time_constant, -reference[:, 1] / impedance)
+        sticking.append(loss * weight / np.maximum(damping, MIN_DAMPING / step))
     proportional = np.concatenate([SMOOTHING_SPEED_FRACTION * fastest, np.zeros(model.ntendon)])
-    return tuple(np.maximum(sticking, proportional).tolist())
+    return tuple(np.maximum(np.concatenate(sticking), proportional).tolist())
 
 
 def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
@@ -398,9 +389,7 @@ def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
             engine's friction.
     """
     remaining = np.asarray(speeds)
-    for arrays in _friction_arrays(model):
-        loss = arrays.loss
-        weight = arrays.inverse_weight
+    for loss, weight, impedance, reference in _friction_arrays(model):
         s, remaining = remaining[: len(loss)], remaining[len(loss) :]
         smoothed = (loss > 0.0) & (s > 0.0)
 
@@ -409,42 +398,22 @@ def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
 
         resistance = (1.0 - SMOOTHED_IMPEDANCE) / SMOOTHED_IMPEDANCE * weight
         damping = SMOOTHED_IMPEDANCE * (loss * resistance)[smoothed] / s[smoothed]
-        arrays.impedance[smoothed] = (SMOOTHED_IMPEDANCE, SMOOTHED_IMPEDANCE, 1e-3, 0.5, 2.0)
-        arrays.reference[smoothed, 0] = -1.0
-        arrays.reference[smoothed, 1] = -damping
+        impedance[smoothed] = (SMOOTHED_IMPEDANCE, SMOOTHED_IMPEDANCE, 1e-3, 0.5, 2.0)
+        reference[smoothed, 0] = -1.0
+        reference[smoothed, 1] = -damping
 
 
-def _friction_arrays(model: Any) -> tuple[_FrictionArrays, _FrictionArrays]:
-    """Views of the friction constraints of joints, and of tendons."""
-    joints = _FrictionArrays(
-        loss=model.dof_frictionloss,
-        inverse_weight=model.dof_invweight0,
-        impedance=model.dof_solimp,
-        reference=model.dof_solref,
-    )
-    tendons = _FrictionArrays(
-        loss=model.tendon_frictionloss,
-        inverse_weight=model.tendon_invweight0,
-        impedance=model.tendon_solimp_fri,
-        reference=model.tendon_solref_fri,
-    )
-    return joints, tendons
+def _friction_arrays(model: Any) -> list[tuple[Array, Array, Array, Array]]:
+    """Views of the friction constraints of the degrees of freedom, and of the tendons.
 
-
-def _sticking_speeds(arrays: _FrictionArrays, timestep: float) -> Array:
-    """(n,) speeds below which the engine's friction sticks.
-
-    Below such a speed, friction brakes with less than its full force: the constraint asks for a
-    deceleration of damping times speed, and its force cannot exceed the friction loss.
+    They are friction losses (n,) [N or N m], inverse inertias at the constraint (n,), `solimp`
+    (n, 5) and `solref` (n, 2).
     """
-    impedance = np.maximum(arrays.impedance[:, 1], MIN_IMPEDANCE)
-    reference = arrays.reference
-
-    # In MuJoCo's standard form the first number of `solref` is positive and is a time constant.
-    # Otherwise the second number is the damping itself.
-    standard = reference[:, 0] > 0.0
-    time_constant = np.where(standard, impedance * reference[:, 0], 1.0)
-    damping = np.where(standard, 2.0 / time_constant, -reference[:, 1] / impedance)
-
-    damping = np.maximum(damping, MIN_DAMPING / timestep)
-    return np.asarray(arrays.loss * arrays.inverse_weight / damping)
+    joints = (model.dof_frictionloss, model.dof_invweight0, model.dof_solimp, model.dof_solref)
+    tendons = (
+        model.tendon_frictionloss,
+        model.tendon_invweight0,
+        model.tendon_solimp_fri,
+        model.tendon_solref_fri,
+    )
+    return [joints, tendons]

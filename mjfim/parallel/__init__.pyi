@@ -1,4 +1,4 @@
-from .dispatch import LostWorkError, Outcome, carry_out, results, results_or_here
+from .dispatch import LostWorkError, Outcome, carry_out, results, results_on
 from .pool import (
     LOST_SENTENCE,
     Pool,
@@ -26,5 +26,5 @@ __all__ = [
     "process_count",
     "require_threads",
     "results",
-    "results_or_here",
+    "results_on",
 ]

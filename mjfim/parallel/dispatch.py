@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
@@ -12,11 +13,14 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from mjfim.errors import ExperimentError, MjfimError
-from mjfim.parallel.budget import Budget, hurried
+from mjfim.parallel.budget import Budget, StopToken, hurried
+from mjfim.parallel.kept import KeptPerThread
+from mjfim.parallel.pool import one_blas_thread, pool_stop_token
 from mjfim.parallel.shared_value import AbsentValue, SentValue, attempt, owned_value
 from mjfim.parallel.workers import ExecutorLike, Workers, is_loss, is_refused_by_pickle
 
 T = TypeVar("T")
+Object = TypeVar("Object")
 Order = TypeVar("Order")
 
 # Time for which running tasks are waited for after a request to stop [s]. The tasks of a pool check
@@ -299,12 +303,48 @@ def results(
         yield here(orders[outcome.index]) if outcome.is_lost else outcome.result
 
 
-def results_or_here(
-    executor: ExecutorLike,
-    function: Callable[[Order], T],
+# The latest objects of a worker, by the key of their study.
+_made: KeptPerThread[Any] = KeptPerThread(2)
+
+
+def results_on(
+    own: Object,
+    make: Callable[[int], Callable[[], Object]],
+    work: Callable[[Object, Order, StopToken], T],
     orders: Sequence[Order],
-    budget: Budget,
-    here: Callable[[Order], T],
+    executor: ExecutorLike | None,
+    stop: StopToken,
 ) -> Iterator[T]:
-    """Carry out orders on workers, and lost ones in this process; see `results`."""
-    return results(function, orders, executor, budget, here)
+    """Do independent work on one object, which a worker makes once; see `results`.
+
+    Args:
+        own: The object of this process.
+        make: Returns what makes the object in a worker, and can be pickled; it gets the number of
+            threads of the worker.
+        work: Does an order on the object, with a token that may ask it to stop.
+        orders: The orders.
+        executor: The workers; None for this process.
+        stop: Ends the work early.
+    """
+
+    def here(order: Order) -> T:
+        """Do an order in this process."""
+        return work(own, order, stop)
+
+    there: Callable[[Order], T] = here
+    workers = Workers.of_any(executor)
+    if workers is not None:
+        made = make(workers.threads_for(len(orders)))
+        there = partial(_in_worker, uuid.uuid4().hex, made, work)
+    return results(there, orders, workers, Budget(stop=stop), here)
+
+
+@one_blas_thread()
+def _in_worker(
+    key: str,
+    make: Callable[[], Object],
+    work: Callable[[Object, Order, StopToken], T],
+    order: Order,
+) -> T:
+    """Do one order in a worker."""
+    return work(_made.get(key, make), order, pool_stop_token())

@@ -1,15 +1,14 @@
 """The model as discrete-time dynamics with outputs, noise, delay and derivatives.
 
 Modules:
-    plant: The dynamics F and h at theta: rollouts, projection, models.
+    plant: The dynamics with their derivatives.
+    dynamics: The dynamics F and h at theta: rollouts, projection, models.
     derivatives: All derivatives of a plant in one object, from the following modules.
-    rollout_derivatives: Sensitivities of whole rollouts.
-    step_derivatives: First derivatives of F and h.
     mixed_derivatives: Mixed second derivatives of F and h.
-    difference_steps: Steps of the differences.
+    step_derivatives: First derivatives of F and h.
+    closed_form_derivatives: The same without steps of the engine, where the plant allows it.
     batch: Many MuJoCo simulations in one call, and observations at their engine steps.
-    closed_loop: The same with control laws that compute controls from a log and from the state.
-    running_law: Control laws at their ticks, and what they remember.
+    laws: The same with control laws that compute controls from a log and from the state.
     state_space: Differences and moves of states on the configuration space.
     outputs: Which components of the state and which sensors are measured.
     noise: Covariance and sampling of the measurements, whitening.

@@ -9,7 +9,7 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -18,10 +18,8 @@ from mujoco.batch import Batch
 from mjfim.arrays import Array
 from mjfim.model.loading import silence_mujoco_log
 from mjfim.parallel import cores
+from mjfim.plant.laws.running_law import InputContext, LoopTrace
 from mjfim.plant.state_space import StateSpace
-
-if TYPE_CHECKING:
-    from mjfim.plant.laws.running_law import InputContext, LoopTrace
 
 # Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,
 # qvel and act.

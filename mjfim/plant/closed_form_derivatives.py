@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.parameters import ParameterSet
-from mjfim.plant.batch import BatchSimulator, SubstepObservations
-from mjfim.plant.closed_form.affine_forces import ParameterChange, acts_on_joints, is_inertial
+from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.closed_form.affine_forces import ParameterChange, is_inertial
 from mjfim.plant.closed_form.samples import (
     MODEL_STEP,
     ClosedForm,
+    KnownJacobians,
     SampleJacobians,
-    closed_form_tree,
     observation_jacobian,
 )
+from mjfim.plant.dynamics import Dynamics
 from mjfim.records.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from mjfim.plant.plant import Plant
 
 # Largest number of parameter values for which the change of the model is kept.
 MAX_KEPT_CHANGES = 64
@@ -35,85 +31,6 @@ CLOSED_FORM_STEP = 1e-6
 TINY = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _KnownJacobians:
-    """Derivatives of the samples of a trajectory.
-
-    Attributes:
-        theta: (p,) parameters [theta-unit].
-        trajectory: The trajectory.
-        substeps: Engine steps of a sample.
-        jacobians: The derivatives, without those by parameters.
-    """
-
-    theta: Array
-    trajectory: Trajectory
-    substeps: int
-    jacobians: SampleJacobians
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class KnownSensitivities:
-    """Sensitivities of the states along some directions of theta.
-
-    Attributes:
-        among: (n,) True for the c directions along which they are known.
-        psi: (c, N+1, nx) sensitivities along these directions [x-unit].
-    """
-
-    among: np.ndarray
-    psi: Array
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MixedInClosedForm:
-    """First and mixed second derivatives of F.
-
-    Attributes:
-        first: First derivatives of the samples.
-        F_mixed: (r, N, nx+nu, nx) derivatives of `DF[psi w, w]` by (x, u), for r directions.
-    """
-
-    first: SampleJacobians
-    F_mixed: Array
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObservedInClosedForm:
-    """First derivatives of F and of observations.
-
-    Attributes:
-        first: First derivatives of the samples.
-        observed: (N, S, w, nx+nu) derivatives of the observations by (x, u).
-    """
-
-    first: SampleJacobians
-    observed: Array
-
-
-class ClosedFormMemory:
-    """Joints and latest derivatives, shared by the closed forms of a plant and of its variants.
-
-    Attributes:
-        tree: Joints of the model; None where there is no closed form.
-        covered: (p,) True for parameters by which derivatives have a closed form: those that change
-            nothing but inertias, or nothing but springs, dampers, gains and armatures.
-        latest: Derivatives that were computed last. The gradient of a design needs those of the
-            trajectory whose sensitivities were computed before.
-        changes: Change of the model by the covered parameters, by the bytes of theta.
-    """
-
-    def __init__(self, simulator: BatchSimulator, parameters: ParameterSet) -> None:
-        """Begin with nothing computed."""
-        has_form = simulator.is_open_loop and not simulator.sensors
-        self.tree = closed_form_tree(simulator.model) if has_form else None
-        self.covered = np.array(
-            [is_inertial(p) or acts_on_joints(p) for p in parameters.parameters], dtype=bool
-        )
-        self.latest: _KnownJacobians | None = None
-        self.changes: dict[bytes, ParameterChange] = {}
-
-
 class ClosedFormDerivatives:
     """Derivatives in closed form; None wherever the plant has no closed form.
 
@@ -121,7 +38,7 @@ class ClosedFormDerivatives:
         plant: The plant.
     """
 
-    def __init__(self, plant: Plant, step_factors: Array | None = None) -> None:
+    def __init__(self, plant: Dynamics, step_factors: Array | None = None) -> None:
         """Set the plant and the factors of its difference steps.
 
         Args:
@@ -170,7 +87,7 @@ class ClosedFormDerivatives:
 
     def closed_form_sensitivity(
         self, theta: Array, trajectory: Trajectory, directions: Array
-    ) -> KnownSensitivities | None:
+    ) -> tuple[np.ndarray, Array] | None:
         """Sensitivities of the states along directions of the covered parameters.
 
         Args:
@@ -179,8 +96,8 @@ class ClosedFormDerivatives:
             directions: (n, p) directions of theta [theta-unit].
 
         Returns:
-            The sensitivities along directions of the covered parameters; None where there is no
-            closed form or no such direction.
+            (n,) True for the c directions of the covered parameters, and (c, N+1, nx) sensitivities
+            along these [x-unit]; None where there is no closed form or no such direction.
         """
         memory = self.plant.closed_form_memory
         among = np.asarray(~directions[:, ~memory.covered].any(axis=1))
@@ -205,11 +122,11 @@ class ClosedFormDerivatives:
         psi = np.zeros((len(found.A) + 1, *found.E.shape[1:]))
         for k, (A, E) in enumerate(zip(found.A, found.E, strict=True)):
             psi[k + 1] = A @ psi[k] + E
-        return KnownSensitivities(among=among, psi=np.moveaxis(psi, 2, 0))
+        return among, np.moveaxis(psi, 2, 0)
 
     def closed_form_mixed(
         self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array
-    ) -> MixedInClosedForm | None:
+    ) -> tuple[SampleJacobians, Array] | None:
         """First derivatives of F, and mixed second ones along directions (psi w, w).
 
         Args:
@@ -219,7 +136,8 @@ class ClosedFormDerivatives:
             directions: (r, p) directions w [theta-unit].
 
         Returns:
-            The derivatives; None where there is no closed form.
+            The first derivatives, and (r, N, nx+nu, nx) derivatives of `DF[psi w, w]` by (x, u);
+            None where there is no closed form.
         """
         closed = self._closed_form(trajectory)
         origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
@@ -243,11 +161,11 @@ class ClosedFormDerivatives:
 
             # A force that reaches its limit between the two is a jump and has no derivative.
             mixed[r][~_has_same_clamps(origin, moved, trajectory.ctrl)] = 0.0
-        return MixedInClosedForm(first=origin, F_mixed=mixed)
+        return origin, mixed
 
     def closed_form_observations(
         self, theta: Array, trajectory: Trajectory, observations: SubstepObservations
-    ) -> ObservedInClosedForm | None:
+    ) -> tuple[SampleJacobians, Array] | None:
         """First derivatives of F and of observations.
 
         Args:
@@ -256,7 +174,8 @@ class ClosedFormDerivatives:
             observations: The w observed quantities.
 
         Returns:
-            The derivatives; None where there is no closed form.
+            The first derivatives, and (N, S, w, nx+nu) derivatives of the observations by (x, u);
+            None where there is no closed form.
         """
         closed = self._closed_form(trajectory)
         origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
@@ -264,7 +183,7 @@ class ClosedFormDerivatives:
             return None
 
         observed = observation_jacobian(origin, trajectory.ctrl, observations)
-        return None if observed is None else ObservedInClosedForm(first=origin, observed=observed)
+        return None if observed is None else (origin, observed)
 
     def _closed_form(self, trajectory: Trajectory) -> ClosedForm | None:
         """The closed form with the sizes of a trajectory; None where there is none."""
@@ -297,7 +216,7 @@ class ClosedFormDerivatives:
 
     def _remember(self, theta: Array, trajectory: Trajectory, found: SampleJacobians) -> None:
         """Keep the first derivatives of a trajectory for its mixed ones."""
-        self.plant.closed_form_memory.latest = _KnownJacobians(
+        self.plant.closed_form_memory.latest = KnownJacobians(
             theta=np.array(theta),
             trajectory=trajectory,
             substeps=self.plant.simulator.substeps,

@@ -17,7 +17,6 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.closed_form_derivatives import TINY
-from mjfim.plant.delay import OutputDelay
 from mjfim.plant.laws.running_law import InputContext
 from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.plant.mixed_derivatives import MixedDerivatives
@@ -54,26 +53,6 @@ class Response:
     y: Array
     common: Array | None
     private: Array | None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _ResponseMoves:
-    """Moves whose rollouts give the derivatives of a response along q directions.
-
-    Attributes:
-        theta: (J, p) moves of theta [theta-unit]: a zero move, q forward moves, and q backward
-            moves for two-sided differences.
-        initial_state: (J, nx) moves of the initial state, in the order of `theta` [x-unit].
-        moving: Indices of the parameters among the q directions, which come first.
-        widths: (q,) distance between the two moves of a quotient.
-        central: True for two-sided differences.
-    """
-
-    theta: Array
-    initial_state: Array
-    moving: np.ndarray
-    widths: Array
-    central: bool
 
 
 class Derivatives(MixedDerivatives):
@@ -232,7 +211,7 @@ class Derivatives(MixedDerivatives):
         known = None
         if closed_form is not None:
             known = self.closed_form_sensitivity(theta, closed_form, directions)
-        rolled = np.ones(len(widths), dtype=bool) if known is None else ~known.among
+        rolled = np.ones(len(widths), dtype=bool) if known is None else ~known[0]
         forward = directions[rolled] * widths[rolled, None]
         begin = np.zeros((int(needs_origin), p))
         moves = np.concatenate([begin, forward, -forward if central else forward[:0]])
@@ -258,8 +237,8 @@ class Derivatives(MixedDerivatives):
                 central,
             )
         if known is not None:
-            psi[~rolled] = known.psi
-            G[~rolled] = plant.outputs.tangent(origin, known.psi, None)
+            psi[~rolled] = known[1]
+            G[~rolled] = plant.outputs.tangent(origin, known[1], None)
 
         count, by_probe = int(is_moved.sum()), psi[-1:]
         psi, G = (_columns(each[:count], is_moved, lumped) for each in (psi, G))
@@ -276,7 +255,13 @@ class Derivatives(MixedDerivatives):
                     closed_form=closed_form,
                 )
 
-        y, G = self._as_measured(theta, plant.outputs(origin, sensors), G, delay)
+        # Errors of the sensors, and the delay.
+        exact = plant.outputs(origin, sensors)
+        y = plant.calibration.measured(exact, theta)
+        G = plant.calibration.by_theta(exact, G, theta)
+        if delay is not None:
+            by_delay = delay.derivative(y)[..., None] * plant.parameters.delay_derivative
+            y, G = delay.apply(y), delay.apply(G) + by_delay
         return y, Sensitivity(psi=psi, G=G, is_lumped=lumped is not None)
 
     def _moved_rollouts(
@@ -312,19 +297,6 @@ class Derivatives(MixedDerivatives):
         is_moved[lumped.lumped] = False
         directions = np.concatenate([np.eye(len(h))[is_moved], lumped.probe[None]])
         return is_moved, directions, np.append(h[is_moved], 1.0 / np.abs(lumped.probe / h).max())
-
-    def _as_measured(
-        self, theta: Array, exact: Array, G: Array, delay: OutputDelay | None
-    ) -> tuple[Array, Array]:
-        """Outputs (N+1, ny) and derivatives (N+1, ny, p) with errors of sensors and the delay."""
-        plant = self.plant
-        y = plant.calibration.measured(exact, theta)
-        G = plant.calibration.by_theta(exact, G, theta)
-        if delay is None:
-            return y, G
-
-        by_delay = delay.derivative(y)[..., None] * plant.parameters.delay_derivative
-        return delay.apply(y), delay.apply(G) + by_delay
 
     def _quotients(
         self,
@@ -392,11 +364,34 @@ class Derivatives(MixedDerivatives):
             The response over each interval; None, and nothing after it, if a simulation diverges.
         """
         plant = self.plant
-        moves = self._response_moves(theta, start_directions, central, step, wanted)
-        models, compiled = plant.try_models(theta + moves.theta)
+        # Moves along parameters that are wanted and change the motion, then along k directions of
+        # the initial state.
+        moving = np.zeros(0, dtype=np.intp)
+        directions = np.zeros((plant.space.nx, 0))
+        if start_directions is not None:
+            chosen = plant.parameters.changes_motion
+            moving = np.flatnonzero(chosen if wanted is None else chosen & wanted)
+            directions = start_directions
+        h = (step * self.parameter_scale)[moving]
+        along = np.zeros((len(moving) + directions.shape[1], len(theta)))
+        along[np.arange(len(moving)), moving] = h
+
+        # A parameter that is a deviation of the initial state moves theta and the initial state.
+        of_start = along @ plant.initial_state_derivative.T
+        reach = (np.abs(directions) / plant.sizes.state[:, None]).max(axis=0, initial=0.0)
+        start_steps = step / np.maximum(reach, TINY)
+        of_start[len(moving) :] = start_steps[:, None] * directions.T
+        widths = np.concatenate([h, start_steps]) * (2.0 if central else 1.0)
+
+        # J rollouts: without a move, then forward, then backward for two-sided differences.
+        theta_moves, start_moves = (
+            np.concatenate([np.zeros((1, each.shape[1])), each, -each if central else each[:0]])
+            for each in (along, of_start)
+        )
+        models, compiled = plant.try_models(theta + theta_moves)
 
         # States at the beginning of the interval: those of each of the J moves for all S curves.
-        current = plant.space.plus(initial_states, moves.initial_state[:, None])
+        current = plant.space.plus(initial_states, start_moves[:, None])
         J, S, state_size = current.shape
         if J > 1:
             models = [model for model in models for _ in range(S)]
@@ -425,95 +420,25 @@ class Derivatives(MixedDerivatives):
             count = held.shape[1] + 1
             states = out.states.reshape(J, S, count, -1)
             sensors = None if out.sensors is None else out.sensors.reshape(J, S, count, -1)
-            yield self._response(
-                theta, first - lead, states, sensors, moves, start_directions is not None
-            )
             current = states[:, :, -1]
+            still = states[0], None if sensors is None else sensors[0]
+            h_still = plant.outputs(*still)
+            y = plant.calibration.measured(h_still, theta)
+            if start_directions is None:
+                yield Response(first=first - lead, y=y, common=None, private=None)
+                continue
 
-    def _response_moves(
-        self,
-        theta: Array,
-        start_directions: Array | None,
-        central: bool,
-        step: float,
-        wanted: np.ndarray | None,
-    ) -> _ResponseMoves:
-        """Moves along parameters, then along k directions of the initial state.
-
-        Parameters are moved if they are wanted and change the motion. The arguments are those of
-        `responses`.
-        """
-        plant, p = self.plant, len(theta)
-        if start_directions is None:
-            start_directions = np.zeros((plant.space.nx, 0))
-            moving = np.zeros(0, dtype=np.intp)
-        else:
-            chosen = plant.parameters.changes_motion
-            moving = np.flatnonzero(chosen if wanted is None else chosen & wanted)
-
-        h = (step * self.parameter_scale)[moving]
-        k = start_directions.shape[1]
-        theta_moves = np.zeros((len(moving) + k, p))
-        theta_moves[np.arange(len(moving)), moving] = h
-
-        # A parameter that is a deviation of the initial state moves theta and the initial state.
-        state_moves = theta_moves @ plant.initial_state_derivative.T
-        reach = (np.abs(start_directions) / plant.sizes.state[:, None]).max(axis=0, initial=0.0)
-        start_steps = step / np.maximum(reach, TINY)
-        state_moves[len(moving) :] = start_steps[:, None] * start_directions.T
-
-        return _ResponseMoves(
-            theta=_with_origin(theta_moves, central),
-            initial_state=_with_origin(state_moves, central),
-            moving=moving,
-            widths=np.concatenate([h, start_steps]) * (2.0 if central else 1.0),
-            central=central,
-        )
-
-    def _response(
-        self,
-        theta: Array,
-        first: int,
-        states: Array,
-        sensors: Array | None,
-        moves: _ResponseMoves,
-        differentiate: bool,
-    ) -> Response:
-        """Response over one interval.
-
-        Args:
-            theta: (p,) parameters [theta-unit].
-            first: Sample at which the interval begins.
-            states: (J, S, n+1, ns) states of all moves.
-            sensors: (J, S, n+1, nsensordata) sensor data of all moves, or None.
-            moves: The J moves.
-            differentiate: Whether derivatives are requested.
-        """
-        outputs, calibration = self.plant.outputs, self.plant.calibration
-        h = outputs(states[0], None if sensors is None else sensors[0])
-        y = calibration.measured(h, theta)
-        if not differentiate:
-            return Response(first=first, y=y, common=None, private=None)
-
-        _, by_move = self._quotients(
-            states[1:],
-            None if sensors is None else sensors[1:],
-            (states[0], None if sensors is None else sensors[0]),
-            moves.widths,
-            moves.central,
-        )
-        G = np.moveaxis(by_move, 0, 3)
-
-        # Directions along parameters come first, then those of the initial state.
-        count = len(moves.moving)
-        common = np.zeros((*y.shape, len(theta)))
-        common[..., moves.moving] = G[..., :count]
-        return Response(
-            first=first,
-            y=y,
-            common=calibration.by_theta(h, common, theta),
-            private=calibration.scaled(G[..., count:], theta),
-        )
+            moved = None if sensors is None else sensors[1:]
+            _, by_move = self._quotients(states[1:], moved, still, widths, central)
+            G = np.moveaxis(by_move, 0, 3)
+            common = np.zeros((*y.shape, len(theta)))
+            common[..., moving] = G[..., : len(moving)]
+            yield Response(
+                first=first - lead,
+                y=y,
+                common=plant.calibration.by_theta(h_still, common, theta),
+                private=plant.calibration.scaled(G[..., len(moving) :], theta),
+            )
 
 
 def _columns(by_move: Array, is_moved: np.ndarray, lumped: LumpedParameters | None) -> Array:
@@ -521,13 +446,3 @@ def _columns(by_move: Array, is_moved: np.ndarray, lumped: LumpedParameters | No
     full = np.zeros((*by_move.shape[1:], len(is_moved)))
     full[..., is_moved] = np.moveaxis(by_move, 0, 2)
     return full if lumped is None else lumped.expanded(full[..., lumped.base])
-
-
-def _with_origin(moves: Array, central: bool) -> Array:
-    """(J, k) moves of rollouts from the forward moves: (q, k).
-
-    There is a zero move, then the forward moves, then the backward moves for two-sided differences.
-    """
-    origin = np.zeros((1, moves.shape[1]))
-    backward = -moves if central else moves[:0]
-    return np.concatenate([origin, moves, backward])

@@ -6,7 +6,6 @@ The simulation is stepped again, one sample after the other, until MuJoCo warns.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -29,25 +28,6 @@ NO_WARNING = "a smaller amplitude or timestep may help"
 MAX_STEPS = 200_000
 
 
-@dataclass(frozen=True, kw_only=True)
-class Divergence:
-    """First warning of MuJoCo in a simulation.
-
-    Attributes:
-        warning: Name of the warning, for example BADQACC.
-        time: Time at the end of the sample in which it occurs [s].
-        joint: Name of the joint where it occurs; empty if the joint has no name.
-    """
-
-    warning: str
-    time: float
-    joint: str
-
-    def __str__(self) -> str:
-        where = f" at joint {self.joint}" if self.joint else ""
-        return f"MuJoCo warns {self.warning}{where} at t = {self.time:.4g} s"
-
-
 def explain_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> str:
     """Explain why a simulation diverges, and say what may help.
 
@@ -62,7 +42,12 @@ def explain_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> 
     """
     rejected = np.argwhere(~(np.abs(ctrl) <= MAX_CONTROL))
     if len(rejected):
-        return _explain_control(model, ctrl, *rejected[0])
+        sample, actuator = rejected[0].tolist()
+        return (
+            f"the control of actuator {model.actuator(actuator).name or actuator} is "
+            f"{ctrl[sample, actuator]:.3g}, and MuJoCo rejects controls above {MAX_CONTROL:.0e} "
+            "(BADCTRL); a larger gear of the actuator needs smaller controls"
+        )
 
     found = find_divergence(model, start, ctrl, substeps)
     if found is None:
@@ -78,7 +63,7 @@ def explain_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> 
     )
 
 
-def find_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> Divergence | None:
+def find_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> str | None:
     """Step a simulation until MuJoCo warns.
 
     Args:
@@ -88,7 +73,7 @@ def find_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> Div
         substeps: `mj_step` calls per sample.
 
     Returns:
-        The first warning, or None without one.
+        The first warning, its joint and time in words; None without one.
     """
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:] = state_space(model).split(start)
@@ -101,8 +86,12 @@ def find_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> Div
         for name in WARNINGS:
             warning = data.warning[int(getattr(mujoco.mjtWarning, f"mjWARN_{name}"))]
             if warning.number:
-                joint = _joint_at(model, name, int(warning.lastinfo))
-                return Divergence(warning=name, time=(k + 1) * duration, joint=joint)
+                # An address in qpos (BADQPOS) or qvel belongs to a joint.
+                addresses = model.jnt_qposadr if name == "BADQPOS" else model.jnt_dofadr
+                joint = np.searchsorted(addresses, int(warning.lastinfo), side="right") - 1
+                named = model.joint(int(joint)).name
+                where = f" at joint {named}" if named else ""
+                return f"MuJoCo warns {name}{where} at t = {(k + 1) * duration:.4g} s"
     return None
 
 
@@ -121,20 +110,3 @@ def _stable_timestep(model: Any, start: Array, ctrl: Array, substeps: int) -> fl
         if find_divergence(refined, start, ctrl, substeps * divisor) is None:
             return timestep
     return None
-
-
-def _explain_control(model: Any, ctrl: Array, sample: int, actuator: int) -> str:
-    """Explain that MuJoCo does not apply a control."""
-    value = ctrl[sample, actuator]
-    name = model.actuator(int(actuator)).name or f"{actuator}"
-    return (
-        f"the control of actuator {name} is {value:.3g}, and MuJoCo rejects controls above "
-        f"{MAX_CONTROL:.0e} (BADCTRL); a larger gear of the actuator needs smaller controls"
-    )
-
-
-def _joint_at(model: Any, warning: str, index: int) -> str:
-    """Name of the joint to which an address in qpos (BADQPOS) or qvel belongs."""
-    addresses = model.jnt_qposadr if warning == "BADQPOS" else model.jnt_dofadr
-    joint = int(np.searchsorted(addresses, index, side="right")) - 1
-    return str(model.joint(joint).name)

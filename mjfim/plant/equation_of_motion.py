@@ -95,7 +95,7 @@ class EquationOfMotion:
         found = self.simulator.engine_steps(model, points.states, points.ctrl, names).fields
         fields = {name: values[:, 0] for name, values in found.items()}
 
-        inertial = _mass_times(model, fields["M"], points.acceleration)
+        inertial = (_mass(model, fields["M"]) @ points.acceleration[..., None])[..., 0]
         inertial += self._implicit_damping(model, fields, points)
         actuation = fields["qfrc_actuator"]
         friction = self._friction(model, points)
@@ -117,7 +117,7 @@ class EquationOfMotion:
             (nv, nv) root mean squares of `M_ij a_j`.
         """
         steps = self.simulator.engine_steps(model, points.states, points.ctrl, ["M"])
-        M = _dense_mass(model, steps.fields["M"][:, 0])
+        M = _mass(model, steps.fields["M"][:, 0])
         forces = M * points.acceleration[:, None, :]
         return np.asarray(np.sqrt(np.mean(forces**2, axis=0)))
 
@@ -168,7 +168,8 @@ class EquationOfMotion:
         """(n, nv) forces `τ B a`."""
         timestep = float(model.opt.timestep)
         if "qDeriv" in fields:
-            return -timestep * _derivative_times(model, fields["qDeriv"], points.acceleration)
+            D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind)
+            return np.asarray(-timestep * (D @ points.acceleration[..., None])[..., 0])
         if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
             return np.zeros_like(points.acceleration)
 
@@ -242,36 +243,16 @@ def activations(
     return np.asarray(simulator.space.split(found.states)[2])
 
 
-def _mass_times(model: Any, values: Array, acceleration: Array) -> Array:
-    """(n, nv) products of mass matrices, as MuJoCo stores them, and accelerations: (n, nv)."""
-    total = np.zeros_like(acceleration)
-    for row in range(model.nv):
-        start, count = int(model.M_rowadr[row]), int(model.M_rownnz[row])
-        entries = values[:, start : start + count]
-        columns = model.M_colind[start : start + count]
-        total[:, row] += np.sum(entries * acceleration[:, columns], axis=1)
-
-        # The matrix holds the lower triangle; the last entry of a row is the diagonal.
-        total[:, columns[:-1]] += entries[:, :-1] * acceleration[:, row : row + 1]
-    return total
+def _mass(model: Any, values: Array) -> Array:
+    """(n, nv, nv) mass matrices from those that MuJoCo stores, which are lower triangles."""
+    lower = _dense(values, model.M_rowadr, model.M_rownnz, model.M_colind)
+    return np.asarray(lower + np.swapaxes(np.tril(lower, -1), 1, 2))
 
 
-def _derivative_times(model: Any, values: Array, acceleration: Array) -> Array:
-    """(n, nv) products of derivatives by the velocity and accelerations: (n, nv)."""
-    total = np.empty_like(acceleration)
-    for row in range(model.nv):
-        start, count = int(model.D_rowadr[row]), int(model.D_rownnz[row])
-        columns = model.D_colind[start : start + count]
-        total[:, row] = np.sum(values[:, start : start + count] * acceleration[:, columns], axis=1)
-    return total
-
-
-def _dense_mass(model: Any, values: Array) -> Array:
-    """(n, nv, nv) mass matrices from those that MuJoCo stores."""
-    M = np.zeros((len(values), model.nv, model.nv))
-    for row in range(model.nv):
-        start, count = int(model.M_rowadr[row]), int(model.M_rownnz[row])
-        columns = model.M_colind[start : start + count]
-        M[:, row, columns] = values[:, start : start + count]
-        M[:, columns, row] = values[:, start : start + count]
-    return M
+def _dense(values: Array, starts: Any, counts: Any, columns: Any) -> Array:
+    """(n, nv, nv) matrices from values (n, entries) of sparse rows."""
+    dense = np.zeros((len(values), len(starts), len(starts)))
+    for row, (start, count) in enumerate(zip(starts, counts, strict=True)):
+        entries = slice(start, start + count)
+        dense[:, row, columns[entries]] = values[:, entries]
+    return dense

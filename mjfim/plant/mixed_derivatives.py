@@ -7,18 +7,15 @@ derivatives by state and control.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.plant.batch import SampleSteps, SubstepObservations
 from mjfim.plant.delay import OutputDelay
+from mjfim.plant.dynamics import Dynamics
 from mjfim.plant.step_derivatives import MovedSamples, StepDerivatives, all_samples, tiled
 from mjfim.records.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from mjfim.plant.plant import Plant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,9 +209,10 @@ class MixedDerivatives(StepDerivatives):
             jacobian = self.observation_jacobians(theta, trajectory, observations)[2]
 
         # Nothing refers to the state after the last sample.
-        first = np.moveaxis(np.concatenate([found.first.A, found.first.B], axis=2), 2, 0)
+        origin, F_mixed = found
+        first = np.moveaxis(np.concatenate([origin.A, origin.B], axis=2), 2, 0)
         after = np.zeros((*first.shape[:1], 1, first.shape[2]))
-        mixed = [np.concatenate([each.swapaxes(0, 1), after], axis=1) for each in found.F_mixed]
+        mixed = [np.concatenate([each.swapaxes(0, 1), after], axis=1) for each in F_mixed]
         return self._bilinear_from(
             theta,
             trajectory.state,
@@ -301,7 +299,7 @@ def _mean_change(moved: MovedSamples, values: Array) -> Array:
 
 
 def _stepped(
-    plant: Plant,
+    plant: Dynamics,
     moved: MovedSamples,
     theta: Array,
     shifts: Array,

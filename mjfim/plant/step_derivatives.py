@@ -97,18 +97,13 @@ class StepDerivatives(ClosedFormDerivatives):
         E = np.moveaxis(_require_finite(by_theta[:, :-1]), 0, 2)
         no_move = np.zeros((len(theta), len(states), self.plant.space.nx))
         H = np.moveaxis(outputs.tangent(states, no_move, sensors_by_theta), 0, 2)
-        h = self._outputs_at(theta, states, ctrl)
-        return Linearization(
-            A=A, B=B, E=E, C=C, D=D, H=self.plant.calibration.by_theta(h, H, theta)
-        )
-
-    def _outputs_at(self, theta: Array, states: Array, ctrl: Array) -> Array:
-        """(n, ny) outputs of the model at n states under controls, where scale errors need them."""
-        plant = self.plant
-        sensors = None
-        if plant.calibration.scales and plant.outputs.needs_sensors:
-            sensors = plant.simulator.step([plant.model(theta)], states, ctrl).sensors
-        return plant.outputs(states, sensors)
+        # Scale errors need the outputs themselves.
+        calibration, sensors = self.plant.calibration, None
+        if calibration.scales and outputs.needs_sensors:
+            model = self.plant.model(theta)
+            sensors = self.plant.simulator.step([model], states, ctrl).sensors
+        H = calibration.by_theta(outputs(states, sensors), H, theta)
+        return Linearization(A=A, B=B, E=E, C=C, D=D, H=H)
 
     def jacobians(
         self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
@@ -165,7 +160,7 @@ class StepDerivatives(ClosedFormDerivatives):
         """
         closed = self.closed_form_observations(theta, trajectory, observations)
         if closed is not None:
-            return closed.first.A, closed.first.B, closed.observed
+            return closed[0].A, closed[0].B, closed[1]
 
         plant, nx = self.plant, self.plant.space.nx
         sizes = self.difference_sizes(trajectory)

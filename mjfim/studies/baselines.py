@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy.signal
 
 from mjfim.arrays import Array
 from mjfim.excitation.design import consume
@@ -25,7 +26,160 @@ from mjfim.experiment.signals import fourier_basis, independent_curves
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.events import DesignEvent
-from mjfim.studies.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
+
+# Largest number of harmonics of a parametric multisine.
+MAX_HARMONICS = 30
+
+# Largest number of levels of parametric random steps.
+MAX_LEVELS = 24
+
+# Smallest amplitude of an actuator, relative to the actuator with the largest amplitude.
+MIN_RELATIVE_AMPLITUDE = 0.05
+
+# Largest power of the frequency with which the amplitudes of a parametric multisine fall.
+MAX_ROLL_OFF = 2.0
+
+# Duration of the shortest transition between two levels, as a fraction of the duration of a level;
+# it avoids a division by zero.
+SHORTEST_TRANSITION = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExcitationSettings:
+    """Settings of all parametric excitations of an experiment.
+
+    Attributes:
+        t: (N,) sample times [s].
+        horizon: Duration [s].
+        nu: Number of actuators.
+        min_frequency: Lowest frequency [Hz].
+        max_frequency: Highest frequency [Hz].
+        may_jump: Whether controls may jump from one sample to the next.
+    """
+
+    t: Array
+    horizon: float
+    nu: int
+    min_frequency: float
+    max_frequency: float
+    may_jump: bool
+
+    def frequency(self, z: Array) -> Array:
+        """Map parameters in [0, 1] to frequencies on a logarithmic scale.
+
+        Args:
+            z: (...) parameters in [0, 1].
+
+        Returns:
+            (...) frequencies [Hz].
+        """
+        return np.asarray(self.min_frequency * (self.max_frequency / self.min_frequency) ** z)
+
+
+def relative_amplitudes(z: Array) -> Array:
+    """Amplitudes of several actuators; the largest one is 1.
+
+    Args:
+        z: (nu,) parameters in [0, 1].
+
+    Returns:
+        (nu,) amplitudes.
+    """
+    amplitude = MIN_RELATIVE_AMPLITUDE ** (1.0 - z)
+    return np.asarray(amplitude / amplitude.max())
+
+
+def chirp(settings: ExcitationSettings, z: Array) -> Array:
+    """A linear frequency sweep of every actuator.
+
+    Args:
+        settings: Settings of all excitations.
+        z: (5 nu,) amplitude, first frequency, last frequency, phase and offset of every actuator,
+            from 0 to 1.
+
+    Returns:
+        (N, nu) curves about zero with a peak of about 1.
+    """
+    amplitude, first, last, phase, offset = z.reshape(5, settings.nu)
+
+    first_frequency = settings.frequency(first).tolist()
+    last_frequency = settings.frequency(last).tolist()
+    degrees = (360.0 * phase).tolist()
+    sweeps = [
+        scipy.signal.chirp(settings.t, f0, settings.horizon, f1, phi=phi)
+        for f0, f1, phi in zip(first_frequency, last_frequency, degrees, strict=True)
+    ]
+
+    centred = np.stack(sweeps, axis=1) + (offset - 0.5)
+    return np.asarray(relative_amplitudes(amplitude) * centred)
+
+
+def schroeder_phases(power: Array) -> Array:
+    """Phases with which the sum of harmonics has a low peak (Schroeder 1970).
+
+    Args:
+        power: (K,) power of every harmonic.
+
+    Returns:
+        (K,) phases [rad].
+    """
+    share = power / power.sum()
+    return np.asarray(-2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(share))[:-1]]))
+
+
+def multisine(settings: ExcitationSettings, z: Array) -> Array:
+    """A sum of harmonics with Schroeder phases for every actuator.
+
+    Args:
+        settings: Settings of all excitations.
+        z: (3 + 2 nu,) base frequency, number of harmonics and their roll-off, then amplitude and
+            delay of every actuator, from 0 to 1.
+
+    Returns:
+        (N, nu) curves about zero with a peak of about 1.
+    """
+    # The base frequency allows for two harmonics if the frequency range does.
+    base, highest = settings.min_frequency, settings.max_frequency
+    if highest > 2.0 * base:
+        base *= (0.5 * highest / base) ** float(z[0])
+    amplitude, delay = z[3:].reshape(2, settings.nu)
+
+    most = min(MAX_HARMONICS, max(int(settings.max_frequency / base), 1))
+    count = max(round(most * float(z[1])), min(2, most))
+    order = np.arange(1, 1 + count)
+    power = order ** (-2.0 * MAX_ROLL_OFF * z[2])
+
+    delayed = settings.t[:, None, None] - (delay / base)[:, None]
+    angle = 2.0 * np.pi * base * order * delayed
+    waves = np.sqrt(power) * np.cos(angle + schroeder_phases(power))
+    curve = waves.sum(axis=2)
+    return np.asarray(relative_amplitudes(amplitude) * curve / np.abs(curve).max(axis=0))
+
+
+def random_steps(settings: ExcitationSettings, z: Array) -> Array:
+    """Random levels of every actuator, each of which is held for some time.
+
+    Args:
+        settings: Settings of all excitations.
+        z: (2 + MAX_LEVELS nu,) duration of a level, the fraction of it that is a smooth transition
+            (unused if jumps are allowed), and the levels of every actuator, from 0 to 1.
+
+    Returns:
+        (N, nu) curves about zero with a peak of about 1.
+    """
+    held = settings.horizon / (3.0 * (MAX_LEVELS / 3.0) ** z[0])
+    index = np.minimum((settings.t / held).astype(int), MAX_LEVELS - 1)
+
+    levels = 2.0 * z[2:].reshape(MAX_LEVELS, settings.nu) - 1.0
+    levels = np.concatenate([np.zeros((1, settings.nu)), levels])
+
+    # Progress of the transition from the previous level to the present one, 0 to 1.
+    duration = max(float(z[1]), SHORTEST_TRANSITION)
+    progress = (settings.t / held - index) / duration
+    smooth = 0.5 - 0.5 * np.cos(np.pi * np.clip(progress, 0.0, 1.0))
+    share = np.where(settings.may_jump, 1.0, smooth)[:, None]
+    return np.asarray((1.0 - share) * levels[index] + share * levels[index + 1])
+
 
 # Base frequencies of the first Fourier series, and bandwidths of the first B-splines [Hz].
 FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)
@@ -145,13 +299,18 @@ def _search_at_random(
     budget: Budget,
     show: SearchCallback,
     *,
-    kind: Callable[[ExcitationSettings], Excitation],
+    wave: Callable[[ExcitationSettings, Array], Array],
+    counts: tuple[int, int],
 ) -> tuple[SearchResult, int]:
-    """Search over the numbers of an excitation, about the best ones or everywhere."""
+    """Search over the numbers of an excitation, about the best ones or everywhere.
+
+    counts: Numbers that all actuators share, and those of each actuator.
+    """
     task = stated.relaxed() if stated.is_limited else stated
     cost = LimitedCost(level=DescentLevel(task, search.combinations))
     rng = np.random.default_rng((search.seed, *search.part))
-    excitation = kind(_settings(cost))
+    settings = _settings(cost)
+    count = 1 + counts[0] + counts[1] * settings.nu
     basis, window = bandwidth_basis(task, task.t), task.fade(task.samples)
     bounds = cost.constraints.control.bounds
     is_bounded = bool(np.isfinite(bounds.lower).all())
@@ -162,14 +321,14 @@ def _search_at_random(
     while budget.exhausted is None:
         show(found.cost)
         # The first number is the size, which matters where weights in the cost decide about it.
-        numbers = rng.random(1 + excitation.parameter_count)
+        numbers = rng.random(count)
         is_local = len(best) > 0 and rng.random() > GLOBAL_SHARE
         if is_local:
             share = max(CHANGED_SHARE, MIN_CHANGED / len(numbers))
             changed = rng.random(len(numbers)) < share
             numbers = reflected(best + spread * changed * rng.normal(size=len(numbers)))
 
-        deviation = largest * window * excitation.curve(numbers[1:]) * bounds.scale
+        deviation = largest * window * wave(settings, numbers[1:]) * bounds.scale
         if basis is not None:
             deviation = basis @ np.linalg.lstsq(basis, deviation)[0]
         scale: float | None = 1.0
@@ -301,12 +460,22 @@ def _series(
 
 Method = Callable[[BaselineSearch, DesignTask, Budget, SearchCallback], tuple[SearchResult, int]]
 
-# The baselines by their keys; `TITLES` has their names for the user, in the same order.
+# The baselines by their keys.
 METHODS: dict[str, Method] = {
-    "chirp": partial(_search_at_random, kind=Chirp),
-    "multisine": partial(_search_at_random, kind=Multisine),
-    "steps": partial(_search_at_random, kind=RandomSteps),
+    "chirp": partial(_search_at_random, wave=chirp, counts=(0, 5)),
+    "multisine": partial(_search_at_random, wave=multisine, counts=(3, 2)),
+    "steps": partial(_search_at_random, wave=random_steps, counts=(2, MAX_LEVELS)),
     "fourier5": partial(_optimise, harmonics=5),
     "fourier15": partial(_optimise, harmonics=15),
     "splines": partial(_optimise, harmonics=None),
+}
+
+# Their names for the user.
+TITLES = {
+    "chirp": "chirp",
+    "multisine": "multisine (Schroeder)",
+    "steps": "random steps",
+    "fourier5": "Fourier 5",
+    "fourier15": "Fourier 15",
+    "splines": "B-splines",
 }

@@ -34,7 +34,7 @@ from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.trajectory import Recording
-from mjfim.studies.redesign import CampaignHistory, redesign, restate_experiment
+from mjfim.studies.redesign import redesign, restate_experiment
 
 # A round makes no progress where the largest ratio of sigma to target stays above this share of the
 # ratio in the last round.
@@ -205,28 +205,21 @@ class _CampaignRun:
             )
             return design, ()
 
-        first, last = self.rounds[0], self.rounds[-1]
-        history = CampaignHistory(
-            estimate=last.estimate,
-            count=sum(len(r.recordings) for r in self.rounds),
-            first_theta=first.theta,
-            first_control=first.control,
-            last_control=last.control,
-        )
+        last = self.rounds[-1]
         try:
-            return self._redesign(history, last.estimate.theta), ()
+            return self._redesign(last.estimate.theta), ()
         except MjfimError as error:
             remark = (
                 "no design could be made at the estimate; it is made at the parameters of the last "
                 f"design instead: {error}"
             )
-            return self._redesign(history, last.theta), (remark,)
+            return self._redesign(last.theta), (remark,)
 
-    def _redesign(self, history: CampaignHistory, theta: Array) -> Design:
+    def _redesign(self, theta: Array) -> Design:
         """Design again at theta: (p,)."""
         return redesign(
             self.base,
-            history,
+            self.rounds,
             theta,
             callback=self._callback,
             executor=self._executor,

@@ -26,9 +26,15 @@ from mjfim.excitation.limits.violations import all_violations_of
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.levels import require_coarse_factor
-from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task import (
+    LEAST_PROBE_AMPLITUDE,
+    MOST_PROBE_AMPLITUDE,
+    RANDOM_HARMONICS,
+    DesignTask,
+)
 from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.signals import multisine
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
@@ -40,7 +46,7 @@ from mjfim.identification.task import refuse_same_data
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
 from mjfim.information.marginal import shared
-from mjfim.parallel import ExecutorLike, one_blas_thread
+from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
@@ -48,14 +54,51 @@ from mjfim.records.check import (
     Check,
     ConfoundedPair,
     ParameterCheck,
+    verdict_of_check,
 )
 from mjfim.records.design import LimitViolation
 from mjfim.records.events import begin_stage, shown_progress
 from mjfim.records.trajectory import Recording, Sensitivity, Trajectory
-from mjfim.studies.check_verdict import verdict_of_check
 from mjfim.studies.derivative_test import self_test
-from mjfim.studies.random_references import random_references
-from mjfim.studies.shared_work import SharedWork
+
+# Columns of a log that are no signals, but say which law acts.
+SWITCHES = ("gain:", "enable:")
+
+
+def random_references(task: DesignTask, count: int) -> Iterator[Trajectory]:
+    """Simulate closed loops under random multisines in place of the inputs of a log.
+
+    They are up to twice as large as the inputs, about their means. Factors of gains and the columns
+    that switch laws on stay as they are; velocities of references are the slopes of the references.
+
+    Args:
+        task: The task along a recording, with control laws.
+        count: Number of motions.
+
+    Yields:
+        Motions; those that diverge are left out.
+    """
+    laws = task.system.laws
+    assert laws is not None
+    rng = np.random.default_rng(task.experiment.descent.seed)
+    logged = task.initial.ctrl
+    mean = logged.mean(axis=0)
+    peak = np.abs(logged - mean).max(axis=0)
+    kept = [i for i, name in enumerate(laws.columns) if name.startswith(SWITCHES)]
+    for _ in range(count):
+        share = rng.uniform(LEAST_PROBE_AMPLITUDE, MOST_PROBE_AMPLITUDE)
+        wave = multisine(task.t, logged.shape[1], 1.0 / task.horizon, RANDOM_HARMONICS, rng)
+        inputs = mean + share * peak * wave
+        inputs[:, kept] = logged[:, kept]
+        for law in laws.laws:
+            if "reference_velocity" in law.columns:
+                reference = inputs[:, law.columns["reference"]]
+                inputs[:, law.columns["reference_velocity"]] = np.gradient(reference, task.dt)
+        try:
+            yield task.plant.simulate(task.theta, np.asarray(inputs))
+        except SimulationDivergedError:
+            continue
+
 
 # Target standard deviation where none is stated, relative to the size of the parameter.
 DEFAULT_RELATIVE_STD = 0.05
@@ -180,7 +223,11 @@ def check_recordings(
     if executor is not None:
         fit = fit.on_workers(FitWorkers(executor))
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
-    task = _task_along(recorded_release(system, longest), system, longest.ctrl[:MAX_TESTED_SAMPLES])
+    release, control = recorded_release(system, longest), longest.ctrl[:MAX_TESTED_SAMPLES]
+    is_free = system.experiment.initial.free
+    task = DesignTask.along(system.released(release) if is_free else system, control)
+    if is_free:
+        task = replace(task, release=ReleaseSpace.of(system, task.limits))
     problem, point = _evaluate(task, task.initial)
     _known(point)
 
@@ -247,14 +294,6 @@ def _known(point: DesignPoint) -> tuple[Sensitivity, Array]:
     return point.sensitivity, point.information
 
 
-def _task_along(start: Array, system: System, control: Array) -> DesignTask:
-    """Task along a recorded control: (N, nu), from the release: (ns,) of the recording."""
-    if not system.experiment.initial.free:
-        return DesignTask.along(system, control)
-    task = DesignTask.along(system.released(start), control)
-    return replace(task, release=ReleaseSpace.of(system, task.limits))
-
-
 def _identifiability_test(
     task: DesignTask, executor: ExecutorLike | None, stop: StopToken
 ) -> IdentifiabilityTest:
@@ -272,8 +311,7 @@ def _identifiability_test(
 
     def differentiated(probes: Iterable[Trajectory]) -> Iterator[RowsAndError | None]:
         """Differentiate motions on the workers."""
-        work = SharedWork(own=test, make=make, executor=executor, stop=stop)
-        return work.results(_rows_along, list(probes))
+        return results_on(test, make, _rows_along, list(probes), executor, stop)
 
     return replace(test, differentiated=differentiated)
 
@@ -355,6 +393,13 @@ def _checked(evidence: _Evidence, stop: StopToken) -> Check:
     groups = found.groups_along_trajectory if here.count > everywhere.count else ()
     not_excited = tuple(group for group in groups if str(group) not in never)
     values = task.theta[task.parameters.interest]
+    strong = np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)
+    pairs = [
+        ConfoundedPair(
+            first=found.names[i], second=found.names[j], correlation=float(correlation[i, j])
+        )
+        for i, j in np.argwhere(strong).tolist()
+    ]
 
     check = Check(
         source=evidence.source,
@@ -364,7 +409,7 @@ def _checked(evidence: _Evidence, stop: StopToken) -> Check:
         information=total,
         eigenvalues=np.maximum(eigenvalues, 0.0),
         correlation=correlation,
-        confounded=_confounded_pairs(found.names, correlation),
+        confounded=tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation))),
         not_separable=found.groups_along_all,
         not_excited=not_excited,
         self_test=tested,
@@ -441,13 +486,3 @@ def _repetitions(
         return 1
     found = bisect_left(range(MAX_REPETITIONS + 1), True, lo=2, key=suffices)
     return found if found <= MAX_REPETITIONS else 0
-
-
-def _confounded_pairs(names: Sequence[str], correlation: Array) -> tuple[ConfoundedPair, ...]:
-    """Confounded pairs of parameters, in descending order of their correlation."""
-    strong = np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)
-    pairs = [
-        ConfoundedPair(first=names[i], second=names[j], correlation=float(correlation[i, j]))
-        for i, j in np.argwhere(strong).tolist()
-    ]
-    return tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation)))

@@ -37,8 +37,7 @@ from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
-from mjfim.studies.baseline_titles import TITLES
-from mjfim.studies.baselines import METHODS, BaselineSearch, SearchResult, run_baseline
+from mjfim.studies.baselines import METHODS, TITLES, BaselineSearch, SearchResult, run_baseline
 
 # Name of the design for the user.
 DESIGN_TITLE = "mjfim's design"
@@ -72,7 +71,7 @@ def compare(
         experiment: Experiment for which controls are searched.
         seconds: Time of each method [s].
         seed: Seed of the baselines.
-        methods: Keys of the baselines (`mjfim.studies.baselines.methods.METHODS`); None for all
+        methods: Keys of the baselines (`mjfim.studies.baselines.METHODS`); None for all
             that are applicable.
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. Each
             method is divided among its workers.
@@ -86,35 +85,15 @@ def compare(
         ExperimentError: A budget or a method is faulty.
         MjfimError: As `mjfim.design` raises it.
     """
-    task = DesignTask.resolve(experiment, threads=threads)
-    with shown_progress("comparing", callback, progress) as show:
-        return compare_task(
-            task,
-            seconds=seconds,
-            seed=seed,
-            methods=methods,
-            executor=executor,
-            callback=show,
-            stop=stop,
-        )
-
-
-def compare_task(
-    task: DesignTask,
-    *,
-    seconds: float = 60.0,
-    seed: int = 0,
-    methods: Sequence[str] | None = None,
-    executor: ExecutorLike | None = None,
-    callback: Callback | None = None,
-    stop: StopToken | None = None,
-) -> Comparison:
-    """Compare the design of a resolved task with baselines. See `compare`."""
     if not (seconds > 0.0 and np.isfinite(seconds)):
         raise ExperimentError("compare: seconds must be positive and finite")
 
+    task = DesignTask.resolve(experiment, threads=threads)
     chosen = (*chosen_methods(task.system, methods), DESIGN)
-    identifiability = _identifiability(task)
+    # What can be identified is found before the time of any method begins.
+    identifiability = designable(task)
+    if task.is_limited:
+        require_feasible_start(task)
     evaluation = MethodEvaluation(task, identifiability.basis)
     search = BaselineSearch(
         experiment=task.experiment,
@@ -128,13 +107,16 @@ def compare_task(
 
     rows: list[MethodResult] = []
     workers = Workers.of_any(executor)
-    with stop_on_interrupt(stop) as token:
+    with (
+        stop_on_interrupt(stop) as token,
+        shown_progress("comparing", callback, progress) as show,
+    ):
         for i, method in enumerate(chosen):
             run = _MethodRun(
                 search=replace(search, method=method),
                 index=i,
                 count=len(chosen),
-                callback=callback,
+                callback=show,
                 executor=workers,
                 stop=token,
                 identifiability=identifiability,
@@ -193,18 +175,6 @@ def chosen_methods(system: System, methods: Sequence[str] | None) -> tuple[str, 
             f"valid: {', '.join(METHODS)}"
         )
     return chosen
-
-
-def _identifiability(task: DesignTask) -> Identifiability:
-    """Find what can be identified, before the time of any method begins.
-
-    Raises:
-        MjfimError: No design is possible, as `mjfim.design` raises it.
-    """
-    identifiability = designable(task)
-    if task.is_limited:
-        require_feasible_start(task)
-    return identifiability
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -358,7 +328,23 @@ class MethodEvaluation:
             found: The best control of its search.
             note: Remark about the result.
         """
-        nothing = replace(self._without_control(method, title, found), note=note)
+        has_control = found.control is not None
+        nothing = MethodResult(
+            method=method,
+            title=title,
+            outcome=MethodOutcome.NOTHING if has_control else MethodOutcome.NONE,
+            control=None,
+            cost=np.nan,
+            criterion=np.nan,
+            std=np.full(len(self.task.parameters), np.nan),
+            min_eigenvalue=np.nan,
+            worst_relative_std=np.nan,
+            seconds=found.seconds,
+            steps=found.steps,
+            margins={},
+            relative_margins={},
+            note=note,
+        )
         if found.control is None:
             return nothing
 
@@ -423,23 +409,4 @@ class MethodEvaluation:
             relative_margins=verification.relative_margins,
             found_by=found.found_by,
             note=note,
-        )
-
-    def _without_control(self, method: str, title: str, found: SearchResult) -> MethodResult:
-        """Result of a method without a control that can be evaluated."""
-        has_control = found.control is not None
-        return MethodResult(
-            method=method,
-            title=title,
-            outcome=MethodOutcome.NOTHING if has_control else MethodOutcome.NONE,
-            control=None,
-            cost=np.nan,
-            criterion=np.nan,
-            std=np.full(len(self.task.parameters), np.nan),
-            min_eigenvalue=np.nan,
-            worst_relative_std=np.nan,
-            seconds=found.seconds,
-            steps=found.steps,
-            margins={},
-            relative_margins={},
         )

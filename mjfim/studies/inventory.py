@@ -85,7 +85,15 @@ def list_model(path: str | Path) -> Inventory:
         parameters=tuple(_parameters(source)),
         outputs=tuple(_outputs(source)),
         actuators=tuple(_actuators(source)),
-        keyframes=tuple(_keyframes(model)),
+        keyframes=tuple(
+            ListedKeyframe(
+                name=model.key(i).name,
+                qpos=tuple(model.key_qpos[i].tolist()),
+                qvel=tuple(model.key_qvel[i].tolist()),
+                ctrl=tuple(model.key_ctrl[i].tolist()),
+            )
+            for i in range(model.nkey)
+        ),
         limits=tuple(map(_listed, limits_of_model(model))),
         terms=tuple(_terms(model)),
         remarks=tuple(_remarks(model)),
@@ -118,18 +126,14 @@ def _paths(model: Any, path: str, kind: str, field: str) -> Iterator[str]:
     array = MODEL_ARRAYS[kind].get(field)
     if array is not None:
         holder = getattr(model.opt if kind == "option" else model, array)
-        width = int(np.shape(holder)[-1]) if _has_entries(kind, holder) else 1
+        has_entries = np.ndim(holder) == (1 if kind == "option" else 2)
+        width = int(np.shape(holder)[-1]) if has_entries else 1
 
     if width == 1:
         yield path
         return
     for i in range(width):
         yield f"{path}[{i}]"
-
-
-def _has_entries(kind: str, holder: Any) -> bool:
-    """Whether an array holds several numbers for each element."""
-    return np.ndim(holder) == (1 if kind == "option" else 2)
 
 
 def _entry(source: ModelSource, path: str, *, skip_zero: bool) -> Iterator[ListedParameter]:
@@ -170,29 +174,14 @@ def _outputs(source: ModelSource) -> Iterator[ListedOutput]:
 def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
     """All actuators, by the names of their controls."""
     model = source.model
-    for control, i in zip(source.coordinates.controls, _actuator_of_control(model), strict=True):
+    counts = np.asarray(model.actuator_ctrlnum, dtype=int)
+    numbers = np.repeat(np.arange(len(counts)), counts).tolist()
+    for control, i in zip(source.coordinates.controls, numbers, strict=True):
         kind = TRANSMISSIONS.get(int(model.actuator_trntype[i]), "")
         drives = ""
         if kind:
             drives = f"{kind} {unique_names(model, kind)[int(model.actuator_trnid[i, 0])]}"
         yield ListedActuator(name=control, drives=drives, unit=control_unit(model, i))
-
-
-def _actuator_of_control(model: Any) -> list[int]:
-    """Number of the actuator of each control."""
-    counts = np.asarray(model.actuator_ctrlnum, dtype=int)
-    return [int(i) for i in np.repeat(np.arange(len(counts)), counts)]
-
-
-def _keyframes(model: Any) -> Iterator[ListedKeyframe]:
-    """All keyframes."""
-    for i in range(model.nkey):
-        yield ListedKeyframe(
-            name=model.key(i).name,
-            qpos=tuple(model.key_qpos[i].tolist()),
-            qvel=tuple(model.key_qvel[i].tolist()),
-            ctrl=tuple(model.key_ctrl[i].tolist()),
-        )
 
 
 def _listed(limit: Limit) -> ListedLimit:

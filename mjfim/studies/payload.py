@@ -70,19 +70,6 @@ class KnownRobot:
     source: str
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class IdentifiedPayload:
-    """Result of the identification of a payload.
-
-    Attributes:
-        estimate: The estimate, with its `payload`.
-        system: The robot with the payload.
-    """
-
-    estimate: Estimate
-    system: System
-
-
 def identify_payload(
     experiment: Experiment,
     recordings: Sequence[Recording],
@@ -126,8 +113,7 @@ def identify_payload(
     """
     with shown_progress("identifying the payload", callback, progress) as show:
         prepared = PayloadTask.of(experiment, body=body, robot=robot, size=size, threads=threads)
-        found = prepared.identify(recordings, without=without, callback=show, stop=stop)
-    return found.estimate
+        return prepared.identify(recordings, without=without, callback=show, stop=stop)[0]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -217,8 +203,8 @@ class PayloadTask:
         without: Sequence[Recording] = (),
         callback: Callback | None = None,
         stop: StopToken | None = None,
-    ) -> IdentifiedPayload:
-        """Identify the payload. See `identify_payload` for the arguments.
+    ) -> tuple[Estimate, System]:
+        """The estimate of the payload, and the robot with it. See `identify_payload`.
 
         Raises:
             RecordingError: A recording cannot be used.
@@ -245,8 +231,7 @@ class PayloadTask:
         payload = self._payload(estimate, known, edge)
         seconds = time.perf_counter() - begun
         steps = system.plant.engine_steps
-        estimate = replace(estimate, payload=payload, seconds=seconds, steps=steps)
-        return IdentifiedPayload(estimate=estimate, system=system)
+        return replace(estimate, payload=payload, seconds=seconds, steps=steps), system
 
     # ---- the robot
 

@@ -11,7 +11,6 @@ effort than the one before, and a round at values below the guess less than the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import ExecutorLike
 from mjfim.parallel.budget import StopToken
+from mjfim.records.campaign import Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback
@@ -41,28 +41,9 @@ SAMPLING_RANGE = 2.5
 MIN_SAMPLING_RANGE = 1e-9
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CampaignHistory:
-    """Results of the earlier rounds of a campaign that a redesign needs.
-
-    Attributes:
-        estimate: Estimate from all recordings so far.
-        count: Number of these recordings.
-        first_theta: (p,) parameters at which the first design was made [theta-unit].
-        first_control: (N, nu) control of the first design [unit of the actuator].
-        last_control: (N, nu) control of the last design [unit of the actuator].
-    """
-
-    estimate: Estimate
-    count: int
-    first_theta: Array
-    first_control: Array
-    last_control: Array
-
-
 def redesign(
     base: DesignTask,
-    history: CampaignHistory,
+    rounds: Sequence[Round],
     theta: Array,
     *,
     callback: Callback | None = None,
@@ -76,7 +57,7 @@ def redesign(
 
     Args:
         base: Task of the experiment as stated.
-        history: Earlier rounds.
+        rounds: Earlier rounds.
         theta: (p,) parameters at which the design is made [theta-unit].
         callback: Called with a `DesignEvent` for every iterate.
         executor: Runs several optimisations at once, under hard limits.
@@ -85,17 +66,17 @@ def redesign(
     Raises:
         MjfimError: As `mjfim.design` raises it.
     """
-    known = history.estimate.data
-    moved = restate_experiment(base, theta, history.estimate)
-    weight = _information_weight(base, moved, history)
+    last = rounds[-1]
+    known = last.estimate.data
+    moved = restate_experiment(base, theta, last.estimate)
+    weight = _information_weight(base, moved, rounds)
     moved = moved.replace(cost={"information": weight})
 
     task = base.restated(moved, added_information=known)
     first = design_task(
         task, callback=callback, executor=executor, budget=design_budget(task, stop)
     )
-    fits = history.last_control.shape == task.control.shape
-    if not fits or first.status is Status.INTERRUPTED:
+    if last.control.shape != task.control.shape or first.status is Status.INTERRUPTED:
         return first
 
     # The second design starts at the control of the last design, and nowhere else.
@@ -105,7 +86,7 @@ def redesign(
         second = design_task(
             task,
             callback=callback,
-            initial_control=history.last_control,
+            initial_control=last.control,
             budget=design_budget(task, stop),
         )
     except SimulationDivergedError:
@@ -120,26 +101,26 @@ def redesign(
     )
 
 
-def _information_weight(base: DesignTask, moved: Experiment, history: CampaignHistory) -> float:
+def _information_weight(base: DesignTask, moved: Experiment, rounds: Sequence[Round]) -> float:
     """Weight of the criterion that keeps the balance between information and effort.
 
     A relative gain of information then costs as much effort as in the first design.
     """
     stated = moved.cost.information
-    rounds = history.count + 1
+    count = sum(len(each.recordings) for each in rounds) + 1
     if moved.cost.criterion == "D":
-        return stated * rounds
+        return stated * count
 
-    first_task = base.restated(restate_experiment(base, history.first_theta))
-    task = base.restated(moved, added_information=history.estimate.data)
+    first_task = base.restated(restate_experiment(base, rounds[0].theta))
+    task = base.restated(moved, added_information=rounds[-1].estimate.data)
     try:
-        first = criterion_of(first_task, history.first_control)
-        last = criterion_of(task, history.last_control)
+        first = criterion_of(first_task, rounds[0].control)
+        last = criterion_of(task, rounds[-1].control)
     except (MjfimError, ValueError):
         # Where a value is missing, take the weight for equal experiments.
-        return stated * rounds**2
+        return stated * count**2
 
-    return float(stated * rounds * first / last)
+    return float(stated * count * first / last)
 
 
 def restate_experiment(
@@ -169,31 +150,30 @@ def restate_experiment(
             continue
 
         # A declared inertia is either kept, or replaced by its individual parameters.
+        # The recordings have to determine all of them, each more accurately than its size.
         members = [j for j, parameter in enumerate(p.parameters) if parameter.group == name]
-        if theta is None or estimate is None or not _are_determined(base, members, estimate):
+        if (
+            theta is None
+            or estimate is None
+            or not (np.diag(estimate.data)[members] * p.magnitude[members] ** 2 > 1.0).all()
+        ):
             tables[name] = table
             continue
         for j in members:
-            member = _member_table(base, j)
+            parameter = p.parameters[j]
+            member: dict[str, Any] = {
+                "target": parameter.targets[0].path,
+                "unit": parameter.unit,
+                "nuisance": parameter.nuisance,
+            }
+            if parameter.prior is not None:
+                member["prior"] = parameter.prior
             tables[p.names[j]] = {**member, **_restated_keys(base, j, theta, estimate)}
 
     values = experiment.model_dump(exclude_unset=True)
     values["parameters"] = tables
     values["cost"] = {**values.get("cost", {}), "linearize_at": "guess"}
     return experiment.restated(values)
-
-
-def _member_table(base: DesignTask, index: int) -> dict[str, Any]:
-    """Table of a parameter that belongs to a declared inertia, as if it were declared alone."""
-    parameter = base.parameters.parameters[index]
-    table: dict[str, Any] = {
-        "target": parameter.targets[0].path,
-        "unit": parameter.unit,
-        "nuisance": parameter.nuisance,
-    }
-    if parameter.prior is not None:
-        table["prior"] = parameter.prior
-    return table
 
 
 def _restated_keys(
@@ -220,14 +200,3 @@ def _restated_keys(
         reach = max(SAMPLING_RANGE * float(estimate.std[index]), MIN_SAMPLING_RANGE * size)
         keys["bounds"] = (max(low, guess - reach), min(high, guess + reach))
     return keys
-
-
-def _are_determined(base: DesignTask, members: Sequence[int], estimate: Estimate) -> bool:
-    """Whether the recordings determine all members, each more accurately than its size."""
-    indices = np.asarray(members)
-    information = np.diag(estimate.data)[indices]
-    size = base.parameters.magnitude[indices]
-
-    # A standard deviation below the size means an information above 1 / size^2.
-    relative_information = information * size**2
-    return bool((relative_information > 1.0).all())

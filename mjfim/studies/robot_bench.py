@@ -17,7 +17,7 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, ConstraintSet, constraint_set_of
+from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import opened_file
@@ -26,13 +26,13 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.information.marginal import standard_deviations
 from mjfim.model.coordinates import tangent_names
+from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.recordings.control_table import read_playback
 from mjfim.records.estimate import Estimate
 from mjfim.records.robustness import RobotConditions, RobotRun
 from mjfim.records.trajectory import Recording
-from mjfim.studies.planned_controller import PlannedController
 
 # Largest number of attempts to draw a robot whose bodies are physical.
 MAX_DRAWS = 500
@@ -66,7 +66,10 @@ class RobotBench:
         late_steps: Number of engine steps by which the control is late.
         constraints: Constraints of the stated task.
         limits: All l limits that are checked.
-        controller: The controller that plays the plan.
+        rest: (nu,) control before the motion begins [unit of the actuator]; None where the
+            experiment begins in motion.
+        sensed: (ns,) index of the output that measures each entry of the state; -1 where no output
+            measures it.
     """
 
     def __init__(self, experiment: Experiment, table: Path, conditions: RobotConditions) -> None:
@@ -114,7 +117,24 @@ class RobotBench:
             )
 
         self.constraints = constraint_set_of(self.stated)
-        self.limits = _assessed_limits(self.stated, self.constraints)
+
+        # First the limits on observed quantities, in the order of the observations.
+        stated_limits = self.stated.limits
+        within = [limit for kind in SUBSTEP_KINDS for limit in stated_limits if limit.kind == kind]
+        others = [limit for limit in stated_limits if limit.kind not in SUBSTEP_KINDS]
+        nearest = self.constraints.clearance
+        if nearest is not None:
+            others.append(
+                Limit(
+                    kind="clearance",
+                    name="nearest pair",
+                    index=0,
+                    lower=nearest.least,
+                    upper=np.inf,
+                    size=nearest.scale,
+                )
+            )
+        self.limits = (*within, *others)
 
         # The controls of a robot arrive late, at any engine step, so its samples are engine steps.
         self._observations = self.constraints.observations.of_single_steps()
@@ -124,17 +144,14 @@ class RobotBench:
             threads=1,
         )
 
-        self.controller = PlannedController(
-            plan=self.plan,
-            space=self.stated.space,
-            bounds=self.constraints.control.bounds,
-            rest=self._rest_control(),
-            sensed=_sensed_entries(self.stated),
-            steps_per_row=self.steps_per_row,
-            late_steps=self.late_steps,
-            feedback=conditions.feedback,
-        )
-        if conditions.feedback and (self.controller.sensed < 0).all():
+        self.rest = self._rest_control()
+        space = self.stated.space
+        self.sensed = np.full(space.nq + space.nv + space.na, -1)
+        for entry, output in outputs_by_state(
+            self.stated.system.model, self.stated.system.outputs
+        ).items():
+            self.sensed[entry] = output
+        if conditions.feedback and (self.sensed < 0).all():
             raise ExperimentError(
                 "--feedback: the gains need a measured position or velocity of a joint, and the "
                 "experiment measures none"
@@ -196,7 +213,7 @@ class RobotBench:
 
         for seed in range(2 * len(task.parameters)):
             theta = self._drawn(np.random.default_rng(seed))
-            start = self._start(task.system.model_at(theta), theta, self.controller)
+            start = self._start(task.system.model_at(theta), theta, self.conditions.feedback)
             deviation = task.space.minus(start, task.plant.nominal_initial_state)
             moved |= np.abs(deviation[: task.space.nv]) > MIN_START_DEVIATION
 
@@ -232,7 +249,7 @@ class RobotBench:
             error = rng.choice([-1.0, 1.0], len(p)) * reach * shrinkage
             theta = np.where(p.changes_model, p.guess + error, prior * rng.standard_normal(len(p)))
             theta = self._with_delay(np.clip(theta, p.lower, p.upper))
-            if not p.writer.unphysical_bodies(self.task.plant.source, theta):
+            if not ParameterWriter(p).unphysical_bodies(self.task.plant.source, theta):
                 return theta
 
         raise ExperimentError(
@@ -246,13 +263,13 @@ class RobotBench:
         is_delay = self.task.parameters.delay_derivative != 0.0
         return np.asarray(np.where(is_delay, delay, theta))
 
-    def _start(self, model: Any, theta: Array, controller: PlannedController) -> Array:
+    def _start(self, model: Any, theta: Array, feedback: bool) -> Array:
         """Initial state of a robot: its equilibrium near the initial state of the model.
 
         Args:
             model: Model of the robot.
             theta: (p,) parameters of the robot [theta-unit].
-            controller: The controller.
+            feedback: Whether the gains act.
 
         Returns:
             (ns,) initial state; that of the model where there is no equilibrium and no latency.
@@ -260,31 +277,29 @@ class RobotBench:
         Raises:
             SimulationDivergedError: There is no equilibrium, and the control is late.
         """
-        if controller.rest is None:
+        if self.rest is None:
             return self.task.plant.initial_state(theta)
 
-        state, acceleration, moves = self._equilibrium(model, controller)
+        state, acceleration, moves = self._equilibrium(model, feedback)
         if moves <= MAX_REST_MOVE:
             return state
         if self.late_steps == 0:
             return np.array(self.stated.plant.nominal_initial_state)
 
         advice = (
-            "play without a latency"
-            if controller.feedback
-            else "play with --feedback, or without a latency"
+            "play without a latency" if feedback else "play with --feedback, or without a latency"
         )
         raise SimulationDivergedError(
             "a robot with other parameters does not stand still at the start "
             f"(it accelerates by {acceleration:.2g} per s²): {advice}"
         )
 
-    def _equilibrium(self, model: Any, controller: PlannedController) -> tuple[Array, float, float]:
+    def _equilibrium(self, model: Any, feedback: bool) -> tuple[Array, float, float]:
         """Find an equilibrium of a robot near the initial state of the model.
 
         Args:
             model: Model of the robot.
-            controller: Controller, whose first gain acts on the state with feedback.
+            feedback: Whether the first gain acts on the state.
 
         Returns:
             (ns,) state, the largest acceleration that is left, and the same relative to the size of
@@ -302,7 +317,7 @@ class RobotBench:
             """Accelerations and rates of the activations after a move, relative to their sizes."""
             state = space.plus(nominal, move @ directions)
             data.qpos[:], data.qvel[:], data.act[:] = space.split(state)
-            data.ctrl[:] = controller.before_start(state)
+            data.ctrl[:] = self._before_start(state, feedback)
             mujoco.mj_forward(model, data)
             return np.asarray(np.concatenate([data.qacc, data.act_dot]) / rates)
 
@@ -328,9 +343,24 @@ class RobotBench:
         noise = self.conditions.loudness * self.task.system.noise.sample(len(self.plan.t), rng)
 
         try:
-            recording, margins, start = self.play(theta, noise, self.controller)
-            system = self._system_from(start)
-            self._put_start(theta, start, system)
+            recording, margins, start = self.play(theta, noise, self.conditions.feedback)
+            system, na = self.task.system, self.task.space.na
+            # The recording begins with the activations of the robot. These are no unknowns, because
+            # they follow from the control before the motion begins.
+            if na:
+                state = np.array(system.plant.nominal_initial_state)
+                state[-na:] = start[-na:]
+                system = replace(
+                    system,
+                    nominal_initial_state=state,
+                    plant=system.plant.with_initial_state(state),
+                )
+
+            # The true deviations of the initial state, as far as they are unknowns.
+            matrix = system.parameters.initial_state_derivative(system.space.nx)
+            used = matrix.any(axis=0)
+            deviation = system.space.minus(start, system.plant.nominal_initial_state)
+            theta[used] = np.linalg.lstsq(matrix[:, used], deviation)[0]
             estimate, restarted = self._identified(recording, system)
         except SimulationDivergedError as error:
             return RobotRun(
@@ -353,34 +383,6 @@ class RobotBench:
             restarted=restarted,
             trouble="" if estimate.success else estimate.status,
         )
-
-    def _system_from(self, start: Array) -> System:
-        """System for the recording of a robot that begins at start: (ns,).
-
-        It begins with the activations of the robot. These are no unknowns, because they follow from
-        the control before the motion begins.
-        """
-        system, na = self.task.system, self.task.space.na
-        if na == 0:
-            return system
-
-        state = np.array(system.plant.nominal_initial_state)
-        state[-na:] = start[-na:]
-        return replace(
-            system, nominal_initial_state=state, plant=system.plant.with_initial_state(state)
-        )
-
-    def _put_start(self, theta: Array, start: Array, system: System) -> None:
-        """Write the true deviations of the initial state into theta: (p,), in place.
-
-        Only deviations that are unknowns are written. start: (ns,) initial state of the robot.
-        """
-        matrix = system.parameters.initial_state_derivative(system.space.nx)
-        used = matrix.any(axis=0)
-
-        deviation = system.space.minus(start, system.plant.nominal_initial_state)
-        solution = np.linalg.lstsq(matrix[:, used], deviation)
-        theta[used] = solution[0]
 
     def _identified(self, recording: Recording, system: System) -> tuple[Estimate, bool]:
         """Identify a robot from its recording.
@@ -413,15 +415,13 @@ class RobotBench:
 
         return best, True
 
-    def play(
-        self, theta: Array, noise: Array, controller: PlannedController
-    ) -> tuple[Recording, Array, Array]:
+    def play(self, theta: Array, noise: Array, feedback: bool) -> tuple[Recording, Array, Array]:
         """Play the plan on one robot.
 
         Args:
             theta: (p,) parameters of the robot [theta-unit].
             noise: (M+1, ny) noise of the outputs at the rows of the plan [y-unit].
-            controller: The controller.
+            feedback: Whether the gains act.
 
         Returns:
             The recording, (l,) margins divided by half of their ranges, and (ns,) initial state of
@@ -433,10 +433,10 @@ class RobotBench:
         """
         task, rows = self.task, len(self.plan.ctrl)
         model = task.system.model_at(theta)
-        start = self._start(model, theta, controller)
-        before = controller.before_start(start)
+        start = self._start(model, theta, feedback)
+        before = self._before_start(start, feedback)
         noise = noise + task.system.plant.calibration.bias @ theta
-        sent = controller.sent(model, start, before, noise)
+        sent = self._sent(model, start, before, noise, feedback)
 
         # The control arrives late. Until then the robot gets the control before the motion begins.
         held = np.repeat(sent, self.steps_per_row, axis=0)
@@ -461,7 +461,7 @@ class RobotBench:
             name="robot",
         )
         qpos = out.states[0][:, : task.space.nq]
-        margins = self._margins(out.observed[0], sent, before, qpos, controller.feedback)
+        margins = self._margins(out.observed[0], sent, before, qpos, feedback)
         return recording, margins, start
 
     def _margins(
@@ -483,7 +483,13 @@ class RobotBench:
         bounds = constraints.substeps.bounds
         quantities = constraints.substeps.quantities(observed)
         inside = bounds.margin(quantities).min(axis=(0, 1), initial=np.inf) / bounds.scale
-        rates = self._control_rates(sent, before, feedback)
+
+        # Rates from row to row of design.csv, with the change from the control before the motion,
+        # and the change to the control after its end.
+        after = None if feedback or constraints.rate is None else constraints.rate.control_after
+        after = sent[-1] if after is None else after
+        changes = np.diff(sent, axis=0, prepend=before[None], append=after[None])
+        rates = changes / self.plan.period
 
         margins = []
         for i, limit in enumerate(self.limits):
@@ -499,19 +505,77 @@ class RobotBench:
 
         return np.array(margins)
 
-    def _control_rates(self, sent: Array, before: Array, feedback: bool) -> Array:
-        """Rates of the control from row to row of design.csv [unit of the actuator / s].
+    # ---- the controller, with or without feedback
 
-        They include the change from the control before the motion, and the change to the control
-        after its end.
+    def _before_start(self, state: Array, feedback: bool) -> Array:
+        """Control before the motion; with feedback, the first gain acts on the state.
+
+        Args:
+            state: (ns,) state in which the robot stands.
+            feedback: Whether the gains act.
+
+        Returns:
+            (nu,) control [unit of the actuator].
         """
-        rate = self.constraints.rate
-        after = sent[-1] if feedback or rate is None else rate.control_after
-        if after is None:
-            after = sent[-1]
+        if self.rest is None:
+            return np.asarray(self.plan.ctrl[0])
+        if not feedback:
+            return self.rest
+        return np.asarray(self.rest + self.plan.gain[0] @ self._deviation(state, 0))
 
-        changes = np.diff(sent, axis=0, prepend=before[None], append=after[None])
-        return np.asarray(changes / self.plan.period)
+    def _sent(self, model: Any, start: Array, before: Array, noise: Array, feedback: bool) -> Array:
+        """Controls that the controller sends.
+
+        Args:
+            model: Model of the robot.
+            start: (ns,) initial state of the robot.
+            before: (nu,) control before the motion begins [unit of the actuator].
+            noise: (M+1, ny) noise of the outputs that the controller reads [y-unit].
+            feedback: Whether the gains act.
+
+        Returns:
+            (M, nu) controls [unit of the actuator].
+        """
+        rows = len(self.plan.ctrl)
+        if not feedback:
+            return self._clipped(self.plan.ctrl)
+
+        data = mujoco.MjData(model)
+        qpos, qvel, act = self.stated.space.split(start)
+        data.qpos[:] = qpos
+        data.qvel[:] = qvel
+        data.act[:] = act
+
+        sent = np.zeros((rows, len(before)))
+        read = np.flatnonzero(self.sensed >= 0)
+
+        for step in range(rows * self.steps_per_row):
+            row, phase = divmod(step, self.steps_per_row)
+            if phase == 0:
+                state = np.concatenate([data.qpos, data.qvel, data.act])
+                state[read] += noise[row, self.sensed[read]]
+                move = self.plan.gain[row] @ self._deviation(state, row)
+                sent[row] = self._clipped(self.plan.ctrl[row] + move)
+
+            arrived = (step - self.late_steps) // self.steps_per_row
+            data.ctrl[:] = before if arrived < 0 else sent[arrived]
+            mujoco.mj_step(model, data)
+
+        return sent
+
+    def _clipped(self, control: Array) -> Array:
+        """Controls in the ranges to which the controller clips [unit of the actuator]."""
+        bounds = self.constraints.control.bounds
+        return np.asarray(np.clip(control, bounds.lower, bounds.upper))
+
+    def _deviation(self, state: Array, row: int) -> Array:
+        """(nx,) planned minus measured state; zero for entries that are not measured."""
+        planned = self.plan.state[row]
+        measured = np.where(self.sensed >= 0, state, planned)
+        for q, _ in self.stated.space.quaternions:
+            measured[q : q + 4] /= np.linalg.norm(measured[q : q + 4])
+
+        return self.stated.space.minus(planned, measured)
 
     # ---- predictions of the model
 
@@ -522,8 +586,7 @@ class RobotBench:
         """
         no_noise = np.zeros((len(self.plan.t), len(self.task.system.outputs)))
         theta = self._with_delay(self.task.parameters.guess)
-        open_loop = replace(self.controller, feedback=False)
-        _, margins, _ = self.play(theta, no_noise, open_loop)
+        _, margins, _ = self.play(theta, no_noise, False)
         return margins
 
     def predicted(self) -> Array:
@@ -537,31 +600,3 @@ class RobotBench:
 
         J = task.system.noise.whitened_rows(found[1])
         return standard_deviations(J.T @ J + task.parameters.prior_information)
-
-
-def _sensed_entries(task: DesignTask) -> np.ndarray:
-    """(ns,) index of the output that measures each entry of the state; -1 where there is none."""
-    found = np.full(task.space.nq + task.space.nv + task.space.na, -1)
-    for entry, output in outputs_by_state(task.system.model, task.system.outputs).items():
-        found[entry] = output
-    return found
-
-
-def _assessed_limits(task: DesignTask, constraints: ConstraintSet) -> tuple[Limit, ...]:
-    """All limits; first those on observed quantities, in the order of the observations."""
-    within = [limit for kind in SUBSTEP_KINDS for limit in task.limits if limit.kind == kind]
-    others = [limit for limit in task.limits if limit.kind not in SUBSTEP_KINDS]
-
-    if constraints.clearance is not None:
-        clearance, scale = constraints.clearance.least, constraints.clearance.scale
-        others.append(
-            Limit(
-                kind="clearance",
-                name="nearest pair",
-                index=0,
-                lower=clearance,
-                upper=np.inf,
-                size=scale,
-            )
-        )
-    return (*within, *others)

@@ -23,7 +23,6 @@ from mjfim.identification.assessment.random_effects import between_variance, f_t
 from mjfim.records.check import join_names
 from mjfim.records.estimate import Estimate
 from mjfim.records.robots import RobotComparison
-from mjfim.records.trajectory import Recording
 
 # Probability to find any difference where there is none.
 LEVEL = 0.05
@@ -291,8 +290,9 @@ def _remarks_on_parameters(
         if why and not name.startswith(INITIAL_STATE_PREFIX):
             yield f"{name} is not compared: {why}"
 
+    index = ((name, [each.parameters.index(name) for each in (first, second)]) for name in common)
     with_prior = [
-        name for name in common if all(_has_prior(name, each) for each in (first, second))
+        name for name, (i, j) in index if first.prior[i, i] > 0.0 and second.prior[j, j] > 0.0
     ]
     if with_prior:
         yield (
@@ -313,25 +313,15 @@ def _remarks_on_parameters(
         )
 
 
-def _has_prior(name: str, estimate: Estimate) -> bool:
-    """Whether a parameter has a prior."""
-    j = estimate.parameters.index(name)
-    return bool(estimate.prior[j, j] > 0.0)
-
-
 def _shared_recordings(first: Estimate, second: Estimate) -> list[str]:
     """Names of recordings that are part of both estimates."""
     return [
         recording.name
         for recording in first.recordings
-        if any(_is_same(recording, other) for other in second.recordings)
+        if any(
+            recording.y.shape == other.y.shape
+            and np.array_equal(recording.t, other.t)
+            and np.array_equal(recording.y, other.y, equal_nan=True)
+            for other in second.recordings
+        )
     ]
-
-
-def _is_same(recording: Recording, other: Recording) -> bool:
-    """Whether two recordings have the same times and measurements."""
-    return (
-        recording.y.shape == other.y.shape
-        and bool(np.array_equal(recording.t, other.t))
-        and bool(np.array_equal(recording.y, other.y, equal_nan=True))
-    )

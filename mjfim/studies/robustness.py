@@ -16,11 +16,10 @@ import scipy
 from threadpoolctl import threadpool_limits
 
 from mjfim.errors import NoResultError
-from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import ExecutorLike
+from mjfim.parallel import ExecutorLike, results_on
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.robustness import (
@@ -32,7 +31,6 @@ from mjfim.records.robustness import (
     Robustness,
 )
 from mjfim.studies.robot_bench import RobotBench
-from mjfim.studies.shared_work import SharedWork
 
 
 def assess_robustness(
@@ -74,7 +72,8 @@ def assess_robustness(
         RecordingError: The design cannot be read.
         NoResultError: The study was stopped before any robot was finished.
     """
-    table = design_table(design)
+    table = Path(design)
+    table = table if table.is_file() else table / "design.csv"
     if conditions is None:
         conditions = RobotConditions(latency=default_latency(experiment))
     bench = RobotBench(experiment, table, conditions)
@@ -90,8 +89,7 @@ def assess_robustness(
             packed = for_workers(experiment, bench.stated.system.source, [table])
             return partial(RobotBench, packed, table, bench.conditions)
 
-        work = SharedWork(own=bench, make=make, executor=executor, stop=token)
-        for run in work.results(_run_until_stopped, range(runs)):
+        for run in results_on(bench, make, _run_until_stopped, range(runs), executor, token):
             if run is None:
                 continue
             found.append(run)
@@ -111,16 +109,6 @@ def assess_robustness(
     if not found:
         raise NoResultError("the study was stopped before any robot was finished")
     return summarize_runs(bench, found)
-
-
-def design_table(design: str | Path) -> Path:
-    """Path of design.csv.
-
-    Args:
-        design: Folder of a design, or its design.csv.
-    """
-    path = Path(design)
-    return path if path.is_file() else path / "design.csv"
 
 
 def default_latency(experiment: Experiment) -> float:
@@ -166,7 +154,16 @@ def summarize_runs(bench: RobotBench, runs: Sequence[RobotRun]) -> Robustness:
         conditions=bench.conditions,
         names=names,
         units=task.system.units,
-        limits=tuple(_assessed(limit) for limit in bench.limits),
+        limits=tuple(
+            AssessedLimit(
+                kind=limit.kind,
+                name=limit.name,
+                lower=limit.lower,
+                upper=limit.upper,
+                scale=limit.scale,
+            )
+            for limit in bench.limits
+        ),
         wrong=np.sqrt(np.mean(squared, axis=0)),
         z=error / std,
         error=error,
@@ -179,17 +176,6 @@ def summarize_runs(bench: RobotBench, runs: Sequence[RobotRun]) -> Robustness:
         misfits=sum(run.misfit for run in runs),
         restarted=sum(run.restarted for run in runs),
         troubles=dict(Counter(run.trouble for run in runs if run.trouble)),
-    )
-
-
-def _assessed(limit: Limit) -> AssessedLimit:
-    """Record of a limit for the user."""
-    return AssessedLimit(
-        kind=limit.kind,
-        name=limit.name,
-        lower=limit.lower,
-        upper=limit.upper,
-        scale=limit.scale,
     )
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -120,62 +120,19 @@ def select_terms(
         SimulationDivergedError: The model diverges at the start.
     """
     with shown_progress("selecting terms", callback, progress) as show:
+        begun = time.perf_counter()
         system = System.resolve(experiment, threads=threads)
-        found = select_terms_system(
-            system,
-            recordings,
-            held_out=held_out,
-            max_terms=max_terms,
-            callback=show,
-            stop=stop,
-            executor=executor,
-        )
-    return found.estimate
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SelectedModel:
-    """Result of a selection.
-
-    Attributes:
-        estimate: The estimate of the extended model.
-        system: The extended model.
-    """
-
-    estimate: Estimate
-    system: System
-
-
-def select_terms_system(
-    system: System,
-    recordings: Sequence[Recording],
-    *,
-    held_out: Sequence[Recording] = (),
-    max_terms: int = MAX_TERMS,
-    callback: Callback | None = None,
-    stop: StopToken | None = None,
-    executor: ExecutorLike | None = None,
-) -> SelectedModel:
-    """Extend a resolved system by the terms that it lacks. See `select_terms`."""
-    begun = time.perf_counter()
-    steps_before = system.plant.engine_steps
-
-    with one_blas_thread(), stop_on_interrupt(stop) as token:
-        selector = _Selector(
-            held_out=tuple(held_out),
-            budget=Budget(stop=token),
-            callback=callback,
-            workers=None if executor is None else FitWorkers(executor),
-            max_terms=max_terms,
-        )
-        estimate, selected = selector.selected(FitTask.of(system, recordings, held_out=held_out))
-
-    estimate = replace(
-        estimate,
-        seconds=time.perf_counter() - begun,
-        steps=system.plant.engine_steps - steps_before,
-    )
-    return SelectedModel(estimate=estimate, system=selected)
+        with one_blas_thread(), stop_on_interrupt(stop) as token:
+            selector = _Selector(
+                held_out=tuple(held_out),
+                budget=Budget(stop=token),
+                callback=show,
+                workers=None if executor is None else FitWorkers(executor),
+                max_terms=max_terms,
+            )
+            found = selector.selected(FitTask.of(system, recordings, held_out=held_out))
+    seconds = time.perf_counter() - begun
+    return replace(found, seconds=seconds, steps=system.plant.engine_steps)
 
 
 class _Selector:
@@ -200,8 +157,8 @@ class _Selector:
         self.steps: list[SelectionStep] = []
         self.ending = ""
 
-    def selected(self, task: FitTask) -> tuple[Estimate, System]:
-        """Estimate of the extended model, and the extended model.
+    def selected(self, task: FitTask) -> Estimate:
+        """Estimate of the extended model.
 
         Where the length of the segments is left to the fit, terms are chosen by whole recordings
         first, and once more over the length that the final fit needs.
@@ -231,8 +188,8 @@ class _Selector:
                 break
         return self._selected(model, is_free)
 
-    def _selected(self, model: FittedModel, is_free: bool) -> tuple[Estimate, System]:
-        """Estimate of the chosen model, and this model."""
+    def _selected(self, model: FittedModel, is_free: bool) -> Estimate:
+        """Estimate of the chosen model."""
         result = _reported(model.result, is_free)
         selection = Selection(
             terms=model.terms,
@@ -251,11 +208,10 @@ class _Selector:
                 hold=settings.hold,
                 segments=settings.segment_length if is_free else None,
             )
-        system = result.task.system
-        return with_selection(estimate, selection, model.losses, system), system
+        return with_selection(estimate, selection, model.losses, result.task.system)
 
-    def _unselected(self, result: FitResult, is_free: bool) -> tuple[Estimate, System]:
-        """Estimate of the stated model where no term could be tried, and this model."""
+    def _unselected(self, result: FitResult, is_free: bool) -> Estimate:
+        """Estimate of the stated model where no term could be tried."""
         ending = "The selection was interrupted before a term was tried."
         if not self._is_stopped():
             ending = (
@@ -267,7 +223,7 @@ class _Selector:
         steps = (SelectionStep(decision=Decision.BEGUN, error=np.nan),)
         selection = Selection(terms=(), steps=steps, ending=ending)
         estimate = estimate_from(result, self.budget)
-        return replace(estimate, selection=selection), result.task.system
+        return replace(estimate, selection=selection)
 
     def _refit_to_held_out(self, result: FitResult, estimate: Estimate) -> HeldOutRefit | None:
         """Fit the selected model to the held-out recordings; None without any, or after a stop."""

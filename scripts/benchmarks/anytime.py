@@ -27,14 +27,13 @@ from matplotlib.ticker import StrMethodFormatter
 from rich.console import Console
 from rich.table import Table
 
+import mjfim
 from mjfim.errors import MjfimError
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.output.vocabulary import DESIGNED, OTHER
 from mjfim.parallel.budget import measured_by, stop_on_interrupt
 from mjfim.records.comparison import DESIGN
-from mjfim.studies.baseline_titles import TITLES
-from mjfim.studies.compare import compare_task
+from mjfim.studies.baselines import TITLES
 from scripts.benchmarks import arms
 
 # Folder of the examples.
@@ -95,9 +94,8 @@ def run(case: str, experiment: Experiment, seconds: float, methods: list[str]) -
     Returns:
         What each method found, the design last.
     """
-    task = DesignTask.resolve(experiment, threads=1)
     with measured_by(time.process_time):
-        found = compare_task(task, seconds=seconds, methods=methods)
+        found = mjfim.compare(experiment, seconds=seconds, methods=methods, threads=1)
 
     return [
         Found(

@@ -64,7 +64,6 @@ from mjfim.parallel import cores, one_blas_thread
 from mjfim.parallel.budget import Budget
 from mjfim.records.estimate import Estimate, Whiteness
 from mjfim.records.trajectory import Recording
-from mjfim.studies.selection import select_terms_system
 from scripts.benchmarks.arm_models import LAWS, TIMESTEP, Arm, panda, ur5e
 
 # Samples of the controller per measurement, and the longest delay of the measurements [samples].
@@ -514,8 +513,10 @@ def fitted(arm: Arm, system: System, recordings: list[Recording], job: Job) -> F
     """Identify a robot, with the whole report or without the parts that search for more."""
     torques = [f"torque_{joint}" for joint in arm.joints]
     if job.fit is Fit.SELECTED:
-        selected = select_terms_system(system, recordings)
-        return _of_estimate(selected.system, selected.estimate, torques)
+        found = mjfim.select_terms(system.experiment, recordings, threads=system.threads)
+        assert found.selection is not None
+        selected = mjfim.selected_experiment(system.experiment, found.selection)
+        return _of_estimate(System.resolve(selected, threads=system.threads), found, torques)
     if job.whole:
         return _of_estimate(system, identify_system(system, recordings), torques)
 

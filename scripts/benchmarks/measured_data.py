@@ -28,7 +28,6 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
-from mjfim.studies.selection import select_terms_system
 
 # Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
@@ -154,7 +153,7 @@ def identified(data: Path, measured: MeasuredSet, is_selecting: bool) -> Result:
 
     begun = time.perf_counter()
     if is_selecting:
-        found = select_terms_system(system, fitted, held_out=held_out).estimate
+        found = mjfim.select_terms(experiment, fitted, held_out=held_out)
     else:
         found = identify_system(system, fitted, held_out=held_out)
     seconds = time.perf_counter() - begun

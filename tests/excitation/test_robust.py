@@ -18,6 +18,7 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import ParameterSamples
 from mjfim.model.parameter_ranges import sample_parameters
+from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.parameters import Parameter, ParameterSet
 from tests.support.numerics import CART_PARAMETERS, Array, body_task, cart_task
 
@@ -258,7 +259,10 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     assert (moments > 0.0).all()
     assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
     free = sample_parameters(task.parameters, task.theta, 8, 0)
-    assert any(task.parameters.writer.unphysical_bodies(task.plant.source, theta) for theta in free)
+    assert any(
+        ParameterWriter(task.parameters).unphysical_bodies(task.plant.source, theta)
+        for theta in free
+    )
     assert len(np.unique(task.samples_of_parameters.thetas, axis=0)) == 8
 
 

@@ -14,6 +14,7 @@ import pytest
 from mjfim.errors import ExperimentError
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource, decoration
+from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
 from mjfim.model.paths import KINDS, ParameterPath, fields_of, resolve
 from mjfim.model.targets import ModelField, RotationField, SpecField
@@ -302,8 +303,8 @@ def both_ways(xml: str, path: str, value: float) -> tuple[Any, Any, Any]:
     spec, base = compiled(xml, parameters)
     resolved = parameter_set(parameters, base, decoration=decoration(spec, base))
     theta, other = np.array([value]), spec.copy()
-    write_spec(other, base, resolved.writer.model(base, theta), resolved, theta)
-    return base, resolved.writer.model(base, theta), other.compile()
+    write_spec(other, base, ParameterWriter(resolved).model(base, theta), resolved, theta)
+    return base, ParameterWriter(resolved).model(base, theta), other.compile()
 
 
 def test_the_edits_cover_every_field_of_a_path() -> None:
@@ -413,7 +414,7 @@ def test_inertias_and_rotations_written_in_place_equal_a_compile(xml: str, path:
     )
     other = spec.copy()
     written_by_hand(other, base, path, change)
-    own, again = resolved.writer.model(base, np.array([value + change])), other.compile()
+    own, again = ParameterWriter(resolved).model(base, np.array([value + change])), other.compile()
     written = (
         INERTIA_PARAMETRISATIONS[field.parametrisation].coordinates(body_inertia(own, field.body))[
             field.component
@@ -424,7 +425,7 @@ def test_inertias_and_rotations_written_in_place_equal_a_compile(xml: str, path:
     assert written == pytest.approx(value + change, rel=1e-9, abs=1e-12)
     for mine, theirs in zip(*(states_and_mass_matrix(m) for m in (own, again)), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-10, atol=1e-10)
-    before = resolved.writer.model(base, np.array([value]))
+    before = ParameterWriter(resolved).model(base, np.array([value]))
     np.testing.assert_allclose(rollout(before, 50), rollout(base, 50), rtol=1e-10, atol=1e-10)
     # what of body a lies across its only hinge cannot be felt
     if not path.startswith(
@@ -483,7 +484,7 @@ def test_geoms_that_change_the_dynamics_are_compiled_anew(
         friction=True,
     )
     before = arrays(source.model)
-    own, theirs = resolved.writer.model(source, np.array([value])), spec.copy()
+    own, theirs = ParameterWriter(resolved).model(source, np.array([value])), spec.copy()
     parsed = ParameterPath.parse(path)
     geom, field, i = theirs.geom(parsed.name), parsed.field, parsed.component
     if np.isfinite(geom.fromto[0]):  # the same capsule by middle, direction and half length
@@ -630,9 +631,12 @@ def test_a_mesh_moves_from_its_compiled_place() -> None:
     now = resolved.parameters[0].targets[0].field.read(base)
     assert abs(now - 0.2) > 0.01, "no offset: a weak test"
     np.testing.assert_allclose(
-        resolved.writer.model(source, np.array([now])).geom_pos, base.geom_pos, rtol=0, atol=1e-14
+        ParameterWriter(resolved).model(source, np.array([now])).geom_pos,
+        base.geom_pos,
+        rtol=0,
+        atol=1e-14,
     )
-    own = resolved.writer.model(source, np.array([now + 0.1]))
+    own = ParameterWriter(resolved).model(source, np.array([now + 0.1]))
     np.testing.assert_allclose(
         own.geom("h").pos - base.geom("h").pos, [0.0, 0.0, 0.1], rtol=0, atol=1e-14
     )
@@ -664,7 +668,7 @@ def test_servo_gains_are_those_of_the_mjcf(kind: str, written: str, path: str) -
     )
     resolved = parameter_set([one(path)], base)
     assert resolved.parameters[0].targets[0].field.read(base) == 10.0
-    own = resolved.writer.model(base, np.array([7.25]))
+    own = ParameterWriter(resolved).model(base, np.array([7.25]))
     assert resolved.parameters[0].targets[0].field.read(own) == 7.25
     np.testing.assert_array_equal(own.actuator_gainprm, again.actuator_gainprm)
     np.testing.assert_array_equal(own.actuator_biasprm, again.actuator_biasprm)
@@ -715,7 +719,7 @@ def test_servos_with_several_controls_have_gains_too(written: str, path: str) ->
     )
     resolved = parameter_set([one(path)], base)
     assert resolved.parameters[0].targets[0].field.read(base) == 2.0
-    mine, theirs = arrays(resolved.writer.model(base, np.array([3.5]))), arrays(again)
+    mine, theirs = arrays(ParameterWriter(resolved).model(base, np.array([3.5]))), arrays(again)
     assert [n for n in theirs if not np.array_equal(mine[n], theirs[n])] == []
 
 
@@ -737,7 +741,7 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     turn, quat = np.zeros(4), np.zeros(4)
     mujoco.mju_axisAngle2Quat(turn, vector / np.linalg.norm(vector), float(np.linalg.norm(vector)))
     mujoco.mju_mulQuat(quat, np.array(getattr(base, kind)(name).quat), turn)
-    own = resolved.writer.model(base, vector)
+    own = ParameterWriter(resolved).model(base, vector)
     assert abs(getattr(own, kind)(name).quat @ quat) == pytest.approx(1.0, abs=1e-14)
     element = getattr(spec, kind)(name)
     element.alt.type, element.quat = mujoco.mjtOrientation.mjORIENTATION_QUAT, quat
@@ -746,7 +750,7 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     )
     targets = [t for parameter in resolved.parameters for t in parameter.targets]
     assert all(isinstance(t.field, RotationField) for t in targets)
-    again = resolved.writer.model(base, np.zeros(3))  # nothing of the first value is left
+    again = ParameterWriter(resolved).model(base, np.zeros(3))  # nothing of the first value is left
     np.testing.assert_allclose(rollout(again, 100), rollout(base, 100), rtol=1e-9, atol=1e-9)
 
 
@@ -796,12 +800,14 @@ def test_mass_beside_first_moments_keeps_them() -> None:
         one("body/a:mass"),
         Parameter(name="h", targets=(target_at("body/a:firstmoment[2]"),), guess=1.0),
     ]
-    own = parameter_set(parameters, base).writer.model(base, np.array([1.5, before[3] + 0.02]))
+    own = ParameterWriter(parameter_set(parameters, base)).model(
+        base, np.array([1.5, before[3] + 0.02])
+    )
     after = INERTIA_PARAMETRISATIONS["barycentric"].coordinates(body_inertia(own, own.body("a").id))
     wanted = np.array(before)
     wanted[0], wanted[3] = 1.5, before[3] + 0.02
     np.testing.assert_allclose(after, wanted, rtol=1e-12, atol=1e-15)
-    alone = parameter_set([one("body/a:mass")], base).writer.model(base, np.array([1.5]))
+    alone = ParameterWriter(parameter_set([one("body/a:mass")], base)).model(base, np.array([1.5]))
     np.testing.assert_array_equal(alone.body("a").ipos, base.body("a").ipos)
 
 
@@ -824,7 +830,9 @@ def test_measurement_and_initial_state_are_outside_the_model() -> None:
     assert resolved.changes_model.tolist() == [False] * 4 + [True]
     assert resolved.changes_motion.tolist() == [True, True, False, False, True]
     assert not resolved.needs_compile.any()
-    own = resolved.writer.model(base, np.array([9.0, 9.0, 9.0, 9.0, base.body("a").mass[0]]))
+    own = ParameterWriter(resolved).model(
+        base, np.array([9.0, 9.0, 9.0, 9.0, base.body("a").mass[0]])
+    )
     np.testing.assert_array_equal(rollout(own, 20), rollout(base, 20))
 
 

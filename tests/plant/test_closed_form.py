@@ -130,8 +130,8 @@ def test_first_derivatives_agree_with_differences(tmp_path, option: str) -> None
     assert found is not None
 
     expected = derivatives.linearize(task.theta, trajectory)
-    assert_close(found.first.A, expected.A, 1e-8)
-    assert_close(found.first.B, expected.B, 1e-8)
+    assert_close(found[0].A, expected.A, 1e-8)
+    assert_close(found[0].B, expected.B, 1e-8)
 
 
 @pytest.mark.parametrize("option", OPTIONS)
@@ -186,10 +186,10 @@ def test_a_force_that_reaches_its_limit_is_no_derivative(tmp_path) -> None:
     psi = np.zeros((task.samples + 1, task.space.nx, p))
     given = (task.theta, trajectory, psi, np.eye(p)[:1])
     before = derivatives.closed_form_mixed(*given)
-    assert before is not None and before.F_mixed[0, 3].any()
+    assert before is not None and before[1][0, 3].any()
 
     # A speed of the shoulder at which its servo is nearly at the limit, and a direction beyond it.
-    forces, states = before.first.forces, before.first.states[3:4, 0].copy()
+    forces, states = before[0].forces, before[0].states[3:4, 0].copy()
     shoulder, nv = 2, task.space.nv
     row, limit = forces.actuators[1], 9.0
     states[0, nv + shoulder] = 0.0
@@ -201,8 +201,8 @@ def test_a_force_that_reaches_its_limit_is_no_derivative(tmp_path) -> None:
     at_limit = replace(trajectory, qvel=qvel)
     found = derivatives.closed_form_mixed(task.theta, at_limit, psi, np.eye(p)[:1])
     assert found is not None
-    assert not found.F_mixed[0, 3].any()
-    assert found.F_mixed[0, 5].any()
+    assert not found[1][0, 3].any()
+    assert found[1][0, 5].any()
 
 
 def test_derivatives_of_observations_agree_with_differences(tmp_path) -> None:

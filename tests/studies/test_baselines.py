@@ -5,6 +5,7 @@ gradients.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,16 @@ from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.experiment.signals import fourier_basis
 from mjfim.parallel.budget import StopToken, measured_by
-from mjfim.studies.baselines import METHODS, BaselineSearch, reflected, run_baseline
-from mjfim.studies.signals import (
-    Chirp,
+from mjfim.studies.baselines import (
+    MAX_LEVELS,
+    METHODS,
+    BaselineSearch,
     ExcitationSettings,
-    Multisine,
-    RandomSteps,
+    chirp,
+    multisine,
+    random_steps,
+    reflected,
+    run_baseline,
     schroeder_phases,
 )
 from tests.support.limits import cart_inside
@@ -40,38 +45,32 @@ def test_schroeder_phases_of_equal_powers_are_the_known_ones() -> None:
     )
 
 
-@pytest.mark.parametrize("kind", [Chirp, Multisine, RandomSteps])
-def test_waves_are_of_size_one_for_any_numbers(kind: Any) -> None:
-    rng, made = np.random.default_rng(0), kind(FRAME)
-    for z in (
-        np.zeros(made.parameter_count),
-        np.ones(made.parameter_count),
-        *rng.random((20, made.parameter_count)),
-    ):
-        wave = made.curve(z)
+@pytest.mark.parametrize(
+    ("made", "count"), [(chirp, 10), (multisine, 7), (random_steps, 2 + 2 * MAX_LEVELS)]
+)
+def test_waves_are_of_size_one_for_any_numbers(made: Any, count: int) -> None:
+    rng = np.random.default_rng(0)
+    for z in (np.zeros(count), np.ones(count), *rng.random((20, count))):
+        wave = made(FRAME, z)
         assert wave.shape == (500, 2)
         assert np.isfinite(wave).all()
         assert np.abs(wave).max() <= 1.5 + 1e-9
-        np.testing.assert_array_equal(wave, made.curve(z))
+        np.testing.assert_array_equal(wave, made(FRAME, z))
 
 
 def test_chirps_stay_within_their_band() -> None:
     z = np.repeat([1.0, 0.3, 0.8, 0.25, 0.5], 2)
-    wave = Chirp(FRAME).curve(z)[:, 0]
+    wave = chirp(FRAME, z)[:, 0]
     crossings = np.flatnonzero(np.diff(np.sign(wave)))
     assert 0.5 / 0.01 / np.diff(crossings).max() >= 0.9 * FRAME.frequency(np.array([0.3]))[0]
     assert 0.5 / 0.01 / np.diff(crossings).min() <= 1.3 * FRAME.frequency(np.array([0.8]))[0]
 
 
 def test_steps_are_held_or_pass_smoothly() -> None:
-    z = np.random.default_rng(3).random(RandomSteps(FRAME).parameter_count)
+    z = np.random.default_rng(3).random(2 + 2 * MAX_LEVELS)
     z[:2] = 0.5, 1.0
-    held = RandomSteps(FRAME).curve(z)
-    smooth = RandomSteps(
-        ExcitationSettings(
-            t=FRAME.t, horizon=5.0, nu=2, min_frequency=0.1, max_frequency=5.0, may_jump=False
-        )
-    ).curve(z)
+    held = random_steps(FRAME, z)
+    smooth = random_steps(replace(FRAME, may_jump=False), z)
     assert np.mean(np.abs(np.diff(held, axis=0)) > 0.0) < 0.05
     assert np.abs(np.diff(held, axis=0)).max() > 10.0 * np.abs(np.diff(smooth, axis=0)).max()
     assert np.abs(smooth[0]).max() < 1e-3  # it begins at rest

@@ -16,10 +16,15 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.studies.check import check
 from mjfim.studies.first_experiment.document import experiment_text
-from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
-from mjfim.studies.first_experiment.selection import identifiable
-from mjfim.studies.first_experiment.start import _candidates, choose_start
-from mjfim.studies.first_experiment.time_scale import RATE_RANGE, _rate, reach, time_scale
+from mjfim.studies.first_experiment.propose import Proposal, identifiable, propose_experiment
+from mjfim.studies.first_experiment.start import (
+    RATE_RANGE,
+    _candidates,
+    _rate,
+    choose_start,
+    reach,
+    time_scale,
+)
 from mjfim.studies.first_experiment.wishes import Wishes
 from tests.support.cli import MODELS
 

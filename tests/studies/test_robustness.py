@@ -326,7 +326,7 @@ def test_a_robot_agrees_with_a_plain_simulation_loop(
     stands = ("initial qpos:slide", "initial qpos:hinge") if feedback else ("initial qpos:hinge",)
     assert bench.task.parameters.names == ("mass", "damping", "spring", *stands, "delay")
     theta = np.array([0.8 * 1.2, 0.1 * 0.8, 4.0 * 1.2, *np.zeros(len(stands)), 0.015])
-    recording, margins, start = bench.play(theta, noise, bench.controller)
+    recording, margins, start = bench.play(theta, noise, bench.conditions.feedback)
     model = mujoco.MjModel.from_xml_string(CART)
     model.body_mass[model.body("bob").id] = theta[0]
     model.dof_damping[1], model.jnt_stiffness[0] = theta[1], theta[2]
@@ -382,7 +382,7 @@ def test_margins_of_servo_forces_hold_at_every_engine_step(
 
     theta = np.append(bench.task.theta[:-1], 0.015)
     noise = np.zeros((len(bench.plan.t), len(bench.task.system.outputs)))
-    recording, margins, start = bench.play(theta, noise, bench.controller)
+    recording, margins, start = bench.play(theta, noise, bench.conditions.feedback)
 
     model = mujoco.MjModel.from_xml_string(servo)
     data = mujoco.MjData(model)

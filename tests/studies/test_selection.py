@@ -11,12 +11,10 @@ import mjfim
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
 from mjfim.parallel.budget import StopToken
 from mjfim.records.terms import Decision
 from mjfim.records.trajectory import Recording
 from mjfim.studies import selection as selection_study
-from mjfim.studies.selection import select_terms_system
 from tests.support.paths import ROOT
 
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
@@ -134,18 +132,18 @@ def test_a_selection_that_cannot_predict_left_out_data_says_so(
     monkeypatch.setattr(selection_study, "held_out_losses", lambda *args: None)
     logs = recorded(tmp_path, 'frictionloss="0.5"', count=2)
     experiment = stated() if segments is None else stated(segments=segments)
-    found = select_terms_system(System.resolve(experiment), logs)
-    selection = found.estimate.selection
+    found = mjfim.select_terms(experiment, logs)
+    selection = found.selection
     assert selection is not None
     assert "No part of the recordings could be predicted" in str(selection)
-    assert not found.estimate.interrupted
+    assert not found.interrupted
 
     plain = mjfim.identify(experiment, logs)
-    np.testing.assert_allclose(found.estimate.theta, plain.theta, rtol=1e-4)
-    assert (found.estimate.horizons is None) == (segments == "whole")
+    np.testing.assert_allclose(found.theta, plain.theta, rtol=1e-4)
+    assert (found.horizons is None) == (segments == "whole")
 
     # The error that is not known is shown, drawn and saved as such.
-    found.estimate.save(tmp_path / "results")
+    found.save(tmp_path / "results")
     (step,) = mjfim.Estimate.load(tmp_path / "results").selection.steps
     assert np.isnan(step.error)
 
@@ -168,9 +166,10 @@ def test_a_term_with_which_the_simulation_diverges_is_not_added(
 @pytest.mark.slow
 def test_a_settled_selection_keeps_the_length_that_the_user_left_free(tmp_path: Path) -> None:
     experiment = stated()
-    found = select_terms_system(System.resolve(experiment), recorded(tmp_path, "", count=2))
-    assert found.system.experiment.fit.segments is None
-    assert found.system.experiment == experiment
+    found = mjfim.select_terms(experiment, recorded(tmp_path, "", count=2))
+    selected = mjfim.selected_experiment(experiment, found.selection)
+    assert selected.fit.segments is None
+    assert selected == experiment
 
 
 @pytest.mark.slow

@@ -95,7 +95,11 @@ class GeomDistances:
 
         # (m, nv): +1 where a degree of freedom moves the second body only, -1 where the first only,
         # else 0.
-        moved = _moved_bodies(model)
+        moved = np.zeros((model.nbody, model.nv))
+        for each in range(1, model.nbody):
+            dof, count = model.body_dofadr[each], model.body_dofnum[each]
+            moved[each] = moved[model.body_parentid[each]]
+            moved[each, dof : dof + count] = 1.0
         first_bodies = body[[p.first for p in leaders]]
         second_bodies = body[[p.second for p in leaders]]
         self._dof_sign = moved[second_bodies] - moved[first_bodies]
@@ -288,14 +292,3 @@ class GeomDistances:
         about = centres[:, model.body_rootid[model.dof_bodyid]]
         screws[:, :, 3:] += np.cross(about, screws[:, :, :3])
         return positions, frames, screws
-
-
-def _moved_bodies(model: Any) -> Array:
-    """(nbody, nv): 1 where a degree of freedom moves a body, else 0."""
-    moved = np.zeros((model.nbody, model.nv))
-    for body in range(1, model.nbody):
-        first = model.body_dofadr[body]
-        count = model.body_dofnum[body]
-        moved[body] = moved[model.body_parentid[body]]
-        moved[body, first : first + count] = 1.0
-    return moved

@@ -102,7 +102,10 @@ class PairDistances:
         by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
         capsule = np.where(kinds[0] == CAPSULE, self.first, self.second)
         self._axis_offset = np.where(by_axis, self._model.geom_size[capsule, 0], 0.0)
-        axis_model = _with_capsule_axes(self._model, AXIS_RADIUS * self._length)
+        axis_model = copy.copy(self._model)
+        capsules = axis_model.geom_type == CAPSULE
+        axis_model.geom_type[capsules] = CYLINDER
+        axis_model.geom_size[capsules, 0] = AXIS_RADIUS * self._length
 
         # Arguments of MuJoCo's function, pair by pair.
         self._calls = [
@@ -230,38 +233,20 @@ class PairDistances:
         normals = (segments[:, 3:] - segments[:, :3]) * sign[:, None]
 
         for i in np.flatnonzero(np.abs(signed) < TOUCHING_DISTANCE * self._length):
-            pose = positions[rows[i]], frames[rows[i]]
-            normals[i] = self._normal_when_parted(pairs[i], *pose, reach)
+            # Geoms that touch are moved apart a little.
+            model, first, second, offset = self._calls[pairs[i]]
+            parted = positions[rows[i]].copy()
+            between = parted[second] - parted[first]
+            apart = PARTING_DISTANCE * self._length
+            parted[second] += apart * between / (np.linalg.norm(between) or 1.0)
+            self.set_pose(parted, frames[rows[i]])
+            segment = np.zeros(6)
+            limit = reach + offset
+            distance = mujoco.mj_geomDistance(model, self._data, first, second, limit, segment)
+            normals[i] = (segment[3:] - segment[:3]) * (-1.0 if distance < 0.0 else 1.0)
 
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(normals / np.where(length > 0.0, length, 1.0))
-
-    def _normal_when_parted(self, p: int, positions: Array, frames: Array, reach: float) -> Array:
-        """(3,) vector from the first to the second geom of a pair that touches.
-
-        The geoms are moved apart a little to find it.
-        """
-        model, first, second, offset = self._calls[p]
-        parted = positions.copy()
-        between = parted[second] - parted[first]
-        apart = PARTING_DISTANCE * self._length
-        parted[second] += apart * between / (np.linalg.norm(between) or 1.0)
-        self.set_pose(parted, frames)
-
-        segment = np.zeros(6)
-        limit = reach + offset
-        distance = mujoco.mj_geomDistance(model, self._data, first, second, limit, segment)
-        sign = -1.0 if distance < 0.0 else 1.0
-        return np.asarray((segment[3:] - segment[:3]) * sign)
-
-
-def _with_capsule_axes(model: Any, radius: float) -> Any:
-    """A copy of a model in which capsules are replaced by their axes: cylinders of a radius [m]."""
-    axes = copy.copy(model)
-    capsules = axes.geom_type == CAPSULE
-    axes.geom_type[capsules] = CYLINDER
-    axes.geom_size[capsules, 0] = radius
-    return axes
 
 
 def _farthest_points(kind: int, size: Array, direction: Array) -> Array:
@@ -333,7 +318,14 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
     """
     bodies = unique_names(model, "body")
     labels = geom_labels(model)
-    _check_ignored(ignored, bodies)
+    for names in ignored:
+        for name in sorted(names):
+            if name not in bodies:
+                raise ExperimentError(f"ignored: {unknown('body', name, bodies)}")
+        if len(names) != 2:
+            raise ExperimentError(
+                f"ignored: {sorted(names)} is no pair of bodies; needs two different names"
+            )
 
     selection = _Selection(model)
     body_of = [bodies[body] for body in model.geom_bodyid.tolist()]
@@ -345,7 +337,13 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
             continue
 
         for geom in (first, second):
-            _check_type(model, geom, labels[geom], *pair)
+            refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
+            if refused is not None:
+                raise ExperimentError(
+                    f"clearance: {labels[geom]} is a {refused}, for which MuJoCo has no reliable "
+                    f"distance; ignore the bodies {pair[0]!r} and {pair[1]!r}, or use boxes or "
+                    "meshes"
+                )
         found.append(
             GeomPair(
                 first=first,
@@ -355,36 +353,6 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
             )
         )
     return tuple(found)
-
-
-def _check_ignored(ignored: Collection[frozenset[str]], bodies: tuple[str, ...]) -> None:
-    """Raise where an ignored pair does not consist of two bodies of the model."""
-    for names in ignored:
-        for name in sorted(names):
-            if name not in bodies:
-                raise ExperimentError(f"ignored: {unknown('body', name, bodies)}")
-        if len(names) != 2:
-            raise ExperimentError(
-                f"ignored: {sorted(names)} is no pair of bodies; needs two different names"
-            )
-
-
-def _check_type(model: Any, geom: int, label: str, first_body: str, second_body: str) -> None:
-    """Raise where MuJoCo has no reliable distance for a geom.
-
-    Args:
-        model: The model (`mujoco.MjModel`).
-        geom: Number of the geom.
-        label: Name of the geom, for the message.
-        first_body: Name of the body of the first geom of the pair, for the message.
-        second_body: Name of the body of the second geom of the pair.
-    """
-    refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
-    if refused is not None:
-        raise ExperimentError(
-            f"clearance: {label} is a {refused}, for which MuJoCo has no reliable distance; ignore "
-            f"the bodies {first_body!r} and {second_body!r}, or use boxes or meshes"
-        )
 
 
 class _Selection:
@@ -425,24 +393,13 @@ class _Selection:
             return False
         if frozenset((first, second)) in self._explicit:
             return True
-        if frozenset((a, b)) in self._excluded or self._are_parent_and_child(a, b):
+
+        # Parent and child do not collide; a body that is fixed in the world is no parent.
+        weld_a, weld_b = self._weld[a], self._weld[b]
+        related = weld_a == self._parent_weld[b] or weld_b == self._parent_weld[a]
+        is_filtered = self._filters_parents and weld_a and weld_b and related
+        if frozenset((a, b)) in self._excluded or is_filtered:
             return False
-        return self._bits_match(first, second)
-
-    def _are_parent_and_child(self, a: int, b: int) -> bool:
-        """Whether MuJoCo lets two bodies not collide because they are parent and child.
-
-        A body that is fixed in the world does not count as a parent.
-        """
-        if not self._filters_parents:
-            return False
-        a = self._weld[a]
-        b = self._weld[b]
-        related = a == self._parent_weld[b] or b == self._parent_weld[a]
-        return bool(a and b and related)
-
-    def _bits_match(self, first: int, second: int) -> bool:
-        """Whether the collision bits of two geoms match."""
         forward = self._contype[first] & self._conaffinity[second]
         backward = self._contype[second] & self._conaffinity[first]
         return bool(forward or backward)

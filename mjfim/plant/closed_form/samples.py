@@ -21,12 +21,14 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.model.parameters import ParameterSet
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.closed_form.affine_forces import (
     FORCE_FIELDS,
     AffineForces,
-    ForceSlopes,
     ParameterChange,
+    acts_on_joints,
+    is_inertial,
 )
 from mjfim.plant.closed_form.rigid_body_motion import (
     MOTION_FIELDS,
@@ -34,6 +36,7 @@ from mjfim.plant.closed_form.rigid_body_motion import (
     RigidBodyMotion,
     barycentric_inertias,
 )
+from mjfim.records.trajectory import Trajectory
 
 # Smallest number of joints for which derivatives have a closed form. With four hinges, a gradient
 # takes half of the time that steps of the engine take, with seven a third.
@@ -186,14 +189,6 @@ class ClosedForm:
             return None
 
         forces = AffineForces.measured(self.simulator, model, states[0], ctrl[0], self.sizes)
-        system = _System(
-            simulator=self.simulator,
-            tree=self.tree,
-            model=model,
-            forces=forces,
-            change=change,
-        )
-
         parts = []
         samples = max(1, STEPS_AT_ONCE // self.simulator.substeps)
         for first in range(0, len(states), samples):
@@ -201,7 +196,7 @@ class ClosedForm:
 
             # Numbers may overflow where a simulation diverges; the check then fails.
             with np.errstate(over="ignore", invalid="ignore"):
-                part = system.jacobians(states[rows], ctrl[rows])
+                part = self._part(model, states[rows], ctrl[rows], forces, change)
             if part is None:
                 return None
             parts.append(part)
@@ -213,6 +208,68 @@ class ClosedForm:
             states=np.concatenate([part.states for part in parts]),
             accelerations=np.concatenate([part.accelerations for part in parts]),
             forces=forces,
+        )
+
+    def _part(
+        self,
+        model: Any,
+        states: Array,
+        ctrl: Array,
+        forces: AffineForces,
+        change: ParameterChange | None,
+    ) -> SampleJacobians | None:
+        """First derivatives of some samples, see `jacobians`."""
+        steps = self.simulator.engine_steps(model, states, ctrl, RECORDED_FIELDS)
+        N, substeps, nv = len(states), self.simulator.substeps, self.tree.count
+        fields = {name: _flat(values) for name, values in steps.fields.items()}
+        timestep = float(model.opt.timestep)
+
+        speed = steps.states[..., nv:]
+        accelerations = _flat(np.diff(speed, axis=1)) / timestep
+        motion = RigidBodyMotion.of(self.tree, model, fields, _flat(speed[:, :-1]), accelerations)
+        points = _flat(steps.states[:, :-1]), np.repeat(ctrl, substeps, axis=0)
+        slopes = forces.at(*points, fields)
+
+        # Whether the motion of the engine solves the equation of motion.
+        damping = slopes.implicit_damping @ motion.acceleration[..., None]
+        force = sum(fields[name] for name in FORCE_FIELDS)
+        error = np.abs(motion.force + timestep * damping[..., 0] - force)
+        solves = (error <= LARGEST_ERROR * motion.largest_force).all()
+        if not (slopes.agree.all() and solves):
+            return None
+
+        by_position, by_speed = motion.force_derivatives()
+        by_point = slopes.slopes
+        by_point[..., :nv] -= by_position
+        by_point[..., nv : 2 * nv] -= by_speed
+
+        # One small inverse for all right-hand sides takes a third of the time of solving for them,
+        # and A and B do not depend on whether parameters are asked for.
+        inverse = np.linalg.inv(motion.mass_matrix + timestep * slopes.implicit_damping)
+        by_point = (inverse @ by_point).reshape(N, substeps, nv, -1)
+
+        count = 0 if change is None else change.count
+        by_theta: Array = np.zeros((N * substeps, nv, count))
+        if change is not None and count:
+            # Less the derivatives of the forces that the motion needs.
+            bodies = self.tree.bodies
+            axes = fields["xmat"].reshape(len(motion.speed), -1, 3, 3)
+            needed = motion.regressor(fields["xpos"][:, bodies], axes[:, bodies], change.inertia)
+            needed = needed + motion.acceleration[..., None] * change.armature
+            by_theta = inverse @ (forces.change(*points, motion.acceleration, change) - needed)
+        by_theta = by_theta.reshape(N, substeps, nv, count)
+
+        # From the accelerations of the engine steps to the samples.
+        nx = 2 * nv
+        E = np.zeros((N, nx, count))
+        AB = unmoved(by_point)
+        for i in range(substeps):
+            advance(AB, by_state_and_control(by_point[:, i], AB), timestep)
+            by_state = np.ascontiguousarray(by_point[:, i, :, :nx])
+            advance(E, by_state @ E + by_theta[:, i], timestep)
+        A, B = (np.ascontiguousarray(each) for each in np.split(AB, [nx], axis=2))
+        return SampleJacobians(
+            A=A, B=B, E=E, states=steps.states, accelerations=by_point, forces=forces
         )
 
     def change_between(
@@ -256,109 +313,6 @@ class ClosedForm:
             damping=quotient(more.dof_damping, less.dof_damping),
             armature=quotient(more.dof_armature, less.dof_armature),
         )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _System:
-    """A model at parameter values, with the forces on its joints.
-
-    Attributes:
-        simulator: Steps the model.
-        tree: Joints of the model.
-        model: The model.
-        forces: Forces of springs and actuators.
-        change: Change of the model by m parameters; None for none.
-    """
-
-    simulator: BatchSimulator
-    tree: JointTree
-    model: Any
-    forces: AffineForces
-    change: ParameterChange | None
-
-    def jacobians(self, states: Array, ctrl: Array) -> SampleJacobians | None:
-        """First derivatives of N samples, see `ClosedForm.jacobians`."""
-        steps = self.simulator.engine_steps(self.model, states, ctrl, RECORDED_FIELDS)
-        N, substeps, nv = len(states), self.simulator.substeps, self.tree.count
-        fields = {name: _flat(values) for name, values in steps.fields.items()}
-
-        speed = steps.states[..., nv:]
-        change = _flat(np.diff(speed, axis=1))
-        motion = RigidBodyMotion.of(
-            self.tree,
-            self.model,
-            fields,
-            _flat(speed[:, :-1]),
-            change / float(self.model.opt.timestep),
-        )
-        slopes = self.forces.at(
-            _flat(steps.states[:, :-1]), np.repeat(ctrl, substeps, axis=0), fields
-        )
-        if not (slopes.agree.all() and self._solves(motion, slopes, fields)):
-            return None
-
-        by_position, by_speed = motion.force_derivatives()
-        by_point = slopes.slopes
-        by_point[..., :nv] -= by_position
-        by_point[..., nv : 2 * nv] -= by_speed
-
-        # One small inverse for all right-hand sides takes a third of the time of solving for them,
-        # and A and B do not depend on whether parameters are asked for.
-        inverse = np.linalg.inv(motion.mass_matrix + self._timestep * slopes.implicit_damping)
-        by_point = inverse @ by_point
-
-        count = 0 if self.change is None else self.change.count
-        by_theta: Array = np.zeros((N * substeps, nv, count))
-        if self.change is not None and count:
-            points = _flat(steps.states[:, :-1]), np.repeat(ctrl, substeps, axis=0)
-            forces = self.forces.change(*points, motion.acceleration, self.change)
-            by_theta = inverse @ (forces - self._inertial(motion, fields, self.change))
-        accelerations = by_point.reshape(N, substeps, nv, -1)
-        A, B, E = self._over_samples(accelerations, by_theta.reshape(N, substeps, nv, count))
-        return SampleJacobians(
-            A=A, B=B, E=E, states=steps.states, accelerations=accelerations, forces=self.forces
-        )
-
-    @property
-    def _timestep(self) -> float:
-        """Engine timestep [s]."""
-        return float(self.model.opt.timestep)
-
-    def _solves(
-        self, motion: RigidBodyMotion, slopes: ForceSlopes, fields: dict[str, Array]
-    ) -> bool:
-        """Check whether a motion of the engine solves the equation of motion."""
-        damping = slopes.implicit_damping @ motion.acceleration[..., None]
-        force = sum(fields[name] for name in FORCE_FIELDS)
-        error = np.abs(motion.force + self._timestep * damping[..., 0] - force)
-        return bool((error <= LARGEST_ERROR * motion.largest_force).all())
-
-    def _inertial(
-        self, motion: RigidBodyMotion, fields: dict[str, Array], change: ParameterChange
-    ) -> Array:
-        """(n, nv, m) derivatives of the forces that the motion needs by the parameters."""
-        bodies = self.tree.bodies
-        axes = fields["xmat"].reshape(len(motion.speed), -1, 3, 3)
-        total = motion.regressor(fields["xpos"][:, bodies], axes[:, bodies], change.inertia)
-        return np.asarray(total + motion.acceleration[..., None] * change.armature)
-
-    def _over_samples(self, by_point: Array, by_theta: Array) -> tuple[Array, Array, Array]:
-        """A, B and E of samples from derivatives of the accelerations of their engine steps.
-
-        Args:
-            by_point: (N, s, nv, 2 nv + nu) derivatives of the accelerations by state and control.
-            by_theta: (N, s, nv, m) derivatives of the accelerations by the parameters.
-        """
-        substeps, nx = by_point.shape[1], 2 * by_point.shape[2]
-        E = np.zeros((len(by_point), nx, by_theta.shape[3]))
-        AB = unmoved(by_point)
-        for i in range(substeps):
-            advance(AB, by_state_and_control(by_point[:, i], AB), self._timestep)
-            by_state = np.ascontiguousarray(by_point[:, i, :, :nx])
-            advance(E, by_state @ E + by_theta[:, i], self._timestep)
-
-        A, B = np.split(AB, [nx], axis=2)
-        return np.ascontiguousarray(A), np.ascontiguousarray(B), E
 
 
 def unmoved(by_point: Array) -> Array:
@@ -426,66 +380,74 @@ def observation_jacobian(
     if observations.has_stages or len(observations.turns) or len(observations.tendon_lengths):
         return None
 
-    samples = _ObservedSamples(found, ctrl, observations)
-    AB = unmoved(found.accelerations)
-    rows = []
-    for i in range(found.accelerations.shape[1]):
-        acceleration = by_state_and_control(found.accelerations[:, i], AB)
-        forces = samples.forces(i, AB)
-        advance(AB, acceleration, observations.timestep)
-        if i + 1 in observations.derivative_substeps:
-            rows.append(np.concatenate([samples.motion(AB, acceleration), forces], axis=1))
-
-    # The further row has the forces at the end of the sample.
-    if observations.force_rows:
-        forces = samples.forces(found.accelerations.shape[1], AB)
-        motion = rows[-1][:, : rows[-1].shape[1] - forces.shape[1]]
-        rows.append(np.concatenate([motion, forces], axis=1))
-    return np.stack(rows, axis=1)
-
-
-class _ObservedSamples:
-    """Derivatives of the observations at single engine steps of samples."""
-
-    def __init__(
-        self, found: SampleJacobians, ctrl: Array, observations: SubstepObservations
-    ) -> None:
-        """Set the samples, their controls and the observations."""
-        self.found, self.ctrl, self.observations = found, ctrl, observations
-
-    def motion(self, AB: Array, acceleration: Array) -> Array:
-        """(N, m, nx+nu) derivatives of positions, speeds and accelerations.
-
-        Args:
-            AB: (N, 2 nv, nx+nu) derivatives of the state after an engine step.
-            acceleration: (N, nv, nx+nu) derivatives of the mean acceleration of the step.
-        """
-        wanted, nv = self.observations, acceleration.shape[1]
-        return np.concatenate(
-            [
-                AB[:, wanted.positions],
-                AB[:, nv + wanted.velocities],
-                acceleration[:, wanted.accelerations],
-            ],
-            axis=1,
-        )
-
-    def forces(self, step: int, AB: Array) -> Array:
-        """(N, f, nx+nu) derivatives of the forces that belong to the state before an engine step.
-
-        Args:
-            step: Number of the engine step, from 0.
-            AB: (N, 2 nv, nx+nu) derivatives of the state before it.
-        """
-        wanted = self.observations
-        if not wanted.fields:
+    def forces_before(step: int) -> Array:
+        """(N, f, nx+nu) derivatives of the forces of the state before an engine step, from 0."""
+        if not observations.fields:
             return np.zeros((len(AB), 0, AB.shape[2]))
-
-        slopes = self.found.forces.actuator_slopes(self.found.states[:, step], self.ctrl)
+        slopes = found.forces.actuator_slopes(found.states[:, step], ctrl)
         actuators = by_state_and_control(slopes, AB)
-        joints = self.found.forces.moments.T @ actuators
-        tendons = [actuators[:, list(pulling)].sum(axis=1) for pulling in wanted.tendon_forces]
-        parts = [actuators[:, wanted.actuator_forces], joints[:, wanted.joint_forces]]
+        joints = found.forces.moments.T @ actuators
+        tendons = [actuators[:, list(each)].sum(axis=1) for each in observations.tendon_forces]
+        parts = [actuators[:, observations.actuator_forces], joints[:, observations.joint_forces]]
         if tendons:
             parts.append(np.stack(tendons, axis=1))
         return np.concatenate(parts, axis=1)
+
+    AB = unmoved(found.accelerations)
+    substeps, nv = found.accelerations.shape[1:3]
+    rows = []
+    for i in range(substeps):
+        acceleration = by_state_and_control(found.accelerations[:, i], AB)
+        forces = forces_before(i)
+        advance(AB, acceleration, observations.timestep)
+        if i + 1 in observations.derivative_substeps:
+            motion = [AB[:, observations.positions], AB[:, nv + observations.velocities]]
+            motion.append(acceleration[:, observations.accelerations])
+            rows.append(np.concatenate([*motion, forces], axis=1))
+
+    # The further row has the forces at the end of the sample.
+    if observations.force_rows:
+        forces = forces_before(substeps)
+        before = rows[-1][:, : rows[-1].shape[1] - forces.shape[1]]
+        rows.append(np.concatenate([before, forces], axis=1))
+    return np.stack(rows, axis=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownJacobians:
+    """Derivatives of the samples of a trajectory.
+
+    Attributes:
+        theta: (p,) parameters [theta-unit].
+        trajectory: The trajectory.
+        substeps: Engine steps of a sample.
+        jacobians: The derivatives, without those by parameters.
+    """
+
+    theta: Array
+    trajectory: Trajectory
+    substeps: int
+    jacobians: SampleJacobians
+
+
+class ClosedFormMemory:
+    """Joints and latest derivatives, shared by the closed forms of a plant and of its variants.
+
+    Attributes:
+        tree: Joints of the model; None where there is no closed form.
+        covered: (p,) True for parameters by which derivatives have a closed form: those that change
+            nothing but inertias, or nothing but springs, dampers, gains and armatures.
+        latest: Derivatives that were computed last. The gradient of a design needs those of the
+            trajectory whose sensitivities were computed before.
+        changes: Change of the model by the covered parameters, by the bytes of theta.
+    """
+
+    def __init__(self, simulator: BatchSimulator, parameters: ParameterSet) -> None:
+        """Begin with nothing computed."""
+        has_form = simulator.is_open_loop and not simulator.sensors
+        self.tree = closed_form_tree(simulator.model) if has_form else None
+        self.covered = np.array(
+            [is_inertial(p) or acts_on_joints(p) for p in parameters.parameters], dtype=bool
+        )
+        self.latest: KnownJacobians | None = None
+        self.changes: dict[bytes, ParameterChange] = {}

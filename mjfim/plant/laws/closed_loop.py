@@ -124,7 +124,10 @@ class LawLoop:
             if sample is not None:
                 self._begin(sample)
             for group in due:
-                self._evaluate(group, qpos, qvel)
+                positions, velocities = qpos[:, group.positions], qvel[:, group.velocities]
+                control = group.running.evaluate(positions, velocities)
+                self.largest = np.maximum(self.largest, np.abs(control).max(axis=1))
+                self._applied[:, group.controls] = control
             if sample is not None:
                 self._note(sample)
             if length:
@@ -167,12 +170,6 @@ class LawLoop:
         inputs, direct = self._laws.direct
         if len(direct):
             self._applied[:, direct] = self._ctrl[:, min(sample, last), inputs]
-
-    def _evaluate(self, group: LawGroup, qpos: Array, qvel: Array) -> None:
-        """Evaluate laws at the current states and apply their controls."""
-        control = group.running.evaluate(qpos[:, group.positions], qvel[:, group.velocities])
-        self.largest = np.maximum(self.largest, np.abs(control).max(axis=1))
-        self._applied[:, group.controls] = control
 
     def _note(self, sample: int) -> None:
         """Note the controls of a sample, once they are known."""

@@ -219,47 +219,31 @@ class RunningLaws:
         self._next += 1
         q, v = self._measure(q, v)
 
-        control = self._proportional(tick, q, v)
+        numbers, commands = self._numbers, self._commands
+        gain = 1.0 if commands.gain is None else commands.gain[tick]
+        control: Array = self._drive[tick] - gain * (numbers.kp * q + numbers.kd * v)
         if self._integrates:
-            control += self._integrate(tick, q)
+            step = gain * (self._integral_step * (commands.reference[tick] - q))
+            limit = numbers.integral_limit
+            self._integral = _clipped(self._integral + step, -limit, limit)
+            control += self._integral
         if self.has_limits:
-            control = self._limited(control)
+            limited = _clipped(control, numbers.saturation_low, numbers.saturation_high)
+            if self._is_slow and self._has_held:
+                change = self._largest_change
+                limited = _clipped(limited, self.held - change, self.held + change)
+            self.is_clipped = limited != control
+            control = limited
 
         # A driver that is off forgets its integral.
-        if self._commands.enabled is not None:
-            enabled = self._commands.enabled[tick]
+        if commands.enabled is not None:
+            enabled = commands.enabled[tick]
             control *= enabled
             self._integral = self._integral * enabled
 
         self.held = control
         self._has_held = True
         return control
-
-    def _limited(self, control: Array) -> Array:
-        """(m, c) controls inside their ranges and near the controls before."""
-        numbers = self._numbers
-        limited = _clipped(control, numbers.saturation_low, numbers.saturation_high)
-        if self._is_slow and self._has_held:
-            change = self._largest_change
-            limited = _clipped(limited, self.held - change, self.held + change)
-        self.is_clipped = limited != control
-        return limited
-
-    def _proportional(self, tick: int, q: Array, v: Array) -> Array:
-        """(m, c) controls at a tick without the integral, for measured positions and velocities."""
-        feedback = self._numbers.kp * q + self._numbers.kd * v
-        if self._commands.gain is not None:
-            feedback *= self._commands.gain[tick]
-        return np.asarray(self._drive[tick] - feedback)
-
-    def _integrate(self, tick: int, q: Array) -> Array:
-        """(m, c) integrals after a tick with measured positions q."""
-        step = self._integral_step * (self._commands.reference[tick] - q)
-        if self._commands.gain is not None:
-            step *= self._commands.gain[tick]
-        limit = self._numbers.integral_limit
-        self._integral = _clipped(self._integral + step, -limit, limit)
-        return self._integral
 
     def _measure(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Positions and velocities that the driver uses, from those of the joints now."""

@@ -27,6 +27,15 @@ PAYLOAD_SHARE = 0.2
 
 AXES = ("x", "y", "z")
 
+# Fields of joints in each group: (field, array of the model, meaning).
+JOINT_FIELDS: dict[Group, tuple[tuple[str, str, str], ...]] = {
+    "friction": (
+        ("damping", "dof_damping", "viscous friction"),
+        ("frictionloss", "dof_frictionloss", "dry friction"),
+    ),
+    "motors": (("armature", "dof_armature", "inertia of the drive"),),
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
@@ -83,11 +92,17 @@ def candidates(
     if payload is not None:
         found += _payload(model, payload)
 
-    makers = {"payload": _last_body, "friction": _friction, "inertia": _inertia, "motors": _motors}
-    for group in GROUPS:
-        # With a stated payload, the mass of the body that carries it is known.
-        if group in groups and not (group == "payload" and payload is not None):
-            found += makers[group](model)
+    # The last body carries what the robot grasps. With a stated payload, its mass is known.
+    elif "payload" in groups:
+        for body in _bodies_from_the_end(model)[:1]:
+            found += _mass_and_centre(model, body, "payload")
+    if "friction" in groups:
+        found += _joint_fields(model, "friction")
+    if "inertia" in groups:
+        found += _inertia(model)
+    if "motors" in groups:
+        found += _joint_fields(model, "motors")
+        found += _servos(model)
 
     # The inertia of the body that carries the load is known.
     own = [
@@ -199,12 +214,6 @@ def _mass_and_centre(model: Any, body: int, group: Group) -> Iterator[Candidate]
         )
 
 
-def _last_body(model: Any) -> Iterator[Candidate]:
-    """Mass and centre of mass of the last body, which carries what the robot grasps."""
-    for body in _bodies_from_the_end(model)[:1]:
-        yield from _mass_and_centre(model, body, "payload")
-
-
 def _inertia(model: Any) -> Iterator[Candidate]:
     """Masses, centres of mass and principal inertias of the last bodies."""
     bodies = _bodies_from_the_end(model)[:LAST_BODIES]
@@ -222,11 +231,9 @@ def _inertia(model: Any) -> Iterator[Candidate]:
                 )
 
 
-def _joint_fields(
-    model: Any, fields: Sequence[tuple[str, str, str]], group: Group
-) -> Iterator[Candidate]:
-    """Fields of joints that are not zero. fields: (field, array of the model, meaning)."""
-    for field, array, meaning in fields:
+def _joint_fields(model: Any, group: Group) -> Iterator[Candidate]:
+    """Fields of joints that are not zero."""
+    for field, array, meaning in JOINT_FIELDS[group]:
         for joint in range(model.njnt):
             name = element_name(model, "joint", joint)
             value = float(getattr(model, array)[int(model.jnt_dofadr[joint])])
@@ -240,20 +247,8 @@ def _joint_fields(
                 )
 
 
-def _friction(model: Any) -> Iterator[Candidate]:
-    """Damping and dry friction of the joints."""
-    fields = (
-        ("damping", "dof_damping", "viscous friction"),
-        ("frictionloss", "dof_frictionloss", "dry friction"),
-    )
-    yield from _joint_fields(model, fields, "friction")
-
-
-def _motors(model: Any) -> Iterator[Candidate]:
-    """Armature of the joints and gains of the servos."""
-    fields = (("armature", "dof_armature", "inertia of the drive"),)
-    yield from _joint_fields(model, fields, "motors")
-
+def _servos(model: Any) -> Iterator[Candidate]:
+    """Gains of the servos."""
     for i in range(model.nactuator):
         name = element_name(model, "actuator", i)
         has_gain = float(model.actuator_gainprm[i, 0]) != 0.0
@@ -301,23 +296,13 @@ def proposed_noise(
         period: Characteristic period of its motion [s].
         wanted: Standard deviations of joints that the user states, by kind; see `Wishes.sigmas`.
     """
-    sensors = list(_sensors(model))
-    return sensors or list(_joints(model, {**typical_sigmas(length, period), **wanted}))
-
-
-def typical_sigmas(length: float, period: float) -> dict[str, float]:
-    """Typical standard deviations of joints by kind.
-
-    Args:
-        length: Length of the robot [m].
-        period: Characteristic period of its motion [s].
-    """
-    return {
+    typical = {
         "angle": ANGLE_SIGMA,
         "length": _rounded(LENGTH_SIGMA * length),
         "angular velocity": _rounded(VELOCITY_SIGMA / period),
         "velocity": _rounded(VELOCITY_SIGMA * length / period),
     }
+    return list(_sensors(model)) or list(_joints(model, {**typical, **wanted}))
 
 
 def _sensors(model: Any) -> Iterator[ProposedNoise]:

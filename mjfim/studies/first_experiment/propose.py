@@ -39,11 +39,14 @@ from mjfim.studies.first_experiment.first_motion import (
     propose_release,
     rounded,
 )
-from mjfim.studies.first_experiment.selection import (
-    identifiable,
+from mjfim.studies.first_experiment.start import (
+    Start,
+    TimeScale,
+    choose_start,
+    influence_of_controls,
+    reach,
+    time_scale,
 )
-from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
-from mjfim.studies.first_experiment.time_scale import TimeScale, reach, time_scale
 from mjfim.studies.first_experiment.urdf import UrdfModel, read_urdf
 from mjfim.studies.first_experiment.wishes import Wishes, require_rate
 
@@ -223,7 +226,21 @@ def propose_experiment(
         )
     else:
         release = propose_release(model, start.qpos, length)
-        _require_release(path, release)
+        if not release.free:
+            raise ExperimentError(
+                f"{path}: the model has neither an actuator nor a slide, hinge or ball joint with "
+                "a name that could be released; add <actuator> elements to the MJCF, or name its "
+                "joints"
+            )
+    # Ranges about the resting control for controls that have none in the MJCF.
+    widths = CONTROL_LIMIT * wanted
+    ranges = {
+        name: (float(f"{centre - width:.3g}"), float(f"{centre + width:.3g}"))
+        for name, centre, width, is_limited in zip(
+            controls, start.control, widths, model.actuator_ctrllimited, strict=True
+        )
+        if not is_limited
+    }
     draft = Proposal(
         model=companion_name if urdf else os.path.relpath(path, folder),
         companion=None if urdf is None else urdf.mjcf(os.path.relpath(path, folder)),
@@ -238,7 +255,7 @@ def propose_experiment(
         noise=proposed_noise(model, length, times.period, wishes.sigmas),
         chosen=found,
         others=(),
-        control_limits=_control_limits(source, start, wanted),
+        control_limits=ranges,
         velocity_limits={} if urdf is None else urdf.velocities,
         rest=False,
         remarks=(),
@@ -248,15 +265,6 @@ def propose_experiment(
     if release is not None:
         return refinement.released(draft, length)
     return refinement.refined(draft)
-
-
-def _require_release(path: Path, release: ProposedRelease) -> None:
-    """Raise ExperimentError where no joint can be released."""
-    if not release.free:
-        raise ExperimentError(
-            f"{path}: the model has neither an actuator nor a slide, hinge or ball joint with a "
-            "name that could be released; add <actuator> elements to the MJCF, or name its joints"
-        )
 
 
 def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
@@ -296,30 +304,6 @@ def _model(path: Path) -> tuple[UrdfModel | None, ModelSource]:
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot add motors: {str(error).strip()}") from None
     return urdf, ModelSource(path, spec)
-
-
-def _control_limits(
-    source: ModelSource, start: Start, amplitudes: Array
-) -> dict[str, tuple[float, float]]:
-    """Ranges about the resting control for controls that have none in the MJCF."""
-    limited = source.model.actuator_ctrllimited.astype(bool)
-    found = {}
-    for i, name in enumerate(source.coordinates.controls):
-        if not limited[i]:
-            centre, width = float(start.control[i]), CONTROL_LIMIT * float(amplitudes[i])
-            found[name] = (float(f"{centre - width:.3g}"), float(f"{centre + width:.3g}"))
-    return found
-
-
-def _unnamed(model: Any) -> list[str]:
-    """Remarks about bodies and joints whose parameters cannot be proposed."""
-    counts = {kind: unnamed_count(model, kind) for kind in ("body", "joint")}
-    return [
-        f"Note: {count} elements of kind {kind} have no name in the MJCF, so that their parameters "
-        "are not proposed."
-        for kind, count in counts.items()
-        if count
-    ]
 
 
 def _with_amplitudes(draft: Proposal, amplitudes: Array) -> Proposal:
@@ -464,7 +448,15 @@ class _Refinement:
         proposed = [draft.chosen[i] for i in chosen]
         others = [each for i, each in enumerate(draft.chosen) if i not in chosen]
 
-        remarks = [*remarks, *_unnamed(self.source.model)]
+        # Parameters of bodies and joints without a name cannot be proposed.
+        counts = {kind: unnamed_count(self.source.model, kind) for kind in ("body", "joint")}
+        unnamed = [
+            f"Note: {count} elements of kind {kind} have no name in the MJCF, so that their "
+            "parameters are not proposed."
+            for kind, count in counts.items()
+            if count
+        ]
+        remarks = [*remarks, *unnamed]
         payload = self.wishes.payload
         if payload is not None and not any(each.group == "payload" for each in proposed):
             remarks.append(
@@ -545,3 +537,48 @@ class _Refinement:
         n = len(draft.chosen)
         hidden = F[:n, n:] @ np.linalg.pinv(F[n:, n:], hermitian=True) @ F[n:, :n]
         return identifiable(F[:n, :n] - hidden, task.parameters.scale[:n])
+
+
+# Largest relative standard deviation of a proposed parameter along the initial control. A designed
+# motion gives several times more information than the initial one.
+LARGEST_STD = 0.3
+
+# Largest number of proposed parameters, so that a design takes a minute.
+MOST_PARAMETERS = 10
+
+
+def identifiable(F: Array, sizes: Array, *, most: int = MOST_PARAMETERS) -> Sequence[int]:
+    """Choose parameters that a motion identifies together, one after the other.
+
+    Args:
+        F: (p, p) information of the motion [1 / (theta_i theta_j unit)].
+        sizes: (p,) sizes of the parameters [theta-unit].
+        most: Largest number of parameters.
+
+    Returns:
+        Indices of the candidates, in their order, that are known accurately together; the one about
+        which most is known where there are none.
+    """
+    # Information about relative changes, in which units do not matter.
+    relative = F * np.outer(sizes, sizes)
+    chosen: list[int] = []
+    for i in range(len(sizes)):
+        if len(chosen) < most and _largest_std(relative, [*chosen, i]) <= LARGEST_STD:
+            chosen.append(i)
+    return chosen or [int(np.argmax(np.diag(relative)))]
+
+
+def _largest_std(F: Array, members: list[int]) -> float:
+    """Largest standard deviation of some parameters that are estimated together."""
+    part = F[np.ix_(members, members)]
+    diagonal = np.sqrt(np.diag(part))
+    if not np.isfinite(part).all() or not (diagonal > 0.0).all():
+        return np.inf
+
+    # Scaling by the diagonal keeps the eigenvalues comparable.
+    correlation = part / np.outer(diagonal, diagonal)
+    values, vectors = np.linalg.eigh(correlation)
+    if values[0] <= len(members) * np.finfo(float).eps * 1e3:
+        return np.inf
+    variances = (vectors**2 / values).sum(axis=1) / diagonal**2
+    return float(np.sqrt(variances.max()))

@@ -19,30 +19,19 @@ COMMENT = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motor:
-    """A motor for one joint.
-
-    Attributes:
-        joint: Name of the joint, and of the motor.
-        effort: Lower and upper end of the force [N or N m]; None where the URDF states none.
-    """
-
-    joint: str
-    effort: tuple[float, float] | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class UrdfModel:
     """A URDF and the motors that it lacks.
 
     Attributes:
         name: Name of the robot.
-        motors: One motor for each revolute or prismatic joint.
+        motors: One motor for each revolute or prismatic joint: its name, which is also that of the
+            motor, and the lower and upper end of its force [N or N m], equal where the URDF states
+            none.
         velocities: Velocity limits of the URDF by joint name [m/s or rad/s]. MJCF has none.
     """
 
     name: str
-    motors: tuple[Motor, ...]
+    motors: tuple[tuple[str, tuple[float, float]], ...]
     velocities: dict[str, float]
 
     def mjcf(self, file: str) -> str:
@@ -59,10 +48,9 @@ class UrdfModel:
         ElementTree.SubElement(world, "attach", model="robot", prefix="")
 
         actuators = ElementTree.SubElement(root, "actuator")
-        for motor in self.motors:
-            attributes = {"name": motor.joint, "joint": motor.joint}
-            if motor.effort is not None:
-                low, high = motor.effort
+        for joint, (low, high) in self.motors:
+            attributes = {"name": joint, "joint": joint}
+            if low < high:
                 attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
             ElementTree.SubElement(actuators, "motor", attributes)
 
@@ -82,7 +70,7 @@ def read_urdf(path: Path) -> UrdfModel:
     spec = load_spec(path)
     driven = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     motors = tuple(
-        Motor(joint=joint.name, effort=_effort(joint))
+        (joint.name, (float(joint.actfrcrange[0]), float(joint.actfrcrange[1])))
         for joint in spec.joints
         if joint.name and joint.type in driven
     )
@@ -90,12 +78,6 @@ def read_urdf(path: Path) -> UrdfModel:
         raise ModelError(f"{path}: the URDF has no revolute or prismatic joint that a motor drives")
 
     return UrdfModel(name=spec.modelname, motors=motors, velocities=_velocities(path))
-
-
-def _effort(joint: Any) -> tuple[float, float] | None:
-    """Range of the force on a joint; None without one."""
-    low, high = joint.actfrcrange
-    return (float(low), float(high)) if low < high else None
 
 
 def _velocities(path: Path) -> dict[str, float]:
