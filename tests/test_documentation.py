@@ -222,45 +222,6 @@ def test_named_code_exists(path: Path) -> None:
 
 # ---- the checks themselves, on small documents
 
-# A document with blocks of all kinds.
-DOCUMENT = """# Title
-```python
-print(1)
-```
-
-<!-- not run: needs a robot -->
-
-```sh
-play
-```
-```sh
-mjfim check gone.toml \\
-  -o out  # exits with 2
-# a comment
-false
-```
-[file](gone.md), [page](https://example.org), [place](#title), ![picture](README.md#top)
-"""
-
-
-def test_blocks_are_found_with_their_lines_and_skipped_by_the_comment(tmp_path: Path) -> None:
-    path = tmp_path / "README.md"
-    path.write_text(DOCUMENT, encoding="utf-8")
-
-    found = [(block.language, block.line, block.skip_reason) for block in code_blocks(path)]
-    assert found == [("python", 2, ""), ("sh", 8, "needs a robot"), ("sh", 11, "")]
-
-    (block,) = runnable(path, "sh")
-    assert [code for _, code in commands(block)] == [2, 0]
-    assert [target.name for target in linked_files(path)] == ["gone.md", "README.md"]
-
-
-def test_a_block_that_is_not_closed_is_an_error(tmp_path: Path) -> None:
-    path = tmp_path / "README.md"
-    path.write_text("text\n```python\nprint(1)\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="block of line 2 is not closed"):
-        code_blocks(path)
-
 
 def test_a_failing_block_is_noticed(tmp_path: Path) -> None:
     run(["bash", "-c", "false"], tmp_path, code=1)

@@ -183,7 +183,9 @@ runpy.run_module("mjfim", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("module", ["mjfim.cli.main", "numpy", "mujoco"])
+@pytest.mark.parametrize(
+    "module", ["mjfim.cli.main", pytest.param("numpy", marks=pytest.mark.slow), "mujoco"]
+)
 def test_a_press_while_the_program_or_a_verb_starts(module: str) -> None:
     """A verb imports numpy and mujoco when it runs."""
     words = ["check", MODELS / "cart_pendulum.toml"]

@@ -36,26 +36,6 @@ def test_montecarlo_leaves_its_files(study: Path, archived: Path, tmp_path: Path
     assert np.all(np.diag(data["final"]["crlb"]) < np.diag(data["initial"]["crlb"]))
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("empty_figures")
-def test_an_executor_of_the_user_finds_the_same_estimates(
-    study: Path, archived: Path, tmp_path: Path
-) -> None:
-    cluster = tmp_path / "cluster.py"
-    cluster.write_text(
-        "from concurrent.futures import ThreadPoolExecutor\n"
-        "def make():\n    return ThreadPoolExecutor(2)\n"
-    )
-    found = []
-    for place in ("local", f"python:{cluster}:make"):
-        out = tmp_path / f"mc{len(found)}"
-        options = ("--trials", 100, "--executor", place)
-        assert run("montecarlo", study, archived, "-o", out, *options).exit_code == 0
-        found.append(read(out / "montecarlo.json")["final"]["covariance"])
-
-    assert found[0] == found[1]
-
-
 def test_montecarlo_of_a_diverging_design(study: Path, archived: Path, tmp_path: Path) -> None:
     """The simulation at the true parameters diverges under the control."""
     with np.load(archived) as data:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -267,12 +266,11 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["threads", "pool"])
 @pytest.mark.parametrize(
     "limits", [{}, {"control": {"force": (-15.0, 15.0)}}], ids=["free", "limited"]
 )
 def test_workers_evaluate_the_samples_as_one_process_does(
-    kind: str, limits: dict[str, Any], tmp_path: Path
+    limits: dict[str, Any], tmp_path: Path
 ) -> None:
     bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.5, 3.5)}}
     task = cart_task(
@@ -283,7 +281,7 @@ def test_workers_evaluate_the_samples_as_one_process_does(
         descent={"max_iterations": 3},
     )
     alone = design_task(task)
-    with ThreadPoolExecutor(2) if kind == "threads" else mjfim.Pool(2) as executor:
+    with mjfim.Pool(2) as executor:
         found = design_task(DesignTask.resolve(task.experiment, threads=1), executor=executor)
 
     assert found.final.cost == alone.final.cost

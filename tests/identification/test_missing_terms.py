@@ -134,16 +134,6 @@ def test_a_complete_model_has_no_missing_terms() -> None:
     assert not any(e.missing_terms or e.misfit for e in found)
 
 
-@pytest.mark.slow
-def test_estimated_parameters_are_no_missing_terms(tmp_path: Path) -> None:
-    recording = robot(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>')
-    friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.1, "bounds": [0.0, 5.0]}}
-    found = mjfim.identify(stated(parameters=friction), [recording])
-    assert not found.misfit
-    f = found.parameters.index("f")
-    assert abs(found.theta[f] - 0.5) < 4.0 * found.std[f]
-
-
 def with_failing(failing: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
     """Test a further candidate between the others."""
     usual = score_tests.candidates_of

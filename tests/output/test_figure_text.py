@@ -69,7 +69,7 @@ class Size:
         return make_labels(self.joints, self.parameters, self.width)
 
 
-SMALL, USUAL, LARGE = Size(1, 1), Size(3, 4), Size(12, 30, LONG)
+SMALL, LARGE = Size(1, 1), Size(12, 30, LONG)
 WIDE = Size(2, 3, LONG)
 
 
@@ -451,7 +451,7 @@ def test_texts_of_quick_figures_do_not_overlap(record: str, picture: str) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [SMALL, USUAL, WIDE, LARGE], ids=str)
+@pytest.mark.parametrize("size", [SMALL, WIDE, LARGE], ids=str)
 @pytest.mark.parametrize("record", RECORDS)
 def test_texts_do_not_overlap_and_stay_inside(record: str, size: Size) -> None:
     pictures = [name for name in pictures_of(RECORDS[record](size)) if "histogram" not in name]

@@ -210,7 +210,7 @@ def test_every_part_of_a_page_is_escaped() -> None:
 
 
 def test_a_fit_keeps_its_iterates_its_segments_and_the_nominal_model(
-    estimate: mjfim.Estimate, tmp_path: Path
+    estimate: mjfim.Estimate,
 ) -> None:
     np.testing.assert_array_equal(estimate.trace[0], estimate.initial_theta)
     np.testing.assert_allclose(estimate.trace[-1], estimate.theta, rtol=1e-2)
@@ -221,11 +221,6 @@ def test_a_fit_keeps_its_iterates_its_segments_and_the_nominal_model(
     assert np.abs(estimate.nominal[0] - estimate.predicted[0]).max() > 0.0
     assert estimate.segments[0][0] == recording.t[0]
     assert (np.diff(estimate.segments[0]) > 0.0).all()
-
-    estimate.save(tmp_path)
-    loaded = mjfim.Estimate.load(tmp_path)
-    np.testing.assert_array_equal(loaded.trace, estimate.trace)
-    np.testing.assert_array_equal(loaded.nominal[0], estimate.nominal[0])
 
 
 # ---- formats of pictures

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, ModelError
-from mjfim.excitation.design import design
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -536,15 +535,3 @@ def test_a_model_without_actuators_is_released(kind: str, tmp_path: Path) -> Non
     assert task.release is not None
     assert verify(task, task.initial).is_feasible
     assert "hinge_damping" in experiment.parameters
-
-
-@pytest.mark.slow
-def test_the_first_experiment_of_a_free_pendulum_runs_without_edits(tmp_path: Path) -> None:
-    proposal = propose_experiment(MODELS / "free_pendulum.xml", tmp_path)
-    file = tmp_path / "first.toml"
-    file.write_text(experiment_text(proposal), encoding="utf-8")
-    experiment = Experiment.from_file(file)
-    assert check(experiment).self_test.passed
-    made = design(experiment)
-    assert made.sound
-    assert made.final.eigenvalues[0] > 10.0 * made.initial.eigenvalues[0]

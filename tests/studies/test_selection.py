@@ -173,17 +173,6 @@ def test_a_settled_selection_keeps_the_length_that_the_user_left_free(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_selection_is_saved_and_loaded(tmp_path: Path) -> None:
-    found = mjfim.select_terms(stated(), recorded(tmp_path, 'stiffness="8"', count=2))
-    assert found.selection is not None
-    assert [term.path for term in found.selection.terms] == ["joint/slide:stiffness"]
-    found.save(tmp_path / "results")
-    loaded = mjfim.Estimate.load(tmp_path / "results")
-    assert loaded.selection == found.selection
-    assert "selection" in loaded.pictures
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_two_missing_terms_are_both_found(tmp_path: Path, seed: int) -> None:
     logs = recorded(
