@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -403,10 +401,7 @@ def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor])
-def test_a_shorter_design_played_twice_is_a_start(
-    tmp_path: Path, executor: type[ThreadPoolExecutor] | None
-) -> None:
+def test_a_shorter_design_played_twice_is_a_start(tmp_path: Path) -> None:
     """Half of the horizon has about as much information per second; costs hold for all of it."""
     rest = {"start": "rest", "end": "rest"}
     descent = {"repeats": (2,), "max_iterations": 80}
@@ -421,8 +416,7 @@ def test_a_shorter_design_played_twice_is_a_start(
         limits=limits,
         initial={**hanging, "control": control},
     )
-    with executor(2) if executor is not None else nullcontext() as pool:
-        design = design_task(task, executor=pool)
+    design = design_task(task)
     assert [start.name for start in design.starts] == ["initial control", "2 times a design of 1 s"]
     assert min(start.iterations for start in design.starts) > 0
     assert len(design.trajectory.ctrl) == task.samples

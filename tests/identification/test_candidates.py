@@ -33,6 +33,7 @@ def closed_loop(latency: float) -> mjfim.Experiment:
     return arm_experiment(laws, parameters=DAMPING)
 
 
+@pytest.mark.slow
 def test_a_late_driver_is_the_first_missing_term() -> None:
     t = np.arange(600)[:, None] / 500.0
     references = 0.4 * np.sin(2.0 * np.pi * t * np.array([1.3, 2.1]) + np.array([0.0, 1.0]))

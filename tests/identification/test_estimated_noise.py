@@ -72,6 +72,7 @@ def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, FitProblem, Array
     return found.theta, weighted, np.sqrt(np.diag(np.linalg.inv(condensed.information())))
 
 
+@pytest.mark.slow
 def test_an_estimate_with_estimated_noise_is_that_of_searches_in_turn(
     task: FitTask, problem: FitProblem
 ) -> None:

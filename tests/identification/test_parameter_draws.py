@@ -290,7 +290,7 @@ def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
     assert np.std(lost) > 50 * KNOWN
 
 
-@pytest.mark.parametrize("prior", [0.5, 3.0])
+@pytest.mark.parametrize("prior", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_a_wide_prior_on_a_whole_inertia_gives_physical_robots(
     tmp_path: Path, prior: float
 ) -> None:

@@ -79,8 +79,12 @@ def test_steps_are_held_or_pass_smoothly() -> None:
 # ---- searches
 
 
-@pytest.mark.parametrize("method", list(METHODS))
-@pytest.mark.parametrize("limited", [True, False])
+LIMITED = [
+    pytest.param(name, True, marks=[] if name == "chirp" else pytest.mark.slow) for name in METHODS
+]
+
+
+@pytest.mark.parametrize(("method", "limited"), [*((name, False) for name in METHODS), *LIMITED])
 def test_every_baseline_keeps_the_limits_and_its_time(
     method: str, limited: bool, tmp_path: Path
 ) -> None:

@@ -451,7 +451,6 @@ def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
 
     # What remains of the second round if the campaign is killed at several moments of it.
     incomplete = {
-        "while-designing": [],
         "while-writing": ["design.npz", "design.csv"],
         "before-recording": ["design.npz", "design.csv", "reference.csv", "design.json"],
     }

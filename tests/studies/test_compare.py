@@ -202,6 +202,7 @@ def test_budgets_must_be_positive(budget: dict[str, float]) -> None:
 # ---- the picture
 
 
+@pytest.mark.slow
 def test_the_picture_has_a_row_per_method() -> None:
     """The best method is on top."""
     cells, bars = compare(small()).panels
