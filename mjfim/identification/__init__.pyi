@@ -1,5 +1,5 @@
-from .fit_problem import FitProblem
 from .assessment.parameter_draws import complete_theta
+from .fit_problem import FitProblem
 from .task import FitTask
 
 __all__ = [
