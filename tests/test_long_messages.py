@@ -53,9 +53,11 @@ def test_a_warning_about_many_outputs_lists_the_first_ones() -> None:
     findings = SimpleNamespace(
         interrupted=False,
         unpredictable=None,
-        quality=SimpleNamespace(unexplained=NAMES),
-        accuracy=SimpleNamespace(groups=(), singular=False),
-        result=SimpleNamespace(begun_instead="", start_diverged=False),
+        result=SimpleNamespace(
+            begun_instead="",
+            quality=SimpleNamespace(unexplained=NAMES),
+            accuracy=SimpleNamespace(groups=(), singular=False),
+        ),
     )
     (warning,) = _warnings_of_search(findings)
     assert len(warning) < LONGEST_MESSAGE
