@@ -13,7 +13,7 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.parameter_draws import draw_parameters_system
+from mjfim.identification.assessment.parameter_draws import complete_theta, draw_parameters_system
 from mjfim.output import robot_samples
 from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
 from mjfim.output.models.mjcf import same_dynamics, write_identified
@@ -73,7 +73,7 @@ def test_every_model_is_the_one_in_memory(system: System, tmp_path: Path) -> Non
     for i in range(5):
         path = tmp_path / "samples" / f"robot_{i + 1:04d}.xml"
         written = mujoco.MjModel.from_xml_path(str(path))
-        theta = estimate.draws.values[i]
+        theta = complete_theta(system, estimate, estimate.draws, i)
         assert same_dynamics(written, system.model_at(theta, at_keyframe=False))
         assert written.body("bob").mass[0] == estimate.draws.values[i, 0]
 
