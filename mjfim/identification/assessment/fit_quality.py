@@ -93,9 +93,10 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
     for j, (name, series) in enumerate(
         zip(names, _whitened_residuals(problem, predicted), strict=True)
     ):
-        squares_of_output, count_of_output = _inliers(problem, series)
-        squares += squares_of_output
-        count += count_of_output
+        # Outliers do not have the distribution of the noise. A comparison with NaN is False.
+        inliers = [z[np.abs(z) <= problem.loss.outlier_threshold] for z in series]
+        squares += sum(float(z @ z) for z in inliers)
+        count += sum(map(len, inliers))
         whiteness.append(whiteness_of(name, series))
         largest = largest.with_output(name, recordings, times, series)
 
@@ -105,8 +106,12 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
 
         # Residuals that are nearly as large as the motion, and larger than the noise.
         rms[name] = float(np.sqrt(np.mean(errors**2)))
-        large = rms[name] > UNEXPLAINED_SHARE * _measured_deviation(problem, j)
-        if large and _mean_square(series) > 1.0 / UNEXPLAINED_SHARE**2:
+        values = [
+            recording.y[mask[:, j], j]
+            for recording, mask in zip(problem.recordings, problem.masks, strict=True)
+        ]
+        large = rms[name] > UNEXPLAINED_SHARE * float(np.std(np.concatenate(values)))
+        if large and float(np.nanmean(np.concatenate(series) ** 2)) > 1.0 / UNEXPLAINED_SHARE**2:
             unexplained.append(name)
 
     return FitQuality(
@@ -118,20 +123,6 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
         worst_residual=largest.interval,
         unexplained=tuple(unexplained),
     )
-
-
-def _mean_square(series: Sequence[Array]) -> float:
-    """Mean square of the residuals of an output, NaN where not measured."""
-    return float(np.nanmean(np.concatenate(series) ** 2))
-
-
-def _measured_deviation(problem: FitProblem, output: int) -> float:
-    """Standard deviation of the measured values of an output over all recordings [y-unit]."""
-    values = [
-        recording.y[mask[:, output], output]
-        for recording, mask in zip(problem.recordings, problem.masks, strict=True)
-    ]
-    return float(np.std(np.concatenate(values)))
 
 
 def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> Iterator[list[Array]]:
@@ -165,18 +156,3 @@ def _correlated_residuals(problem: FitProblem, predicted: Sequence[Array]) -> It
         z[mask] = problem.noise.whiten_present(difference, mask)
         whitened.append(z)
     yield from ([z[:, j] for z in whitened] for j in range(len(problem.noise.sigma)))
-
-
-def _inliers(problem: FitProblem, series: Sequence[Array]) -> tuple[float, int]:
-    """Sum of squares and number of the whitened residuals of an output that are no outliers.
-
-    Outliers do not count, because they do not have the distribution of the noise.
-    """
-    squares = 0.0
-    count = 0
-    for z in series:
-        # A comparison with NaN is False.
-        inliers = z[np.abs(z) <= problem.loss.outlier_threshold]
-        squares += float(inliers @ inliers)
-        count += len(inliers)
-    return squares, count

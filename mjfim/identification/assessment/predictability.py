@@ -15,7 +15,6 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segments import MIN_SAMPLES
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.records.trajectory import Trajectory
 
 # Largest number of samples of a motion along which the amplification is computed.
 MAX_SAMPLES = 20_000
@@ -86,7 +85,15 @@ def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> Unpredictabl
     if motion is None:
         return None
 
-    motion = _begin_of(motion, longest.begin, samples)
+    rows = slice(longest.begin, longest.begin + samples + 1)
+    motion = replace(
+        motion,
+        t=motion.t[rows],
+        qpos=motion.qpos[rows],
+        qvel=motion.qvel[rows],
+        act=motion.act[rows],
+        ctrl=motion.ctrl[longest.begin : longest.begin + samples],
+    )
     plant = problem.system.plant
     try:
         A, _, _, _ = plant.derivatives.jacobians(problem.theta(at), motion)
@@ -142,16 +149,3 @@ def amplifications(A: Array, sizes: Array) -> Array:
         first, second = slice(0, 2 * pairs, 2), slice(1, 2 * pairs, 2)
         products = products[second] @ products[first]
         logarithms = logarithms[first] + logarithms[second]
-
-
-def _begin_of(motion: Trajectory, first: int, samples: int) -> Trajectory:
-    """A number of samples of a motion from a first sample."""
-    rows = slice(first, first + samples + 1)
-    return replace(
-        motion,
-        t=motion.t[rows],
-        qpos=motion.qpos[rows],
-        qvel=motion.qvel[rows],
-        act=motion.act[rows],
-        ctrl=motion.ctrl[first : first + samples],
-    )

@@ -183,21 +183,6 @@ def _describe(test: Whiteness) -> str:
     return f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Windows:
-    """Whitened residuals of one output of a recording, window by window.
-
-    Attributes:
-        edges: (w+1,) times between the windows [s].
-        counts: (w,) numbers of values.
-        squares: (w,) sums of squares.
-    """
-
-    edges: Array
-    counts: np.ndarray
-    squares: Array
-
-
 @dataclass(frozen=True, kw_only=True)
 class LargestResidual:
     """The interval in which residuals are largest, among those of some outputs.
@@ -239,65 +224,46 @@ class LargestResidual:
         """
         total, squares, worst = self.total, self.squares, self.worst
         for name, t, z in zip(recordings, times, whitened, strict=True):
-            windows = _windows(t, z)
-            if windows is None:
+            measured = np.isfinite(z)
+            if not measured.any():
                 continue
 
-            total += float(windows.squares.sum())
-            inside = _largest_windows(windows)
-            within = float(windows.squares[inside].sum())
-            count = max(windows.counts[inside].sum(), 1)
+            # Windows of equal duration; round-off must not exclude the last row.
+            number = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
+            edges = np.linspace(t[0], t[-1] * (1 + 1e-12), number + 1)
+            rows = np.searchsorted(t, edges)
+            rows[0], rows[-1] = 0, len(t)
+            parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
+            counts = np.array([len(part) for part in parts])
+            of_windows = np.array([float(part @ part) for part in parts])
+
+            total += float(of_windows.sum())
+            inside = _largest_windows(counts, of_windows)
+            within = float(of_windows[inside].sum())
+            count = max(counts[inside].sum(), 1)
             size = float(np.sqrt(within / count))
             if worst is None or size > worst.size:
                 squares = within
                 worst = WorstResidual(
                     output=output,
                     recording=name,
-                    begin=windows.edges[inside.start],
-                    end=windows.edges[inside.stop],
+                    begin=edges[inside.start],
+                    end=edges[inside.stop],
                     size=size,
                     share=0.0,
                 )
         return LargestResidual(total=total, squares=squares, worst=worst)
 
 
-def _windows(t: Array, z: Array) -> _Windows | None:
-    """Divide the residuals of an output into windows.
-
-    Args:
-        t: (M,) times of the rows [s].
-        z: (M,) whitened residuals, NaN where not measured.
-
-    Returns:
-        The windows; None without a residual.
-    """
-    measured = np.isfinite(z)
-    if not measured.any():
-        return None
-
-    # Windows of equal duration; round-off must not exclude the last row.
-    count = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
-    edges = np.linspace(t[0], t[-1] * (1 + 1e-12), count + 1)
-    rows = np.searchsorted(t, edges)
-    rows[0], rows[-1] = 0, len(t)
-
-    parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
-    return _Windows(
-        edges=edges,
-        counts=np.array([len(part) for part in parts]),
-        squares=np.array([float(part @ part) for part in parts]),
-    )
-
-
-def _largest_windows(windows: _Windows) -> slice:
+def _largest_windows(counts: np.ndarray, squares: Array) -> slice:
     """Neighbouring windows in which residuals are largest.
 
     These are all windows where none has clearly larger residuals than the others.
     """
     # Windows with few values count as if they had more: a single large value is not an interval.
-    rms = np.sqrt(windows.squares / np.maximum(windows.counts, VALUES_PER_WINDOW))
+    rms = np.sqrt(squares / np.maximum(counts, VALUES_PER_WINDOW))
     peak = int(np.argmax(rms))
-    overall = float(np.sqrt(windows.squares.sum() / windows.counts.sum()))
+    overall = float(np.sqrt(squares.sum() / counts.sum()))
     if not rms[peak] > PEAK_RATIO * overall:
         return slice(0, len(rms))
 
