@@ -18,7 +18,6 @@ from mjfim.experiment.system import System
 from mjfim.identification import complete_theta
 from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.assessment.parameter_draws import (
-    complete_theta,
     draw_parameters,
     draw_parameters_system,
 )
