@@ -36,7 +36,7 @@ MAX_MISSED_LIMITS = 8
 # What to do after a campaign, by how it ended.
 AFTER_CAMPAIGN = {
     CampaignStatus.WAITING: (
-        "Play the last design on the robot, record it, and repeat the call with "
+        "Play `round_{}/design.csv` on the robot, record it, and repeat the call with "
         "`--recordings FILE`."
     ),
     CampaignStatus.REACHED: "Use `identified.xml`, the model with the estimated parameters.",
@@ -78,7 +78,7 @@ def campaign_page(campaign: Campaign, parameters: CampaignParameters | None = No
     return Page(
         kind="Campaign of designs and recordings",
         verdict=Verdict(as_sentence(str(campaign)), level),
-        next_steps=() if step is None else (step,),
+        next_steps=() if step is None else (step.format(len(campaign.rounds) + 1),),
         warnings=campaign.warnings,
         facts=facts,
         sections=sections,

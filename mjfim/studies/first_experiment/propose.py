@@ -524,11 +524,16 @@ class _Refinement:
         return draft.times.samples
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
-        """Indices of the candidates that the chirp or the release identifies together."""
+        """Indices of the candidates that the chirp or the release identifies together.
+
+        Dry friction and contacts make derivatives inaccurate, so that parameters seem to differ
+        that never do. The test of a check knows the error of the derivatives; a parameter that it
+        cannot tell apart makes room for later ones.
+        """
         system = System.resolve(self._experiment(draft), source=self.source)
         task = self._task(system, draft)
         point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-        if point.information is None:
+        if point.information is None or point.sensitivity is None:
             raise SimulationDivergedError(
                 "the simulation diverges when the parameters change a little"
             )
@@ -536,12 +541,27 @@ class _Refinement:
         # The error of a release is a further unknown.
         n = len(draft.chosen)
         hidden = F[:n, n:] @ np.linalg.pinv(F[n:, n:], hermitian=True) @ F[n:, :n]
-        return identifiable(F[:n, :n] - hidden, task.parameters.scale[:n])
+        F, sizes, left = F[:n, :n] - hidden, task.parameters.scale[:n], list(range(n))
+        while True:
+            chosen = [left[i] for i in identifiable(F[np.ix_(left, left)], sizes[left])]
+            part = replace(draft, chosen=[draft.chosen[i] for i in chosen])
+            tried = self._task(System.resolve(self._experiment(part), source=self.source), part)
+            columns = point.sensitivity.of_parameters([*chosen, *range(n, len(task.parameters))])
+            # Other controls need not be tried, because this one has to show every parameter.
+            found = tried.identifiability_test.along(tried.initial, columns, lambda: True)
+            shares = np.abs(found.along_trajectory.directions) / sizes[chosen, None]
+            if len(chosen) == 1 or not shares.size:
+                return chosen
+            members = shares[:, 0] > LEAST_SHARE * shares[:, 0].max()
+            left.remove(chosen[int(np.flatnonzero(members)[-1])])
 
 
 # Largest relative standard deviation of a proposed parameter along the initial control. A designed
 # motion gives several times more information than the initial one.
 LARGEST_STD = 0.3
+
+# A parameter belongs to a combination without effect if its share in it is larger than this.
+LEAST_SHARE = 1e-4
 
 # Largest number of proposed parameters, so that a design takes a minute.
 MOST_PARAMETERS = 10
