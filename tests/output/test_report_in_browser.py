@@ -31,7 +31,8 @@ PATIENCE = 120_000
 # Height and width of each plot, and the number of its drawn shapes.
 MEASURE_PLOTS = """nodes => nodes.map(node => {
   const box = node.getBoundingClientRect();
-  const shapes = node.querySelectorAll('.trace path, .trace text, .heatmaplayer image');
+  const drawn = '.trace path, .trace text, .annotation text, .heatmaplayer image';
+  const shapes = node.querySelectorAll(drawn);
   return [box.width, box.height, shapes.length];
 })"""
 
@@ -139,7 +140,7 @@ def test_a_name_in_the_legend_hides_its_curves(browser: Any, tmp_path: Path) -> 
     view = Viewed(browser, report_file(tmp_path, results.design()), WINDOWS[0], "light")
     group = view.page.locator(".group", has_text="hinge [rad]").first
     key = group.locator("button", has_text="initial")
-    curves = group.locator(".scatterlayer .trace")
+    curves = group.locator(".plot").first.locator(".scatterlayer .trace")
     expect(curves).to_have_count(2)
 
     key.click()

@@ -296,7 +296,7 @@ def _name_ticks(axis: DrawnAxis, stated: Axis, room: float) -> None:
     axis.set_ticklabels(names, fontsize=SMALL_FONT if len(names) <= MANY else TINY_FONT)
     if room:
         widest = max((text_width(name, SMALL_FONT) for name in names), default=0.0)
-        axis.set_tick_params(rotation=90 if widest > 0.8 * room / max(len(names), 1) else 0)
+        axis.set_tick_params(rotation=90 if widest > 0.65 * room / max(len(names), 1) else 0)
     for label, role in zip(axis.get_ticklabels(), stated.roles, strict=False):
         label.set_color(ROLES[role])
     axis.set_tick_params(length=0.0)
