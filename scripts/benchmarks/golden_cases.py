@@ -32,7 +32,7 @@ CASES: dict[str, str] = {
     # Designs.
     "design cart": "design cart_pendulum.toml -o o",
     "design guess": "design cart_pendulum_guess.toml -o o",
-    "design newton": "design cart_pendulum+descent.method=newton -o o",
+    "design metric": "design cart_pendulum+descent.method=metric -o o",
     "design D": "design cart_pendulum+cost.criterion=D -o o",
     "design starts": "design cart_pendulum+descent.starts=4+descent.max_iterations=30 -o o",
     "design workers": "design cart_pendulum+descent.starts=4+descent.max_iterations=30 -o o"
@@ -47,7 +47,7 @@ CASES: dict[str, str] = {
     "design robust": "design cart_pendulum_guess+robust.samples=3+descent.max_iterations=15 -o o",
     "design shortest": "design cart_pendulum+descent.max_iterations=20 -o o --shortest",
     "design previous": "design cart_pendulum+descent.max_iterations=10 -o a"
-    " ; design cart_pendulum+descent.previous=a/design.npz+descent.max_iterations=40 -o o",
+    " ; design cart_pendulum+descent.previous=[\\"a/design.npz\\"]+descent.max_iterations=40 -o o",
     # Hard limits.
     "limits": "design cart_pendulum_limits+descent.starts=1+descent.max_iterations=60 -o o",
     "limits starts": "design cart_pendulum_limits+descent.starts=3+descent.seconds=8 -o o",
