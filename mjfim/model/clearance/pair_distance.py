@@ -396,7 +396,7 @@ class _Selection:
 
         # Parent and child do not collide; a body that is fixed in the world is no parent.
         weld_a, weld_b = self._weld[a], self._weld[b]
-        related = weld_a == self._parent_weld[b] or weld_b == self._parent_weld[a]
+        related = weld_a == self._parent_weld[weld_b] or weld_b == self._parent_weld[weld_a]
         is_filtered = self._filters_parents and weld_a and weld_b and related
         if frozenset((a, b)) in self._excluded or is_filtered:
             return False
