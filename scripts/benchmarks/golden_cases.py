@@ -47,7 +47,7 @@ CASES: dict[str, str] = {
     "design robust": "design cart_pendulum_guess+robust.samples=3+descent.max_iterations=15 -o o",
     "design shortest": "design cart_pendulum+descent.max_iterations=20 -o o --shortest",
     "design previous": "design cart_pendulum+descent.max_iterations=10 -o a"
-    " ; design cart_pendulum+descent.previous=[\\"a/design.npz\\"]+descent.max_iterations=40 -o o",
+    ' ; design cart_pendulum+descent.previous=[\\"a/design.npz\\"]+descent.max_iterations=40 -o o',
     # Hard limits.
     "limits": "design cart_pendulum_limits+descent.starts=1+descent.max_iterations=60 -o o",
     "limits starts": "design cart_pendulum_limits+descent.starts=3+descent.seconds=8 -o o",
