@@ -167,6 +167,8 @@ def design_task(
     )
     steps_before = task.plant.engine_steps - steps_before
     results = consume(search.run([candidate_of(start) for start in starts]), callback)
+    if not search.grounds.is_limited:
+        results = _with_stops_evaluated(stage, results)
     interrupted = budget.stop.requested
     winner, point = _chosen(search, results, [first, begin])
     steps = steps_before + search.steps
@@ -206,8 +208,6 @@ def _chosen(
     nothing = Candidate(
         name="initial control", control=search.stage.task.control, status=Status.INTERRUPTED
     )
-    if not is_limited:
-        results = _with_stops_evaluated(search.stage, results)
     best = min(results, key=lambda result: (result.cost, result.rank), default=nothing)
     point: DesignPoint | None = best.point
     if is_limited:
