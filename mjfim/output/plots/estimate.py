@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices
 from mjfim.model.coordinates import split_unit
-from mjfim.output.distributions import chi_squared_quantiles
 from mjfim.output.panels import (
     Axis,
     Mark,
@@ -31,6 +30,7 @@ from mjfim.output.panels import (
     vline,
 )
 from mjfim.output.plots.words import (
+    chi_squared_quantiles,
     format_number,
     format_with_uncertainty,
     shorten,

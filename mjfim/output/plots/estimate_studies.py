@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array
-from mjfim.output.distributions import normal_density
 from mjfim.output.panels import (
     Axis,
     Mark,
@@ -25,7 +24,7 @@ from mjfim.output.panels import (
     vline,
     vspan,
 )
-from mjfim.output.plots.words import as_sentence, format_number, shorten
+from mjfim.output.plots.words import as_sentence, format_number, normal_density, shorten
 from mjfim.output.vocabulary import DESIGNED, IDENTIFIED, MEASURED, NOMINAL
 from mjfim.records.estimate import Estimate, HorizonStudy
 from mjfim.records.labels import with_unit

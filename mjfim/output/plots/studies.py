@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.output.campaign_parameters import CampaignParameters
-from mjfim.output.distributions import normal_density
 from mjfim.output.pages.accuracy import BEST_CASE
 from mjfim.output.pages.studies import budget_in_words
 from mjfim.output.panels import (
@@ -39,6 +38,7 @@ from mjfim.output.plots.words import (
     format_number,
     format_percent,
     format_with_uncertainty,
+    normal_density,
     quotient_unit,
     shorten,
     squared_unit,

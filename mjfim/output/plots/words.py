@@ -1,8 +1,11 @@
-"""Numbers, units and names as pictures write them."""
+"""Numbers, units, names and densities as pictures write and draw them."""
 
 from __future__ import annotations
 
 import numpy as np
+import scipy
+
+from mjfim.arrays import Array
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -133,3 +136,29 @@ def as_sentence(text: str) -> str:
         text: The text, without a full stop.
     """
     return f"{text[:1].upper()}{text[1:]}."
+
+
+def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
+    """Return the density of a normal distribution.
+
+    Args:
+        x: (n,) places [unit of the quantity].
+        mean: Mean.
+        std: Standard deviation, positive.
+
+    Returns:
+        (n,) densities [1/unit].
+    """
+    deviations = (x - mean) / std
+    return np.asarray(np.exp(-0.5 * deviations**2) / (np.sqrt(2.0 * np.pi) * std))
+
+
+def chi_squared_quantiles(shares: tuple[float, float], freedom: float) -> tuple[float, float]:
+    """Return two quantiles of a chi-squared distribution.
+
+    Args:
+        shares: Probabilities that a value lies below each (0..1).
+        freedom: Degrees of freedom, positive.
+    """
+    low, high = 2.0 * scipy.special.gammaincinv(0.5 * freedom, np.array(shares))
+    return float(low), float(high)
