@@ -11,7 +11,7 @@ import pytest
 
 from mjfim.errors import OutputError
 from mjfim.output import folders
-from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, locked
+from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, claimed, locked
 from tests.support.cli import misused, names, run, write_experiment
 from tests.support.paths import SCRIPTS
 
@@ -66,6 +66,33 @@ def test_compare_keeps_controls_that_it_did_not_write(tmp_path: Path) -> None:
     assert {name: after[name] for name in before} == before
     assert "control_steps.csv" in after
     assert "control_chirp.csv" not in after
+
+
+def test_compare_keeps_an_earlier_result_that_it_reads(study: Path, tmp_path: Path) -> None:
+    """A control of an earlier comparison is the initial control now."""
+    write_experiment(tmp_path, start='"control_chirp.csv"')
+    guard = OutputGuard([], force=False)
+    with claimed(tmp_path, guard, exclusive=True):
+        folders.archive.write_table(tmp_path / "control_chirp.csv", {"t": [0.0]})
+    shutil.copy(study.parent / "cart_pendulum.csv", tmp_path / "control_chirp.csv")
+    words = ("compare", tmp_path / "study.toml", "-o", tmp_path, "--methods", "chirp", "--force")
+    misused(run(*words), "control_chirp.csv: this result would replace", "an input")
+
+
+def test_an_edited_result_is_kept(study: Path, archived: Path, tmp_path: Path) -> None:
+    """--force replaces it; afterwards a run replaces its own result again."""
+    file = tmp_path / "run.csv"
+    words = ("simulate", study, archived, "-o", file)
+    assert run(*words).exit_code == 0
+    first = file.read_bytes()
+
+    file.write_text("edited", encoding="utf-8")
+    misused(run(*words), f"{file}: changed after mjfim wrote it", "--force")
+    assert file.read_text(encoding="utf-8") == "edited"
+
+    for force in (("--force",), ()):
+        assert run(*words, *force).exit_code == 0
+        assert file.read_bytes() == first
 
 
 def test_a_second_run_does_not_enter_the_folder_of_the_first(study: Path, tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -12,8 +14,9 @@ from mjfim.cli.common import replace_unencodable_characters
 from mjfim.cli.progress import errors, out
 from mjfim.output.page import Row, Table
 from mjfim.output.terminal import render
-from tests.support.cli import misused, run
+from tests.support.cli import PROCESS, loads, misused, run, write_experiment
 from tests.support.pages import page_with
+from tests.support.paths import ROOT
 
 # Name that a terminal library would take for markup, a closing tag without a begin, and an emoji.
 NAME = "run [bold]1[/] [/red] :smile:"
@@ -53,3 +56,28 @@ def test_streams_that_are_not_utf8(encoding: str, monkeypatch: pytest.MonkeyPatc
     stream.flush()
     printed = stream.buffer.getvalue().decode(encoding)
     assert printed == ("? of [/?]: ?_min\n" if encoding == "ascii" else "? of [/é]: ?_min\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"PYTHONIOENCODING": "ascii"},
+        {"PYTHONIOENCODING": "cp1252"},
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ],
+    ids=["ascii", "cp1252", "locale-C"],
+)
+def test_processes_that_are_not_utf8(tmp_path: Path, settings: dict[str, str]) -> None:
+    """Results are printed, and the files are UTF-8."""
+    experiment = write_experiment(tmp_path)
+    text = experiment.read_text(encoding="utf-8")
+    experiment.write_text(text.replace("[parameters.m]", '[parameters."µ"]'), encoding="utf-8")
+
+    words = [*PROCESS, "check", experiment, "-o", tmp_path / "out"]
+    environment = {**os.environ, **settings, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, capture_output=True, env=environment, check=False, timeout=120)
+
+    assert (done.returncode, b"Traceback" in done.stderr) == (0, False), done.stderr
+    written = (tmp_path / "out" / "check.json").read_text(encoding="utf-8")
+    assert "µ" in str(loads(written))

@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.excitation.objective import ExtendedDesignProblem
+from mjfim.excitation.objective import ExtendedDesignProblem, extend
 from mjfim.excitation.task import DesignTask
+from mjfim.information.fisher import FisherInformation
+from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from tests.support.numerics import Array, body_task, cart_task, relative_error
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, Bilinear
+from mjfim.plant.noise import Noise
+from mjfim.records.trajectory import Sensitivity
+from tests.support.numerics import Array, Loop, body_task, cart_task, relative_error
 
 TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "control": 1e-2}
 SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}
@@ -78,6 +82,53 @@ def test_with_weight_on_psi_the_extended_direction_is_another_descent_direction(
     assert expansion.slope(wide) < 0.0
 
 
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_the_slope_with_psi_eliminated_is_that_of_the_extended_system(criterion: str) -> None:
+    rng, (N, nx, nu, ny, p) = np.random.default_rng(2), (9, 3, 2, 2, 3)
+    A, B = 0.5 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
+    C, D = rng.normal(size=(N + 1, ny, nx)), rng.normal(size=(N + 1, ny, nu))
+    unit = Bilinear(
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        F_mixed=rng.normal(size=(p, N, nx + nu, nx)),
+        h_mixed=rng.normal(size=(p, N + 1, nx + nu, ny)),
+    )
+    S = Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, ny, p)))
+    noise = Noise.independent([0.3, 2.0])
+    made = FisherInformation(
+        noise=noise,
+        measure_rate=20.0,
+        scale=np.array([1.0, 0.5, 3.0]),
+        prior=np.zeros((p, p)),
+        criterion=criterion,
+    )
+    found = made.evaluate(made.matrix(S))
+    F, h = (np.einsum("rj,jkzx->rkzx", found.directions, m) for m in (unit.F_mixed, unit.h_mixed))
+    a, b = made.gradient(found, S, Bilinear(A=A, B=B, C=C, D=D, F_mixed=F, h_mixed=h))
+    a_psi, a_h, b_h = made.partial_derivatives(found, S, unit)
+    wide = extend(unit, a_h, b_h, a_psi)
+    v = rng.normal(size=(N, nu))
+    z = LinearRecursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
+    full = LinearRecursion(wide.A).forward(
+        np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v)
+    )
+    reduced, slope = (
+        Expansion(A=A, B=B, a=a, b=b).slope(TangentCurve(z=z, v=v)),
+        wide.slope(TangentCurve(z=full, v=v)),
+    )
+    assert slope == pytest.approx(reduced, rel=1e-10)
+    R, Q = np.eye(nu), np.diag([1.0, 2.0, 0.0])
+    plain = MetricDescent(Q, R, Q)(Expansion(A=A, B=B, a=a, b=b), np.zeros((N, nu, nx)))
+    wide_Q = np.zeros((nx * (1 + p), nx * (1 + p)))
+    wide_Q[:nx, :nx] = Q
+    same = extended_direction(
+        Expansion(A=A, B=B, a=a, b=b, extended=wide), np.zeros((N, nu, nx)), wide_Q, R, wide_Q
+    )
+    assert relative_error(same.v, plain.v) < 1e-10
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_extended_slope_is_the_reduced_slope(case: str, tmp_path) -> None:
     task = CASES[case](tmp_path)
@@ -116,6 +167,58 @@ def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_t
     moved = full[:, nx:].reshape(task.samples + 1, p, nx)
     for j in range(p):
         assert relative_error(moved[:, j], change[:, j]) < 1e-3
+
+
+def psi_step(
+    task: DesignTask, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int
+) -> Array:
+    """psi_{k+1} of parameter j at (x, u, psi), by a difference of two steps at theta_j +- h."""
+    up, down = thetas
+    ahead, back = up.plus(x, h * psi), up.plus(x, -h * psi)
+    return up.minus(up.F(ahead, u), down.F(back, u)) / (2 * h)
+
+
+@pytest.mark.parametrize("case", ["cart E", "free body"])
+def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tmp_path) -> None:
+    task = CASES[case](tmp_path)
+    wide, nx, p, nu = expanded(task).extended, task.space.nx, len(task.theta), task.plant.nu
+    curve, S = task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
+    d = 1e-3
+    for k, j in ((11, 0), (37, p - 1)):
+        h = 1e-3 * abs(task.theta[j])
+        shift = h * np.eye(p)[j]
+        pair = tuple(
+            Loop(
+                ParameterWriter(task.parameters).model(
+                    task.plant.source.model, task.theta + s * shift
+                ),
+                1,
+            )
+            for s in (1, -1)
+        )
+        x, u, psi, loop = curve.state[k], curve.ctrl[k], S.psi[k][:, j], pair[0]
+        columns = []
+        for i in range(nx + nu):
+            e = d * np.eye(nx + nu)[i]
+            moved = [
+                psi_step(task, pair, h, loop.plus(x, s * e[:nx]), u + s * e[nx:], psi, j)
+                for s in (1, -1)
+            ]
+            columns.append((moved[0] - moved[1]) / (2 * d))
+        by_psi = [
+            (psi_step(task, pair, h, x, u, psi + s, j) - psi_step(task, pair, h, x, u, psi - s, j))
+            / 2
+            for s in np.eye(nx)
+        ]
+        rows = slice(nx * (1 + j), nx * (2 + j))
+        mixed = np.array(columns).T
+        assert relative_error(wide.A[k, rows, :nx], mixed[:, :nx]) < 1e-4
+        assert np.abs(wide.B[k, rows] - mixed[:, nx:]).max() < 1e-4 * np.abs(mixed).max()
+        assert relative_error(wide.A[k, rows, rows], np.array(by_psi).T) < 1e-5
+        others = [c for c in range(nx, nx * (1 + p)) if not rows.start <= c < rows.stop]
+        np.testing.assert_array_equal(
+            wide.A[k, rows][:, others], 0.0
+        )  # psi of one parameter does not depend on psi of another
 
 
 def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:

@@ -279,6 +279,22 @@ def test_the_slope_of_all_limits_together_holds_with_every_integrator(
     assert barrier_check(task, 0.05) < 2e-3
 
 
+@pytest.mark.parametrize("name", ["tilt", "velocity", "turn"])
+def test_a_wrong_slope_of_a_magnitude_would_be_noticed(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = Magnitude.barrier
+
+    def wrong(*args: Any, **kwargs: Any) -> VectorBarrier:
+        found = right(*args, **kwargs)
+        slope = 1.05 * found.slope
+        return VectorBarrier(value=found.value, slope=slope, curvature=found.curvature)
+
+    monkeypatch.setattr(Magnitude, "barrier", wrong)
+    task = ship_task(tmp_path, limits=KINDS[name], horizon=0.1).relaxed()
+    assert barrier_check(task, 0.1) > 1e-2
+
+
 @pytest.mark.parametrize("is_angle", [False, True])
 def test_derivatives_of_the_barrier_of_a_norm_are_those_of_differences(is_angle: bool) -> None:
     """Also at the norm zero, near the bound and beyond it."""
@@ -629,6 +645,17 @@ def test_limits_of_a_free_body_do_not_depend_on_units(
 def _times(numbers: str, factor: float) -> str:
     """Numbers of an attribute, multiplied by a factor."""
     return " ".join(repr(float(number) * factor) for number in numbers.split())
+
+
+def test_a_falling_body_exceeds_a_single_number_for_velocities(tmp_path: Path) -> None:
+    """One number for all velocities had done nothing on a free body."""
+    still = {"kind": "constant", "amplitude": 0.0}
+    task = flight(tmp_path, limits={"velocity": 1.0}, control=still)
+    found = verify(task, task.initial)
+    assert not found.is_feasible
+    assert found.margins["velocity"] == pytest.approx(1.0 - 9.81 * 1.0, rel=1e-6)
+    (violation,) = violations_of(task, found)
+    assert str(violation) == ("velocity of float is 9.81 m/s at 1 s, above 1 (first at 0.105 s)")
 
 
 def test_angles_may_be_stated_in_degrees(tmp_path: Path) -> None:

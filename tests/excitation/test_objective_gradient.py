@@ -8,7 +8,7 @@ control is too weak to reach them (a docstring says so).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from tests.support.numerics import (
     Array,
     body_task,
     cart_task,
+    directional_check,
     filtered_task,
     make_task,
     richardson,
@@ -249,10 +250,10 @@ class MeasuredSlopes:
     ways: list[Array]
     values: Array
 
-    def error(self, expansion: Expansion) -> float:
+    def error(self, expansion: Expansion, factor: float = 1.0) -> float:
         """Largest error of the slopes of an expansion, relative to the largest slope."""
         slopes = [expansion.slope(expansion.lift(self.K, c)) for c in self.ways]
-        errors = np.abs(np.array(slopes) - self.values)
+        errors = np.abs(factor * np.array(slopes) - self.values)
         return float(errors.max() / np.abs(self.values).max())
 
 
@@ -303,6 +304,82 @@ def test_the_gradient_is_that_of_J_through_the_projection(
 
     _, fast = expansion_of(task, FORWARD_DIFFERENCES)
     assert measured.error(fast) < 1e-3
+
+
+@pytest.mark.parametrize("case", OFF)
+def test_a_gradient_off_by_a_thousandth_would_be_rejected(case: str, tmp_path) -> None:
+    task = SETUPS[case](tmp_path)
+    point, expansion = expansion_of(task, CENTRAL_DIFFERENCES)
+    measured = measured_slopes(task, gain(task), point, expansion, 5e-3)
+    for factor in (1.001, 0.999, -1.0):
+        assert measured.error(expansion, factor) > 5e-4
+
+
+def test_a_gradient_without_the_part_of_psi_would_be_rejected(tmp_path) -> None:
+    task = cart_task(tmp_path)
+    point, expansion = expansion_of(task, CENTRAL_DIFFERENCES)
+    K = np.zeros((task.samples, 1, 4))
+    a, b = task.problem.running.gradient(task.initial)
+    wrong = Expansion(A=expansion.A, B=expansion.B, a=a, b=b)
+    c = directions(task, expansion.gradient(K))[0]
+    zeta = expansion.lift(K, c)
+
+    def J(t: float) -> float:
+        return task.problem.value(task.problem.project(point, zeta, t, K))
+
+    assert directional_check([expansion.slope(zeta)], [J], 5e-3) < 1e-5
+    assert directional_check([wrong.slope(zeta)], [J], 5e-3) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("case", "term"),
+    [
+        ("bias and delay unknown", "delay_derivative"),
+        ("delay wanted", "output_delay"),
+        ("quaternions measured", "h_mixed"),
+    ],
+)
+def test_a_gradient_without_a_term_of_the_outputs_would_be_rejected(
+    case: str, term: str, tmp_path
+) -> None:
+    task = SETUPS[case](tmp_path)
+    problem = task.problem
+    point, expansion = expansion_of(task, CENTRAL_DIFFERENCES)
+    bilinear = task.plant.derivatives.bilinear(
+        task.theta,
+        point.trajectory,
+        point.sensitivity.psi,
+        point.criterion.directions,
+        point.accuracy,
+    )
+    incomplete = replace(bilinear, **{term: None})
+    a, b = problem.information.gradient(point.criterion, point.sensitivity, incomplete)
+    a_running, b_running = problem.running.gradient(point.trajectory)
+    wrong = replace(expansion, a=a + a_running, b=b + b_running)
+    K = np.zeros((task.samples, task.plant.nu, task.space.nx))
+    assert measured_slopes(task, K, point, expansion, 5e-3).error(wrong) > 1e-3
+
+
+@pytest.mark.parametrize("case", ["robust mean", "robust worst", "robust worst D"])
+def test_a_gradient_without_a_sample_of_a_robust_design_would_be_rejected(
+    case: str, tmp_path
+) -> None:
+    task = SETUPS[case](tmp_path)
+    point, K = (
+        task.problem.point(task.initial, CENTRAL_DIFFERENCES),
+        np.zeros((task.samples, 1, 4)),
+    )
+    whole, blind = (
+        task.problem.expand(point),
+        replace(task.problem, parameter_samples=None).expand(point),
+    )
+    zeta = whole.lift(K, directions(task, whole.gradient(K))[0])
+
+    def J(t: float) -> float:
+        return task.problem.value(task.problem.project(point, zeta, t, K))
+
+    assert directional_check([whole.slope(zeta)], [J], 5e-3) < 1e-5
+    assert directional_check([blind.slope(zeta)], [J], 5e-3) > 1e-2
 
 
 @pytest.mark.parametrize("case", ["cart A tracking", "free body with ball joint"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from tests.fuzz.faults import FAULTS, packed_bomb
 from tests.fuzz.inputs import Ending
 from tests.fuzz.mechanism_problems import omissions
 from tests.fuzz.mechanisms import random_mechanism
-from tests.fuzz.outcome import Case
+from tests.fuzz.outcome import Case, KnownFailure, Outcome
 from tests.fuzz.plants import random_plant
 from tests.fuzz.player import (
     NEAREST,
@@ -64,6 +65,14 @@ def test_a_hidden_feasible_motion_is_found(seed: int, tmp_path: Path) -> None:
         outcome = problems.run(Case(kind="problem", seed=seed), tmp_path)
     assert outcome.group == "claimed"
     assert outcome.complaint == ""
+
+
+def test_a_case_is_read_as_it_is_printed() -> None:
+    case = Case(kind="input", seed=17)
+    assert Case.parse(str(case)) == case
+    for text in ("input", "nonsense:1", "input:-1", "input:x"):
+        with pytest.raises(ValueError, match="a case is KIND:SEED"):
+            Case.parse(text)
 
 
 def test_a_seed_gives_the_same_problem() -> None:
@@ -208,6 +217,20 @@ def test_a_value_of_reference_csv_beyond_a_limit_is_noticed() -> None:
             assert bool(read_reference([row], limit).sentences(ROUNDING)) is is_violated
 
 
+def test_feedback_is_played() -> None:
+    """With a gain on the position, the control follows the deviation from the planned state."""
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(MASS))
+    row = {"ctrl:motor": 0.0, "gain:motor:qpos:slide": 3.0, "gain:motor:qvel:slide": 0.0}
+    rows = [
+        {"t": 0.0, "qpos:slide": 0.0, "qvel:slide": 0.0, **row},
+        {"t": 0.1, "qpos:slide": 1.0, "qvel:slide": 0.0, **row},
+        {"t": 0.2, "qpos:slide": 1.0, "qvel:slide": 0.0, **row},
+    ]
+    limit = {("control", "motor"): (-2.9, 2.9)}
+    assert not play(model, rows, limit, period=0.1).sentences(ROUNDING)
+    assert play(model, rows, limit, period=0.1, feedback=True).sentences(ROUNDING)
+
+
 # A ball of 1 kg on a free joint, with a thruster, above a floor.
 FLOATING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
 <geom type="plane" size="1 1 1"/><body pos="0 0 0.5"><freejoint name="free"/>
@@ -317,6 +340,12 @@ def test_a_state_that_is_not_a_number_is_a_violation() -> None:
     assert play(model, [first, {**first, "t": 0.1}], limit, period=0.1).sentences(ROUNDING)
 
 
+def test_the_toml_of_the_suite_is_read_back() -> None:
+    value = {"a b": [1.0, True, "x\n\"'"], "n": 5e-324, "t": {"k": -3}, "i": float("inf")}
+    text = f"value = {bad_inputs.toml_of(value)}"
+    assert tomllib.loads(text) == {"value": value}
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -333,6 +362,18 @@ def test_a_state_that_is_not_a_number_is_a_violation() -> None:
 def test_half_files_are_noticed(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     assert len(faults_of(tmp_path / name)) == 1
+
+
+def test_whole_files_are_accepted(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", t=np.zeros(3))
+    for name, content in (
+        ("a.json", b'{"a": null}'),
+        ("a.csv", b"a,b\n1,2\n"),
+        ("a.png", PIXEL),
+        ("a.xml", MASS.encode()),
+    ):
+        (tmp_path / name).write_bytes(content)
+    assert [fault for path in tmp_path.iterdir() for fault in faults_of(path)] == []
 
 
 def test_temporary_files_are_recognised() -> None:
@@ -380,3 +421,13 @@ def test_changed_inputs_and_half_written_results_are_noticed(tmp_path: Path) -> 
         assert fragment in told
     assert "design.json is not whole" in told
     assert "is a temporary file that stayed" in told
+
+
+def test_a_known_failure_is_known_by_kind_description_and_complaint() -> None:
+    known = KnownFailure(kind="input", description="twice", complaint="accepted", reason="")
+    case = Case(kind="input", seed=0)
+    twice = Outcome(case=case, group="", description="log twice", complaint="accepted: exit 0")
+    assert known.fits(twice)
+    assert not known.fits(Outcome(case=case, group="", description="log twice"))
+    other = Outcome(case=case, group="", description="log", complaint="accepted")
+    assert not known.fits(other)

@@ -160,6 +160,18 @@ def test_where_two_eigenvalues_coincide_only_the_smooth_criterion_is_differentia
     assert min(kinks) > 0.05
 
 
+def test_the_exact_derivative_at_a_crossing_would_be_rejected() -> None:
+    info = matrix(np.array([1.0, 1.0, 3.0, 8.0]))
+    M, rng = derivative(e_optimality(info)), np.random.default_rng(4)
+    errors = []
+    for _ in range(6):
+        d = symmetric(rng)
+        errors.append(
+            abs(np.sum(M * d) - richardson(lambda t, d=d: e_optimality(info + t * d).value, 1e-4))
+        )
+    assert max(errors) > 0.05
+
+
 def test_the_smooth_derivative_does_not_depend_on_the_basis_of_a_repeated_eigenvalue() -> None:
     Q = rotation(np.random.default_rng(5))
     turned = Q @ np.diag([1.0, 1.0, 1.0, 5.0]) @ Q.T
@@ -181,3 +193,26 @@ def test_c_is_the_summed_variance_of_the_combinations() -> None:
     # and of estimates that have this covariance
     draws = rng.multivariate_normal(np.zeros(4), np.linalg.inv(info), 40_000) @ CONTRAST
     assert c_optimality(info, CONTRAST).value == pytest.approx(draws.var(axis=0).sum(), rel=0.03)
+
+
+def test_c_of_all_parameters_is_A_and_of_one_its_variance() -> None:
+    info = matrix(SPECTRA["spread"])
+    assert c_optimality(info, np.eye(4)).value == pytest.approx(
+        CRITERIA["A"](info).value, rel=1e-12
+    )
+    np.testing.assert_allclose(
+        derivative(c_optimality(info, np.eye(4))), derivative(CRITERIA["A"](info)), rtol=1e-9
+    )
+    assert c_optimality(info, np.eye(4)[:, 2:3]).value == pytest.approx(
+        np.linalg.inv(info)[2, 2], rel=1e-12
+    )
+
+
+def test_c_does_not_see_what_is_independent_of_the_combination() -> None:
+    contrast = np.array([[1.0], [1.0], [0.0], [0.0]])
+    info = np.diag([1.0, 2.0, 3.0, 4.0])
+    found = c_optimality(info, contrast)
+    assert c_optimality(info + np.diag([0.0, 0.0, 9.0, 9.0]), contrast).value == pytest.approx(
+        found.value
+    )
+    np.testing.assert_array_equal(derivative(found)[2:], 0.0)

@@ -9,14 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mjfim.errors import UnidentifiableError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.information.criteria import CRITERIA
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.marginal import standard_deviations
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Sensitivity
-from tests.support.numerics import cart_task, relative_error, richardson
+from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error, richardson
 
 SIGMA = np.array([0.1, 0.5, 2.0])
 
@@ -87,6 +90,25 @@ def test_criterion_is_that_of_the_scaled_information_per_second(criterion: str) 
     found = made.evaluate(matrix)
     assert found.value == pytest.approx(3.0 * expected, rel=1e-12)
     np.testing.assert_allclose(found.eigenvalues, values, rtol=1e-12)
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_criterion_derivative_is_that_of_differences_in_random_symmetric_directions(
+    criterion: str,
+) -> None:
+    rng, made = np.random.default_rng(4), information(criterion=criterion, weight=2.0)
+    matrix = spread_matrix(rng)
+    found = made.evaluate(matrix)
+    M = (
+        np.einsum("r,ri,rj->ij", found.weights, found.directions, found.directions)
+        / made.measure_rate
+    )
+    for _ in range(8):
+        d = rng.normal(size=(4, 4))
+        d = 0.01 * (d + d.T)
+        measured = richardson(lambda t, d=d: made.evaluate(matrix + t * d).value, 0.1)
+        assert np.sum(M * d) == pytest.approx(measured, rel=1e-7)
+        assert np.sum(1.001 * M * d) != pytest.approx(measured, rel=1e-4)
 
 
 NUISANCE = {"interest": np.array([0, 2])}
@@ -226,12 +248,52 @@ def test_criterion_c_without_a_contrast_is_refused() -> None:
         information(criterion="c").evaluate(np.eye(4))
 
 
+EXACT = {"initial": 1e-9, "bias": 1e-9, "delay": 1e-9}
+VAGUE = {"initial": 0.1, "bias": 0.1, "delay": 0.01}
+
+
+@pytest.mark.slow
+def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tmp_path) -> None:
+    plain, exact, vague = (
+        cart_task(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE})
+    )
+    here = [evaluate_task(s, s.initial) for s in (plain, exact, vague)]
+    assert here[1].criterion == pytest.approx(here[0].criterion, rel=1e-6)
+    np.testing.assert_allclose(here[1].std[:3], here[0].std, rtol=1e-6)
+    np.testing.assert_allclose(here[1].std[3:], 1e-9, rtol=1e-6)
+    assert here[2].criterion > 1.1 * here[0].criterion
+    recording = simulate_system(plain.system, plain.initial, seed=4)
+    found = [identify_system(s.system, [recording]) for s in (plain, exact, vague)]
+    np.testing.assert_allclose(found[1].theta[:3], found[0].theta, atol=1e-4 * found[0].std.min())
+    np.testing.assert_allclose(found[1].std[:3], found[0].std, rtol=1e-5)
+    assert (found[2].std[:3] > 1.01 * found[0].std).all()
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_more_information_never_costs_more(criterion: str) -> None:
+    rng, made = np.random.default_rng(5), information(criterion=criterion)
+    matrix = spread_matrix(rng)
+    for _ in range(10):
+        g = 0.1 * rng.normal(size=4)
+        assert made.evaluate(matrix + np.outer(g, g)).value <= made.evaluate(matrix).value
+
+
 @pytest.mark.parametrize(("criterion", "rank"), [("E", 1), ("A", 4), ("D", 4)])
 def test_criterion_says_how_many_directions_its_gradient_needs(criterion: str, rank: int) -> None:
     found = CRITERIA[criterion](spread_matrix(np.random.default_rng(6)))
     assert found.weights.shape == (rank,)
     assert found.directions.shape == (rank, 4)
     assert (found.weights < 0).all()  # information only ever lowers the cost
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_singular_information_has_an_infinite_criterion_without_a_warning(criterion: str) -> None:
+    for matrix in (
+        np.zeros((4, 4)),
+        np.diag([0.0, 1.0, 2.0, 3.0]),
+        np.diag([-1e-9, 1.0, 1.0, 1.0]),
+    ):
+        assert information(criterion=criterion).evaluate(matrix).value == np.inf
 
 
 def test_accumulated_smallest_eigenvalue_is_monotone_and_ends_at_the_whole() -> None:
@@ -336,3 +398,25 @@ def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -
     assert result.final.std[0] == pytest.approx(
         0.01, rel=1e-3
     )  # the data add nothing about the gear
+
+
+@pytest.mark.parametrize(
+    "others", [{}, {"m": CART_PARAMETERS["m"]}], ids=["alone", "beside a mass"]
+)
+def test_a_parameter_without_effect_is_an_error_that_names_it(others: dict, tmp_path) -> None:
+    blind = {"depth": {"target": "body/bob:pos[1]", "guess": 0.1}, **others}
+    with pytest.raises(UnidentifiableError, match=r"parameters\.depth changes nothing") as caught:
+        design_task(cart_task(tmp_path, parameters=blind))
+    assert "parameters.m" not in str(caught.value)
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi], ids=["upright", "hanging, rounded"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_start_at_rest_without_control_is_unidentifiable(
+    count: int, angle: float, tmp_path
+) -> None:
+    rest = {"qpos": (0.0, angle), "control": {"kind": "constant", "amplitude": 0.0}}
+    parameters = dict(list(CART_PARAMETERS.items())[-count:])
+    task = cart_task(tmp_path, initial=rest, parameters=parameters, descent={"max_iterations": 5})
+    with pytest.raises(UnidentifiableError, match="the initial control does not excite"):
+        design_task(task)

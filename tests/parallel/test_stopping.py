@@ -20,8 +20,9 @@ from mjfim import parallel as workers
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.parallel import dispatch
-from mjfim.parallel.budget import Budget, StopToken
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
 from tests.support.cli import names, read, write_experiment
 from tests.support.limits import HARD, cart_inside
 from tests.support.paths import MODELS, ROOT
@@ -119,6 +120,52 @@ def test_the_work_of_a_killed_worker_is_done_again(tmp_path: Path) -> None:
 
         # Later work uses the new processes.
         assert pool.submit(identity).result(timeout=30.0) != os.getpid()
+
+
+@pytest.mark.slow
+def test_an_interrupted_design_keeps_the_results_of_its_workers(
+    tmp_path: Path, pool: mjfim.Pool
+) -> None:
+    """SIGINT arrives while two of hundreds of starts are running."""
+    task = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
+    assert pool.submit(identity).result()
+    sent = []
+
+    def interrupt(event: DesignEvent) -> None:
+        """Send one signal when the first start has ended, so that a third one has begun."""
+        if not sent and event.start not in ("initial control", "multisine 1 of 399"):
+            sent.append(event)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with stop_on_interrupt() as stop:
+        budget = Budget(stop=stop)
+        design = design_task(task, callback=interrupt, executor=pool, budget=budget)
+
+    assert design.status is Status.INTERRUPTED
+    assert design.starts
+    assert design.final.cost < design.initial.cost
+
+
+@pytest.mark.slow
+def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(
+    tmp_path: Path, pool: mjfim.Pool
+) -> None:
+    task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
+
+    # Both processes have imported what they need.
+    processes: set[int] = set()
+    while len(processes) < 2:
+        processes |= {future.result() for future in [pool.submit(identity) for _ in range(8)]}
+
+    stop = StopToken()
+
+    def callback(event: DesignEvent) -> None:
+        stop.request()
+
+    design = design_task(task, callback=callback, executor=pool, budget=Budget(stop=stop))
+    assert design.status is Status.INTERRUPTED
+    assert len(design.starts) >= 2
+    assert design.final.cost < design.initial.cost
 
 
 def test_a_search_that_is_stopped_at_once_is_not_worse_than_an_initial_control_within_limits(

@@ -110,10 +110,26 @@ def test_adjoints_by_dot_products() -> None:
             )
 
 
-def test_a_delay_over_two_samples_has_finite_outputs(tmp_path: Path) -> None:
+def test_the_sensitivity_to_a_delay_is_the_derivative_of_delayed_outputs(tmp_path: Path) -> None:
+    """Predictions of the plant at two delays agree with G; a horizon of two samples works too."""
+    task = cart_task(tmp_path, nuisance={"delay": 0.01})
+    theta = np.array(task.parameters.guess)
+    theta[-1] = 0.0137
+    assert task.parameters.names[-1] == "delay"
+    y, G = task.plant.derivatives.predict(theta, task.control)
+    plain, _ = task.plant.derivatives.predict(task.parameters.guess, task.control)
+    inside = task.t[4:] - 0.0137
+    shifted = np.stack(
+        [np.interp(inside, np.arange(len(plain)) * task.dt, c) for c in plain.T], axis=1
+    )
+    np.testing.assert_allclose(y[4:-1], shifted, rtol=0, atol=2e-3)
+    for k, i in ((10, 1), (30, 3), (50, 2)):
+
+        def at(h: float, k: int = k, i: int = i) -> float:
+            moved = np.array(theta)
+            moved[-1] += h
+            return float(task.plant.measure(moved[None], task.control)[0][0, k, i])
+
+        assert G[k, i, -1] == pytest.approx(richardson(at, 1e-4), rel=1e-6)
     short = cart_task(tmp_path, horizon=0.02, nuisance={"delay": True})
-    assert np.isfinite(
-        short.plant.derivatives.predict(
-            short.theta + 0.0137 * np.eye(len(short.theta))[-1], short.control
-        )[0]
-    ).all()
+    assert np.isfinite(short.plant.derivatives.predict(theta, short.control)[0]).all()
