@@ -161,4 +161,4 @@ def test_a_walk_ends_with_the_parameters_of_the_robot(tmp_path: Path) -> None:
 def test_a_model_that_init_refuses_has_a_row(tmp_path: Path) -> None:
     found = walk(tmp_path / "absent.xml", tmp_path / "walk")
     assert found.codes == {"init": 2}
-    assert "no such model file" in found.messages["init"]
+    assert "no such file" in found.messages["init"]

@@ -289,7 +289,7 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         "mjfim's design",
         "worst σ",
         "σ of each parameter",
-        "m kg",
+        "m (kg)",
         "The design is the best",
     ):
         assert word in " ".join(again.stdout.split())

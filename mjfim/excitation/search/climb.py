@@ -476,7 +476,8 @@ class Climb:
         found, begun, cost = self.candidate, self._begin, self._grounds.cost
         last, level_cost = found, self._level_cost
         # A small violation of the last control ends after scaling, or on the next rung.
-        if self._latest is not None and self._latest[1] < level_cost:
+        has_time = self._move.budget.exhausted is None
+        if has_time and self._latest is not None and self._latest[1] < level_cost:
             last, level_cost = replace(found, control=self._latest[0]), self._latest[1]
         control = without_jumps(cost, last.over_horizon, variant.sample_factor)
         curves = found.curves if self._move.keeps_curves else None
