@@ -5,10 +5,11 @@ All kinds follow one protocol, so that the barrier of a constraint set is a sum 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -338,41 +339,65 @@ class SubstepConstraint:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ControlConstraint:
+class BoundedQuantity(ABC):
+    """Ranges of a quantity that follows from the trajectory alone.
+
+    Attributes:
+        kind: Kind of the limits.
+        bounds: Ranges of the quantity.
+    """
+
+    kind: ClassVar[str] = ""
+
+    bounds: Bounds
+
+    @abstractmethod
+    def quantity(self, values: ConstraintValues) -> Array:
+        """The quantity, with one column for each range."""
+
+    def weight(self, values: ConstraintValues) -> float:
+        """Weight of one row of the quantity in the barrier."""
+        return values.weight
+
+    @property
+    def quantities_between_bounds(self) -> Self:
+        """See `Constraint.quantities_between_bounds`."""
+        return self
+
+    def tightened(self, fractions: Mapping[str, float]) -> Self:
+        """Narrow the ranges by the fraction of their half-width for this kind."""
+        return replace(self, bounds=self.bounds.tightened(fractions.get(self.kind, 0.0)))
+
+    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
+        """See `Constraint.margins`."""
+        yield KindMargins(self.kind, self.bounds.margin(self.quantity(values)), self.bounds.scale)
+
+    def barrier(self, values: ConstraintValues, delta: float) -> float:
+        """See `Constraint.barrier`."""
+        return self.bounds.barrier(self.quantity(values), delta, self.weight(values)).value
+
+    def slacks(self, values: ConstraintValues) -> Array:
+        """See `LimitedQuantities.slacks`."""
+        return self.bounds.slacks(self.quantity(values))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlConstraint(BoundedQuantity):
     """Ranges of the controls.
 
     Attributes:
         bounds: Range of each control, (nu,) [u-unit].
     """
 
-    bounds: Bounds
+    kind = "control"
 
-    @property
-    def quantities_between_bounds(self) -> ControlConstraint:
-        """See `Constraint.quantities_between_bounds`."""
-        return self
-
-    def tightened(self, fractions: Mapping[str, float]) -> ControlConstraint:
-        """Narrow the ranges by the fraction of their half-width for this kind."""
-        fraction = fractions.get("control", 0.0)
-        return replace(self, bounds=self.bounds.tightened(fraction))
+    def quantity(self, values: ConstraintValues) -> Array:
+        """(N, nu) controls [u-unit]."""
+        return values.trajectory.ctrl
 
     def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
         """See `LimitedQuantities.slack_changes`."""
         return self.bounds.slack_changes(step.v)
-
-    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
-        """See `Constraint.margins`."""
-        margins = self.bounds.margin(values.trajectory.ctrl)
-        yield KindMargins("control", margins, self.bounds.scale)
-
-    def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """See `Constraint.barrier`."""
-        return self.bounds.barrier(values.trajectory.ctrl, delta, values.weight).value
-
-    def slacks(self, values: ConstraintValues) -> Array:
-        """See `LimitedQuantities.slacks`."""
-        return self.bounds.slacks(values.trajectory.ctrl)
 
     def add_expansion(
         self,
@@ -390,7 +415,7 @@ class ControlConstraint:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ControlRateConstraint:
+class ControlRateConstraint(BoundedQuantity):
     """Ranges of the rates of the controls.
 
     A rate is the change of a control from one sample to the next over the time in which it is
@@ -405,21 +430,16 @@ class ControlRateConstraint:
         periodic: The control after the last sample is that of the first one.
     """
 
-    bounds: Bounds
+    kind = "control_rate"
+
     dt: float
     control_before: Array | None = None
     control_after: Array | None = None
     periodic: bool = False
 
-    @property
-    def quantities_between_bounds(self) -> ControlRateConstraint:
-        """See `Constraint.quantities_between_bounds`."""
-        return self
-
-    def tightened(self, fractions: Mapping[str, float]) -> ControlRateConstraint:
-        """Narrow the ranges by the fraction of their half-width for this kind."""
-        fraction = fractions.get("control_rate", 0.0)
-        return replace(self, bounds=self.bounds.tightened(fraction))
+    def quantity(self, values: ConstraintValues) -> Array:
+        """(N+1, nu) rates of the controls [u-unit / s]."""
+        return self.rates(values.trajectory.ctrl)
 
     def rates(self, ctrl: Array) -> Array:
         """Compute the rates of the control into each sample and out of the last one.
@@ -454,20 +474,6 @@ class ControlRateConstraint:
         after = None if self.control_after is None else unchanged
         return self.bounds.slack_changes(self._rates_between(step.v, before, after))
 
-    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
-        """See `Constraint.margins`."""
-        margins = self.bounds.margin(self.rates(values.trajectory.ctrl))
-        yield KindMargins("control_rate", margins, self.bounds.scale)
-
-    def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """See `Constraint.barrier`."""
-        rates = self.rates(values.trajectory.ctrl)
-        return self.bounds.barrier(rates, delta, values.weight).value
-
-    def slacks(self, values: ConstraintValues) -> Array:
-        """See `LimitedQuantities.slacks`."""
-        return self.bounds.slacks(self.rates(values.trajectory.ctrl))
-
     def add_expansion(
         self,
         values: ConstraintValues,
@@ -476,8 +482,7 @@ class ControlRateConstraint:
         factors: Array | None = None,
     ) -> None:
         """See `LimitedQuantities.add_expansion`."""
-        rates = self.rates(values.trajectory.ctrl)
-        barrier = self.bounds.barrier(rates, delta, values.weight, factors)
+        barrier = self.bounds.barrier(self.quantity(values), delta, values.weight, factors)
         slope = barrier.slope / self.dt
 
         # A control raises the rate into its sample and lowers the rate out of it.
@@ -499,7 +504,7 @@ class ControlRateConstraint:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EndStateConstraint:
+class EndStateConstraint(BoundedQuantity):
     """Tolerances of the final state about a target.
 
     Attributes:
@@ -509,15 +514,17 @@ class EndStateConstraint:
     """
 
     space: StateSpace
-    bounds: Bounds
     target: Array
 
-    @property
-    def quantities_between_bounds(self) -> EndStateConstraint:
-        """See `Constraint.quantities_between_bounds`."""
-        return self
+    def quantity(self, values: ConstraintValues) -> Array:
+        """(nx,) final state minus the target."""
+        return self.space.minus(values.trajectory.state[-1], self.target)
 
-    def tightened(self, fractions: Mapping[str, float]) -> EndStateConstraint:
+    def weight(self, values: ConstraintValues) -> float:
+        """Weight of the final state in the barrier."""
+        return END_WEIGHT
+
+    def tightened(self, fractions: Mapping[str, float]) -> Self:
         """Narrow the tolerances by a fraction of their half-width, by kind."""
         position = fractions.get("end_position", 0.0)
         velocity = fractions.get("end_velocity", 0.0)
@@ -528,26 +535,18 @@ class EndStateConstraint:
 
     def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
         """See `LimitedQuantities.slack_changes`."""
-        J = self.space.minus_derivative(self._difference(values))
+        J = self.space.minus_derivative(self.quantity(values))
         return self.bounds.slack_changes(J @ step.z[-1])
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
-        margins = self.bounds.margin(self._difference(values))
+        margins = self.bounds.margin(self.quantity(values))
         scale = self.bounds.scale
 
         nv = self.space.nv
         positions, velocities = slice(nv), slice(nv, 2 * nv)
         yield KindMargins("end_position", margins[positions], scale[positions])
         yield KindMargins("end_velocity", margins[velocities], scale[velocities])
-
-    def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """See `Constraint.barrier`."""
-        return self.bounds.barrier(self._difference(values), delta, END_WEIGHT).value
-
-    def slacks(self, values: ConstraintValues) -> Array:
-        """See `LimitedQuantities.slacks`."""
-        return self.bounds.slacks(self._difference(values))
 
     def add_expansion(
         self,
@@ -557,17 +556,13 @@ class EndStateConstraint:
         factors: Array | None = None,
     ) -> None:
         """See `LimitedQuantities.add_expansion`."""
-        difference = self._difference(values)
+        difference = self.quantity(values)
         barrier = self.bounds.barrier(difference, delta, END_WEIGHT, factors)
 
         # The difference of two rotations is not linear in the state, so that J is no identity.
         J = self.space.minus_derivative(difference)
         sums.a[-1] += J.T @ barrier.slope
         sums.weights.Q[-1] += J.T @ (barrier.curvature[:, None] * J)
-
-    def _difference(self, values: ConstraintValues) -> Array:
-        """(nx,) final state minus the target."""
-        return self.space.minus(values.trajectory.state[-1], self.target)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
