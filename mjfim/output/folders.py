@@ -25,7 +25,6 @@ from mjfim.output.plots.pictures import (
     fit_names,
     held_out_names,
     histogram_name,
-    picture_files,
     pictures_of,
 )
 from mjfim.output.report import REPORT
@@ -62,7 +61,7 @@ DESIGN_FILES = (
     *DESIGN_ARCHIVE,
     REPORT,
     "design.rrd",
-    *picture_files(DESIGN_PICTURES),
+    *map(PictureFormat.PNG.file_of, DESIGN_PICTURES),
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
@@ -97,7 +96,7 @@ def estimate_files(
     names = [name for name in ESTIMATE_PICTURES if not unwanted.get(name)]
     names += [*fit_names(recordings), *held_out_names(held_out)]
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
-    return (*data, *picture_files(names))
+    return (*data, *map(PictureFormat.PNG.file_of, names))
 
 
 def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
@@ -106,7 +105,7 @@ def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
     Args:
         parameters: Names of the parameters.
     """
-    histograms = picture_files(map(histogram_name, parameters))
+    histograms = (PictureFormat.PNG.file_of(histogram_name(name)) for name in parameters)
     return ("montecarlo.json", "montecarlo.npz", REPORT, "overview.png", *histograms)
 
 

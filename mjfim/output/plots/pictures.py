@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial, singledispatch
 from typing import TYPE_CHECKING
 
@@ -57,11 +57,6 @@ ESTIMATE_PICTURES = (
 
 # Functions that make the pictures of a record, by their names.
 Pictures = dict[str, Callable[[], Picture]]
-
-
-def picture_files(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the files of pictures; `PictureFormat.files` has those of another format than PNG."""
-    return tuple(f"{name}.png" for name in names)
 
 
 def fit_names(count: int) -> tuple[str, ...]:
