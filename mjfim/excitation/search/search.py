@@ -554,7 +554,7 @@ class Search:
             moves = [
                 replace(
                     self._move(each, _rungs_left(each, rungs), min(seconds, longest), is_last),
-                    may_continue=seconds > longest,
+                    may_continue=seconds > longest and each.iterations <= self._max_iterations,
                     plan=plan,
                 )
                 for each in waiting
