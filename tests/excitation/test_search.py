@@ -141,12 +141,13 @@ def test_the_barrier_alone_steers_a_control_inside(tmp_path: Path) -> None:
     values = ground.values(outside)
     assert values is not None
     assert not ground.constraints.is_feasible(values)
-    inside = ground.begin(outside, Budget())
-    assert inside is not None
-    values = ground.values(inside)
-    assert values is not None
-    margins = ground.constraints.relative_margins(values)
-    assert min(margins.values()) > -1.0
+    for strictly, least in ((False, -1.0), (True, 0.0)):
+        inside = ground.begin(outside, Budget(), strictly=strictly)
+        assert inside is not None
+        values = ground.values(inside)
+        assert values is not None
+        margins = ground.constraints.relative_margins(values)
+        assert min(margins.values()) > least
 
 
 def test_the_weights_of_the_barrier_fall_from_the_first_to_the_last() -> None:

@@ -54,9 +54,7 @@ def test_random_cases(kind: str) -> None:
 
 # Random problems with a feasible motion that is hard to find: about the holding control, with a
 # small share of the initial control, and by steering.
-# The search of today ends without it for the first one, which is to be mended.
-LOST = pytest.mark.xfail(reason="the search gives up after the stages of its barrier", strict=True)
-HIDDEN = (pytest.param(2, marks=LOST), 19, 62, 113, 472)
+HIDDEN = (2, 19, 62, 113, 472)
 
 
 @pytest.mark.slow

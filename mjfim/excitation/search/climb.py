@@ -95,6 +95,7 @@ class Candidate:
         best: (N, nu) control of lowest cost that was seen there; None where there is none yet.
         point: Its evaluation, where it is known.
         first_weight: Barrier weight with which the next rung begins; None for the usual one.
+        begins_inside: The next descent begins strictly inside the limits, even from near them.
         status: Status of the last descent; None where its time was over.
         slope: Slope of the cost at the last iterate.
         history: Iterates.
@@ -113,6 +114,7 @@ class Candidate:
     best: Array | None = None
     point: DesignPoint | None = None
     first_weight: float | None = None
+    begins_inside: bool = False
     status: Status | None = None
     slope: float = np.inf
     history: tuple[HistoryRow, ...] = ()
@@ -364,7 +366,9 @@ class Climb:
 
         The last stage is repeated within tighter limits while its result violates one.
         """
-        begin = ground.begin(self.candidate.control, self._budget)
+        begin = ground.begin(
+            self.candidate.control, self._budget, strictly=self.candidate.begins_inside
+        )
         if begin is None:
             return
         weights, direction = barrier.weights, ground.direction()

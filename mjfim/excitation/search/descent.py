@@ -274,7 +274,7 @@ class Ground:
 
     # ---- with a barrier
 
-    def begin(self, control: Array, budget: Budget) -> Array | None:
+    def begin(self, control: Array, budget: Budget, *, strictly: bool = False) -> Array | None:
         """Find a control of this level from which the barrier can start.
 
         A small violation is removed by the relaxed barrier itself. A larger one is scaled away,
@@ -283,12 +283,13 @@ class Ground:
         Args:
             control: (N, nu) control at the stated sample rate [u-unit].
             budget: Ends the search.
+            strictly: A small violation is removed before as well.
 
         Returns:
             The control; None where none inside was found.
         """
         fitted = self._fitted(self.task.averaged(control))
-        if self.is_near(fitted):
+        if not strictly and self.is_near(fitted):
             return fitted
 
         for centre in map(self._fitted, self.task.centres):

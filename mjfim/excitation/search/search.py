@@ -265,7 +265,33 @@ class Search:
             size = max(HALVING_RATE, workers)
             done += yield from self._climbed(waiting[:size], ladder)
             waiting = waiting[size:]
+        if all(each.best is None for each in done):
+            done[0] = yield from self._begun_inside(done[0], ladder[-1])
         return (yield from self._helped_by_chance(done, ladder))
+
+    def _begun_inside(
+        self, candidate: Candidate, rung: Rung
+    ) -> Generator[DesignEvent, None, Candidate]:
+        """Descend once more where nothing keeps the limits, from controls strictly inside.
+
+        These are what holds the start, and the control that the candidate has found; where they are
+        outside, the barrier alone steers them inside first.
+        """
+        task = self.grounds.stated.task
+        holding = [np.tile(centre, (task.samples, 1)) for centre in reversed(task.centres)]
+        for control in (*holding, candidate.over_horizon):
+            if self.budget.exhausted is not None or candidate.best is not None:
+                break
+            curves = candidate.curves if self.keeps_curves else None
+            begun = replace(candidate, control=control, curves=curves, repeats=1, history=())
+            begun = replace(begun, begins_inside=True, first_weight=None)
+            for moved in (yield from self._moved([begun], (rung,), is_last=True)):
+                rows = [
+                    replace(row, iteration=candidate.iterations + row.iteration)
+                    for row in moved.history
+                ]
+                candidate = replace(moved, history=extended(candidate.history, rows))
+        return candidate
 
     def _climbed(
         self, batch: list[Candidate], ladder: tuple[Rung, ...]
