@@ -373,7 +373,6 @@ def main() -> int:
     )
     parser.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="MJCF or URDF")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/newcomer"))
-    parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
     options = parser.parse_args()
 
     walks = []
@@ -386,7 +385,7 @@ def main() -> int:
         record = json.dumps([asdict(each) for each in walks], indent=2, ensure_ascii=False)
         (options.output / "newcomer.json").write_text(record + "\n", encoding="utf-8")
 
-    print(record if options.json else markdown(walks))
+    print(markdown(walks))
     return 0 if all(_is_done(each) for each in walks) else 1
 
 

@@ -1,23 +1,16 @@
 """Time and memory to read and fit an hour of two joints at 1 kHz by the command line.
 
     python -m scripts.benchmarks benchmark_hour [--hours 1.0] [--seed 0]
-    python -m scripts.benchmarks benchmark_hour --short
 
 The 3.6 million samples are written as CSV first. The times of reading and fitting stand beside
 the time that the engine needs to simulate all samples once on as many threads. The memory is the
-largest of the process. The limits are 70 seconds and 1 GiB on two cores. A second row has what was
-measured before the passes over much data were reduced.
-
-With `--short`, a recording of 4 s is fitted instead, by the Python interface and by the command
-line; the limit is 0.5 s after the start-up of the program.
+largest of the process. The limits are 70 seconds and 1 GiB on two cores.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -29,36 +22,17 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.signals import multisine
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
 from mjfim.parallel import cores
+from mjfim.recordings.read import read_recording
 from mjfim.records.trajectory import Recording
 from scripts.benchmarks.child import ROOT, CommandRun, run_command
 
 # Experiment of the two joints.
 EXPERIMENT = ROOT / "models" / "two_joint_arm.toml"
-
-# Experiment of the short recording.
-SHORT = ROOT / "models" / "cart_pendulum.toml"
-
-# An hour as it was measured on two cores before.
-BEFORE = ("before", "455 MB", "3.8 s", "166 s", "", "2.5 s", "67.9", "154 M (43)", "2.16 GiB", "")
-
-# Code of the process that reads the recording and prints the time that this takes.
-READ = """
-import sys, time
-from pathlib import Path
-import mjfim
-from mjfim.recordings.read import read_recording
-from mjfim.experiment.system import System
-system = System.resolve(mjfim.Experiment.from_file(sys.argv[1]))
-clock = time.perf_counter()
-read_recording(Path(sys.argv[2]), system.channels)
-print(time.perf_counter() - clock)
-"""
 
 
 @dataclass(frozen=True)
@@ -113,20 +87,8 @@ def played(system: System, seconds: float, seed: int) -> Recording:
     parts = [amplitude * multisine(minute, 2, 0.1, 30, rng) for _ in range(minutes)]
     ctrl = np.concatenate(parts)[: round(seconds * rate)]
 
-    # Simulate in pieces, to bound the memory.
-    theta = system.parameters.true
-    states = [system.plant.initial_state(theta)[None]]
-    for first in range(0, len(ctrl), 100_000):
-        model = [system.plant.model(theta)]
-        piece = ctrl[None, first : first + 100_000]
-        result = system.plant.simulator.rollout(model, states[-1][-1:], piece)
-        states.append(result.states[0, 1:])
-
-    y = system.plant.outputs(np.concatenate(states), None)
-    y += system.noise.sample(len(y), rng)
-    return Recording(
-        t=np.arange(len(y)) / rate, ctrl=ctrl, y=y, outputs=system.outputs.names, name="hour"
-    )
+    still = np.tile(system.plant.initial_state(system.parameters.true), (len(ctrl) + 1, 1))
+    return simulate_system(system, system.plant.trajectory(still, ctrl), rng)
 
 
 def bare(system: System, samples: int) -> float:
@@ -198,11 +160,12 @@ def measured(hours: float, seed: int) -> Hour:
         samples = write_hour(hours, seed, log)
         size = log.stat().st_size / 1e6
 
-        files = [str(EXPERIMENT), str(log)]
-        read = subprocess.check_output([sys.executable, "-c", READ, *files], cwd=ROOT, text=True)
+        system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
+        clock = time.perf_counter()
+        read_recording(log, system.channels)
+        read = time.perf_counter() - clock
         run, found = fit_hour(log, folder / "out")
 
-    system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
     true = system.parameters.true
     error = (np.array(found["theta"]) - true) / np.array(found["std"])
     low, high = np.array(found["interval"], dtype=float).T
@@ -210,7 +173,7 @@ def measured(hours: float, seed: int) -> Hour:
     return Hour(
         samples=samples,
         size=size,
-        read=float(read),
+        read=read,
         fitted=run.wall,
         cpu=run.processor,
         engine=bare(system, samples),
@@ -252,42 +215,6 @@ def hour_table(hour: Hour) -> Table:
         f"{hour.gigabytes:.2f} GiB",
         f"{hour.within} of {hour.parameters}, worst {hour.wrong:.1f} σ",
     )
-    table.add_row(*BEFORE)
-    return table
-
-
-def short_recording() -> tuple[mjfim.Experiment, Recording]:
-    """Simulate a recording of 4 s of the cart-pendulum; return its experiment as well."""
-    experiment = mjfim.Experiment.from_file(SHORT).replace(horizon=4.0)
-    task = DesignTask.resolve(experiment)
-    return experiment, simulate_system(task.system, task.initial, 0)
-
-
-def short_table() -> Table:
-    """Fit a recording of 4 s, and make a table of the times."""
-    experiment, recording = short_recording()
-    title = "a recording of 4 s, three parameters, 401 rows (limit: 0.5 s after the start-up)"
-    table = Table("", "wall", "CPU", "steps", title=title, title_justify="left")
-
-    # The first call imports libraries, which is a part of the start-up.
-    for call in ("first call of identify", "second call", "third call"):
-        clock, cpu = time.perf_counter(), time.process_time()
-        found = mjfim.identify(experiment, [recording], progress=False)
-        wall, cpu = time.perf_counter() - clock, time.process_time() - cpu
-        table.add_row(call, f"{wall:.2f} s", f"{cpu:.2f} s", f"{found.steps:,}")
-
-    with tempfile.TemporaryDirectory() as name:
-        log = Path(name) / "short.csv"
-        write_recording(log, recording, System.resolve(experiment))
-        fit = ["identify", str(SHORT), str(log), "-o", str(Path(name) / "out")]
-        for label, words in (
-            ("mjfim --version", ["--version"]),
-            ("mjfim identify with all pictures", fit),
-        ):
-            run = run_command(words)
-            if run.code != 0:
-                raise SystemExit(run.messages)
-            table.add_row(label, f"{run.wall:.2f} s", f"{run.processor:.2f} s", "")
     return table
 
 
@@ -298,9 +225,5 @@ def main() -> None:
     )
     parser.add_argument("--hours", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--short", action="store_true", help="fit a recording of 4 s instead")
     args = parser.parse_args()
-    if args.short:
-        Console(width=100).print(short_table(), f"{cores()} cores")
-        return
     Console(width=160).print(hour_table(measured(args.hours, args.seed)), f"{cores()} cores")
