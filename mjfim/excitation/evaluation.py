@@ -10,8 +10,12 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, UnidentifiableError, first_ones, listed
 from mjfim.excitation.limits.limits import unsupported_ranges
-from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, Verification, verify
-from mjfim.excitation.limits.violations import all_violations_of
+from mjfim.excitation.limits.verification import (
+    SAME_STATE_TOLERANCE,
+    Verification,
+    all_violations_of,
+    verify,
+)
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask

@@ -12,14 +12,15 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.holding_control import holding_control, least_drift_control
 from mjfim.excitation.limits.limits import Limit, limits_of
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task_parts import (
     ParameterSamples,
     contrast_of,
+    holding_control,
     information_of,
+    least_drift_control,
     parameter_samples_of,
     require_bounded_controls,
     require_design_keys,

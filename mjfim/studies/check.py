@@ -21,8 +21,7 @@ from mjfim.excitation.evaluation import (
     require_evaluated,
 )
 from mjfim.excitation.initial_controls import initial_controls_of
-from mjfim.excitation.limits.verification import require_feasible_start
-from mjfim.excitation.limits.violations import all_violations_of
+from mjfim.excitation.limits.verification import all_violations_of, require_feasible_start
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.levels import require_coarse_factor

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.excitation.holding_control import holding_control, least_drift_control
+from mjfim.excitation.task_parts import holding_control, least_drift_control
 from tests.support.numerics import make_task
 from tests.support.stiff_servos import START, stiff_arm_task
 

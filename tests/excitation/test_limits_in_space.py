@@ -16,8 +16,7 @@ from mjfim.excitation.evaluation import open_boundary_warnings
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import limits_of
 from mjfim.excitation.limits.magnitudes import Magnitude, VectorBarrier
-from mjfim.excitation.limits.verification import require_feasible_start, verify
-from mjfim.excitation.limits.violations import violations_of
+from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.task_tables import Limits

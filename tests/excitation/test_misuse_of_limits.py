@@ -13,9 +13,9 @@ import pytest
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.holding_control import holding_control
 from mjfim.excitation.limits.limits import limits_of, unsupported_ranges
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import holding_control
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import Limits

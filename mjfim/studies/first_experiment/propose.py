@@ -13,8 +13,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDivergedError
-from mjfim.excitation.limits.verification import verify
-from mjfim.excitation.limits.violations import violations_of
+from mjfim.excitation.limits.verification import verify, violations_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
