@@ -34,8 +34,7 @@ from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
 from mjfim.parallel import require_threads
 from mjfim.plant.batch import state_space
-from mjfim.plant.noise import Noise
-from mjfim.plant.outputs import Outputs
+from mjfim.plant.outputs import Noise, Outputs
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.recordings.channels import Channels

@@ -36,7 +36,7 @@ from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel.budget import Budget
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Recording
 
 T = TypeVar("T")

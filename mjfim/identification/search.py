@@ -23,7 +23,7 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.parallel.budget import Budget, StopReason
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.events import FitEvent, begin_stage
 
 # Settings of the paper's Newton-Raphson iteration.

@@ -24,8 +24,7 @@ from mjfim.information.null_space import NullSpace
 from mjfim.model.parameter_ranges import make_physical
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
-from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
-from mjfim.plant.dynamics import UNSTABLE_LOOP
+from mjfim.plant.dynamics import NO_WARNING, UNSTABLE_LOOP, explain_divergence, find_divergence
 from mjfim.records.events import begin_stage
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.trajectory import Recording

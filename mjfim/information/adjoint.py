@@ -20,7 +20,7 @@ from mjfim.information.criteria import Criterion
 from mjfim.optimize.eigenvalue_model import EigenvalueModel, divided_log_differences
 from mjfim.optimize.lq import LinearRecursion
 from mjfim.plant.mixed_derivatives import Bilinear
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 
 

@@ -35,7 +35,7 @@ from mjfim.information.criteria import (
 from mjfim.information.marginal import PSEUDO_INVERSE_CUTOFF, standard_deviations
 from mjfim.optimize.eigenvalue_model import EigenvalueModel
 from mjfim.plant.mixed_derivatives import Bilinear
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 
 # A unit vector lies within the identifiable combinations if the squared length of its part outside

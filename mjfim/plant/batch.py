@@ -18,7 +18,7 @@ from mujoco.batch import Batch
 from mjfim.arrays import Array
 from mjfim.model.loading import silence_mujoco_log
 from mjfim.parallel import cores
-from mjfim.plant.laws.running_law import InputContext, LoopTrace
+from mjfim.plant.running_law import InputContext, LoopTrace
 from mjfim.plant.state_space import StateSpace
 
 # Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,

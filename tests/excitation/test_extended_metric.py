@@ -13,7 +13,7 @@ from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, Bilinear
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import Array, Loop, body_task, cart_task, relative_error
 

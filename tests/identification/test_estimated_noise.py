@@ -18,7 +18,7 @@ from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget, StopToken
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.events import FitEvent
 from tests.support.paths import MODELS
 

@@ -17,7 +17,7 @@ from mjfim.identification.identify import identify_system
 from mjfim.information.criteria import CRITERIA
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.marginal import standard_deviations
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error, richardson
 
