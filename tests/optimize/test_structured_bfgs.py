@@ -373,7 +373,7 @@ def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Pat
     """Its slope agrees with differences of simulated trials."""
     from mjfim.excitation.limits.constraints import constraint_set_of
     from mjfim.excitation.search.interior_problem import InteriorProblem
-    from mjfim.experiment.signals import spline_basis
+    from mjfim.experiment.initial import spline_basis
 
     task = cart_task(
         tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}

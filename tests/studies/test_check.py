@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.fisher import FisherInformation
 from mjfim.plant.plant import Derivatives

@@ -23,7 +23,7 @@ from mjfim.excitation.search.inside import largest_share
 from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProblem, values_of
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.signals import independent_curves
+from mjfim.experiment.initial import independent_curves
 from mjfim.information.criteria import Criterion
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
