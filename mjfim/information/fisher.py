@@ -36,7 +36,7 @@ from mjfim.information.criteria import (
     smooth_e_optimality,
     standard_deviations,
 )
-from mjfim.optimize.eigenvalue_model import EigenvalueModel, divided_log_differences
+from mjfim.optimize.cost_models import EigenvalueModel, divided_log_differences
 from mjfim.optimize.lq import LinearRecursion
 from mjfim.plant.mixed_derivatives import Bilinear
 from mjfim.plant.outputs import Noise

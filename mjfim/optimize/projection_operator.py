@@ -13,8 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.optimize.barrier import BarrierExpansion
-from mjfim.optimize.eigenvalue_model import EigenvalueModel
+from mjfim.optimize.cost_models import BarrierExpansion, EigenvalueModel
 from mjfim.optimize.lq import (
     CurveCoordinates,
     TangentCurve,

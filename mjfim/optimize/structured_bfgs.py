@@ -14,7 +14,12 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.optimize.barrier import BarrierExpansion
+from mjfim.optimize.cost_models import BarrierExpansion
+from mjfim.optimize.directions import (
+    CurvaturePair,
+    convex_pairs,
+    inverse_hessian_product,
+)
 from mjfim.optimize.lq import (
     CurveCoordinates,
     RiccatiSolution,
@@ -23,11 +28,6 @@ from mjfim.optimize.lq import (
     products_at_samples,
 )
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.optimize.quasi_newton import (
-    CurvaturePair,
-    convex_pairs,
-    inverse_hessian_product,
-)
 
 # Smallest curvature of a pair that is used, relative to the norms of the step and of the change of
 # the gradient.

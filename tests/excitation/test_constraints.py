@@ -14,7 +14,7 @@ from mjfim.excitation.limits.constraint_kinds import END_WEIGHT, ConstraintValue
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
-from mjfim.optimize.barrier import Bounds
+from mjfim.optimize.cost_models import Bounds
 from mjfim.optimize.lq import TangentCurve
 from tests.support.limits import ARM, barrier_check, directions_of, floating_task
 from tests.support.numerics import Array, make_task, relative_error

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mjfim.optimize.condensed_least_squares import Condensed, Step
+from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step
 from mjfim.optimize.levenberg_marquardt import (
     ABSOLUTE_STAGNATION,
     IterationReport,
@@ -24,7 +24,6 @@ from mjfim.optimize.levenberg_marquardt import (
     _Search,
     minimise,
 )
-from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel.budget import Budget, StopToken
 from tests.support.numerics import Array
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.optimize.quasi_newton import CurvaturePair, convex_pairs, inverse_hessian_product
+from mjfim.optimize.directions import CurvaturePair, convex_pairs, inverse_hessian_product
 from tests.support.lq import positive
 
 SHAPE = (3, 2)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from mjfim.optimize.barrier import BarrierExpansion, Bounds
+from mjfim.optimize.cost_models import BarrierExpansion, Bounds
 from mjfim.optimize.lq import CurveCoordinates, LinearRecursion, TangentCurve, Weights
 from mjfim.optimize.projection_operator import Armijo, Expansion, Regulator, optimize
 from mjfim.optimize.structured_bfgs import BasisMetric, CurveMetric, StructuredBFGS

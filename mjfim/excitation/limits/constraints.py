@@ -34,7 +34,7 @@ from mjfim.model.limited_elements import (
     turn_weights,
 )
 from mjfim.model.sizes import model_length
-from mjfim.optimize.barrier import (
+from mjfim.optimize.cost_models import (
     BarrierExpansion,
     Bounds,
     CurvatureAlong,

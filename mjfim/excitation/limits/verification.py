@@ -22,7 +22,7 @@ from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
 from mjfim.model.variants import unconstrained
-from mjfim.optimize.barrier import Bounds
+from mjfim.optimize.cost_models import Bounds
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
 from mjfim.records.trajectory import Trajectory
