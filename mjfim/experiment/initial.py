@@ -17,7 +17,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import by_name
 from mjfim.experiment.system_tables import Initial, Signal
 from mjfim.model.coordinates import joint_dofs, joint_names
-from mjfim.model.terms.extension import StateLayout
+from mjfim.model.terms.term import StateLayout
 
 # Degree of the splines.
 SPLINE_DEGREE = 3

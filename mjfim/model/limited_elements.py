@@ -11,14 +11,14 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import ROTATION_VECTOR, TRANSLATION, actuator_names, joint_names
-from mjfim.model.elements import unique_names
-from mjfim.model.sizes import (
+from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
     actuator_force_sizes,
     control_sizes,
     force_sizes,
     model_length,
     position_sizes,
+    unique_names,
 )
 from mjfim.model.units import (
     ANGLE,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.model.sizes import (
+from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
     bristle_sizes,
     control_sizes,

@@ -23,9 +23,8 @@ from mjfim.excitation.limits.constraint_kinds import (
 )
 from mjfim.excitation.limits.limits import Limit, derivative_substeps_of, has_constant_forces
 from mjfim.excitation.task import DesignTask
-from mjfim.model.clearance.geom_distance import GeomDistances
-from mjfim.model.clearance.pair_distance import find_geom_pairs
-from mjfim.model.elements import is_rk4
+from mjfim.model.clearance import GeomDistances, find_geom_pairs
+from mjfim.model.elements import is_rk4, model_length
 from mjfim.model.limited_elements import (
     actuators_of_tendon,
     quaternion_address,
@@ -33,7 +32,6 @@ from mjfim.model.limited_elements import (
     tilt_weights,
     turn_weights,
 )
-from mjfim.model.sizes import model_length
 from mjfim.optimize.cost_models import (
     BarrierExpansion,
     Bounds,
