@@ -182,22 +182,6 @@ class Condensed:
         rows = np.concatenate([remaining, R[:, n:, n:]], axis=1)
         return np.asarray(rows.reshape(-1, rows.shape[2]))
 
-    def gradients_after(self, common: Array) -> Array:
-        """Gradient of every segment after a step of the common unknowns, by the linearisation.
-
-        The private unknowns follow at their optimum.
-
-        Args:
-            common: (c,) step of the common unknowns.
-
-        Returns:
-            (P, c) gradients of half of the squares of each segment, without the `common_rows`.
-        """
-        rows = self.reduced_rows()
-        J, residual = rows[:, :-1], rows[:, :-1] @ common + rows[:, -1]
-        each = (J * residual[:, None]).reshape(self.segment_count, -1, J.shape[1])
-        return np.asarray(each.sum(axis=1))
-
     def after(self, step: Step) -> Condensed:
         """The linearised residuals at the end of a step.
 
@@ -349,19 +333,6 @@ class Condensed:
         weight = np.sqrt(damping) * scale
         R = self._damped_triangles(weight[:n], scale[:n])
         return self._evaluated(common, self._substituted(R, common))
-
-    def private_step(self, common: Array) -> Array:
-        """Step of the private unknowns to their minimum, for a given step of the common ones.
-
-        Args:
-            common: (c,) step of the common unknowns.
-
-        Returns:
-            (P, n) steps.
-        """
-        n = self.private_count
-        R = self._damped_triangles(np.zeros(n), self.column_norms[:n])
-        return self._substituted(R, common)
 
     def _damped_triangles(self, weight: Array, scale: Array) -> Array:
         """(P, m, m) triangles of all rows of each segment and of the damping of private unknowns.

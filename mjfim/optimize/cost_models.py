@@ -269,32 +269,23 @@ class Bounds:
         return BarrierDerivatives(value=value, slope=slope, curvature=curvature)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CurvatureAlong:
-    """Curvature of the barrier along a step.
-
-    Attributes:
-        weights: The Gauss-Newton Hessian with this curvature, as a quadratic form on tangent
-            curves.
-        factors: Factors of the curvature at the beginning of the step, by kind of limit.
-        growth: Largest ratio of a factor to that in the model that led to the step; at least 1.
-    """
-
-    weights: Weights
-    factors: tuple[Array, ...]
-    growth: float
-
-
 class StepCurvature(Protocol):
     """The barrier about a trajectory, from which its curvature along steps follows."""
 
-    def along(self, step: TangentCurve, factors: Sequence[Array] | None) -> CurvatureAlong:
+    def along(
+        self, step: TangentCurve, factors: Sequence[Array] | None
+    ) -> tuple[Weights, tuple[Array, ...], float]:
         """Curvature along the minimum of a quadratic model, see `curvature_factors`.
 
         Args:
             step: The minimum of the model.
             factors: Factors of the curvature in this model, by kind of limit; None where it has
                 the curvature at the beginning of the step.
+
+        Returns:
+            The Gauss-Newton Hessian with this curvature, as a quadratic form on tangent curves;
+            factors of the curvature at the beginning of the step, by kind of limit; largest ratio
+            of a factor to that in the model that led to the step, at least 1.
         """
         ...
 

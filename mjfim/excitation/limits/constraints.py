@@ -35,11 +35,10 @@ from mjfim.model.limited_elements import (
 from mjfim.optimize.cost_models import (
     BarrierExpansion,
     Bounds,
-    CurvatureAlong,
     StepCurvature,
     curvature_factors,
 )
-from mjfim.optimize.lq import TangentCurve
+from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
 
@@ -149,7 +148,9 @@ class CurvatureOfLimits(StepCurvature):
     nu: int
     mu: float = 1.0
 
-    def along(self, step: TangentCurve, factors: Sequence[Array] | None) -> CurvatureAlong:
+    def along(
+        self, step: TangentCurve, factors: Sequence[Array] | None
+    ) -> tuple[Weights, tuple[Array, ...], float]:
         """See `StepCurvature.along`."""
         found: list[Array] = []
         growth = 1.0
@@ -161,9 +162,7 @@ class CurvatureOfLimits(StepCurvature):
             growth = max(growth, float((new / old).max(initial=1.0)))
             found.append(new)
 
-        return CurvatureAlong(
-            weights=self.sums(found).weights.scaled(self.mu), factors=tuple(found), growth=growth
-        )
+        return self.sums(found).weights.scaled(self.mu), tuple(found), growth
 
     def sums(self, factors: Sequence[Array] | None = None) -> ExpansionSums:
         """Gradient and Gauss-Newton Hessian of the barrier, without its weight.
