@@ -130,7 +130,7 @@ def _wave_derivatives(t: Array, omega: Array, order: int) -> Array:
     """
     angle = np.outer(t, omega) + 0.5 * np.pi * order
     waves = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
-    return np.asarray(waves * np.tile(omega**order, 2))
+    return waves * np.tile(omega**order, 2)
 
 
 def _power_derivatives(t: Array, horizon: float, powers: np.ndarray, order: int) -> Array:
@@ -218,7 +218,7 @@ def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> A
     if signal.offset is not None:
         offset = by_name("initial.control.offset", signal.offset, names, "actuator")
 
-    return np.asarray(offset + amplitude * _shape(signal, t, len(names)))
+    return offset + amplitude * _shape(signal, t, len(names))
 
 
 def _shape(signal: Signal, t: Array, nu: int) -> Array:
@@ -226,7 +226,7 @@ def _shape(signal: Signal, t: Array, nu: int) -> Array:
     spread = 1.0 + FREQUENCY_SPREAD * np.arange(nu)
 
     if signal.kind == "sine":
-        return np.asarray(np.sin(2 * np.pi * signal.frequency * t[:, None] * spread))
+        return np.sin(2 * np.pi * signal.frequency * t[:, None] * spread)
 
     if signal.kind == "chirp":
         first = signal.frequency

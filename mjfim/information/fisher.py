@@ -292,7 +292,7 @@ class FisherInformation:
             (p, p) sum over the measured samples and the prior [1 / (theta_i theta_j unit)].
         """
         flat = self.noise.whitened_rows(sensitivity.G)
-        return np.asarray(flat.T @ flat + self.prior)
+        return flat.T @ flat + self.prior
 
     def accumulated_eigenvalue(self, sensitivity: Sensitivity) -> Array:
         """(N+1,) smallest eigenvalue of R from the information up to each sample."""
@@ -305,7 +305,7 @@ class FisherInformation:
 
     def scaled(self, information: Array) -> Array:
         """I~ = S I S / f_m of information I: (..., p, p)."""
-        return np.asarray(information * np.outer(self.scale, self.scale) / self.measure_rate)
+        return information * np.outer(self.scale, self.scale) / self.measure_rate
 
     def reduced(self, information: Array) -> tuple[Array, Array]:
         """Reduce an information matrix to the part that the criterion uses.
@@ -521,7 +521,7 @@ class FisherInformation:
         projector = np.eye(len(information))
         projector[np.ix_(t, t)] = self.basis @ self.basis.T
         unscaled = projector / self.scale[:, None] * self.scale
-        return np.asarray(unscaled @ information @ unscaled.T)
+        return unscaled @ information @ unscaled.T
 
     def _basis_with_prior(self, basis: Array) -> Array:
         """(t, s') identifiable combinations and those that only the stated priors determine."""

@@ -245,7 +245,7 @@ def _complement(directions: Array) -> Array:
         return np.eye(t)
 
     Q = np.linalg.qr(directions, mode="complete")[0]
-    return np.asarray(Q[:, k:])
+    return Q[:, k:]
 
 
 def _independent(directions: Array) -> Array:
@@ -253,7 +253,7 @@ def _independent(directions: Array) -> Array:
     U, sizes, _ = np.linalg.svd(directions, full_matrices=False)
     largest = max(sizes.max(initial=0.0), SMALLEST_NORM)
     kept = sizes > DEPENDENT * largest
-    return np.asarray(U[:, kept])
+    return U[:, kept]
 
 
 def _range(A: Array) -> Array:
@@ -264,7 +264,7 @@ def _range(A: Array) -> Array:
 
     U, sizes, _ = np.linalg.svd(unit, full_matrices=False)
     kept = sizes > ZERO_SINGULAR_VALUES[0]
-    return np.asarray(U[:, kept])
+    return U[:, kept]
 
 
 def parameter_groups(

@@ -256,7 +256,7 @@ class PairDistances:
             normals[i] = (segment[3:] - segment[:3]) * (-1.0 if distance < 0.0 else 1.0)
 
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.asarray(normals / np.where(length > 0.0, length, 1.0))
+        return normals / np.where(length > 0.0, length, 1.0)
 
 
 def _farthest_points(kind: int, size: Array, direction: Array) -> Array:

@@ -233,7 +233,7 @@ def force_sizes(model: Any, time: float) -> Array:
     """
     weight = np.asarray(model.dof_invweight0)
     inertia = 1.0 / np.where(weight > 0.0, weight, 1.0)
-    return np.asarray(inertia * position_sizes(model) / time**2)
+    return inertia * position_sizes(model) / time**2
 
 
 def actuator_force_sizes(model: Any, time: float) -> Array:

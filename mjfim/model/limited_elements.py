@@ -381,7 +381,7 @@ def tilt_weights(model: Any, joint: int) -> Array:
     rotation = data.xmat[int(model.jnt_bodyid[joint])].reshape(3, 3)
     up = rotation.T @ upward(model)
     _, _, directions = np.linalg.svd(up[None])
-    return np.asarray(directions[1:] @ turn_weights(model, joint))
+    return directions[1:] @ turn_weights(model, joint)
 
 
 def quaternion_joints(model: Any) -> list[int]:

@@ -263,7 +263,7 @@ class ParameterSet:
     @property
     def prior_information(self) -> Array:
         """(p, p) information of the stated priors and of an earlier estimate [1/theta^2]."""
-        return np.asarray(self.prior_rows.T @ self.prior_rows)
+        return self.prior_rows.T @ self.prior_rows
 
     @property
     def prior_rows(self) -> Array:
@@ -620,7 +620,7 @@ def _values(parameter: Parameter, value: float, quantiles: Array) -> Array:
     """Values of a parameter (n,) at quantiles (n,) of its distribution about a value."""
     low, high = parameter.bounds
     if parameter.prior is None:
-        return np.asarray(low + (high - low) * quantiles)
+        return low + (high - low) * quantiles
 
     # A parameter whose magnitude is that of its guess is a scalar, which keeps its sign.
     is_scalar = parameter.size == abs(parameter.guess)

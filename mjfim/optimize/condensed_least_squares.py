@@ -146,7 +146,7 @@ class Condensed:
         """(P, n, c) derivative of the optimal private unknowns by the common unknowns."""
         n = self.private_count
         coupling = self.triangles[:, :n, n:-1]
-        return np.asarray(-self._private_inverse @ coupling)
+        return -self._private_inverse @ coupling
 
     @cached_property
     def _private_inverse(self) -> Array:
@@ -159,7 +159,7 @@ class Condensed:
         scaled = self.triangles[:, :n, :n] / norms
 
         inverse = np.linalg.pinv(scaled, rcond=PRIVATE_RANK_TOLERANCE)
-        return np.asarray(inverse / norms[:, None])
+        return inverse / norms[:, None]
 
     def reduced_rows(self) -> Array:
         """Rows of the common unknowns after elimination of the private ones.
@@ -170,7 +170,7 @@ class Condensed:
         R = self.triangles
         n = self.private_count
         if not n:
-            return np.asarray(R.reshape(-1, R.shape[2]))
+            return R.reshape(-1, R.shape[2])
 
         # Where a segment has no full rank, the best private unknowns do not cancel these rows.
         private = R[:, :n, :n]
@@ -180,7 +180,7 @@ class Condensed:
         remaining = np.concatenate([remaining_jacobian, remaining_residual], axis=2)
 
         rows = np.concatenate([remaining, R[:, n:, n:]], axis=1)
-        return np.asarray(rows.reshape(-1, rows.shape[2]))
+        return rows.reshape(-1, rows.shape[2])
 
     def after(self, step: Step) -> Condensed:
         """The linearised residuals at the end of a step.
@@ -265,7 +265,7 @@ class Condensed:
         if with_common_rows:
             J = np.concatenate([J, self.common_rows[:, :-1]])
 
-        return np.asarray(J.T @ J)
+        return J.T @ J
 
     @cached_property
     def column_norms(self) -> Array:
@@ -409,7 +409,7 @@ class Condensed:
         """
         J, r = self._reduced_blocks
         gradient = np.swapaxes(J, 1, 2) @ r
-        return np.asarray(gradient[..., 0])
+        return gradient[..., 0]
 
     @cached_property
     def block_information(self) -> Array:
@@ -418,7 +418,7 @@ class Condensed:
         The private unknowns follow the common ones at their optimum.
         """
         J, _ = self._reduced_blocks
-        return np.asarray(np.swapaxes(J, 1, 2) @ J)
+        return np.swapaxes(J, 1, 2) @ J
 
     @property
     def true_deviation(self) -> float:
@@ -614,10 +614,10 @@ class RobustLoss:
         """
         z = (r / self.scale) ** 2
         if self.kind == "huber":
-            return np.asarray(np.minimum(1.0, np.maximum(z, SMALLEST_SQUARE) ** -0.25))
+            return np.minimum(1.0, np.maximum(z, SMALLEST_SQUARE) ** -0.25)
         if self.kind == "soft_l1":
-            return np.asarray((1.0 + z) ** -0.25)
+            return (1.0 + z) ** -0.25
         if self.kind == "cauchy":
-            return np.asarray((1.0 + z) ** -0.5)
+            return (1.0 + z) ** -0.5
 
         return np.ones_like(r)

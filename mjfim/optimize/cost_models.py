@@ -195,7 +195,7 @@ class Bounds:
         Returns:
             (..., w) distances [unit of each number], negative outside, infinite without a bound.
         """
-        return np.asarray(np.minimum(r - self.lower, self.upper - r))
+        return np.minimum(r - self.lower, self.upper - r)
 
     def relative_position(self, r: Array) -> Array:
         """Position of each number in its range.
@@ -210,7 +210,7 @@ class Bounds:
         from_lower = (r - self.lower) / self.scale - 1.0
 
         one_sided = np.where(np.isfinite(self.lower), from_lower, 0.0)
-        return np.asarray(np.where(np.isfinite(self.upper), from_upper, one_sided))
+        return np.where(np.isfinite(self.upper), from_upper, one_sided)
 
     def slacks(self, r: Array) -> Array:
         """Relative distances to both bounds.
@@ -601,7 +601,7 @@ def symmetric_matrix(d: Array, r: int) -> Array:
     Returns:
         (r, r) matrix.
     """
-    return np.asarray((d @ symmetric_units(r).reshape(-1, r * r)).reshape(r, r))
+    return (d @ symmetric_units(r).reshape(-1, r * r)).reshape(r, r)
 
 
 def symmetric_coordinates(full: Array) -> Array:
@@ -615,7 +615,7 @@ def symmetric_coordinates(full: Array) -> Array:
         row.
     """
     r = len(full)
-    return np.asarray(symmetric_units(r).reshape(-1, r * r) @ full.reshape(r * r))
+    return symmetric_units(r).reshape(-1, r * r) @ full.reshape(r * r)
 
 
 def divided_log_differences(values: Array) -> Array:

@@ -190,7 +190,7 @@ class BasisMetric:
         Returns:
             (M, nu) product, or (m, M, nu).
         """
-        return np.asarray((s.reshape(-1, len(self.H)) @ self.H).reshape(s.shape))
+        return (s.reshape(-1, len(self.H)) @ self.H).reshape(s.shape)
 
     def solve(self, g: Array) -> Array:
         """Product of the inverse of the matrix with a vector.
@@ -278,7 +278,7 @@ class _LocalModel:
 
         d = np.tensordot(self.eigenvalue_slopes, s, axes=s.ndim)
         change = model.gradient(d) - model.gradient(np.zeros_like(d))
-        return np.asarray(np.tensordot(change, self.eigenvalue_slopes, axes=1))
+        return np.tensordot(change, self.eigenvalue_slopes, axes=1)
 
 
 @dataclass

@@ -598,9 +598,9 @@ class BatchSimulator:
 
         duration = engine_steps * timestep
         error = np.abs(time - START_TIME - duration)
-        return np.asarray(error < 0.5 * timestep)
+        return error < 0.5 * timestep
 
 
 def is_accepted(ctrl: Array) -> np.ndarray:
     """True for controls that MuJoCo applies unchanged."""
-    return np.asarray(np.abs(ctrl) <= MAX_CONTROL)
+    return np.abs(ctrl) <= MAX_CONTROL

@@ -304,7 +304,7 @@ class ClosedForm:
 
         def quotient(larger: Array, smaller: Array) -> Array:
             """Quotient by one parameter."""
-            return np.asarray((larger - smaller)[..., None] / distance)
+            return (larger - smaller)[..., None] / distance
 
         return ParameterChange(
             inertia=quotient(*inertias),

@@ -489,7 +489,7 @@ class EquationOfMotion:
         timestep = float(model.opt.timestep)
         if "qDeriv" in fields:
             D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind)
-            return np.asarray(-timestep * (D @ points.acceleration[..., None])[..., 0])
+            return -timestep * (D @ points.acceleration[..., None])[..., 0]
         if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
             return np.zeros_like(points.acceleration)
 
@@ -511,7 +511,7 @@ class EquationOfMotion:
             (n, nv) the signs of the velocities, and numbers between -1 and 1 near rest.
         """
         share = speed / np.maximum(self.friction_speeds, np.finfo(float).tiny)
-        return np.asarray(np.clip(share, -1.0, 1.0))
+        return np.clip(share, -1.0, 1.0)
 
     def _friction(self, model: Any, points: MotionPoints) -> Array:
         """(n, nv) forces of dry friction of joints and tendons."""
@@ -560,13 +560,13 @@ def activations(
     states[:, simulator.space.nq : simulator.space.nq + simulator.space.nv] = 0.0
     controls = np.repeat(ctrl[None], len(held), axis=0)
     found = simulator.rollout(held, states, controls)
-    return np.asarray(simulator.space.split(found.states)[2])
+    return simulator.space.split(found.states)[2]
 
 
 def _mass(model: Any, values: Array) -> Array:
     """(n, nv, nv) mass matrices from those that MuJoCo stores, which are lower triangles."""
     lower = _dense(values, model.M_rowadr, model.M_rownnz, model.M_colind)
-    return np.asarray(lower + np.swapaxes(np.tril(lower, -1), 1, 2))
+    return lower + np.swapaxes(np.tril(lower, -1), 1, 2)
 
 
 def _dense(values: Array, starts: Any, counts: Any, columns: Any) -> Array:

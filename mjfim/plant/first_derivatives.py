@@ -62,7 +62,7 @@ class ClosedFormDerivatives:
     @property
     def parameter_scale(self) -> Array:
         """(p,) magnitude of each parameter, to which its steps are relative [theta-unit]."""
-        return np.asarray(self.plant.parameters.magnitude * self._step_factors)
+        return self.plant.parameters.magnitude * self._step_factors
 
     def difference_sizes(self, trajectory: Trajectory) -> Array:
         """Magnitudes of state and control along a trajectory, to which steps are relative.
@@ -312,7 +312,7 @@ class MovedSamples:
         """(c, n, k) derivative by (x, u) from (m, n, k) values of the moved samples."""
         count = len(self.widths)
         difference = values[:count] - values[count:]
-        return np.asarray(difference / self.widths)
+        return difference / self.widths
 
     def observation_jacobian(self, change: Array) -> Array:
         """Derivative of observations by (x, u).

@@ -273,7 +273,7 @@ class Calibration:
         Returns:
             (..., ny) factors.
         """
-        return np.asarray(1.0 + theta @ self.scale.T)
+        return 1.0 + theta @ self.scale.T
 
     def measured(self, h: Array, theta: Array) -> Array:
         """Outputs with their errors.
@@ -285,7 +285,7 @@ class Calibration:
         Returns:
             (..., ny) outputs [y-unit].
         """
-        return np.asarray(self.factor(theta) * h + self.bias @ theta)
+        return self.factor(theta) * h + self.bias @ theta
 
     def scaled(self, derivative: Array, theta: Array) -> Array:
         """Derivatives of the outputs by states, controls or directions of theta.
@@ -299,7 +299,7 @@ class Calibration:
         """
         if not self.scales:
             return derivative
-        return np.asarray(self.factor(theta)[:, None] * derivative)
+        return self.factor(theta)[:, None] * derivative
 
     def by_theta(self, h: Array, derivative: Array, theta: Array) -> Array:
         """Derivatives of the outputs with their errors by theta.
@@ -346,7 +346,7 @@ class Noise:
     @cached_property
     def sigma(self) -> Array:
         """(ny,) standard deviations [y-unit]."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
     @cached_property
     def correlated(self) -> bool:
@@ -401,11 +401,11 @@ class Noise:
             (N+1, ny, ...) whitened values.
         """
         if not self.correlated:
-            return np.asarray(values / self.sigma.reshape(-1, *[1] * (values.ndim - 2)))
+            return values / self.sigma.reshape(-1, *[1] * (values.ndim - 2))
 
         rows = np.moveaxis(values, 1, 0)
         flat = scipy.linalg.solve_triangular(self.factor, rows.reshape(len(rows), -1), lower=True)
-        return np.asarray(np.moveaxis(flat.reshape(rows.shape), 0, 1))
+        return np.moveaxis(flat.reshape(rows.shape), 0, 1)
 
     def whitened_rows(self, values: Array) -> Array:
         """Whitened values of all measurements, one after the other.
@@ -416,7 +416,7 @@ class Noise:
         Returns:
             (n, ...) whitened values of the n measurements.
         """
-        return np.asarray(self.whiten(values)[self.measured(len(values) - 1) > 0])
+        return self.whiten(values)[self.measured(len(values) - 1) > 0]
 
     def whiten_present(self, values: Array, present: np.ndarray) -> Array:
         """Whitened values of the measurements that are present; missing ones are marginalised out.
@@ -455,7 +455,7 @@ class Noise:
         Returns:
             (count, ny) noise [y-unit].
         """
-        return np.asarray(rng.standard_normal((count, len(self.factor))) @ self.factor.T)
+        return rng.standard_normal((count, len(self.factor))) @ self.factor.T
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -106,7 +106,7 @@ def filter_shares(time_constant: Array, period: float) -> Array:
     """
     filtered = time_constant > 0.0
     ratio = period / np.where(filtered, time_constant, 1.0)
-    return np.asarray(np.where(filtered, -np.expm1(-ratio), 1.0))
+    return np.where(filtered, -np.expm1(-ratio), 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,7 +136,7 @@ class Ticks:
     def samples(self) -> Array:
         """(before + count,) times of all evaluations, in samples after the begin of a curve."""
         steps = self.period * np.arange(-self.before, self.count)
-        return np.asarray(steps / self.substeps)
+        return steps / self.substeps
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -272,7 +272,7 @@ class _Columns:
         # Share of the mean that lies in the following sample.
         widths = self.widths
         share = np.maximum((place - sample) + (widths - 1.0), 0.0) / widths
-        return np.asarray((1.0 - share) * values + share * following)
+        return (1.0 - share) * values + share * following
 
     def late(self, quantity: Quantity, latency: Array) -> Array | None:
         """(K, m, c) quantity at the ticks, late by (m, c) samples; None where no law reads it."""
@@ -296,7 +296,7 @@ class _Columns:
         sample = np.clip(np.floor(self.places), 0, last).astype(np.intp)
         values = self._values(quantity, np.broadcast_to(sample, (len(sample), *self._shape)))
         reads = np.array([quantity in law.columns for law in self.laws])
-        return np.asarray(np.where(reads, values, otherwise))
+        return np.where(reads, values, otherwise)
 
     @property
     def _shape(self) -> tuple[int, int]:
@@ -309,7 +309,7 @@ class _Columns:
         columns = np.array([law.columns.get(quantity, 0) for law in self.laws])
         reads = np.array([quantity in law.columns for law in self.laws])
         found = self.window[curves, sample, columns]
-        return np.asarray(np.where(reads, found, 0.0))
+        return np.where(reads, found, 0.0)
 
 
 def lead_time(numbers: LawNumbers, period: float) -> float:
@@ -363,7 +363,7 @@ def _with_differences(
         return velocity
 
     slopes = np.diff(reference, axis=0, prepend=reference[:1]) / period
-    return np.asarray(np.where(differs, slopes, 0.0 if velocity is None else velocity))
+    return np.where(differs, slopes, 0.0 if velocity is None else velocity)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -707,9 +707,9 @@ def _integral_at_begin(
         late = late * commands.gain[commands.before]
     integral = share * numbers.integral + numbers.ki * errors + late
     limited = _clipped(integral, -numbers.integral_limit, numbers.integral_limit)
-    return np.asarray(np.where(np.isnan(share), numbers.integral, limited))
+    return np.where(np.isnan(share), numbers.integral, limited)
 
 
 def _clipped(values: Array, low: Array, high: Array) -> Array:
     """Values inside ranges of the same shape."""
-    return np.asarray(np.minimum(np.maximum(values, low), high))
+    return np.minimum(np.maximum(values, low), high)

@@ -298,4 +298,4 @@ class StateSizes:
 def _shown(values: Array, natural: Array) -> Array:
     """(w,) largest magnitudes of values: (N, w); natural sizes where they are negligible."""
     largest = np.abs(values).max(axis=0, initial=0.0)
-    return np.asarray(np.where(largest > NEGLIGIBLE_CONTROL * natural, largest, natural))
+    return np.where(largest > NEGLIGIBLE_CONTROL * natural, largest, natural)
