@@ -47,130 +47,12 @@ from mjfim.records.trajectory import Sensitivity
 ROUND_OFF_SHARE = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _AdjointRay:
-    """One of the r terms v^r w_r' of V, and its costate.
-
-    Attributes:
-        measured: (N+1, ny) weights v of the measured outputs.
-        outputs: (N+1, ny) equivalent weights of the outputs before the delay.
-        costate: (N+1, nx) costate l of the adjoint recursion.
-    """
-
-    measured: Array
-    outputs: Array
-    costate: Array
+# One of the r terms v^r w_r' of V: (N+1, ny) weights v of the measured outputs, (N+1, ny)
+# equivalent weights of the outputs before the delay, and the (N+1, nx) costate l.
+_Ray = tuple[Array, Array, Array]
 
 
-def output_weights(
-    noise: Noise, measure_rate: float, criterion: Criterion, sensitivity: Sensitivity
-) -> Array:
-    """Weights v of the outputs, with `V_k = sum_r v^r_k w_r'`.
-
-    Args:
-        noise: Noise of the outputs.
-        measure_rate: Rate of the measurements [Hz].
-        criterion: The criterion with its r directions.
-        sensitivity: Sensitivities of the outputs to the parameters.
-
-    Returns:
-        (r, N+1, ny) weights, zero where nothing is measured.
-    """
-    measured = noise.measured(len(sensitivity.G) - 1)
-    scale = (2.0 * criterion.weights / measure_rate)[:, None, None]
-    Gw = np.einsum("kyp,rp->rky", sensitivity.G, criterion.directions)
-
-    if noise.correlated:
-        return np.asarray(scale * ((Gw * measured) @ noise.precision))
-    return np.asarray(scale * Gw / noise.sigma**2 * measured)
-
-
-def criterion_gradient(
-    weights: Array, criterion: Criterion, bilinear: Bilinear
-) -> tuple[Array, Array]:
-    """Gradient of the criterion; psi is eliminated by the adjoint.
-
-    Args:
-        weights: (r, N+1, ny) weights of the outputs, by `output_weights`.
-        criterion: The criterion with its r directions.
-        bilinear: Derivatives of the plant along these directions.
-
-    Returns:
-        (N+1, nx) derivative by the state and (N, nu) derivative by the control.
-    """
-    rays = _adjoint_rays(weights, bilinear)
-    terms = [_term(ray, r, criterion, bilinear) for r, ray in enumerate(rays)]
-    return _by_state_and_control(np.sum(terms, axis=0), bilinear)
-
-
-def eigenvalue_model(
-    weights: Array, criterion: Criterion, bilinear: Bilinear, cost: float
-) -> EigenvalueModel:
-    """Model of log J about a point of the smooth E-criterion.
-
-    It needs the derivatives that the gradient needs, too. With `V = 2 Sigma^-1 G w_i`, the change
-    of `w_i' I w_j` is half of the sum of two terms: the ray of w_i along w_j, and the ray of w_j
-    along w_i.
-
-    Args:
-        weights: (r, N+1, ny) weights of the outputs, by `output_weights`.
-        criterion: The smooth E-criterion with its r directions.
-        bilinear: Derivatives of the plant along these directions.
-        cost: J.
-
-    Returns:
-        The model of the r smallest eigenvalues.
-    """
-    rays = _adjoint_rays(weights / criterion.weights[:, None, None], bilinear)
-    r, nx = len(rays), bilinear.A.shape[1]
-    eigenvalues = criterion.eigenvalues[:r]
-    rotation = divided_log_differences(eigenvalues)
-
-    rows = []
-    for i in range(r):
-        for j in range(i, r):
-            change = _term(rays[i], j, criterion, bilinear)
-            if i != j:
-                change = (change + _term(rays[j], i, criterion, bilinear)) / np.sqrt(2.0)
-            rows.append(rotation[i, j] * change)
-
-    slopes = np.stack(rows)
-    return EigenvalueModel(
-        eigenvalues=eigenvalues,
-        power=criterion.power,
-        weight=criterion.value / cost,
-        a=slopes[..., :nx],
-        b=slopes[:, :-1, nx:],
-    )
-
-
-def partial_derivatives(
-    weights: Array, criterion: Criterion, full: Bilinear
-) -> tuple[Array, Array, Array]:
-    """Derivatives of the criterion if psi is a part of the state.
-
-    Args:
-        weights: (r, N+1, ny) weights of the outputs, by `output_weights`.
-        criterion: The criterion with its r directions.
-        full: Derivatives of the plant along the unit directions of theta.
-
-    Returns:
-        (N+1, nx, p) derivative by psi, (N+1, nx) by the state and (N, nu) by the control.
-    """
-    V = np.einsum("rky,rp->kyp", weights, criterion.directions)
-    outputs = V if full.output_delay is None else full.output_delay.apply_transposed(V)
-
-    direct = np.zeros((len(V), full.A.shape[1] + full.B.shape[2]))
-    if full.h_mixed is not None:
-        direct = np.einsum("pkzy,kyp->kz", full.h_mixed, outputs)
-    if full.output_delay is not None and full.delay_derivative is not None:
-        direct += _delay_term(full, V @ full.delay_derivative)
-
-    by_psi = np.einsum("kyx,kyp->kxp", full.C, outputs)
-    return by_psi, *_by_state_and_control(_with_held_control(direct, full), full)
-
-
-def _adjoint_rays(weights: Array, bilinear: Bilinear) -> list[_AdjointRay]:
+def _adjoint_rays(weights: Array, bilinear: Bilinear) -> list[_Ray]:
     """Rays for the (r, N+1, ny) weights of the outputs."""
     recursion = LinearRecursion(bilinear.A)
     delay = bilinear.output_delay
@@ -179,11 +61,11 @@ def _adjoint_rays(weights: Array, bilinear: Bilinear) -> list[_AdjointRay]:
     for v in weights:
         outputs = v if delay is None else delay.apply_transposed(v)
         costate = recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, outputs))
-        rays.append(_AdjointRay(measured=v, outputs=outputs, costate=costate))
+        rays.append((v, outputs, costate))
     return rays
 
 
-def _term(ray: _AdjointRay, direction: int, criterion: Criterion, bilinear: Bilinear) -> Array:
+def _term(ray: _Ray, direction: int, criterion: Criterion, bilinear: Bilinear) -> Array:
     """(N+1, nx+nu) derivative of `sum_k v_k' dG_k w` with respect to (x_k, u_k).
 
     Args:
@@ -192,14 +74,15 @@ def _term(ray: _AdjointRay, direction: int, criterion: Criterion, bilinear: Bili
         criterion: The criterion with its r directions.
         bilinear: Derivatives of the plant along these directions.
     """
-    term = np.zeros((len(ray.measured), bilinear.A.shape[1] + bilinear.B.shape[2]))
-    term[:-1] = np.einsum("kzx,kx->kz", bilinear.F_mixed[direction], ray.costate[1:])
+    measured, outputs, costate = ray
+    term = np.zeros((len(measured), bilinear.A.shape[1] + bilinear.B.shape[2]))
+    term[:-1] = np.einsum("kzx,kx->kz", bilinear.F_mixed[direction], costate[1:])
 
     if bilinear.h_mixed is not None:
-        term += np.einsum("kzy,ky->kz", bilinear.h_mixed[direction], ray.outputs)
+        term += np.einsum("kzy,ky->kz", bilinear.h_mixed[direction], outputs)
     if bilinear.output_delay is not None and bilinear.delay_derivative is not None:
         rate = float(bilinear.delay_derivative @ criterion.directions[direction])
-        term += _delay_term(bilinear, ray.measured * rate)
+        term += _delay_term(bilinear, measured * rate)
     return _with_held_control(term, bilinear)
 
 
@@ -383,13 +266,18 @@ class FisherInformation:
         Returns:
             (N+1, nx) derivative by the state and (N, nu) derivative by the control.
         """
-        weights = self._output_weights(criterion, sensitivity)
-        return criterion_gradient(weights, criterion, bilinear)
+        rays = _adjoint_rays(self._output_weights(criterion, sensitivity), bilinear)
+        terms = [_term(ray, r, criterion, bilinear) for r, ray in enumerate(rays)]
+        return _by_state_and_control(np.sum(terms, axis=0), bilinear)
 
     def eigenvalue_model(
         self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear, cost: float
     ) -> EigenvalueModel:
         """Model of log J about a point of the smooth E-criterion.
+
+        It needs the derivatives that the gradient needs, too. With `V = 2 Sigma^-1 G w_i`, the
+        change of `w_i' I w_j` is half of the sum of two terms: the ray of w_i along w_j, and the
+        ray of w_j along w_i.
 
         Args:
             criterion: The criterion with its r directions.
@@ -401,7 +289,27 @@ class FisherInformation:
             The model of the r smallest eigenvalues.
         """
         weights = self._output_weights(criterion, sensitivity)
-        return eigenvalue_model(weights, criterion, bilinear, cost)
+        rays = _adjoint_rays(weights / criterion.weights[:, None, None], bilinear)
+        r, nx = len(rays), bilinear.A.shape[1]
+        eigenvalues = criterion.eigenvalues[:r]
+        rotation = divided_log_differences(eigenvalues)
+
+        rows = []
+        for i in range(r):
+            for j in range(i, r):
+                change = _term(rays[i], j, criterion, bilinear)
+                if i != j:
+                    change = (change + _term(rays[j], i, criterion, bilinear)) / np.sqrt(2.0)
+                rows.append(rotation[i, j] * change)
+
+        slopes = np.stack(rows)
+        return EigenvalueModel(
+            eigenvalues=eigenvalues,
+            power=criterion.power,
+            weight=criterion.value / cost,
+            a=slopes[..., :nx],
+            b=slopes[:, :-1, nx:],
+        )
 
     def partial_derivatives(
         self, criterion: Criterion, sensitivity: Sensitivity, full: Bilinear
@@ -417,11 +325,31 @@ class FisherInformation:
             (N+1, nx, p) derivative by psi, (N+1, nx) by the state and (N, nu) by the control.
         """
         weights = self._output_weights(criterion, sensitivity)
-        return partial_derivatives(weights, criterion, full)
+        V = np.einsum("rky,rp->kyp", weights, criterion.directions)
+        outputs = V if full.output_delay is None else full.output_delay.apply_transposed(V)
+
+        direct = np.zeros((len(V), full.A.shape[1] + full.B.shape[2]))
+        if full.h_mixed is not None:
+            direct = np.einsum("pkzy,kyp->kz", full.h_mixed, outputs)
+        if full.output_delay is not None and full.delay_derivative is not None:
+            direct += _delay_term(full, V @ full.delay_derivative)
+
+        by_psi = np.einsum("kyx,kyp->kxp", full.C, outputs)
+        return by_psi, *_by_state_and_control(_with_held_control(direct, full), full)
 
     def _output_weights(self, criterion: Criterion, sensitivity: Sensitivity) -> Array:
-        """(r, N+1, ny) weights of the outputs in the derivative of the criterion."""
-        return output_weights(self.noise, self.measure_rate, criterion, sensitivity)
+        """(r, N+1, ny) weights v of the outputs, with `V_k = sum_r v^r_k w_r'`.
+
+        They are zero where nothing is measured.
+        """
+        noise = self.noise
+        measured = noise.measured(len(sensitivity.G) - 1)
+        scale = (2.0 * criterion.weights / self.measure_rate)[:, None, None]
+        Gw = np.einsum("kyp,rp->rky", sensitivity.G, criterion.directions)
+
+        if noise.correlated:
+            return np.asarray(scale * ((Gw * measured) @ noise.precision))
+        return np.asarray(scale * Gw / noise.sigma**2 * measured)
 
     # Standard deviations
 
