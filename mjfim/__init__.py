@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mjfim.excitation.evaluation import evaluate
     from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
     from mjfim.experiment.schema import Experiment
-    from mjfim.experiment.simulate import simulate
+    from mjfim.experiment.system import simulate
     from mjfim.identification.assessment.parameter_draws import draw_parameters
     from mjfim.identification.assessment.predictions import predict
     from mjfim.identification.identify import identify
@@ -104,7 +104,7 @@ MODULES = {
     "ShortestExperiment": "mjfim.excitation.shortest_horizon",
     "shortest_experiment": "mjfim.excitation.shortest_horizon",
     "Experiment": "mjfim.experiment.schema",
-    "simulate": "mjfim.experiment.simulate",
+    "simulate": "mjfim.experiment.system",
     "predict": "mjfim.identification.assessment.predictions",
     "identify": "mjfim.identification.identify",
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",

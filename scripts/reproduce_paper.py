@@ -21,7 +21,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.labels import labels_of_system
+from mjfim.experiment.system import labels_of_system
 from mjfim.files import write_json
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design

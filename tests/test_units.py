@@ -15,7 +15,7 @@ from mjfim.excitation.design import design
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate
+from mjfim.experiment.system import simulate
 from mjfim.identification.identify import identify
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording

@@ -171,7 +171,7 @@ class _Lab:
 
     def record(self, design: mjfim.Design, number: int, seed: int) -> mjfim.Recording:
         """Simulate the recording of a round, write it, and read it as --resume does."""
-        from mjfim.experiment.simulate import simulate_system
+        from mjfim.experiment.system import simulate_system
         from mjfim.output.archive import write_recording
         from mjfim.recordings.read import read_recording
 

@@ -29,8 +29,7 @@ def replay(
     force: Force = False,
 ) -> None:
     """Show a result in the Rerun viewer."""
-    from mjfim.experiment.labels import labels_of_system
-    from mjfim.experiment.system import System
+    from mjfim.experiment.system import System, labels_of_system
     from mjfim.output import archive
     from mjfim.output import rerun as rerun_log
     from mjfim.output.folders import find_experiment_file, find_rerun_file

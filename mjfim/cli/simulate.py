@@ -49,8 +49,7 @@ def simulate(
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys, stated_motion
     from mjfim.experiment.packing import input_files
-    from mjfim.experiment.simulate import simulate_system
-    from mjfim.experiment.system import System
+    from mjfim.experiment.system import System, simulate_system
     from mjfim.output import archive
 
     system = System.resolve(stated)

@@ -32,8 +32,8 @@ from mjfim.excitation.search.search import Search, candidate_of
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
+from mjfim.information.criteria import shared
 from mjfim.information.identifiability import Identifiability
-from mjfim.information.marginal import shared
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES

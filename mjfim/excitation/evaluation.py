@@ -19,11 +19,11 @@ from mjfim.excitation.limits.verification import (
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
+from mjfim.experiment.system import labels_of_system
+from mjfim.information.criteria import shared
 from mjfim.information.identifiability import PROBES, Identifiability
-from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.parallel import one_blas_thread

@@ -11,8 +11,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.initial import fourier_basis
 from mjfim.experiment.packing import opened
-from mjfim.experiment.signals import fourier_basis
 from mjfim.recordings.control_table import read_control
 
 # Largest number of harmonics of a Fourier series.

@@ -14,14 +14,13 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.plant.mixed_derivatives import (
     CENTRAL_DIFFERENCES,
     FORWARD_DIFFERENCES,
     Bilinear,
     DifferenceAccuracy,
 )
-from mjfim.plant.plant import Plant
+from mjfim.plant.plant import LumpedParameters, Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Sensitivity, Trajectory
 

@@ -27,10 +27,9 @@ from mjfim.excitation.task_parts import (
     stated_control,
     tracking_weights_of,
 )
-from mjfim.experiment.initial_state import keyframe
+from mjfim.experiment.initial import keyframe, multisine
 from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment, by_name
-from mjfim.experiment.signals import multisine
 from mjfim.experiment.system import System
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import IdentifiabilityTest

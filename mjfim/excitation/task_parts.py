@@ -14,19 +14,20 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, listed, shortened, unknown
 from mjfim.excitation.limits.limits import Limit
-from mjfim.experiment.initial_state import generate
+from mjfim.experiment.initial import generate
 from mjfim.experiment.packing import opened
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import Signal
 from mjfim.files import read_json
-from mjfim.information.marginal import marginal
+from mjfim.information.criteria import marginal
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.parameter_ranges import sample_parameters
 from mjfim.model.variants import Relaxation
 from mjfim.plant.batch import BatchSimulator
+from mjfim.model.parameters import sample_parameters
 from mjfim.recordings.control_table import read_control
 from mjfim.records.trajectory import Trajectory
 

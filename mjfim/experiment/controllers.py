@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.experiment.controller_tables import ControllerSpec
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system_tables import ControllerSpec
 from mjfim.experiment.time_grid import possible_rates, whole_timesteps
 from mjfim.model.control_laws import (
     KINDS,

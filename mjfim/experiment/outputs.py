@@ -20,8 +20,7 @@ from mjfim.model.coordinates import (
     StateComponent,
     unknown_coordinate,
 )
-from mjfim.plant.noise import Noise
-from mjfim.plant.outputs import Output, Outputs
+from mjfim.plant.outputs import Noise, Output, Outputs
 from mjfim.plant.state_space import StateSpace
 
 # A covariance is not positive definite if its smallest eigenvalue is below this fraction of its

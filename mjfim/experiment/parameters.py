@@ -16,8 +16,7 @@ from mjfim.model.coordinates import output_label, split_unit, unknown_coordinate
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
-from mjfim.model.parameter_ranges import physical_bounds
-from mjfim.model.parameters import Parameter, ParameterSet, Target
+from mjfim.model.parameters import Parameter, ParameterSet, Target, physical_bounds
 from mjfim.model.paths import ParameterPath, resolve, term_quantity, unit_of
 from mjfim.model.targets import InertiaField, OutputBiasField, OutputDelayField
 from mjfim.model.variants import MocapPlacement

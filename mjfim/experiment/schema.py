@@ -14,8 +14,8 @@ from pydantic_core import PydanticSerializationError
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, unknown
-from mjfim.experiment.controller_tables import ControllerSpec
 from mjfim.experiment.system_tables import (
+    ControllerSpec,
     Correlated,
     Initial,
     NoiseSpec,

@@ -1,7 +1,8 @@
 """The system that an experiment is about: model, parameters, outputs, noise, time grid and plant.
 
 A system has no horizon, no cost and no control; these belong to the tasks in `excitation.task` and
-`identification.task`. Every name in the experiment is checked here against the model.
+`identification.task`. Every name in the experiment is checked here against the model. A system
+makes synthetic recordings, and worker processes make it again from an order.
 """
 
 from __future__ import annotations
@@ -15,31 +16,39 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError
+from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError, listed
 from mjfim.experiment.controllers import resolve_controllers
-from mjfim.experiment.initial_state import initial_state, keyframe
+from mjfim.experiment.initial import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
-from mjfim.experiment.packing import model_of
+from mjfim.experiment.packing import for_workers, model_of
 from mjfim.experiment.parameters import Measured, resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.control_laws import ControlLaws
-from mjfim.model.coordinates import ScalarJoint
+from mjfim.model.coordinates import (
+    ScalarJoint,
+    control_labels,
+    dof_names,
+    output_label,
+    state_components,
+    tangent_components,
+)
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.terms.library import resolve_terms
 from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
+from mjfim.model.units import per_second
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
 from mjfim.parallel import require_threads
 from mjfim.plant.batch import state_space
-from mjfim.plant.noise import Noise
-from mjfim.plant.outputs import Outputs
+from mjfim.plant.outputs import Noise, Outputs
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.recordings.channels import Channels
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.labels import Labels
+from mjfim.records.trajectory import Recording, Trajectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -482,3 +491,158 @@ def _terms_of(experiment: Experiment, stated: ModelSource) -> tuple[Term, ...]:
         )
         tables.append((spec.kind, table))
     return resolve_terms(tables, stated.model, 1.0 / experiment.rate)
+
+
+def simulate(
+    experiment: Experiment,
+    trajectory: Trajectory | Array,
+    seed: int | np.random.Generator = 0,
+    *,
+    threads: int | None = None,
+) -> Recording:
+    """Simulate a recording at the `true` parameter values.
+
+    The trajectory's control is applied open loop, and noise is added to the measured samples. The
+    motion begins at the initial state of the experiment, or where a design chooses the release, at
+    that of the trajectory.
+
+    Args:
+        experiment: The experiment.
+        trajectory: The trajectory whose control is applied; or (N, nu) controls, with control laws
+            what they read of a log.
+        seed: Seed of the noise, or a generator of random numbers.
+        threads: Threads for the engine; default: one per core.
+
+    Returns:
+        The recording; outputs that are not measured at a sample are NaN.
+
+    Raises:
+        SimulationDivergedError: The simulation diverges under this control.
+    """
+    system = System.resolve(experiment, threads=threads)
+    if not isinstance(trajectory, Trajectory):
+        inputs = np.asarray(trajectory, dtype=np.float64)
+        if inputs.ndim != 2 or inputs.shape[1] != len(system.inputs):
+            raise ExperimentError(
+                f"{experiment.source}: simulate: controls of shape {inputs.shape}; expected a row "
+                f"for each sample with {len(system.inputs)} columns: {listed(system.inputs)}"
+            )
+        at_rest = np.tile(system.nominal_initial_state, (len(inputs) + 1, 1))
+        trajectory = system.plant.trajectory(at_rest, inputs)
+    return simulate_system(system, trajectory, seed)
+
+
+def simulate_system(
+    system: System, trajectory: Trajectory, seed: int | np.random.Generator = 0
+) -> Recording:
+    """Simulate a recording of a resolved system. See `simulate`."""
+    system = system.released_as(trajectory.state[0])
+    rng = np.random.default_rng(seed)
+    true = system.parameters.true
+    outputs, finite = system.plant.measure(true[None], trajectory.ctrl)
+    if not finite[0]:
+        why = system.plant.why_diverged(true, trajectory.ctrl)
+        raise SimulationDivergedError(
+            f"the simulation diverges at the true parameters under this control: {why}"
+        )
+
+    noisy = outputs[0] + system.noise.sample(len(outputs[0]), rng)
+
+    # All outputs are recorded at the first sample, afterwards each output at its rate.
+    measured = system.noise.measured(trajectory.samples)
+    measured[0] = 1.0
+    noisy[measured == 0.0] = np.nan
+
+    return Recording(
+        t=np.arange(len(noisy), dtype=np.float64) * system.dt,
+        ctrl=trajectory.ctrl,
+        y=noisy,
+        outputs=system.outputs.names,
+        name="simulated",
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SystemOrder:
+    """Everything that determines a system on the user's model. It can be pickled.
+
+    Attributes:
+        experiment: The experiment, with its files.
+        initial_state: (ns,) nominal initial state.
+        substeps: Engine steps of a sample.
+        step_factors: (p,) factors of the difference steps; None where they are not calibrated.
+        threads: Threads for the engine.
+    """
+
+    experiment: Experiment
+    initial_state: Array
+    substeps: int
+    step_factors: Array | None
+    threads: int
+
+    @classmethod
+    def of(cls, system: System, threads: int) -> SystemOrder:
+        """Describe a system.
+
+        Args:
+            system: A system on the plant that the experiment states, or with other substeps.
+            threads: Threads that each worker may use.
+        """
+        assert system.variant == STATED
+        return cls(
+            experiment=for_workers(system.experiment, system.source),
+            initial_state=system.nominal_initial_state,
+            substeps=system.grid.substeps,
+            step_factors=system.plant.step_factors,
+            threads=threads,
+        )
+
+    def system(self) -> System:
+        """Make the system; the model is parsed once in a process."""
+        system = System.resolve(self.experiment, threads=self.threads)
+        if self.substeps != system.grid.substeps:
+            system = system.with_substeps(self.substeps)
+
+        plant = system.plant.with_initial_state(self.initial_state)
+        return replace(
+            system,
+            nominal_initial_state=self.initial_state,
+            plant=plant.with_step_factors(self.step_factors),
+        )
+
+
+def labels_of_model(model: mujoco.MjModel) -> Labels:
+    """Make labels of the joints and actuators of a model.
+
+    Args:
+        model: The model.
+    """
+    state = state_components(model)[: model.nq]
+    tangent = tangent_components(model)[: model.nv]
+    names = dof_names(model)
+
+    return Labels(
+        qpos=tuple(f"{c.name.removeprefix('qpos:')} [{c.unit or '1'}]" for c in state),
+        positions=tuple(f"{name} [{c.unit}]" for name, c in zip(names, tangent, strict=True)),
+        velocities=tuple(
+            f"{name} velocity [{per_second(c.unit)}]"
+            for name, c in zip(names, tangent, strict=True)
+        ),
+        controls=control_labels(model),
+    )
+
+
+def labels_of_system(system: System) -> Labels:
+    """Make labels of a system's model, parameters and outputs.
+
+    Args:
+        system: The system.
+    """
+    base = labels_of_model(system.model)
+    outputs = {name: output_label(system.model, name) for name in system.outputs.names}
+    return replace(
+        base,
+        parameters=system.parameters.names,
+        parameter_units=system.units,
+        outputs=outputs,
+    )

@@ -18,8 +18,8 @@ from mjfim.errors import RecordingError, listed, unknown
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import MEASURED_SUMS, ControlLaw
 from mjfim.model.variants import STATED
-from mjfim.plant.laws.law_commands import ON
 from mjfim.plant.outputs import outputs_by_state
+from mjfim.plant.running_law import ON
 from mjfim.records.trajectory import Recording, Trajectory
 
 

@@ -32,11 +32,10 @@ from mjfim.identification.segments import (
 )
 from mjfim.identification.unknowns import Pins, PriorRows, UnknownLayout
 from mjfim.information.null_space import NullSpace
-from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
+from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel.budget import Budget
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Recording
 
 T = TypeVar("T")

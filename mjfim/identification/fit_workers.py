@@ -19,8 +19,7 @@ from typing import Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 
-from mjfim.experiment.system import System
-from mjfim.experiment.system_order import SystemOrder
+from mjfim.experiment.system import System, SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
 from mjfim.parallel import (

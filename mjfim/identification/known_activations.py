@@ -17,8 +17,8 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
-from mjfim.model.terms.extension import FILTERS
+from mjfim.model.elements import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
+from mjfim.model.terms.term import FILTERS
 from mjfim.model.units import actuator_gear
 
 # Columns of the friction of a `dcmotor` in its bias: Coulomb, static, Stribeck speed.

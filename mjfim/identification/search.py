@@ -14,16 +14,15 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
 from mjfim.identification.segments import spread_over_data
 from mjfim.identification.task import FitTask
-from mjfim.model.parameter_ranges import sample_parameters
+from mjfim.model.parameters import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
-    IterationReport,
     SearchSettings,
     Solution,
     UnknownValues,
     minimise,
 )
 from mjfim.parallel.budget import Budget, StopReason
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.events import FitEvent, begin_stage
 
 # Settings of the paper's Newton-Raphson iteration.
@@ -160,17 +159,10 @@ class FitSearch:
         """Search for a minimum, and report the iterations; None where the start diverges."""
         callback = self.callback
 
-        def report(iteration: IterationReport) -> None:
+        def report(iteration: int, cost: float, step: float) -> None:
             """Report one iteration as an event."""
             if callback is not None:
-                callback(
-                    FitEvent(
-                        phase=phase,
-                        iteration=iteration.iteration,
-                        cost=iteration.cost,
-                        step=iteration.step_length,
-                    )
-                )
+                callback(FitEvent(phase=phase, iteration=iteration, cost=cost, step=step))
 
         return minimise(problem, begin, settings, self.budget, report)
 

@@ -16,9 +16,9 @@ from mjfim.identification.segments import Segment, batches
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.batch import Rollouts
-from mjfim.plant.delay import OutputDelay
-from mjfim.plant.derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
-from mjfim.plant.laws.running_law import InputContext
+from mjfim.plant.outputs import OutputDelay
+from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
+from mjfim.plant.running_law import InputContext
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of engine steps of a batch. On small models it takes about 0.2 s on two threads. At

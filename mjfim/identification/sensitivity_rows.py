@@ -16,7 +16,7 @@ from mjfim.identification.segment_simulation import SegmentBatch, SegmentRows
 from mjfim.information.null_space import COARSER_STEP_FACTOR
 from mjfim.optimize.condensed_least_squares import triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.plant.derivatives import SENSITIVITY_STEP
+from mjfim.plant.plant import SENSITIVITY_STEP
 
 
 def sensitivity_rows(

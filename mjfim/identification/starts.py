@@ -21,11 +21,9 @@ from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equatio
 from mjfim.identification.search import FitSearch, of_subset, quick_subset, restart_subset
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
-from mjfim.model.parameter_ranges import make_physical
-from mjfim.model.parameters import ParameterSet
+from mjfim.model.parameters import ParameterSet, make_physical
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
-from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
-from mjfim.plant.dynamics import UNSTABLE_LOOP
+from mjfim.plant.dynamics import NO_WARNING, UNSTABLE_LOOP, explain_divergence, find_divergence
 from mjfim.records.events import begin_stage
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.trajectory import Recording

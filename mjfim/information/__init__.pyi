@@ -1,7 +1,6 @@
-from .criteria import Criterion
+from .criteria import Criterion, standard_deviations
 from .fisher import FisherInformation
 from .identifiability import IdentifiabilityTest
-from .marginal import standard_deviations
 from .null_space import NullSpace
 
 __all__ = [

@@ -1,6 +1,7 @@
-"""Optimality criteria phi of an information matrix I and their derivatives.
+"""Optimality criteria phi of an information matrix I, their derivatives, and standard deviations.
 
-A derivative has the form `M = dphi/dI = sum_r m_r w_r w_r'`.
+A derivative has the form `M = dphi/dI = sum_r m_r w_r w_r'`. Nuisance parameters are eliminated by
+the Schur complement.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 
 # An information matrix is singular if the ratio of its smallest to its largest eigenvalue is at
 # most this number.
@@ -19,6 +20,9 @@ SINGULAR_RATIO = 1e-14
 # Eigenvectors whose weight is below this fraction of the largest weight are left out of a
 # derivative.
 NEGLIGIBLE_WEIGHT = 1e-9
+
+# Singular values below this fraction of the largest one count as zero in a pseudo-inverse.
+PSEUDO_INVERSE_CUTOFF = 1e-13
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,3 +213,64 @@ CRITERIA: dict[str, Callable[[Array], Criterion]] = {
     "A": a_optimality,
     "D": d_optimality,
 }
+
+
+def marginal(information: Array, prior: Array, kept: np.ndarray) -> Array:
+    """Information about several parameters if the others are estimated, too.
+
+    Args:
+        information: (p, p) information of the data [1 / (theta_i theta_j unit)].
+        prior: (p, p) prior information, of which only the block of the other parameters is used.
+        kept: (k,) indices of the parameters that are kept.
+
+    Returns:
+        (k, k) Schur complement [1 / (theta_i theta_j unit)].
+    """
+    others = np.setdiff1d(np.arange(len(information)), kept)
+    among_kept = information[np.ix_(kept, kept)]
+    if not len(others):
+        return np.asarray(among_kept)
+
+    cross = information[np.ix_(kept, others)]
+    among_others = (information + prior)[np.ix_(others, others)]
+    inverse = np.linalg.pinv(among_others, rcond=PSEUDO_INVERSE_CUTOFF, hermitian=True)
+    return np.asarray(among_kept - cross @ inverse @ cross.T)
+
+
+def shared(information: Array, prior: Array, private: np.ndarray) -> Array:
+    """Information about the parameters that several experiments have in common.
+
+    Args:
+        information: (p, p) information of one experiment [1 / (theta_i theta_j unit)].
+        prior: (p, p) prior information, of which only the block of the private parameters is used.
+        private: (p,) True for parameters with another value in each experiment; they are
+            marginalised.
+
+    Returns:
+        (p, p) information, zero in the rows and columns of the private parameters.
+    """
+    if not private.any():
+        return information
+
+    kept = np.flatnonzero(~private)
+    out = np.zeros_like(information)
+    out[np.ix_(kept, kept)] = marginal(information, prior, kept)
+    return out
+
+
+def standard_deviations(information: Array) -> Array:
+    """Cramer-Rao standard deviations.
+
+    Args:
+        information: (p, p) information [1 / (theta_i theta_j unit)].
+
+    Returns:
+        (p,) standard deviations [theta-unit], all infinite if the information is singular.
+    """
+    scaled, scale = scaled_to_unit_diagonal(information)
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] <= SINGULAR_RATIO * values[-1]:
+        return np.full(len(scale), np.inf)
+
+    variances = np.sum(vectors**2 / values, axis=1)
+    return np.asarray(np.sqrt(variances) / scale)

@@ -1,4 +1,4 @@
-"""Fisher information of the measured samples, and its reduction to the part that a criterion uses.
+"""Fisher information of the measured samples, the part that a criterion uses, and its derivatives.
 
     I   = I_prior + sum_k G_k' Sigma^-1 G_k            over the measured samples k
     I~  = S I S / f_m                                  S = diag(scale), f_m the measurement rate
@@ -8,6 +8,14 @@
 
 With `P = T' [1, -I~_tn I~_nn^+]`, `dR = P dI~ P'`. A derivative `sum_r m_r w_r w_r'` with respect
 to R is therefore a derivative with respect to I~ with the directions P'w.
+
+The variation of phi along a trajectory is `sum_k tr V_k' dG_k` with
+
+    V_k = 2 Sigma^-1 G_k M,    M = dphi/dI = sum_r m_r w_r w_r'.
+
+The adjoint `Lambda_k = A_k' Lambda_{k+1} + C_k' V_k = sum_r l^r_k w_r'` eliminates psi. The
+derivative of `l' DF[psi w, w] + v' Dh[psi w, w]` with respect to (x, u) remains, which needs only
+the r directions w instead of all p parameters.
 """
 
 from __future__ import annotations
@@ -18,29 +26,94 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array, scaled_to_unit_diagonal
-from mjfim.information.adjoint import (
-    criterion_gradient,
-    eigenvalue_model,
-    output_weights,
-    partial_derivatives,
-)
 from mjfim.information.criteria import (
     CRITERIA,
     NEGLIGIBLE_WEIGHT,
+    PSEUDO_INVERSE_CUTOFF,
     SINGULAR_RATIO,
     Criterion,
     c_optimality,
     smooth_e_optimality,
+    standard_deviations,
 )
-from mjfim.information.marginal import PSEUDO_INVERSE_CUTOFF, standard_deviations
-from mjfim.optimize.eigenvalue_model import EigenvalueModel
+from mjfim.optimize.cost_models import EigenvalueModel, divided_log_differences
+from mjfim.optimize.lq import LinearRecursion
 from mjfim.plant.mixed_derivatives import Bilinear
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 
 # A unit vector lies within the identifiable combinations if the squared length of its part outside
 # is below this number.
 ROUND_OFF_SHARE = 1e-6
+
+
+# One of the r terms v^r w_r' of V: (N+1, ny) weights v of the measured outputs, (N+1, ny)
+# equivalent weights of the outputs before the delay, and the (N+1, nx) costate l.
+_Ray = tuple[Array, Array, Array]
+
+
+def _adjoint_rays(weights: Array, bilinear: Bilinear) -> list[_Ray]:
+    """Rays for the (r, N+1, ny) weights of the outputs."""
+    recursion = LinearRecursion(bilinear.A)
+    delay = bilinear.output_delay
+
+    rays = []
+    for v in weights:
+        outputs = v if delay is None else delay.apply_transposed(v)
+        costate = recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, outputs))
+        rays.append((v, outputs, costate))
+    return rays
+
+
+def _term(ray: _Ray, direction: int, criterion: Criterion, bilinear: Bilinear) -> Array:
+    """(N+1, nx+nu) derivative of `sum_k v_k' dG_k w` with respect to (x_k, u_k).
+
+    Args:
+        ray: The ray, with the weights v.
+        direction: Index of the direction w.
+        criterion: The criterion with its r directions.
+        bilinear: Derivatives of the plant along these directions.
+    """
+    measured, outputs, costate = ray
+    term = np.zeros((len(measured), bilinear.A.shape[1] + bilinear.B.shape[2]))
+    term[:-1] = np.einsum("kzx,kx->kz", bilinear.F_mixed[direction], costate[1:])
+
+    if bilinear.h_mixed is not None:
+        term += np.einsum("kzy,ky->kz", bilinear.h_mixed[direction], outputs)
+    if bilinear.output_delay is not None and bilinear.delay_derivative is not None:
+        rate = float(bilinear.delay_derivative @ criterion.directions[direction])
+        term += _delay_term(bilinear, measured * rate)
+    return _with_held_control(term, bilinear)
+
+
+def _with_held_control(term: Array, bilinear: Bilinear) -> Array:
+    """(N+1, nx+nu) derivatives in which the last control gets the derivative of the last outputs.
+
+    The last control is held for the outputs of the last sample.
+    """
+    nx = bilinear.A.shape[1]
+    term[-2, nx:] += term[-1, nx:]
+    return term
+
+
+def _by_state_and_control(total: Array, bilinear: Bilinear) -> tuple[Array, Array]:
+    """(N+1, nx) and (N, nu) parts of (N+1, nx+nu) derivatives."""
+    nx = bilinear.A.shape[1]
+    return total[:, :nx], total[:-1, nx:]
+
+
+def _delay_term(bilinear: Bilinear, v: Array) -> Array:
+    """(N+1, nx+nu) derivative of `sum_k v_k' dy_k/d(delay)` with respect to (x_k, u_k).
+
+    v: (N+1, ny) weights of the measured outputs.
+    """
+    if bilinear.output_delay is None:
+        raise ValueError("the outputs have no delay")
+
+    e = bilinear.output_delay.derivative_transposed(v)
+    by_state = np.einsum("kyx,ky->kx", bilinear.C, e)
+    by_control = np.einsum("kyu,ky->ku", bilinear.D, e)
+    return np.concatenate([by_state, by_control], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,7 +175,7 @@ class FisherInformation:
             (p, p) sum over the measured samples and the prior [1 / (theta_i theta_j unit)].
         """
         flat = self.noise.whitened_rows(sensitivity.G)
-        return np.asarray(flat.T @ flat + self.prior)
+        return flat.T @ flat + self.prior
 
     def accumulated_eigenvalue(self, sensitivity: Sensitivity) -> Array:
         """(N+1,) smallest eigenvalue of R from the information up to each sample."""
@@ -115,7 +188,7 @@ class FisherInformation:
 
     def scaled(self, information: Array) -> Array:
         """I~ = S I S / f_m of information I: (..., p, p)."""
-        return np.asarray(information * np.outer(self.scale, self.scale) / self.measure_rate)
+        return information * np.outer(self.scale, self.scale) / self.measure_rate
 
     def reduced(self, information: Array) -> tuple[Array, Array]:
         """Reduce an information matrix to the part that the criterion uses.
@@ -193,13 +266,18 @@ class FisherInformation:
         Returns:
             (N+1, nx) derivative by the state and (N, nu) derivative by the control.
         """
-        weights = self._output_weights(criterion, sensitivity)
-        return criterion_gradient(weights, criterion, bilinear)
+        rays = _adjoint_rays(self._output_weights(criterion, sensitivity), bilinear)
+        terms = [_term(ray, r, criterion, bilinear) for r, ray in enumerate(rays)]
+        return _by_state_and_control(np.sum(terms, axis=0), bilinear)
 
     def eigenvalue_model(
         self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear, cost: float
     ) -> EigenvalueModel:
         """Model of log J about a point of the smooth E-criterion.
+
+        It needs the derivatives that the gradient needs, too. With `V = 2 Sigma^-1 G w_i`, the
+        change of `w_i' I w_j` is half of the sum of two terms: the ray of w_i along w_j, and the
+        ray of w_j along w_i.
 
         Args:
             criterion: The criterion with its r directions.
@@ -211,7 +289,27 @@ class FisherInformation:
             The model of the r smallest eigenvalues.
         """
         weights = self._output_weights(criterion, sensitivity)
-        return eigenvalue_model(weights, criterion, bilinear, cost)
+        rays = _adjoint_rays(weights / criterion.weights[:, None, None], bilinear)
+        r, nx = len(rays), bilinear.A.shape[1]
+        eigenvalues = criterion.eigenvalues[:r]
+        rotation = divided_log_differences(eigenvalues)
+
+        rows = []
+        for i in range(r):
+            for j in range(i, r):
+                change = _term(rays[i], j, criterion, bilinear)
+                if i != j:
+                    change = (change + _term(rays[j], i, criterion, bilinear)) / np.sqrt(2.0)
+                rows.append(rotation[i, j] * change)
+
+        slopes = np.stack(rows)
+        return EigenvalueModel(
+            eigenvalues=eigenvalues,
+            power=criterion.power,
+            weight=criterion.value / cost,
+            a=slopes[..., :nx],
+            b=slopes[:, :-1, nx:],
+        )
 
     def partial_derivatives(
         self, criterion: Criterion, sensitivity: Sensitivity, full: Bilinear
@@ -227,11 +325,31 @@ class FisherInformation:
             (N+1, nx, p) derivative by psi, (N+1, nx) by the state and (N, nu) by the control.
         """
         weights = self._output_weights(criterion, sensitivity)
-        return partial_derivatives(weights, criterion, full)
+        V = np.einsum("rky,rp->kyp", weights, criterion.directions)
+        outputs = V if full.output_delay is None else full.output_delay.apply_transposed(V)
+
+        direct = np.zeros((len(V), full.A.shape[1] + full.B.shape[2]))
+        if full.h_mixed is not None:
+            direct = np.einsum("pkzy,kyp->kz", full.h_mixed, outputs)
+        if full.output_delay is not None and full.delay_derivative is not None:
+            direct += _delay_term(full, V @ full.delay_derivative)
+
+        by_psi = np.einsum("kyx,kyp->kxp", full.C, outputs)
+        return by_psi, *_by_state_and_control(_with_held_control(direct, full), full)
 
     def _output_weights(self, criterion: Criterion, sensitivity: Sensitivity) -> Array:
-        """(r, N+1, ny) weights of the outputs in the derivative of the criterion."""
-        return output_weights(self.noise, self.measure_rate, criterion, sensitivity)
+        """(r, N+1, ny) weights v of the outputs, with `V_k = sum_r v^r_k w_r'`.
+
+        They are zero where nothing is measured.
+        """
+        noise = self.noise
+        measured = noise.measured(len(sensitivity.G) - 1)
+        scale = (2.0 * criterion.weights / self.measure_rate)[:, None, None]
+        Gw = np.einsum("kyp,rp->rky", sensitivity.G, criterion.directions)
+
+        if noise.correlated:
+            return np.asarray(scale * ((Gw * measured) @ noise.precision))
+        return np.asarray(scale * Gw / noise.sigma**2 * measured)
 
     # Standard deviations
 
@@ -331,7 +449,7 @@ class FisherInformation:
         projector = np.eye(len(information))
         projector[np.ix_(t, t)] = self.basis @ self.basis.T
         unscaled = projector / self.scale[:, None] * self.scale
-        return np.asarray(unscaled @ information @ unscaled.T)
+        return unscaled @ information @ unscaled.T
 
     def _basis_with_prior(self, basis: Array) -> Array:
         """(t, s') identifiable combinations and those that only the stated priors determine."""

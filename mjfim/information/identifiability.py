@@ -24,9 +24,8 @@ from mjfim.information.null_space import (
     parameter_groups,
 )
 from mjfim.model.parameters import ParameterSet
-from mjfim.plant.derivatives import SENSITIVITY_STEP
-from mjfim.plant.noise import Noise
-from mjfim.plant.plant import Plant
+from mjfim.plant.outputs import Noise
+from mjfim.plant.plant import SENSITIVITY_STEP, Plant
 from mjfim.records.check import ParameterGroup, combination_matrix, groups_in_words
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.trajectory import Sensitivity, Trajectory

@@ -83,21 +83,6 @@ class NullSpace:
         return int(self.directions.shape[1])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Columns:
-    """Columns of G of the t wanted parameters, without the part that nuisance parameters explain.
-
-    Attributes:
-        J: (n, t) effect of each parameter changed by its size [standard deviations].
-        error: (n, t) error of these columns.
-        length_before: (t,) length of each column before the projection.
-    """
-
-    J: Array
-    error: Array
-    length_before: Array
-
-
 def find_null_space(
     J: Array,
     error: Array | None,
@@ -122,11 +107,15 @@ def find_null_space(
     Returns:
         The null space of the wanted parameters.
     """
-    columns = _wanted_columns(J, error, size, interest, prior)
-    J, error = columns.J, columns.error
+    J, error, length_before = _wanted_columns(J, error, size, interest, prior)
     length = np.linalg.norm(J, axis=0)
-    dead = _dead_columns(columns)
-    left_by_nuisance = length / np.maximum(columns.length_before, SMALLEST_NORM)
+
+    # A parameter is dead if it has no effect, or only one that nuisance parameters explain.
+    explained = length <= ZERO_SINGULAR_VALUES[0] * length_before
+    round_off = length <= COLUMN_ERROR_FACTOR * np.linalg.norm(error, axis=0)
+    weak = length <= LEAST_RELATIVE_EFFECT * length_before.max(initial=0.0)
+    dead = (length <= LEAST_EFFECT) | explained | (round_off & weak)
+    left_by_nuisance = length / np.maximum(length_before, SMALLEST_NORM)
     least_share = float(left_by_nuisance[~dead].min(initial=1.0))
 
     # Columns without effect and known directions are in the null space. Further directions are
@@ -165,10 +154,14 @@ def has_weak_column(J: Array, size: Array) -> bool:
 
 def _wanted_columns(
     J: Array, error: Array | None, size: Array, interest: np.ndarray, prior: Array
-) -> _Columns:
+) -> tuple[Array, Array, Array]:
     """Columns of the wanted parameters, from which the effects of nuisance parameters are removed.
 
     The arguments are those of `find_null_space`.
+
+    Returns:
+        (n, t) effect of each parameter changed by its size [standard deviations], (n, t) error of
+        these columns, and the (t,) length of each column before the removal.
     """
     J = J * size
     error = np.zeros_like(J) if error is None else error * size
@@ -185,20 +178,7 @@ def _wanted_columns(
         J = J - Q @ (Q.T @ J)
         error = error - Q @ (Q.T @ error)
 
-    return _Columns(J=J[:, interest], error=error[:, interest], length_before=length_before)
-
-
-def _dead_columns(columns: _Columns) -> np.ndarray:
-    """(t,) True if a parameter has no effect, or only one that nuisance parameters explain."""
-    length = np.linalg.norm(columns.J, axis=0)
-    doubt = np.linalg.norm(columns.error, axis=0)
-    strongest = columns.length_before.max(initial=0.0)
-
-    no_effect = length <= LEAST_EFFECT
-    explained = length <= ZERO_SINGULAR_VALUES[0] * columns.length_before
-    round_off = length <= COLUMN_ERROR_FACTOR * doubt
-    weak = length <= LEAST_RELATIVE_EFFECT * strongest
-    return np.asarray(no_effect | explained | (round_off & weak))
+    return J[:, interest], error[:, interest], length_before
 
 
 def _hidden_directions(J: Array, error: Array, live: np.ndarray) -> tuple[Array, float]:
@@ -245,7 +225,7 @@ def _complement(directions: Array) -> Array:
         return np.eye(t)
 
     Q = np.linalg.qr(directions, mode="complete")[0]
-    return np.asarray(Q[:, k:])
+    return Q[:, k:]
 
 
 def _independent(directions: Array) -> Array:
@@ -253,7 +233,7 @@ def _independent(directions: Array) -> Array:
     U, sizes, _ = np.linalg.svd(directions, full_matrices=False)
     largest = max(sizes.max(initial=0.0), SMALLEST_NORM)
     kept = sizes > DEPENDENT * largest
-    return np.asarray(U[:, kept])
+    return U[:, kept]
 
 
 def _range(A: Array) -> Array:
@@ -264,7 +244,7 @@ def _range(A: Array) -> Array:
 
     U, sizes, _ = np.linalg.svd(unit, full_matrices=False)
     kept = sizes > ZERO_SINGULAR_VALUES[0]
-    return np.asarray(U[:, kept])
+    return U[:, kept]
 
 
 def parameter_groups(

@@ -14,9 +14,8 @@ from mjfim.errors import listed
 from mjfim.information.null_space import LEAST_EFFECT, LEAST_RELATIVE_EFFECT
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.active_constraints import active_constraints
-from mjfim.plant.derivatives import SENSITIVITY_STEP
-from mjfim.plant.noise import Noise
-from mjfim.plant.plant import Plant
+from mjfim.plant.outputs import Noise
+from mjfim.plant.plant import SENSITIVITY_STEP, Plant
 from mjfim.records.check import Roughness
 from mjfim.records.trajectory import Sensitivity, Trajectory
 

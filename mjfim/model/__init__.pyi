@@ -1,4 +1,4 @@
-from .clearance.geom_distance import GeomDistances
+from .clearance import GeomDistances
 from .loading import ModelSource
 from .parameters import ParameterSet
 from .paths import ParameterPath

@@ -1,10 +1,18 @@
-"""Elements of a compiled MuJoCo model by kind and name."""
+"""Elements of a compiled MuJoCo model by kind and name, and natural sizes of its coordinates.
+
+Small numbers are relative to these sizes. A rotation has the size of one radian whatever the robot.
+All other sizes follow from the lengths, masses and ranges of the model, so that they scale with its
+units.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
 
 # MuJoCo's object type of every kind of element that a parameter path can name.
 OBJECT_TYPES = {
@@ -20,6 +28,12 @@ OBJECT_TYPES = {
 
 # Field of MjModel that counts the elements of a kind, where it is not called `n<kind>`.
 COUNT_FIELDS = {"joint": "njnt", "actuator": "nactuator"}
+
+# Share of its size by which a slow coordinate moves in one sample. Slower motions count as rest.
+LEAST_MOVE_PER_SAMPLE = 0.01
+
+# Column of the stiffness of a bristle in the dynamics of a `dcmotor`.
+BRISTLE_STIFFNESS_COLUMN = 5
 
 
 def element_count(model: Any, kind: str) -> int:
@@ -124,3 +138,215 @@ def is_rk4(model: Any) -> bool:
         model: The compiled model (`mujoco.MjModel`).
     """
     return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+
+
+def model_length(model: Any) -> float:
+    """Length of the largest moving tree of a model [m].
+
+    It is the largest sum of the offsets of bodies from the root of their tree to a centre of mass,
+    and the radius of gyration about it. Places in the world and geoms without mass do not matter.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    from_root = np.zeros(model.nbody)
+    longest = 0.0
+
+    for body in range(1, model.nbody):
+        if not model.body_weldid[body]:
+            continue
+        parent = int(model.body_parentid[body])
+        if model.body_weldid[parent]:
+            offset = float(np.linalg.norm(model.body_pos[body]))
+            from_root[body] = from_root[parent] + offset
+
+        mass = float(model.body_mass[body])
+        if mass > 0.0:
+            gyration = float(np.sqrt(model.body_inertia[body].max() / mass))
+            centre = float(np.linalg.norm(model.body_ipos[body]))
+            longest = max(longest, from_root[body] + centre + gyration)
+
+    # MuJoCo's extent is the size of the geoms and sites, where nothing that moves has a mass.
+    return longest or float(model.stat.extent)
+
+
+def translations(model: Any) -> np.ndarray:
+    """(nv,) True for the degrees of freedom that are translations.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    found = np.zeros(model.nv, dtype=bool)
+    for joint in range(model.njnt):
+        first = int(model.jnt_dofadr[joint])
+        kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+        if kind == mujoco.mjtJoint.mjJNT_SLIDE:
+            found[first] = True
+        elif kind == mujoco.mjtJoint.mjJNT_FREE:
+            found[first : first + 3] = True
+    return found
+
+
+def position_sizes(model: Any) -> Array:
+    """Natural size of each degree of freedom.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+
+    Returns:
+        (nv,) sizes: the model's length for translations, 1 for rotations [m, rad].
+    """
+    return np.where(translations(model), model_length(model), 1.0)
+
+
+def control_sizes(model: Any, time: float) -> Array:
+    """Natural size of each control, where no trajectory shows it.
+
+    It is the range of the control or of the force; else the control that moves the joint of a servo
+    by its natural size, or accelerates the joint by its natural size in a natural time.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        (nu,) positive sizes [u-unit].
+    """
+    sizes = np.ones(model.nu)
+    for actuator in range(model.nactuator):
+        control = int(model.actuator_ctrladr[actuator])
+        count = int(model.actuator_ctrlnum[actuator])
+        if count:
+            sizes[control : control + count] = _control_size(model, actuator, control, time)
+    return sizes
+
+
+def force_sizes(model: Any, time: float) -> Array:
+    """Force that accelerates each degree of freedom by its natural size in a natural time, squared.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        (nv,) forces [N or N m].
+    """
+    weight = np.asarray(model.dof_invweight0)
+    inertia = 1.0 / np.where(weight > 0.0, weight, 1.0)
+    return inertia * position_sizes(model) / time**2
+
+
+def actuator_force_sizes(model: Any, time: float) -> Array:
+    """Natural size of each force of an actuator.
+
+    It is the range of the force, else the force that accelerates the joint by its natural size in a
+    natural time, squared.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        (nf,) positive sizes, by the address of the force [N or N m].
+    """
+    sizes = np.ones(len(model.actuator_acc0))
+    for actuator in range(model.nactuator):
+        first, count = int(model.actuator_outadr[actuator]), int(model.actuator_outnum[actuator])
+        sizes[first : first + count] = _actuator_force_size(model, actuator, time)
+    return sizes
+
+
+def bristle_actuators(model: Any) -> list[int]:
+    """Numbers of the `dcmotor` actuators without control whose only activation is a bristle.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    has_bristle = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_DCMOTOR)
+    has_bristle = has_bristle & (model.actuator_dynprm[:, BRISTLE_STIFFNESS_COLUMN] > 0.0)
+    has_bristle &= (model.actuator_ctrlnum == 0) & (model.actuator_actnum == 1)
+    return [int(actuator) for actuator in np.flatnonzero(has_bristle)]
+
+
+def bristle_sizes(model: Any, time: float) -> dict[int, float]:
+    """Natural deflections of the bristles of friction in `dcmotor` actuators without control.
+
+    A bristle bends under a natural force, or by the way of one engine step before it slides.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        The larger of both deflections, by its address in the activations [m or rad].
+    """
+    found = {}
+    for actuator in bristle_actuators(model):
+        stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
+        under_force = _actuator_force_size(model, actuator, time) / stiffness
+        way = _transmission_size(model, actuator) / time * float(model.opt.timestep)
+        found[int(model.actuator_actadr[actuator])] = max(under_force, way)
+    return found
+
+
+def _control_size(model: Any, actuator: int, control: int, time: float) -> float:
+    """Natural size of a control of one actuator, see `control_sizes`."""
+    stated = _largest_finite(model.actuator_ctrlrange[control])
+    if stated > 0.0:
+        return stated
+
+    gain = abs(float(model.actuator_gainprm[actuator, 0])) or 1.0
+    bias = np.abs(model.actuator_biasprm[actuator])
+    length = _transmission_size(model, actuator)
+
+    # A servo for positions or velocities.
+    if bias[1] > 0.0:
+        return float(length * bias[1] / gain)
+    if bias[2] > 0.0:
+        return float(length / time * bias[2] / gain)
+
+    return _actuator_force_size(model, actuator, time) / gain
+
+
+def _actuator_force_size(model: Any, actuator: int, time: float) -> float:
+    """Natural size of the force of one actuator, see `actuator_force_sizes`."""
+    stated = _largest_finite(model.actuator_forcerange[actuator])
+    if stated > 0.0 and model.actuator_ctrlnum[actuator]:
+        return stated
+
+    output = int(model.actuator_outadr[actuator])
+    length = _transmission_size(model, actuator)
+    return length / time**2 / (_acceleration(model, actuator, output) or 1.0)
+
+
+def _acceleration(model: Any, actuator: int, output: int) -> float:
+    """Acceleration that a unit force of an actuator causes, 0 without any [1/s² per unit force]."""
+    if not _acts_on_joint(model, actuator):
+        return float(model.actuator_acc0[output])
+
+    # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
+    gear = float(np.abs(model.actuator_gear[output]).max())
+    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    return gear * float(model.dof_invweight0[dof])
+
+
+def _acts_on_joint(model: Any, actuator: int) -> bool:
+    """True for an actuator on a joint."""
+    joint_like = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    return int(model.actuator_trntype[actuator]) in [int(kind) for kind in joint_like]
+
+
+def _largest_finite(bounds: Array) -> float:
+    """Largest magnitude of the finite bounds; 0 without one."""
+    return float(np.abs(bounds[np.isfinite(bounds)]).max(initial=0.0))
+
+
+def _transmission_size(model: Any, actuator: int) -> float:
+    """Natural size of the length that an actuator acts on [m or rad, times the gear]."""
+    if not _acts_on_joint(model, actuator):
+        return model_length(model)
+
+    output = int(model.actuator_outadr[actuator])
+    gear = float(np.abs(model.actuator_gear[output]).max()) or 1.0
+    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    return gear * float(position_sizes(model)[dof])

@@ -206,7 +206,7 @@ def _steiner(mass: float, com: Array) -> Array:
         com: (3,) its position [m].
     """
     squared = com @ com
-    return np.asarray(mass * (squared * np.eye(3) - np.outer(com, com)))
+    return mass * (squared * np.eye(3) - np.outer(com, com))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,7 +316,7 @@ def logcholesky_derivatives(values: Array) -> Array:
         change[4 + k, row, column] = scale
 
     one_side = change @ factor.T
-    return np.asarray(one_side + np.swapaxes(one_side, 1, 2))
+    return one_side + np.swapaxes(one_side, 1, 2)
 
 
 def barycentric_of(pseudo_inertia: Array) -> Array:
@@ -425,4 +425,4 @@ def _divided_differences(values: Array, logarithms: Array) -> Array:
 
 def _norm_entries(matrix: Array) -> Array:
     """(..., 10) entries of symmetric matrices (..., 4, 4), with the norm of the matrix."""
-    return np.asarray(_FACTORS * matrix[..., _PSEUDO_ROWS, _PSEUDO_COLUMNS])
+    return _FACTORS * matrix[..., _PSEUDO_ROWS, _PSEUDO_COLUMNS]

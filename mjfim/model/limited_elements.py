@@ -11,14 +11,14 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import ROTATION_VECTOR, TRANSLATION, actuator_names, joint_names
-from mjfim.model.elements import unique_names
-from mjfim.model.sizes import (
+from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
     actuator_force_sizes,
     control_sizes,
     force_sizes,
     model_length,
     position_sizes,
+    unique_names,
 )
 from mjfim.model.units import (
     ANGLE,
@@ -381,7 +381,7 @@ def tilt_weights(model: Any, joint: int) -> Array:
     rotation = data.xmat[int(model.jnt_bodyid[joint])].reshape(3, 3)
     up = rotation.T @ upward(model)
     _, _, directions = np.linalg.svd(up[None])
-    return np.asarray(directions[1:] @ turn_weights(model, joint))
+    return directions[1:] @ turn_weights(model, joint)
 
 
 def quaternion_joints(model: Any) -> list[int]:

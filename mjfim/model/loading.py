@@ -17,8 +17,7 @@ import mujoco
 from mjfim.errors import ModelError, ModelWarning
 from mjfim.model.coordinates import ModelCoordinates
 from mjfim.model.model_files import PackedFiles, files_of_model, name_of
-from mjfim.model.terms.extension import StateLayout, extended_spec
-from mjfim.model.terms.term import Term
+from mjfim.model.terms.term import StateLayout, Term, extended_spec
 from mjfim.parallel.kept import Kept
 
 

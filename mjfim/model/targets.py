@@ -23,9 +23,8 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
-from mjfim.model.elements import element_name
+from mjfim.model.elements import LEAST_MOVE_PER_SAMPLE, element_name, position_sizes
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
-from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, position_sizes
 from mjfim.model.terms.term import Term
 
 # Array of MjModel -> array that says whether the frame of the element coincides with that of its

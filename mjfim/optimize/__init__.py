@@ -6,13 +6,11 @@ Modules:
         manifold.
     directions: Descent directions without limits: metric descent and limited-memory BFGS.
     structured_bfgs: Descent direction under hard limits.
-    quasi_newton: The two-loop recursion that both quasi-Newton directions share.
-    barrier: Relaxed logarithmic barrier of numbers between bounds.
-    eigenvalue_model: Model of the smooth E-criterion where eigenvalues meet.
+    cost_models: Barrier of numbers between bounds, and the smooth E-criterion where eigenvalues
+        meet.
     condensed_least_squares: Least squares with private unknowns of many segments, eliminated
-        segment by segment.
+        segment by segment, and robust losses.
     levenberg_marquardt: Bounded Levenberg-Marquardt on condensed least squares.
-    robust_losses: Losses that grow more slowly than the square.
     bracketing: Search for the smallest feasible number of samples.
 """
 

@@ -1,10 +1,9 @@
-from .barrier import Bounds, relaxed_log_barrier
 from .bracketing import SampleGrid, smallest_feasible
-from .condensed_least_squares import Condensed
+from .condensed_least_squares import Condensed, RobustLoss
+from .cost_models import Bounds, relaxed_log_barrier
 from .directions import LBFGS, MetricDescent
 from .levenberg_marquardt import minimise
 from .lq import regulator
-from .robust_losses import RobustLoss
 from .structured_bfgs import StructuredBFGS
 
 __all__ = [

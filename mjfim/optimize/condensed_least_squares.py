@@ -1,15 +1,17 @@
-"""Condensed linear least squares over many segments with private unknowns.
+"""Condensed linear least squares over many segments with private unknowns, and robust losses.
 
 The whitened rows `[J_private, J_common, r]` of each block of data are reduced to a triangle with
 equal inner products (QR decomposition), so that all rows are never in memory at once. The private
 unknowns are then eliminated segment by segment. The remaining problem has the size of the common
-unknowns, and its solution is exact.
+unknowns, and its solution is exact. Names and formulas of the robust losses are those of
+`scipy.optimize.least_squares`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -56,6 +58,13 @@ MIN_STRETCHES = 10
 # one that is believed.
 MIN_TRUE_DEVIATION = 2.0
 MAX_TRUE_DEVIATION = 10.0
+
+# Smallest threshold [standard deviations] above which a residual counts as an outlier; normal noise
+# rarely exceeds it.
+MIN_OUTLIER_THRESHOLD = 3.0
+
+# Smallest squared residual in a weight, because zero has no negative power.
+SMALLEST_SQUARE = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -137,7 +146,7 @@ class Condensed:
         """(P, n, c) derivative of the optimal private unknowns by the common unknowns."""
         n = self.private_count
         coupling = self.triangles[:, :n, n:-1]
-        return np.asarray(-self._private_inverse @ coupling)
+        return -self._private_inverse @ coupling
 
     @cached_property
     def _private_inverse(self) -> Array:
@@ -150,7 +159,7 @@ class Condensed:
         scaled = self.triangles[:, :n, :n] / norms
 
         inverse = np.linalg.pinv(scaled, rcond=PRIVATE_RANK_TOLERANCE)
-        return np.asarray(inverse / norms[:, None])
+        return inverse / norms[:, None]
 
     def reduced_rows(self) -> Array:
         """Rows of the common unknowns after elimination of the private ones.
@@ -161,7 +170,7 @@ class Condensed:
         R = self.triangles
         n = self.private_count
         if not n:
-            return np.asarray(R.reshape(-1, R.shape[2]))
+            return R.reshape(-1, R.shape[2])
 
         # Where a segment has no full rank, the best private unknowns do not cancel these rows.
         private = R[:, :n, :n]
@@ -171,23 +180,7 @@ class Condensed:
         remaining = np.concatenate([remaining_jacobian, remaining_residual], axis=2)
 
         rows = np.concatenate([remaining, R[:, n:, n:]], axis=1)
-        return np.asarray(rows.reshape(-1, rows.shape[2]))
-
-    def gradients_after(self, common: Array) -> Array:
-        """Gradient of every segment after a step of the common unknowns, by the linearisation.
-
-        The private unknowns follow at their optimum.
-
-        Args:
-            common: (c,) step of the common unknowns.
-
-        Returns:
-            (P, c) gradients of half of the squares of each segment, without the `common_rows`.
-        """
-        rows = self.reduced_rows()
-        J, residual = rows[:, :-1], rows[:, :-1] @ common + rows[:, -1]
-        each = (J * residual[:, None]).reshape(self.segment_count, -1, J.shape[1])
-        return np.asarray(each.sum(axis=1))
+        return rows.reshape(-1, rows.shape[2])
 
     def after(self, step: Step) -> Condensed:
         """The linearised residuals at the end of a step.
@@ -272,7 +265,7 @@ class Condensed:
         if with_common_rows:
             J = np.concatenate([J, self.common_rows[:, :-1]])
 
-        return np.asarray(J.T @ J)
+        return J.T @ J
 
     @cached_property
     def column_norms(self) -> Array:
@@ -340,19 +333,6 @@ class Condensed:
         weight = np.sqrt(damping) * scale
         R = self._damped_triangles(weight[:n], scale[:n])
         return self._evaluated(common, self._substituted(R, common))
-
-    def private_step(self, common: Array) -> Array:
-        """Step of the private unknowns to their minimum, for a given step of the common ones.
-
-        Args:
-            common: (c,) step of the common unknowns.
-
-        Returns:
-            (P, n) steps.
-        """
-        n = self.private_count
-        R = self._damped_triangles(np.zeros(n), self.column_norms[:n])
-        return self._substituted(R, common)
 
     def _damped_triangles(self, weight: Array, scale: Array) -> Array:
         """(P, m, m) triangles of all rows of each segment and of the damping of private unknowns.
@@ -429,7 +409,7 @@ class Condensed:
         """
         J, r = self._reduced_blocks
         gradient = np.swapaxes(J, 1, 2) @ r
-        return np.asarray(gradient[..., 0])
+        return gradient[..., 0]
 
     @cached_property
     def block_information(self) -> Array:
@@ -438,7 +418,7 @@ class Condensed:
         The private unknowns follow the common ones at their optimum.
         """
         J, _ = self._reduced_blocks
-        return np.asarray(np.swapaxes(J, 1, 2) @ J)
+        return np.swapaxes(J, 1, 2) @ J
 
     @property
     def true_deviation(self) -> float:
@@ -566,3 +546,78 @@ def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Arr
 
     d[~fixed] = inside
     return d
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustLoss:
+    """Loss `scale^2 rho((r / scale)^2)` of a whitened residual r.
+
+    Attributes:
+        kind: Function rho. With `linear`, the loss is the square; `huber`, `soft_l1` and `cauchy`
+            grow more slowly.
+        scale: Residual [standard deviations] above which the loss clearly differs from the square.
+    """
+
+    kind: Literal["linear", "huber", "soft_l1", "cauchy"] = "linear"
+    scale: float = 3.0
+
+    @property
+    def outlier_threshold(self) -> float:
+        """Size above which a residual counts as an outlier [standard deviations].
+
+        It is infinite for the loss `linear`.
+        """
+        return np.inf if self.kind == "linear" else max(self.scale, MIN_OUTLIER_THRESHOLD)
+
+    @property
+    def inlier_mean_square(self) -> float:
+        """Mean square of standard normal residuals that are not outliers."""
+        if self.kind == "linear":
+            return 1.0
+
+        # Variance of the normal distribution truncated at both sides.
+        limit = self.outlier_threshold
+        inside = 1.0 - 2.0 * scipy.special.ndtr(-limit)
+        density = np.exp(-0.5 * limit**2) / np.sqrt(2.0 * np.pi)
+        return float(1.0 - 2.0 * limit * density / inside)
+
+    def value(self, r: Array) -> float:
+        """Sum of the loss over residuals.
+
+        Args:
+            r: (...) whitened residuals.
+
+        Returns:
+            The sum.
+        """
+        if self.kind == "linear":
+            return float(np.sum(r**2))
+
+        z = (r / self.scale) ** 2
+        if self.kind == "huber":
+            rho = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
+        elif self.kind == "soft_l1":
+            rho = 2.0 * (np.sqrt(1.0 + z) - 1.0)
+        else:
+            rho = np.log1p(z)
+
+        return float(self.scale**2 * rho.sum())
+
+    def weight(self, r: Array) -> Array:
+        """Weights of the rows in iteratively reweighted least squares.
+
+        Args:
+            r: (...) whitened residuals.
+
+        Returns:
+            (...) square roots of the derivative of rho, between 0 and 1.
+        """
+        z = (r / self.scale) ** 2
+        if self.kind == "huber":
+            return np.minimum(1.0, np.maximum(z, SMALLEST_SQUARE) ** -0.25)
+        if self.kind == "soft_l1":
+            return (1.0 + z) ** -0.25
+        if self.kind == "cauchy":
+            return (1.0 + z) ** -0.5
+
+        return np.ones_like(r)

@@ -1,7 +1,12 @@
-"""Descent directions of Algorithm 1 without limits: metric descent and limited-memory BFGS."""
+"""Descent directions of Algorithm 1 without limits: metric descent and limited-memory BFGS.
+
+The two-loop recursion of limited-memory BFGS is algorithm 7.4 of Nocedal & Wright, Numerical
+Optimization.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,88 +14,120 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.optimize.lq import CurveCoordinates, TangentCurve, descent
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.optimize.quasi_newton import CurvaturePair, inverse_hessian_product
 
 # Smallest curvature of a stored pair, relative to the norms of the step and of the change of the
 # gradient.
 MIN_RELATIVE_CURVATURE = 1e-10
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CurvaturePair:
+    """A step and the change of the gradient along it.
+
+    Attributes:
+        s: (...) step.
+        y: (...) change of the gradient along the step.
+        curvature: Product s'y, which is positive.
+    """
+
+    s: Array
+    y: Array
+    curvature: float
+
+
+def convex_pairs(s: Array, y: Array, tolerance: float) -> list[CurvaturePair]:
+    """The pairs of steps and changes of the gradient whose curvature is clearly positive.
+
+    Args:
+        s: (p, ...) steps.
+        y: (p, ...) changes of the gradient along these steps.
+        tolerance: Smallest curvature, relative to the norms of s and y.
+
+    Returns:
+        The pairs, in the same order.
+    """
+    steps = s.reshape(len(s), -1)
+    changes = y.reshape(len(y), -1)
+    curvatures = np.einsum("pi,pi->p", steps, changes)
+    norms = np.linalg.norm(steps, axis=1) * np.linalg.norm(changes, axis=1)
+    is_convex = curvatures > tolerance * norms
+    return [
+        CurvaturePair(s=s[i], y=y[i], curvature=float(curvatures[i]))
+        for i in np.flatnonzero(is_convex)
+    ]
+
+
+def inverse_hessian_product(
+    g: Array, pairs: Sequence[CurvaturePair], initial: Callable[[Array], Array]
+) -> Array:
+    """Product of the BFGS approximation of the inverse Hessian with a vector.
+
+    Args:
+        g: (...) vector, usually a gradient, or m vectors: (m, ...).
+        pairs: Curvature pairs, the oldest first.
+        initial: Product of the initial inverse Hessian with vectors of the shape of g.
+
+    Returns:
+        (...) or (m, ...) the product.
+    """
+    if not pairs:
+        return initial(g)
+
+    # A product of the rows with a vector has the shape (m,), or is a number for a single row.
+    size = pairs[0].s.size
+    rows = g.reshape(*g.shape[: g.ndim - pairs[0].s.ndim], size)
+
+    alphas = []
+    for pair in reversed(pairs):
+        alpha = (rows @ pair.s.reshape(size) / pair.curvature)[..., None]
+        rows = rows - alpha * pair.y.reshape(size)
+        alphas.append(alpha)
+
+    rows = initial(rows.reshape(g.shape)).reshape(rows.shape)
+
+    for pair, alpha in zip(pairs, reversed(alphas), strict=True):
+        beta = (rows @ pair.y.reshape(size) / pair.curvature)[..., None]
+        rows = rows + (alpha - beta) * pair.s.reshape(size)
+
+    return rows.reshape(g.shape)
+
+
 @dataclass
 class MetricDescent:
     """The paper's direction, the solution of its problem (8).
 
-    It minimises `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space, with a metric that does not
-    weigh psi. All weights are already multiplied by the sample period.
+    It minimises `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space. All weights are already
+    multiplied by the sample period.
 
     Attributes:
-        Q: (nx, nx) metric on the state.
+        Q: (nx, nx) metric on the state, or (nx (1+p), nx (1+p)) metric on x and on psi, stacked
+            parameter by parameter.
         R: (nu, nu) metric on the control.
-        terminal: (nx, nx) metric on the last state.
+        terminal: Metric on the last state, shaped like Q.
+        weighs_psi: Whether the metric also weighs the psi-part of zeta.
     """
 
     Q: Array
     R: Array
     terminal: Array
+    weighs_psi: bool = False
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """The direction, by the Riccati equations."""
-        return descent(
-            expansion.A,
-            expansion.B,
-            expansion.a,
-            expansion.b,
-            Q=self.Q,
-            R=self.R,
-            terminal=self.terminal,
-        )
-
-    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Ignore an accepted step; this direction has no memory.
-
-        Args:
-            expansion: Expansion at the new point.
-            K: (N, nu, nx) gain of the projection operator.
-            moved: Difference between the new and the old point.
-        """
-
-    def reset(self) -> bool:
-        """Return False: there is no memory to clear."""
-        return False
-
-
-@dataclass
-class ExtendedMetricDescent:
-    """Problem (8) as the paper states it, with a metric that also weighs the psi-part of zeta.
-
-    All weights are already multiplied by the sample period.
-
-    Attributes:
-        Q: (nx (1+p), nx (1+p)) metric on x and on psi, stacked parameter by parameter.
-        R: (nu, nu) metric on the control.
-        terminal: (nx (1+p), nx (1+p)) metric on the last x and psi.
-    """
-
-    Q: Array
-    R: Array
-    terminal: Array
-
-    def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """The direction, by the Riccati equations of the extended system.
+        """The direction, by the Riccati equations.
 
         Its psi-part is left out, because the projection computes psi anew.
         """
-        extended = expansion.extended
-        if extended is None:
+        shown = expansion.extended if self.weighs_psi else expansion
+        if shown is None:
             raise ValueError(
                 "the problem must provide extended expansions for a metric with weight on psi"
             )
 
         zeta = descent(
-            extended.A,
-            extended.B,
-            extended.a,
-            extended.b,
+            shown.A,
+            shown.B,
+            shown.a,
+            shown.b,
             Q=self.Q,
             R=self.R,
             terminal=self.terminal,
@@ -112,21 +149,6 @@ class ExtendedMetricDescent:
         return False
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Evaluated:
-    """The gradient at an expansion under a regulator.
-
-    Attributes:
-        expansion: Expansion of the cost.
-        K: (N, nu, nx) gain of the projection operator.
-        gradient: (N, nu) derivative by the curve coordinate.
-    """
-
-    expansion: Expansion
-    K: Array
-    gradient: Array
-
-
 @dataclass
 class LBFGS:
     """Limited-memory BFGS in the curve coordinate `c = u + K x`.
@@ -142,12 +164,11 @@ class LBFGS:
     R: Array
     memory: int = 40
     _pairs: tuple[CurvaturePair, ...] = ()
-    _last: _Evaluated | None = None
+    _last: tuple[Expansion, Array, Array] | None = None
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
         """The quasi-Newton direction zeta = -H DJ."""
-        gradient = self._evaluated(expansion, K).gradient
-        c = -inverse_hessian_product(gradient, self._pairs, self._initial)
+        c = -inverse_hessian_product(self._gradient(expansion, K), self._pairs, self._initial)
         return expansion.lift(K, c)
 
     def _initial(self, g: Array) -> Array:
@@ -177,22 +198,19 @@ class LBFGS:
         if self._last is None:
             return
 
-        before = self._last.gradient
+        before = self._last[2]
         s = CurveCoordinates(A=expansion.A, B=expansion.B, K=K).coordinate(moved)
-        y = self._evaluated(expansion, K).gradient - before
+        y = self._gradient(expansion, K) - before
 
-        pair = CurvaturePair.where_convex(s, y, MIN_RELATIVE_CURVATURE)
-        if pair is not None:
-            self._pairs = (*self._pairs, pair)[-self.memory :]
+        pairs = convex_pairs(s[None], y[None], MIN_RELATIVE_CURVATURE)
+        self._pairs = (*self._pairs, *pairs)[-self.memory :]
 
-    def _evaluated(self, expansion: Expansion, K: Array) -> _Evaluated:
-        """The gradient, computed once per expansion and regulator."""
+    def _gradient(self, expansion: Expansion, K: Array) -> Array:
+        """(N, nu) gradient by the curve coordinate, once per expansion and regulator."""
         last = self._last
-        if last is None or last.expansion is not expansion or last.K is not K:
-            last = _Evaluated(expansion=expansion, K=K, gradient=expansion.gradient(K))
-            self._last = last
-
-        return last
+        if last is None or last[0] is not expansion or last[1] is not K:
+            last = self._last = (expansion, K, expansion.gradient(K))
+        return last[2]
 
     def refined(self, R: Array, factor: int) -> LBFGS:
         """A direction with this memory on a finer grid of samples.

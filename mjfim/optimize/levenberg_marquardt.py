@@ -281,21 +281,6 @@ class Problem(Protocol):
         """
 
 
-@dataclass(frozen=True, kw_only=True)
-class IterationReport:
-    """One accepted iteration, for callbacks.
-
-    Attributes:
-        iteration: Number of the iteration, from 1.
-        cost: Cost of the problem at the new unknowns.
-        step_length: Length of the step of the common unknowns [standard deviations].
-    """
-
-    iteration: int
-    cost: float
-    step_length: float
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
     """Result of a search.
@@ -373,7 +358,9 @@ class SearchSettings:
     stagnant_share: float = 0.0
 
 
-Callback = Callable[[IterationReport], None]
+# What is called after every accepted iteration: with its number from 1, the cost at the new
+# unknowns, and the length of the step of the common unknowns [standard deviations].
+Callback = Callable[[int, float, float], None]
 
 
 def minimise(
@@ -427,11 +414,6 @@ class _Trial:
     cost: float
     fraction: float
     ratio: float
-
-    @property
-    def length(self) -> float:
-        """Length of what was taken of the step [standard deviations]."""
-        return self.fraction * self.step.common_length
 
 
 class _Search:
@@ -524,7 +506,8 @@ class _Search:
         self.unknowns = trial.unknowns
         self.cost = trial.cost
         self._keep(trial.unknowns)
-        self._report(trial.length)
+        if self.callback is not None:
+            self.callback(self.iteration, self.cost, trial.fraction * trial.step.common_length)
 
         if converged:
             return self._finished(trial.step)
@@ -741,13 +724,6 @@ class _Search:
     def _keep(self, at: UnknownValues) -> None:
         """Keep an iterate, with the private unknowns of the first segment only."""
         self.iterates.append(replace(at, private=at.private[:1]))
-
-    def _report(self, length: float) -> None:
-        """Call the callback after a step of some length."""
-        if self.callback is not None:
-            self.callback(
-                IterationReport(iteration=self.iteration, cost=self.cost, step_length=length)
-            )
 
     def _relax_damping(self, ratio: float) -> None:
         """Adapt the damping to the ratio of actual to predicted decrease.

@@ -111,7 +111,7 @@ def products_at_samples(matrices: Array, vectors: Array) -> Array:
 
     # One product of matrices per sample is quicker than m products with a vector.
     columns = np.ascontiguousarray(vectors.transpose(1, 2, 0))
-    return np.asarray((matrices @ columns).transpose(2, 0, 1))
+    return (matrices @ columns).transpose(2, 0, 1)
 
 
 def largest_amplification(A: Array, sizes: Array | None = None) -> float:
@@ -538,7 +538,7 @@ class CurveCoordinates:
             driving[..., :-1, :] -= products_at_samples(self.K.swapaxes(1, 2), b)
         costate = self._closed_loop.adjoint(driving)
         through_state = products_at_samples(self.B.swapaxes(1, 2), costate[..., 1:, :])
-        return np.asarray(b + through_state)
+        return b + through_state
 
     def lift(self, c: Array) -> TangentCurve:
         """Tangent curve of a curve coordinate.
@@ -566,4 +566,4 @@ class CurveCoordinates:
         """
         if not self._has_feedback:
             return zeta.v
-        return np.asarray(zeta.v + products_at_samples(self.K, zeta.z[..., :-1, :]))
+        return zeta.v + products_at_samples(self.K, zeta.z[..., :-1, :])

@@ -13,8 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.optimize.barrier import BarrierExpansion
-from mjfim.optimize.eigenvalue_model import EigenvalueModel
+from mjfim.optimize.cost_models import BarrierExpansion, EigenvalueModel
 from mjfim.optimize.lq import (
     CurveCoordinates,
     TangentCurve,
@@ -265,27 +264,6 @@ class Armijo:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DescentState(Generic[P]):
-    """All that Algorithm 1 needs to go on from an iterate, beside its direction.
-
-    Attributes:
-        point: The point.
-        expansion: Expansion of the cost at the point.
-        K: (N, nu, nx) gain of the projection operator.
-        zeta: Direction at the point; None before it is chosen.
-        gamma: Length of the step that led to the point.
-        index: Number of accepted steps so far.
-    """
-
-    point: P
-    expansion: Expansion
-    K: Array
-    zeta: TangentCurve | None = None
-    gamma: float = 0.0
-    index: int = 0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Iterate(Generic[P]):
     """One iterate of Algorithm 1.
 
@@ -296,7 +274,6 @@ class Iterate(Generic[P]):
         slope: Magnitude of DJ.zeta at the point.
         gamma: Length of the step that led to the point.
         status: Why the algorithm ended; None except in the last iterate.
-        state: State from which the algorithm can go on; None where it is not known.
     """
 
     index: int
@@ -305,7 +282,6 @@ class Iterate(Generic[P]):
     slope: float
     gamma: float
     status: Status | None = None
-    state: DescentState[P] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -367,7 +343,6 @@ def optimize(
     *,
     tolerance: float,
     max_iterations: int,
-    resumed: DescentState[P] | None = None,
 ) -> Iterator[Iterate[P]]:
     """Run Algorithm 1 from a point; the consumer decides when to stop earlier.
 
@@ -379,21 +354,17 @@ def optimize(
         armijo: Line search.
         tolerance: The algorithm has converged where `|DJ.zeta| <= tolerance * size`.
         max_iterations: Largest number of accepted steps.
-        resumed: State of an iterate from which the algorithm goes on, to the last digit as if it
-            had not been interrupted; the direction has to be that of then. This iterate is the
-            first one that is yielded. None to begin.
 
     Yields:
         Every iterate; the last one carries a status.
     """
-    state = resumed or _first_state(problem, start, regulate)
-    point, gamma, index = state.point, state.gamma, state.index
-    expansion, K, known = state.expansion, state.K, state.zeta
+    point, gamma, index = start, 0.0, 0
+    expansion = problem.expand(point)
+    K = regulate.gain(expansion)
 
     while True:
         # A direction may learn when it is asked, so that it is asked once at each point.
-        zeta = direction(expansion, K) if known is None else known
-        known = None
+        zeta = direction(expansion, K)
         slope = expansion.slope(zeta)
         size = problem.size(point)
         iterate = Iterate(
@@ -402,9 +373,6 @@ def optimize(
             value=problem.value(point),
             slope=abs(slope),
             gamma=gamma,
-            state=DescentState(
-                point=point, expansion=expansion, K=K, zeta=zeta, gamma=gamma, index=index
-            ),
         )
 
         # Converged, unless more accurate derivatives show a further descent.
@@ -451,9 +419,3 @@ def optimize(
         index += 1
         if index % regulate.period == 0:
             K = regulate.gain(expansion)
-
-
-def _first_state(problem: Problem[P], start: P, regulate: Regulator) -> DescentState[P]:
-    """State at the first point, before a direction is chosen."""
-    expansion = problem.expand(start)
-    return DescentState(point=start, expansion=expansion, K=regulate.gain(expansion))

@@ -14,7 +14,8 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.optimize.barrier import BarrierExpansion
+from mjfim.optimize.cost_models import BarrierExpansion
+from mjfim.optimize.directions import CurvaturePair, convex_pairs, inverse_hessian_product
 from mjfim.optimize.lq import (
     CurveCoordinates,
     RiccatiSolution,
@@ -23,11 +24,6 @@ from mjfim.optimize.lq import (
     products_at_samples,
 )
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.optimize.quasi_newton import (
-    CurvaturePair,
-    convex_pairs,
-    inverse_hessian_product,
-)
 
 # Smallest curvature of a pair that is used, relative to the norms of the step and of the change of
 # the gradient.
@@ -116,69 +112,57 @@ class CurveMetric:
         return self.coordinates.coordinate(self._riccati.descent(a, -g))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BasisResponse:
+def basis_response(expansion: Expansion, basis: Array) -> Array:
     """Change of the state by the coefficients of a basis of controls; all controls share the basis.
 
-    Attributes:
+    The linearised dynamics are followed for every basis function and control.
+
+    Args:
+        expansion: Expansion at a trajectory.
         basis: (N, M) basis functions.
-        z: (N+1, nx, M nu) derivative of the state by the coefficients.
+
+    Returns:
+        (N+1, nx, M nu) derivative of the state by the coefficients.
     """
+    N, nx, _ = expansion.B.shape
+    inputs = np.einsum("km,kiu->kimu", basis, expansion.B).reshape(N, nx, -1)
+    z = np.zeros((N + 1, *inputs.shape[1:]))
+    for k in range(N):
+        z[k + 1] = expansion.A[k] @ z[k] + inputs[k]
+    return z
 
-    basis: Array
-    z: Array
 
-    @staticmethod
-    def simulate(expansion: Expansion, basis: Array) -> BasisResponse:
-        """Follow the linearised dynamics for every basis function and control.
+def basis_matrix(basis: Array, response: Array, weights: Weights) -> Array:
+    """Matrix of a quadratic form on the coefficients of a basis of controls.
 
-        Args:
-            expansion: Expansion at a trajectory.
-            basis: (N, M) basis functions.
+    Args:
+        basis: (N, M) basis functions.
+        response: (N+1, nx, M nu) derivative of the state by the coefficients.
+        weights: Quadratic form on tangent curves.
 
-        Returns:
-            The response.
-        """
-        A = expansion.A
-        B = expansion.B
-        N, nx, _ = B.shape
+    Returns:
+        (M nu, M nu) symmetric matrix.
+    """
+    N, nu, nx = weights.S.shape
+    M = basis.shape[1]
 
-        inputs = np.einsum("km,kiu->kimu", basis, B).reshape(N, nx, -1)
-        z = np.zeros((N + 1, *inputs.shape[1:]))
-        for k in range(N):
-            z[k + 1] = A[k] @ z[k] + inputs[k]
+    # Terms with the state: z'Qz + 2 v'Sz.
+    Qz = (weights.Q @ response).reshape(-1, M * nu)
+    coupling = np.einsum("km,kui->kimu", basis, weights.S)
+    Qz[: N * nx] += 2.0 * coupling.reshape(N * nx, M * nu)
+    H = Qz.T @ response.reshape(-1, M * nu)
 
-        return BasisResponse(basis=basis, z=z)
+    # Terms with the control: v'Rv.
+    products = np.einsum("km,kn->kmn", basis, basis).reshape(N, -1)
+    control = (products.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
 
-    def matrix(self, weights: Weights) -> Array:
-        """Matrix of a quadratic form on the coefficients.
+    # Terms with the changes of the control.
+    steps = np.diff(basis, axis=0, prepend=0.0, append=0.0)
+    for u in range(nu):
+        control[:, :, u, u] += steps.T @ (weights.W[:, u, None] * steps)
 
-        Args:
-            weights: Quadratic form on tangent curves.
-
-        Returns:
-            (M nu, M nu) symmetric matrix.
-        """
-        N, nu, nx = weights.S.shape
-        M = self.basis.shape[1]
-
-        # Terms with the state: z'Qz + 2 v'Sz.
-        Qz = (weights.Q @ self.z).reshape(-1, M * nu)
-        coupling = np.einsum("km,kui->kimu", self.basis, weights.S)
-        Qz[: N * nx] += 2.0 * coupling.reshape(N * nx, M * nu)
-        H = Qz.T @ self.z.reshape(-1, M * nu)
-
-        # Terms with the control: v'Rv.
-        products = np.einsum("km,kn->kmn", self.basis, self.basis).reshape(N, -1)
-        control = (products.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
-
-        # Terms with the changes of the control.
-        steps = np.diff(self.basis, axis=0, prepend=0.0, append=0.0)
-        for u in range(nu):
-            control[:, :, u, u] += steps.T @ (weights.W[:, u, None] * steps)
-
-        control_matrix = control.swapaxes(1, 2).reshape(M * nu, M * nu)
-        return np.asarray(0.5 * (H + H.T) + control_matrix)
+    control_matrix = control.swapaxes(1, 2).reshape(M * nu, M * nu)
+    return np.asarray(0.5 * (H + H.T) + control_matrix)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -190,20 +174,6 @@ class BasisMetric:
     """
 
     H: Array
-
-    @staticmethod
-    def from_weights(expansion: Expansion, weights: Weights, basis: Array) -> BasisMetric:
-        """Metric of a quadratic form on tangent curves.
-
-        Args:
-            expansion: Expansion at a trajectory.
-            weights: Quadratic form on tangent curves.
-            basis: (N, M) basis functions.
-
-        Returns:
-            The metric on the coefficients.
-        """
-        return BasisMetric(H=BasisResponse.simulate(expansion, basis).matrix(weights))
 
     @cached_property
     def _factor(self) -> tuple[Array, bool]:
@@ -220,7 +190,7 @@ class BasisMetric:
         Returns:
             (M, nu) product, or (m, M, nu).
         """
-        return np.asarray((s.reshape(-1, len(self.H)) @ self.H).reshape(s.shape))
+        return (s.reshape(-1, len(self.H)) @ self.H).reshape(s.shape)
 
     def solve(self, g: Array) -> Array:
         """Product of the inverse of the matrix with a vector.
@@ -233,21 +203,6 @@ class BasisMetric:
         """
         columns = g.reshape(-1, len(self.H)).T
         return np.asarray(scipy.linalg.cho_solve(self._factor, columns).T.reshape(g.shape))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _RemainderPair:
-    """A step, and the change of the cost's gradient along it that the model did not predict.
-
-    The barrier of the limits is not included.
-
-    Attributes:
-        s: (N, nu) step of the curve coordinate, or (M, nu) of the coefficients of a basis.
-        y: Change of the gradient less the predicted change, shaped like s.
-    """
-
-    s: Array
-    y: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -295,19 +250,18 @@ class _LocalModel:
             H = H + damping * uniform_H
         return BasisMetric(H=H)
 
-    def with_weights(self, weights: Weights) -> _LocalModel:
-        """The model with other weights."""
-        return replace(self, weights=weights)
-
     @cached_property
     def _matrices(self) -> tuple[Array, Array]:
         """(M nu, M nu) matrices of the weights and of the uniform weights on the coefficients."""
         if self.basis is None:
             raise ValueError("without a basis there are no coefficients")
 
-        response = BasisResponse.simulate(self.expansion, self.basis)
+        response = basis_response(self.expansion, self.basis)
         uniform = _barrier(self.expansion).uniform_weights
-        return response.matrix(self.weights), response.matrix(uniform)
+        return (
+            basis_matrix(self.basis, response, self.weights),
+            basis_matrix(self.basis, response, uniform),
+        )
 
     def predicted_change(self, s: Array) -> Array:
         """Change of the cost's gradient along a step s that the eigenvalue model predicts.
@@ -324,7 +278,7 @@ class _LocalModel:
 
         d = np.tensordot(self.eigenvalue_slopes, s, axes=s.ndim)
         change = model.gradient(d) - model.gradient(np.zeros_like(d))
-        return np.asarray(np.tensordot(change, self.eigenvalue_slopes, axes=1))
+        return np.tensordot(change, self.eigenvalue_slopes, axes=1)
 
 
 @dataclass
@@ -343,6 +297,10 @@ class StructuredBFGS:
     The next directions then follow this change: the minimum of the model is found again with the
     curvature along the minimum before, which costs no simulation.
 
+    A curvature pair is a step of the curve coordinate, or of the coefficients of a basis, and the
+    change of the cost's gradient along it that the model did not predict; the barrier of the limits
+    is not included.
+
     Attributes:
         ridge: (nu,) weight of the control at every sample, which keeps the metric positive.
         basis: (N, M) basis of the controls, or None where the controls are free.
@@ -359,7 +317,7 @@ class StructuredBFGS:
     reach: float = 0.5
     damping: float = 0.0
     is_bent: bool = False
-    _pairs: tuple[_RemainderPair, ...] = ()
+    _pairs: tuple[tuple[Array, Array], ...] = ()
     _last: _LocalModel | None = field(default=None, repr=False)
     _proposed: TangentCurve | None = field(default=None, repr=False)
 
@@ -412,11 +370,10 @@ class StructuredBFGS:
 
         factors: tuple[Array, ...] | None = None
         for _ in range(MAX_BENT_MODELS):
-            along = curvature.along(zeta, factors)
-            if along.growth < SIGNIFICANT_GROWTH:
+            weights, factors, growth = curvature.along(zeta, factors)
+            if growth < SIGNIFICANT_GROWTH:
                 break
-            factors = along.factors
-            here = here.with_weights(self._with_ridge(along.weights))
+            here = replace(here, weights=self._with_ridge(weights))
             zeta, relative_length = self._damped_curve(here)
 
         return here, zeta, relative_length
@@ -463,8 +420,7 @@ class StructuredBFGS:
         """Product of the inverse Hessian of metric and stored pairs with a vector."""
         pairs: list[CurvaturePair] = []
         if self._pairs:
-            s = np.stack([remainder.s for remainder in self._pairs])
-            y = np.stack([remainder.y for remainder in self._pairs])
+            s, y = (np.stack(each) for each in zip(*self._pairs, strict=True))
             pairs = convex_pairs(s, y + metric.apply(s), MIN_RELATIVE_CURVATURE)
 
         return partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
@@ -490,7 +446,7 @@ class StructuredBFGS:
             s = np.asarray(np.linalg.lstsq(self.basis, s)[0], dtype=np.float64)
 
         y = after.cost_gradient - before.cost_gradient - before.predicted_change(s)
-        self._pairs = (*self._pairs, _RemainderPair(s=s, y=y))[-self.memory :]
+        self._pairs = (*self._pairs, (s, y))[-self.memory :]
 
     def _adapt(self, before: _LocalModel, proposed: TangentCurve, moved: TangentCurve) -> None:
         """Lower the damping after a step that was taken, raise it after a shortened one.
@@ -541,7 +497,9 @@ class StructuredBFGS:
         if model is not None:
             a.append(model.a)
             b.append(model.b)
-        gradients = self._gradients(coordinates, np.concatenate(a), np.concatenate(b))
+        gradients = coordinates.gradient(np.concatenate(a), np.concatenate(b))
+        if self.basis is not None:
+            gradients = self.basis.T @ gradients
 
         self._last = _LocalModel(
             expansion=expansion,
@@ -553,19 +511,6 @@ class StructuredBFGS:
             basis=self.basis,
         )
         return self._last
-
-    def _gradients(self, coordinates: CurveCoordinates, a: Array, b: Array) -> Array:
-        """(m, N, nu) gradients of linear costs by the coordinates; (m, M, nu) with a basis.
-
-        Args:
-            coordinates: Curve coordinates of the trajectory.
-            a: (m, N+1, nx) derivatives of the costs by the state.
-            b: (m, N, nu) derivatives of the costs by the control.
-        """
-        gradients = coordinates.gradient(a, b)
-        if self.basis is None:
-            return gradients
-        return np.asarray(self.basis.T @ gradients)
 
 
 def _barrier(expansion: Expansion) -> BarrierExpansion:

@@ -10,8 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from mjfim.errors import ModelError, RecordingError
-from mjfim.experiment.labels import labels_of_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, labels_of_system
 from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.output import archive
 from mjfim.output import rerun as rerun_log

@@ -1,18 +1,18 @@
 """The model as discrete-time dynamics with outputs, noise, delay and derivatives.
 
 Modules:
-    plant: The dynamics with their derivatives.
+    plant: The dynamics with all their derivatives in one object.
     dynamics: The dynamics F and h at theta: rollouts, projection, models.
-    derivatives: All derivatives of a plant in one object, from the following modules.
+    first_derivatives: First derivatives of F and h, in closed form or by steps of the engine.
     mixed_derivatives: Mixed second derivatives of F and h.
-    step_derivatives: First derivatives of F and h.
-    closed_form_derivatives: The same without steps of the engine, where the plant allows it.
+    closed_form: Derivatives of samples without steps of the engine, where the plant allows it.
+    rigid_body_motion: Inverse dynamics of rigid bodies, and its derivatives.
+    equation_of_motion: The equation of motion of an engine step, and its affine forces.
     batch: Many MuJoCo simulations in one call, and observations at their engine steps.
-    laws: The same with control laws that compute controls from a log and from the state.
+    closed_loop: The same with control laws that compute controls from a log and from the state.
+    running_law: What these laws receive, remember and compute at a tick.
     state_space: Differences and moves of states on the configuration space.
-    outputs: Which components of the state and which sensors are measured.
-    noise: Covariance and sampling of the measurements, whitening.
-    delay: Time delay of the outputs.
+    outputs: Which components of the state and which sensors are measured, their noise and delay.
     active_constraints: Contacts, limits, friction and clamps that act along a trajectory.
 """
 

@@ -1,7 +1,5 @@
-from .derivatives import Derivatives
-from .noise import Noise
-from .outputs import Outputs
-from .plant import Plant
+from .outputs import Noise, Outputs
+from .plant import Derivatives, Plant
 from .state_space import StateSpace
 
 __all__ = [

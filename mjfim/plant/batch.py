@@ -18,7 +18,7 @@ from mujoco.batch import Batch
 from mjfim.arrays import Array
 from mjfim.model.loading import silence_mujoco_log
 from mjfim.parallel import cores
-from mjfim.plant.laws.running_law import InputContext, LoopTrace
+from mjfim.plant.running_law import InputContext, LoopTrace
 from mjfim.plant.state_space import StateSpace
 
 # Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,
@@ -598,9 +598,9 @@ class BatchSimulator:
 
         duration = engine_steps * timestep
         error = np.abs(time - START_TIME - duration)
-        return np.asarray(error < 0.5 * timestep)
+        return error < 0.5 * timestep
 
 
 def is_accepted(ctrl: Array) -> np.ndarray:
     """True for controls that MuJoCo applies unchanged."""
-    return np.asarray(np.abs(ctrl) <= MAX_CONTROL)
+    return np.abs(ctrl) <= MAX_CONTROL

@@ -1,4 +1,4 @@
-"""The equation of motion of an engine step, evaluated along a given motion.
+"""The equation of motion of an engine step, evaluated along a given motion, and its affine forces.
 
 With the mean acceleration a of a step of length τ, MuJoCo solves
 
@@ -7,22 +7,51 @@ With the mean acceleration a of a step of length τ, MuJoCo solves
 where B is the damping that the integrator takes at the end of the step: of all forces with the
 implicit integrators, of the joints' dampers with Euler's method, none with RK4. The engine computes
 all terms but the dry friction, which follows the measured velocity: near rest the engine's friction
-depends on the acceleration that the wrong parameters would give.
+depends on the acceleration that the wrong parameters would give. Forces of actuators and springs
+on the joints are affine in state and control, between limits (`AffineForces`).
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.model.parameters import Parameter
+from mjfim.model.targets import InertiaField, ModelField
 from mjfim.plant.batch import BatchSimulator
-from mjfim.plant.closed_form.affine_forces import MOMENT_FIELDS
+
+# MjData fields whose sum are these forces.
+FORCE_FIELDS = ("qfrc_passive", "qfrc_actuator")
+
+# MjData fields with the moment arms of the actuators, a sparse matrix by rows.
+MOMENT_FIELDS = ("actuator_moment", "moment_rownnz", "moment_rowadr", "moment_colind")
+
+# Move of every coordinate from which the slopes are computed, relative to its size. Affine forces
+# allow long moves, which have little round-off.
+RELATIVE_MOVE = 1e-2
+
+# Largest deviation of a force from this function, relative to the terms of the function.
+LARGEST_DEVIATION = 1e-9
+
+# Arrays of MjModel that hold the inertia of bodies.
+INERTIA_ARRAYS = ("body_mass", "body_ipos", "body_inertia")
+
+# Arrays of MjModel that hold what springs, dampers and actuators do, and the inertia of the joints
+# themselves.
+FORCE_ARRAYS = (
+    "dof_damping",
+    "dof_armature",
+    "jnt_stiffness",
+    "qpos_spring",
+    "actuator_gainprm",
+    "actuator_biasprm",
+)
 
 # Integrators that take the damping of all forces at the end of the step.
 IMPLICIT = (
@@ -32,6 +61,297 @@ IMPLICIT = (
 
 # Factor by which the inertia of the joints is larger where only activations are to move.
 HELD_INERTIA = 1e9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ForceSlopes:
+    """Joint forces at n states and their derivatives.
+
+    Attributes:
+        slopes: (n, nv, 2 nv + nu) derivatives by positions, speeds and controls.
+        implicit_damping: (n, nv, nv) damping D of an engine step, which solves
+            `(M + timestep D) a = forces` for the mean acceleration a of the step.
+        agree: (n,) True where the forces are those of the engine.
+    """
+
+    slopes: Array
+    implicit_damping: Array
+    agree: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AffineForces:
+    """Springs, dampers and actuators whose forces are affine in (q, v, u), with clamped forces.
+
+    Attributes:
+        model: The model, whose limits clamp controls and forces.
+        springs: (nv, 1 + 2 nv + nu) forces of springs and dampers at zero, and their slopes.
+        actuators: (actuators, 1 + 2 nv + nu) forces of actuators at zero, and their slopes.
+        moments: (actuators, nv) joint forces per unit of an actuator's force.
+    """
+
+    model: Any
+    springs: Array
+    actuators: Array
+    moments: Array
+
+    @staticmethod
+    def measured(
+        simulator: BatchSimulator, model: Any, state: Array, ctrl: Array, sizes: Array
+    ) -> AffineForces:
+        """Slopes by differences of the engine's forces, without their limits.
+
+        Args:
+            simulator: Steps the model.
+            model: A model with hinges and slides only.
+            state: (2 nv,) state about which coordinates are moved.
+            ctrl: (nu,) control about which it is moved.
+            sizes: (2 nv + nu,) sizes of the coordinates.
+        """
+        # A copy of a model with many meshes takes time.
+        unlimited = model
+        if model.actuator_forcelimited.any() or model.actuator_ctrllimited.any():
+            unlimited = copy.copy(model)
+            unlimited.actuator_forcelimited[:] = 0
+            unlimited.actuator_ctrllimited[:] = 0
+
+        moves = RELATIVE_MOVE * sizes
+        about = np.concatenate([state, ctrl])
+        points = about + np.concatenate([np.zeros((1, len(moves))), np.diag(moves)])
+        n = len(state)
+        names = ("qfrc_passive", "actuator_force", *MOMENT_FIELDS)
+        fields = simulator.engine_steps(unlimited, points[:, :n], points[:, n:], names).fields
+        first = {name: values[0, 0] for name, values in fields.items()}
+
+        return AffineForces(
+            model=model,
+            springs=_affine(fields["qfrc_passive"][:, 0], about, moves),
+            actuators=_affine(fields["actuator_force"][:, 0], about, moves),
+            moments=_dense_moments(first, n // 2),
+        )
+
+    def at(self, states: Array, ctrl: Array, fields: dict[str, Array]) -> ForceSlopes:
+        """Derivatives of the forces at n states.
+
+        Args:
+            states: (n, 2 nv) states.
+            ctrl: (n, nu) controls.
+            fields: The `FORCE_FIELDS` of the engine, each (n, nv).
+        """
+        points = self._points(states, ctrl)
+        clamped, acts = self._clamped(points)
+
+        # The largest terms of the function show the round-off that its sum may have.
+        total = points @ self.springs.T + clamped @ self.moments
+        terms = (
+            np.abs(points)
+            @ (np.abs(self.springs) + np.abs(self.moments.T) @ np.abs(self.actuators)).T
+        )
+        deviation = np.abs(total - sum(fields[name] for name in FORCE_FIELDS))
+        agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
+
+        slopes = self._slopes(acts, self._applied(ctrl)[1])
+        return ForceSlopes(slopes=slopes, implicit_damping=self._damping(slopes), agree=agree)
+
+    def change(self, states: Array, ctrl: Array, acceleration: Array, by: ParameterChange) -> Array:
+        """Derivatives of the right-hand side of an engine step, `forces - timestep D a`.
+
+        Args:
+            states: (n, 2 nv) states before the step.
+            ctrl: (n, nu) controls.
+            acceleration: (n, nv) mean accelerations a.
+            by: Change of the model by m parameters.
+
+        Returns:
+            (n, nv, m) derivatives at fixed accelerations.
+        """
+        points = self._points(states, ctrl)
+        acts = self._clamped(points)[1]
+
+        # Where the integrator takes all forces at the end of the step, the step moves the speeds.
+        model, nv = self.model, acceleration.shape[1]
+        if self._is_implicit:
+            speeds = slice(1 + nv, 1 + 2 * nv)
+            points = np.array(points)
+            points[:, speeds] += float(model.opt.timestep) * acceleration
+
+        total = np.zeros((len(points), nv, by.count))
+        for joint, k in np.argwhere(by.springs.any(axis=1)).tolist():
+            total[:, joint, k] += points @ by.springs[joint, :, k]
+        for actuator, k in np.argwhere(by.actuators.any(axis=1)).tolist():
+            force = acts[:, actuator] * (points @ by.actuators[actuator, :, k])
+            total[:, :, k] += force[:, None] * self.moments[actuator]
+
+        if self._damps_implicitly:
+            total -= float(model.opt.timestep) * acceleration[..., None] * by.damping
+        return total
+
+    def actuator_slopes(self, states: Array, ctrl: Array) -> Array:
+        """(n, actuators, 2 nv + nu) derivatives of the actuators' forces at n states.
+
+        Args:
+            states: (n, 2 nv) states.
+            ctrl: (n, nu) controls.
+        """
+        _, acts = self._clamped(self._points(states, ctrl))
+        _, is_free = self._applied(ctrl)
+        slopes = acts[..., None] * self.actuators[:, 1:]
+        slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
+        return np.asarray(slopes)
+
+    def clamped(self, states: Array, ctrl: Array) -> np.ndarray:
+        """(n, actuators) True where the force of an actuator is clamped.
+
+        Args:
+            states: (n, 2 nv) states.
+            ctrl: (n, nu) controls.
+        """
+        return ~self._clamped(self._points(states, ctrl))[1]
+
+    def _points(self, states: Array, ctrl: Array) -> Array:
+        """(n, 1 + 2 nv + nu) ones, states and controls within their limits."""
+        applied, _ = self._applied(ctrl)
+        return np.concatenate([np.ones((len(states), 1)), states, applied], axis=1)
+
+    def _clamped(self, points: Array) -> tuple[Array, np.ndarray]:
+        """(n, actuators) forces within their limits, and True where they are not clamped.
+
+        Args:
+            points: (n, 1 + 2 nv + nu) ones, states and controls.
+        """
+        force = points @ self.actuators.T
+        if not self.model.actuator_forcelimited.any():
+            return force, np.ones(force.shape, dtype=bool)
+
+        low, high = self._limits()
+        clamped = np.clip(force, low, high)
+        return clamped, clamped == force
+
+    def _slopes(self, acts: np.ndarray, is_free: np.ndarray) -> Array:
+        """(n, nv, 2 nv + nu) derivatives.
+
+        Args:
+            acts: (n, actuators) True where the force of an actuator is not clamped.
+            is_free: (n, nu) True where a control is not clamped.
+        """
+        slopes = self.springs[:, 1:] + (self.moments.T * acts[:, None]) @ self.actuators[:, 1:]
+        slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
+        return np.asarray(slopes)
+
+    def _damping(self, slopes: Array) -> Array:
+        """(n, nv, nv) damping that the integrator takes at the end of an engine step."""
+        nv = slopes.shape[1]
+        if self._is_implicit:
+            return -slopes[..., nv : 2 * nv]
+        if not self._damps_implicitly:
+            return np.zeros((len(slopes), nv, nv))
+        return np.broadcast_to(np.diag(self.model.dof_damping), (len(slopes), nv, nv))
+
+    @property
+    def _is_implicit(self) -> bool:
+        """Whether the integrator takes all forces at the end of an engine step."""
+        return bool(self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+
+    @property
+    def _damps_implicitly(self) -> bool:
+        """Whether it takes those of the joints' dampers, and no others, at the end of the step."""
+        is_explicit = self.model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        return not (self._is_implicit or is_explicit)
+
+    def _applied(self, ctrl: Array) -> tuple[Array, np.ndarray]:
+        """(n, nu) controls within their limits, and (n, nu) True where they are not clamped."""
+        model = self.model
+        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL):
+            return ctrl, np.ones(ctrl.shape, dtype=bool)
+
+        low = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 0], -np.inf)
+        high = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], np.inf)
+        applied = np.clip(ctrl, low, high)
+        return applied, applied == ctrl
+
+    def _limits(self) -> tuple[Array, Array]:
+        """(actuators,) least and largest forces of the actuators."""
+        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
+        return (
+            np.where(limited, limits[:, 0], -np.inf),
+            np.where(limited, limits[:, 1], np.inf),
+        )
+
+
+def _affine(forces: Array, about: Array, moves: Array) -> Array:
+    """(w, 1 + c) values at zero and slopes, from (1 + c, w) forces: unmoved, then moved each."""
+    slopes = ((forces[1:] - forces[0]) / moves[:, None]).T
+    offset = forces[0] - slopes @ about
+    return np.concatenate([offset[:, None], slopes], axis=1)
+
+
+def _dense_moments(fields: dict[str, Array], nv: int) -> Array:
+    """(actuators, nv) moment arms from the sparse matrix of the `MOMENT_FIELDS`."""
+    counts, starts = fields["moment_rownnz"], fields["moment_rowadr"]
+    moments = np.zeros((len(counts), nv))
+    for row, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
+        entries = slice(start, start + count)
+        moments[row, fields["moment_colind"][entries]] = fields["actuator_moment"][entries]
+    return moments
+
+
+def is_inertial(parameter: Parameter) -> bool:
+    """Whether a parameter changes nothing but the inertia of bodies."""
+    fields = [target.field for target in parameter.targets]
+    return bool(fields) and all(
+        isinstance(field, InertiaField)
+        or (isinstance(field, ModelField) and field.array in INERTIA_ARRAYS)
+        for field in fields
+    )
+
+
+def acts_on_joints(parameter: Parameter) -> bool:
+    """Whether a parameter changes nothing but springs, dampers, gains and armatures."""
+    fields = [target.field for target in parameter.targets]
+    return bool(fields) and all(
+        isinstance(field, ModelField) and {name for name, _, _ in field.numbers} <= {*FORCE_ARRAYS}
+        for field in fields
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParameterChange:
+    """Derivatives of a model by m parameters, or along m directions of them.
+
+    Attributes:
+        inertia: (b, 10, m) of the moved bodies' barycentric inertias.
+        springs: (nv, 1 + 2 nv + nu, m) of the affine forces of springs and dampers.
+        actuators: (actuators, 1 + 2 nv + nu, m) of the affine forces of actuators.
+        damping: (nv, m) of the damping of the joints.
+        armature: (nv, m) of the inertia that is added to each joint.
+    """
+
+    inertia: Array
+    springs: Array
+    actuators: Array
+    damping: Array
+    armature: Array
+
+    @property
+    def count(self) -> int:
+        """Number m of parameters or directions."""
+        return int(self.inertia.shape[-1])
+
+    def along(self, directions: Array) -> ParameterChange:
+        """Change along directions of the m parameters: (n, m)."""
+        names = [field.name for field in fields(self)]
+        return ParameterChange(**{name: getattr(self, name) @ directions.T for name in names})
+
+    @staticmethod
+    def joined(changes: Sequence[ParameterChange]) -> ParameterChange:
+        """Changes by several parameters side by side."""
+        names = [field.name for field in fields(ParameterChange)]
+        return ParameterChange(
+            **{
+                name: np.concatenate([getattr(change, name) for change in changes], axis=-1)
+                for name in names
+            }
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,7 +489,7 @@ class EquationOfMotion:
         timestep = float(model.opt.timestep)
         if "qDeriv" in fields:
             D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind)
-            return np.asarray(-timestep * (D @ points.acceleration[..., None])[..., 0])
+            return -timestep * (D @ points.acceleration[..., None])[..., 0]
         if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
             return np.zeros_like(points.acceleration)
 
@@ -191,7 +511,7 @@ class EquationOfMotion:
             (n, nv) the signs of the velocities, and numbers between -1 and 1 near rest.
         """
         share = speed / np.maximum(self.friction_speeds, np.finfo(float).tiny)
-        return np.asarray(np.clip(share, -1.0, 1.0))
+        return np.clip(share, -1.0, 1.0)
 
     def _friction(self, model: Any, points: MotionPoints) -> Array:
         """(n, nv) forces of dry friction of joints and tendons."""
@@ -240,13 +560,13 @@ def activations(
     states[:, simulator.space.nq : simulator.space.nq + simulator.space.nv] = 0.0
     controls = np.repeat(ctrl[None], len(held), axis=0)
     found = simulator.rollout(held, states, controls)
-    return np.asarray(simulator.space.split(found.states)[2])
+    return simulator.space.split(found.states)[2]
 
 
 def _mass(model: Any, values: Array) -> Array:
     """(n, nv, nv) mass matrices from those that MuJoCo stores, which are lower triangles."""
     lower = _dense(values, model.M_rowadr, model.M_rownnz, model.M_colind)
-    return np.asarray(lower + np.swapaxes(np.tril(lower, -1), 1, 2))
+    return lower + np.swapaxes(np.tril(lower, -1), 1, 2)
 
 
 def _dense(values: Array, starts: Any, counts: Any, columns: Any) -> Array:

@@ -12,9 +12,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.plant.batch import SampleSteps, SubstepObservations
-from mjfim.plant.delay import OutputDelay
 from mjfim.plant.dynamics import Dynamics
-from mjfim.plant.step_derivatives import MovedSamples, StepDerivatives, all_samples, tiled
+from mjfim.plant.first_derivatives import MovedSamples, StepDerivatives, all_samples, tiled
+from mjfim.plant.outputs import OutputDelay
 from mjfim.records.trajectory import Trajectory
 
 

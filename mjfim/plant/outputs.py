@@ -1,7 +1,12 @@
-"""Measured outputs `y = h(x, u, theta)`: components of the state, and sensors."""
+"""Measured outputs `y = h(x, u, theta)`: parts of the state and sensors, their noise and delay.
+
+The noise has a covariance, with which measurements are sampled and whitened. The delay is
+interpolation between samples, written as a linear operator, with its derivative by the delay.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,10 +14,14 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.state_space import StateSpace, quaternion_product
+
+# Number of samples through which the cubic polynomial of the interpolation passes.
+NODES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,7 +273,7 @@ class Calibration:
         Returns:
             (..., ny) factors.
         """
-        return np.asarray(1.0 + theta @ self.scale.T)
+        return 1.0 + theta @ self.scale.T
 
     def measured(self, h: Array, theta: Array) -> Array:
         """Outputs with their errors.
@@ -276,7 +285,7 @@ class Calibration:
         Returns:
             (..., ny) outputs [y-unit].
         """
-        return np.asarray(self.factor(theta) * h + self.bias @ theta)
+        return self.factor(theta) * h + self.bias @ theta
 
     def scaled(self, derivative: Array, theta: Array) -> Array:
         """Derivatives of the outputs by states, controls or directions of theta.
@@ -290,7 +299,7 @@ class Calibration:
         """
         if not self.scales:
             return derivative
-        return np.asarray(self.factor(theta)[:, None] * derivative)
+        return self.factor(theta)[:, None] * derivative
 
     def by_theta(self, h: Array, derivative: Array, theta: Array) -> Array:
         """Derivatives of the outputs with their errors by theta.
@@ -305,3 +314,309 @@ class Calibration:
         """
         total = self.scaled(derivative, theta) + self.bias
         return total + h[..., None] * self.scale if self.scales else total
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Noise:
+    """Gaussian noise, white in time, correlated between the outputs of one sample.
+
+    Attributes:
+        covariance: (ny, ny) covariance [y-unit y-unit].
+        strides: (ny,) strides; every strides[i]-th sample measures output i, except the initial
+            state k = 0. Correlated outputs share their stride.
+    """
+
+    covariance: Array
+    strides: np.ndarray
+
+    @staticmethod
+    def independent(sigma: Sequence[float] | Array, stride: int = 1) -> Noise:
+        """Noise of uncorrelated outputs that are measured at the same samples.
+
+        Args:
+            sigma: (ny,) standard deviations [y-unit].
+            stride: Stride of all outputs.
+
+        Returns:
+            The noise.
+        """
+        covariance = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
+        return Noise(covariance=covariance, strides=np.full(len(sigma), stride))
+
+    @cached_property
+    def sigma(self) -> Array:
+        """(ny,) standard deviations [y-unit]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @cached_property
+    def correlated(self) -> bool:
+        """True if any two outputs are correlated."""
+        return bool(np.count_nonzero(self.covariance) > len(self.covariance))
+
+    @cached_property
+    def factor(self) -> Array:
+        """(ny, ny) lower triangular L with `L L' = covariance` [y-unit]."""
+        return np.asarray(np.linalg.cholesky(self.covariance))
+
+    @cached_property
+    def precision(self) -> Array:
+        """(ny, ny) inverse of the covariance [1 / y-unit y-unit]."""
+        return np.asarray(np.linalg.inv(self.covariance))
+
+    def at_every_sample(self, stride: int) -> Noise:
+        """Noise on a grid that measures every output at every sample.
+
+        The information per second is equal to that of this noise.
+
+        Args:
+            stride: Stride of the measurement rate to which information is related.
+
+        Returns:
+            The noise on the other grid.
+        """
+        scale = np.sqrt(self.strides / stride)
+        return Noise(
+            covariance=self.covariance * np.outer(scale, scale), strides=np.ones_like(self.strides)
+        )
+
+    def measured(self, N: int) -> Array:
+        """Mask of the measured samples.
+
+        Args:
+            N: Number of control samples.
+
+        Returns:
+            (N+1, ny) 1 where an output is measured, else 0.
+        """
+        k = np.arange(N + 1)[:, None]
+        return np.asarray((k % self.strides == 0) & (k > 0), dtype=np.float64)
+
+    def whiten(self, values: Array) -> Array:
+        """Whitened values `L^-1 y`.
+
+        Args:
+            values: (N+1, ny, ...) values [y-unit].
+
+        Returns:
+            (N+1, ny, ...) whitened values.
+        """
+        if not self.correlated:
+            return values / self.sigma.reshape(-1, *[1] * (values.ndim - 2))
+
+        rows = np.moveaxis(values, 1, 0)
+        flat = scipy.linalg.solve_triangular(self.factor, rows.reshape(len(rows), -1), lower=True)
+        return np.moveaxis(flat.reshape(rows.shape), 0, 1)
+
+    def whitened_rows(self, values: Array) -> Array:
+        """Whitened values of all measurements, one after the other.
+
+        Args:
+            values: (N+1, ny, ...) values [y-unit].
+
+        Returns:
+            (n, ...) whitened values of the n measurements.
+        """
+        return self.whiten(values)[self.measured(len(values) - 1) > 0]
+
+    def whiten_present(self, values: Array, present: np.ndarray) -> Array:
+        """Whitened values of the measurements that are present; missing ones are marginalised out.
+
+        Args:
+            values: (N+1, ny, ...) values [y-unit].
+            present: (N+1, ny) True where a measurement is present.
+
+        Returns:
+            (n, ...) whitened values of the n measurements that are present.
+        """
+        if not self.correlated:
+            return np.asarray(self.whiten(values)[present])
+
+        # The marginal covariance, and with it the factor, depends on which outputs are present at a
+        # sample. All samples with an equal pattern are whitened together.
+        whitened = np.zeros(values.shape)
+        for pattern in np.unique(present, axis=0):
+            if not pattern.any():
+                continue
+            samples = (present == pattern).all(axis=1)
+            marginal = Noise(
+                covariance=self.covariance[np.ix_(pattern, pattern)], strides=self.strides[pattern]
+            )
+            block = np.ix_(samples, pattern)
+            whitened[block] = marginal.whiten(values[block])
+        return np.asarray(whitened[present])
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw noise.
+
+        Args:
+            count: Number of samples.
+            rng: Random generator.
+
+        Returns:
+            (count, ny) noise [y-unit].
+        """
+        return rng.standard_normal((count, len(self.factor))) @ self.factor.T
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OutputDelay:
+    """Values `y(t - d)` from samples y_k, by cubic Lagrange interpolation.
+
+    The order is lower where there are fewer than four samples. Before the first sample the first
+    value is held, after the last sample the last one.
+
+    Attributes:
+        nodes: (M, n) ascending indices of the samples that each value is made of; M = N+1 if values
+            are wanted at the samples themselves.
+        node_weights: (M, n) interpolation weights of these samples.
+        node_slopes: (M, n) derivative of the weights by d [1/s].
+        samples: Number of samples N+1.
+    """
+
+    nodes: np.ndarray
+    node_weights: Array
+    node_slopes: Array
+    samples: int
+
+    @cached_property
+    def weights(self) -> Any:
+        """(M, N+1) sparse interpolation weights."""
+        return self._sparse(self.node_weights)
+
+    @cached_property
+    def weight_slopes(self) -> Any:
+        """(M, N+1) sparse derivative of the weights by d [1/s]."""
+        return self._sparse(self.node_slopes)
+
+    def _sparse(self, of_nodes: Array) -> Any:
+        """(M, N+1) sparse operator with these numbers at the nodes: (M, n).
+
+        All rows have the same number of nodes, so that the operator needs no sorting.
+        """
+        rows, count = of_nodes.shape
+        row_starts = np.arange(rows + 1) * count
+        return scipy.sparse.csr_array(
+            (of_nodes.ravel(), self.nodes.ravel(), row_starts), shape=(rows, self.samples)
+        )
+
+    @staticmethod
+    def on_grid(samples: int, delay: float, dt: float) -> OutputDelay:
+        """Delayed values at the samples themselves.
+
+        Args:
+            samples: Number of samples N+1.
+            delay: Delay d [s].
+            dt: Sample period [s].
+
+        Returns:
+            The operator.
+        """
+        wanted = np.arange(samples, dtype=np.float64) - delay / dt
+        return OutputDelay.at(wanted, samples, dt)
+
+    @staticmethod
+    def at(wanted: Array, samples: int, dt: float) -> OutputDelay:
+        """Delayed values at any times, for outputs that are measured between the samples.
+
+        Args:
+            wanted: (M,) places `(t - d) / dt` in samples.
+            samples: Number of samples N+1.
+            dt: Sample period [s].
+
+        Returns:
+            The operator.
+        """
+        place = np.clip(wanted, 0.0, samples - 1.0)
+        count = min(NODES, samples)
+
+        # No node lies after the sample at or behind the place: a controller feeds the noise of a
+        # measurement back into the later samples, and a slope from these would be correlated with
+        # that noise. At both ends, the nodes are shifted to existing samples.
+        first = np.clip(np.ceil(place).astype(int) - (count - 1), 0, samples - count)
+        nodes = first[:, None] + np.arange(count)
+        value, slope = _lagrange(place[:, None] - first[:, None], count)
+
+        # Where the first or last value is held, a change of the delay changes nothing.
+        inside = (wanted >= 0.0) & (wanted <= samples - 1.0)
+        slope *= np.where(inside, -1.0 / dt, 0.0)[:, None]
+
+        return OutputDelay(nodes=nodes, node_weights=value, node_slopes=slope, samples=samples)
+
+    def apply(self, values: Array) -> Array:
+        """Delayed values.
+
+        Args:
+            values: (N+1, ...) samples.
+
+        Returns:
+            (M, ...) delayed values.
+        """
+        return _apply(self.weights, values)
+
+    def derivative(self, values: Array) -> Array:
+        """Derivative of the delayed values by the delay.
+
+        Args:
+            values: (N+1, ...) samples.
+
+        Returns:
+            (M, ...) derivative [unit of the values / s].
+        """
+        return _apply(self.weight_slopes, values)
+
+    def apply_transposed(self, values: Array) -> Array:
+        """Adjoint of `apply`.
+
+        Args:
+            values: (M, ...) covector of the delayed values.
+
+        Returns:
+            (N+1, ...) covector of the samples.
+        """
+        return _apply(self.weights.T, values)
+
+    def derivative_transposed(self, values: Array) -> Array:
+        """Adjoint of `derivative`.
+
+        Args:
+            values: (M, ...) covector of the derivative.
+
+        Returns:
+            (N+1, ...) covector of the samples.
+        """
+        return _apply(self.weight_slopes.T, values)
+
+
+def _apply(operator: Any, values: Array) -> Array:
+    """Apply a sparse operator (M, N+1) to the first axis of values: (N+1, ...)."""
+    rows = values.reshape(len(values), -1)
+    applied = operator @ rows
+
+    shape = (operator.shape[0], *values.shape[1:])
+    return np.asarray(applied.reshape(shape))
+
+
+def _lagrange(s: Array, count: int) -> tuple[Array, Array]:
+    """Lagrange weights of equidistant nodes.
+
+    Args:
+        s: (n, 1) places, in units of the distance between two nodes.
+        count: Number of nodes; they are at 0, 1, 2 and so on.
+
+    Returns:
+        (n, count) weights, and (n, count) their derivatives by s.
+    """
+    # Values of all nodes are contiguous here, because NumPy is slow along short rows.
+    value = np.ones((count, len(s)))
+    slope = np.zeros((count, len(s)))
+    for i in range(count):
+        others = [j for j in range(count) if j != i]
+        scale = math.prod(i - j for j in others)
+        factors = [s[:, 0] - j for j in others]
+        value[i] = math.prod(factors, start=value[i]) / scale
+
+        # The product rule: a sum of products, each without one of the factors.
+        for k in range(count - 1):
+            slope[i] += math.prod(factors[:k] + factors[k + 1 :])
+        slope[i] /= scale
+    return value.T, slope.T

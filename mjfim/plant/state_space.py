@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.model.sizes import (
+from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
     bristle_sizes,
     control_sizes,
@@ -298,4 +298,4 @@ class StateSizes:
 def _shown(values: Array, natural: Array) -> Array:
     """(w,) largest magnitudes of values: (N, w); natural sizes where they are negligible."""
     largest = np.abs(values).max(axis=0, initial=0.0)
-    return np.asarray(np.where(largest > NEGLIGIBLE_CONTROL * natural, largest, natural))
+    return np.where(largest > NEGLIGIBLE_CONTROL * natural, largest, natural)

@@ -21,8 +21,8 @@ from mjfim.excitation.search.inside import LimitedCost, largest_share
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, boundary_splines
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.initial import fourier_basis, independent_curves
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.signals import fourier_basis, independent_curves
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.events import DesignEvent

@@ -32,19 +32,18 @@ from mjfim.excitation.task import (
     DesignTask,
 )
 from mjfim.excitation.task_parts import require_design_keys
+from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.signals import multisine
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import System
-from mjfim.experiment.system_order import SystemOrder
+from mjfim.experiment.system import System, SystemOrder
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.segments import recorded_release
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import refuse_same_data
+from mjfim.information.criteria import shared
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
-from mjfim.information.marginal import shared
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES

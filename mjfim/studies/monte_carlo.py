@@ -18,10 +18,8 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import System
-from mjfim.experiment.system_order import SystemOrder
+from mjfim.experiment.system import System, SystemOrder, labels_of_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.information.identifiability import require_visible

@@ -13,10 +13,9 @@ from mjfim.experiment.packing import model_of
 from mjfim.experiment.parameters import BARYCENTRIC_FIELDS, LOGCHOLESKY_FIELDS
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import ParameterSpec
-from mjfim.model.elements import identifier, names_of
+from mjfim.model.elements import identifier, model_length, names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
-from mjfim.model.sizes import model_length
-from mjfim.model.terms.base import AXES
+from mjfim.model.terms.library import AXES
 from mjfim.studies.first_experiment.candidates import PAYLOAD_SHARE
 
 # Kind of the term that is a payload, and the name of the one that is added.

@@ -24,7 +24,7 @@ from mjfim.experiment.packing import opened_file
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.information.marginal import standard_deviations
+from mjfim.information.criteria import standard_deviations
 from mjfim.model.coordinates import tangent_names
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.plant.batch import BatchSimulator

@@ -34,8 +34,8 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.signals import multisine
 
 # Folder of the models that others wrote, beside the repository.
 MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"

@@ -25,6 +25,9 @@ import mjfim
 from mjfim.experiment.signals import multisine
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.initial import multisine
+from mjfim.experiment.system import System, simulate_system
 from mjfim.output.archive import write_recording
 from mjfim.parallel import cores
 from mjfim.recordings.read import read_recording

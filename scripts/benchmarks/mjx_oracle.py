@@ -37,7 +37,7 @@ from mujoco import mjx
 from mjfim.arrays import Array
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.plant.closed_form.samples import closed_form_tree
+from mjfim.plant.closed_form import closed_form_tree
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 
 MODELS = Path(__file__).resolve().parents[2] / "models"

@@ -33,7 +33,7 @@ from rich.table import Table
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.files import replacing
 from mjfim.parallel import cores
 from mjfim.records.estimate import Estimate

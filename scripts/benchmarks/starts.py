@@ -38,7 +38,7 @@ from rich.table import Table
 import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError
-from mjfim.experiment.signals import multisine
+from mjfim.experiment.initial import multisine
 from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.identification.fit_problem import FitProblem

@@ -13,8 +13,8 @@ import mjfim
 from mjfim.excitation.design import design_task
 from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.initial import spline_basis
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.signals import spline_basis
 from mjfim.output.pages import page_of
 from mjfim.records.design import Design, HistoryRow, Status
 from tests.support.limits import ARM, HARD, cart_inside

@@ -14,7 +14,7 @@ from mjfim.excitation.limits.constraint_kinds import END_WEIGHT, ConstraintValue
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
-from mjfim.optimize.barrier import Bounds
+from mjfim.optimize.cost_models import Bounds
 from mjfim.optimize.lq import TangentCurve
 from tests.support.limits import ARM, barrier_check, directions_of, floating_task
 from tests.support.numerics import Array, make_task, relative_error
@@ -268,19 +268,19 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     assert barrier.curvature is not None
     K = np.zeros((task.samples, 2, task.space.nx))
     way = directions_of(task, 1, seed=6)[0]
-    still = barrier.curvature.along(expansion.lift(K, 0.0 * way), None)
-    assert still.growth == 1.0
-    np.testing.assert_allclose(still.weights.Q, barrier.weights.Q, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(still.weights.R, barrier.weights.R, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(still.weights.W, barrier.weights.W, rtol=1e-9, atol=0)
+    weights, _, growth = barrier.curvature.along(expansion.lift(K, 0.0 * way), None)
+    assert growth == 1.0
+    np.testing.assert_allclose(weights.Q, barrier.weights.Q, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(weights.R, barrier.weights.R, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(weights.W, barrier.weights.W, rtol=1e-9, atol=0)
 
     step = expansion.lift(K, way)
-    once = barrier.curvature.along(step, None)
-    assert once.growth > 1.0
-    assert once.growth == pytest.approx(max(each.max() for each in once.factors))
-    again = barrier.curvature.along(step, once.factors)
-    ratios = [b / a for a, b in zip(once.factors, again.factors, strict=True)]
-    assert again.growth == pytest.approx(max(each.max() for each in ratios))
+    _, once, growth = barrier.curvature.along(step, None)
+    assert growth > 1.0
+    assert growth == pytest.approx(max(each.max() for each in once))
+    _, again, growth = barrier.curvature.along(step, once)
+    ratios = [b / a for a, b in zip(once, again, strict=True)]
+    assert growth == pytest.approx(max(each.max() for each in ratios))
     # with a smooth barrier, or where it is not asked for, the curvature is not followed
     for other in (replace(problem, mu=0.1), replace(problem, follows_curvature=False)):
         smooth = other.expand(other.point(task.control)).barrier

@@ -9,11 +9,11 @@ from mjfim.excitation.objective import ExtendedDesignProblem, extend
 from mjfim.excitation.task import DesignTask
 from mjfim.information.fisher import FisherInformation
 from mjfim.model.parameter_writer import ParameterWriter
-from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
+from mjfim.optimize.directions import MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, Bilinear
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import Array, Loop, body_task, cart_task, relative_error
 
@@ -48,7 +48,7 @@ def both_directions(
 
 def extended_direction(e: Expansion, K: Array, Q: Array, R: Array, terminal: Array) -> TangentCurve:
     """The direction zeta of the extended problem."""
-    return ExtendedMetricDescent(Q, R, terminal)(e, K)
+    return MetricDescent(Q, R, terminal, weighs_psi=True)(e, K)
 
 
 CASES = {

@@ -11,7 +11,7 @@ import pytest
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.initial_controls import initial_controls_of
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.signals import fourier_basis
+from mjfim.experiment.initial import fourier_basis
 from tests.support.limits import ARM
 from tests.support.numerics import make_task
 

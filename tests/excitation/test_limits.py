@@ -12,7 +12,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import Limit, limits_of
-from mjfim.experiment.labels import labels_of_model
+from mjfim.experiment.system import labels_of_model
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
 from mjfim.plant.active_constraints import saturated_actuators

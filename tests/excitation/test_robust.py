@@ -16,9 +16,8 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import ParameterSamples
-from mjfim.model.parameter_ranges import sample_parameters
 from mjfim.model.parameter_writer import ParameterWriter
-from mjfim.model.parameters import Parameter, ParameterSet
+from mjfim.model.parameters import Parameter, ParameterSet, sample_parameters
 from tests.support.numerics import CART_PARAMETERS, Array, body_task, cart_task
 
 KINDS = {

@@ -9,7 +9,7 @@ import pytest
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.initial_state import generate
+from mjfim.experiment.initial import generate
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from tests.support.paths import MODELS

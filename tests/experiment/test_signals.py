@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from mjfim.experiment.signals import fourier_basis, independent_curves, multisine, spline_basis
+from mjfim.experiment.initial import fourier_basis, independent_curves, multisine, spline_basis
 
 # Duration [s].
 HORIZON = 2.0

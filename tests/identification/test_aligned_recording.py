@@ -20,7 +20,7 @@ from mjfim.identification.aligned_recording import (
     measured_trajectory,
     resample_control,
 )
-from mjfim.plant.delay import OutputDelay
+from mjfim.plant.outputs import OutputDelay
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
 

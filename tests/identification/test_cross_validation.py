@@ -7,7 +7,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification import left_out
 from mjfim.identification.assessment import predictions
 from mjfim.identification.fit_problem import FitProblem

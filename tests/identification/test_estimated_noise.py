@@ -11,14 +11,13 @@ import pytest
 import mjfim
 from mjfim.arrays import Array
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget, StopToken
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.events import FitEvent
 from tests.support.paths import MODELS
 

@@ -14,8 +14,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification import (
     fit_workers,
     left_out,

@@ -7,7 +7,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.identification.left_out import HeldOutLosses, held_out_losses

@@ -9,7 +9,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.output.pages import page_of
 from tests.support.paths import ROOT

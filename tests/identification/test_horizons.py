@@ -12,7 +12,7 @@ import pytest
 import mjfim
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.horizons import _chosen
 from mjfim.identification.identify import DIVERGED
 from mjfim.identification.left_out import HeldOutLosses

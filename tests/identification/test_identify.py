@@ -18,7 +18,7 @@ from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedErro
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify, identify_system, least_squares

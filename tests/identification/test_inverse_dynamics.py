@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, RecordingError
+from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.signals import multisine
 from mjfim.experiment.system import System
 from mjfim.identification.inverse_dynamics import inverse_dynamics
 from mjfim.records.inverse_dynamics import InverseDynamicsFit

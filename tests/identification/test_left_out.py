@@ -10,7 +10,7 @@ import pytest
 import mjfim
 from mjfim.arrays import Array
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.identification.left_out import LeftOutPart, fit_without, left_out_parts

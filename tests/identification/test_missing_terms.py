@@ -9,8 +9,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.identification.task import FitTask
 from mjfim.identification.terms import find_missing_terms, score_tests

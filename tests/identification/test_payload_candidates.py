@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.experiment.signals import multisine
+from mjfim.experiment.initial import multisine
 from mjfim.experiment.system import System
 from mjfim.identification.terms.candidates import Candidate, candidates_of
 from tests.support.closed_loop import ARM

@@ -9,7 +9,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.assessment.recording_comparison import compare_evidence
 from mjfim.identification.assessment.robust_covariance import (
     block_length,

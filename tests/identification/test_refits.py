@@ -10,8 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.assessment.report import FitResult, estimate_from
 from mjfim.identification.identify import fit_task, refit_task
 from mjfim.identification.search import FitSearch

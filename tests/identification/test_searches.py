@@ -11,8 +11,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch, first_subset

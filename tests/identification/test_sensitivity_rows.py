@@ -13,8 +13,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import _unseen_directions

@@ -9,8 +9,7 @@ import pytest
 
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.records.estimate import Estimate
 from tests.support.numerics import shared_model

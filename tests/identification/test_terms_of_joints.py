@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.experiment.signals import multisine
+from mjfim.experiment.initial import multisine
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.terms.score_tests import (

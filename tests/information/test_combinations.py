@@ -13,7 +13,7 @@ import mjfim
 from mjfim.errors import UnidentifiableError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.output import archive
 from mjfim.studies.check import check_recordings, check_task

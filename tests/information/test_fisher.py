@@ -12,12 +12,11 @@ import pytest
 from mjfim.errors import UnidentifiableError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.identify import identify_system
-from mjfim.information.criteria import CRITERIA
+from mjfim.information.criteria import CRITERIA, standard_deviations
 from mjfim.information.fisher import FisherInformation
-from mjfim.information.marginal import standard_deviations
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error, richardson
 

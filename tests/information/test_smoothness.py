@@ -18,7 +18,7 @@ from mjfim.information.smoothness import (
     only_curved,
     roughness,
 )
-from mjfim.plant.derivatives import Derivatives
+from mjfim.plant.plant import Derivatives
 from mjfim.records.check import Roughness
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
 

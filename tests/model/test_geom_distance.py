@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.model.clearance.geom_distance import GeomDistances, SignedDistances
-from mjfim.model.clearance.pair_distance import BOX, CAPSULE, find_geom_pairs
+from mjfim.model.clearance import BOX, CAPSULE, GeomDistances, SignedDistances, find_geom_pairs
 from tests.support.numerics import Array, directional_check
 
 ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))

@@ -10,8 +10,7 @@ import pytest
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate
 from mjfim.identification.identify import identify
 from mjfim.model.parameters import ParameterSet
 from tests.support.paths import MODELS

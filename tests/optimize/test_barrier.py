@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from mjfim.optimize.barrier import (
+from mjfim.optimize.cost_models import (
     BarrierExpansion,
     Bounds,
     curvature_factors,

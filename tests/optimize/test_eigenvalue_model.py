@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import smooth_e_optimality
-from mjfim.optimize.eigenvalue_model import (
+from mjfim.optimize.cost_models import (
     EigenvalueModel,
     divided_log_differences,
     symmetric_coordinates,

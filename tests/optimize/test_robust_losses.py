@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mjfim.optimize.robust_losses import RobustLoss
+from mjfim.optimize.condensed_least_squares import RobustLoss
 from tests.support.numerics import Array, richardson
 
 Kind = Literal["linear", "huber", "soft_l1", "cauchy"]

@@ -13,10 +13,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from mjfim.optimize.barrier import BarrierExpansion, Bounds
+from mjfim.optimize.cost_models import BarrierExpansion, Bounds
 from mjfim.optimize.lq import CurveCoordinates, LinearRecursion, TangentCurve, Weights
 from mjfim.optimize.projection_operator import Armijo, Expansion, Regulator, optimize
-from mjfim.optimize.structured_bfgs import BasisMetric, CurveMetric, StructuredBFGS
+from mjfim.optimize.structured_bfgs import (
+    BasisMetric,
+    CurveMetric,
+    StructuredBFGS,
+    basis_matrix,
+    basis_response,
+)
 from mjfim.records.design import Status
 from tests.support.lq import random_system, random_weights
 from tests.support.numerics import Array, cart_task, relative_error
@@ -29,6 +35,11 @@ def random_expansion(rng: np.random.Generator) -> tuple[Expansion, Weights]:
     A, B = random_system(rng, N, NX, NU)
     expansion = Expansion(A=A, B=B, a=rng.normal(size=(N + 1, NX)), b=rng.normal(size=(N, NU)))
     return expansion, random_weights(rng, N, NX, NU, steps=True)
+
+
+def basis_metric(expansion: Expansion, weights: Weights, basis: Array) -> BasisMetric:
+    """Metric of a quadratic form on the coefficients of a basis."""
+    return BasisMetric(H=basis_matrix(basis, basis_response(expansion, basis), weights))
 
 
 def dense(metric: CurveMetric) -> Array:
@@ -72,7 +83,7 @@ def test_both_metrics_agree_on_an_identity_basis() -> None:
         coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))),
         weights=weights,
     )
-    based = BasisMetric.from_weights(expansion, weights, np.eye(N))
+    based = basis_metric(expansion, weights, np.eye(N))
     for _ in range(3):
         s = rng.normal(size=(N, NU))
         assert relative_error(based.apply(s), free.apply(s)) < 1e-8
@@ -97,7 +108,7 @@ def test_the_metric_of_a_basis_is_the_projected_metric() -> None:
         )
         @ wide
     )
-    based = BasisMetric.from_weights(expansion, weights, basis)
+    based = basis_metric(expansion, weights, basis)
     assert relative_error(based.H, H) < 1e-9
     g = rng.normal(size=(5, NU))
     assert relative_error(based.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1))) < 1e-7
@@ -373,7 +384,7 @@ def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Pat
     """Its slope agrees with differences of simulated trials."""
     from mjfim.excitation.limits.constraints import constraint_set_of
     from mjfim.excitation.search.interior_problem import InteriorProblem
-    from mjfim.experiment.signals import spline_basis
+    from mjfim.experiment.initial import spline_basis
 
     task = cart_task(
         tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}

@@ -20,7 +20,7 @@ import mjfim
 from mjfim.errors import RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.files import PREFIX, as_json, replacing
 from mjfim.identification.identify import identify_system
 from mjfim.output import archive

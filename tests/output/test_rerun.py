@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError
-from mjfim.experiment.labels import labels_of_model
+from mjfim.experiment.system import labels_of_model
 from mjfim.output.rerun import log_design, log_estimate, log_trajectories, show
 from mjfim.output.rerun.camera import (
     FIELD_OF_VIEW,

@@ -14,7 +14,7 @@ import mjfim
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.output.models.mjcf import same_dynamics
 from mjfim.output.models.sysid import SysidProblem, silenced, sysid_problem

@@ -16,8 +16,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.output import vocabulary
 from mjfim.output.video.film import Film, film_of, film_of_motions, film_speed, positions_at
 from mjfim.output.video.video import NoVideoError, Video, render, report_video, require_format

@@ -12,7 +12,7 @@ import pytest
 
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.closed_form.samples import closed_form_tree
+from mjfim.plant.closed_form import closed_form_tree
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
 from mjfim.records.trajectory import Trajectory
 from tests.support.numerics import make_task

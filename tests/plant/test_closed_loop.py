@@ -10,7 +10,7 @@ import pytest
 
 from mjfim.experiment.system import System
 from mjfim.model.loading import silence_mujoco_log
-from mjfim.plant.laws.running_law import InputContext
+from mjfim.plant.running_law import InputContext
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
 
 # The arm with a sensor of the torque of the shoulder's motor.

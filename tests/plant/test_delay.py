@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjfim.plant.delay import OutputDelay
+from mjfim.plant.outputs import OutputDelay
 from tests.support.numerics import Array, cart_task, richardson
 
 DT = 0.01

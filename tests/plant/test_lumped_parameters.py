@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.search.levels import DescentLevel
-from mjfim.plant.lumped_parameters import LumpedParameters
+from mjfim.plant.plant import LumpedParameters
 from tests.support.numerics import cart_task
 
 # The force of the cart is the product of the gain and the gear of its motor.

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import pytest
 
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.search.levels import DescentLevel
-from mjfim.experiment.signals import fourier_basis
+from mjfim.experiment.initial import fourier_basis
 from mjfim.parallel.budget import StopToken, measured_by
 from mjfim.studies.baselines import (
     MAX_LEVELS,

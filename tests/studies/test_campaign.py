@@ -21,7 +21,7 @@ from mjfim.cli.campaign import with_target_accuracies
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.files import write_json
 from mjfim.identification.identify import identify_system
 from mjfim.output.campaign_folder import (

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.fisher import FisherInformation
-from mjfim.plant.derivatives import Derivatives
+from mjfim.plant.plant import Derivatives
 from mjfim.records.trajectory import Recording
 from mjfim.studies.check import check_recordings, check_task
 from tests.support.dense_residuals import dense_residuals

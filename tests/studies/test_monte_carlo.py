@@ -9,7 +9,7 @@ import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.identification.identify import identify
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import Event, StudyEvent

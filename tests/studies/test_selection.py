@@ -10,7 +10,7 @@ import pytest
 import mjfim
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import simulate_system
 from mjfim.parallel.budget import StopToken
 from mjfim.records.terms import Decision
 from mjfim.records.trajectory import Recording

@@ -10,8 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, simulate_system
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.terms import Decision, PooledParameter
 from mjfim.records.trajectory import Recording

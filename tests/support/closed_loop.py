@@ -1,6 +1,6 @@
 """A closed loop simulated by a plain loop over engine steps, one simulation and one law at a time.
 
-It shares no code with `mjfim.plant.laws.closed_loop`.
+It shares no code with `mjfim.plant.closed_loop`.
 """
 
 from __future__ import annotations

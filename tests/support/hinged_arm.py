@@ -8,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.signals import multisine
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array
 

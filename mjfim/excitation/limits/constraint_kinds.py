@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.excitation.limits.magnitudes import Magnitude, VectorBarrier
-from mjfim.model.clearance.geom_distance import GeomDistances
-from mjfim.optimize.barrier import BarrierDerivatives, Bounds
+from mjfim.model.clearance import GeomDistances
+from mjfim.optimize.cost_models import BarrierDerivatives, Bounds
 from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.state_space import StateSpace

@@ -23,9 +23,8 @@ from mjfim.excitation.limits.constraint_kinds import (
 )
 from mjfim.excitation.limits.limits import Limit, derivative_substeps_of, has_constant_forces
 from mjfim.excitation.task import DesignTask
-from mjfim.model.clearance.geom_distance import GeomDistances
-from mjfim.model.clearance.pair_distance import find_geom_pairs
-from mjfim.model.elements import is_rk4
+from mjfim.model.clearance import GeomDistances, find_geom_pairs
+from mjfim.model.elements import is_rk4, model_length
 from mjfim.model.limited_elements import (
     actuators_of_tendon,
     quaternion_address,
@@ -33,15 +32,13 @@ from mjfim.model.limited_elements import (
     tilt_weights,
     turn_weights,
 )
-from mjfim.model.sizes import model_length
-from mjfim.optimize.barrier import (
+from mjfim.optimize.cost_models import (
     BarrierExpansion,
     Bounds,
-    CurvatureAlong,
     StepCurvature,
     curvature_factors,
 )
-from mjfim.optimize.lq import TangentCurve
+from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
 
@@ -151,7 +148,9 @@ class CurvatureOfLimits(StepCurvature):
     nu: int
     mu: float = 1.0
 
-    def along(self, step: TangentCurve, factors: Sequence[Array] | None) -> CurvatureAlong:
+    def along(
+        self, step: TangentCurve, factors: Sequence[Array] | None
+    ) -> tuple[Weights, tuple[Array, ...], float]:
         """See `StepCurvature.along`."""
         found: list[Array] = []
         growth = 1.0
@@ -163,9 +162,7 @@ class CurvatureOfLimits(StepCurvature):
             growth = max(growth, float((new / old).max(initial=1.0)))
             found.append(new)
 
-        return CurvatureAlong(
-            weights=self.sums(found).weights.scaled(self.mu), factors=tuple(found), growth=growth
-        )
+        return self.sums(found).weights.scaled(self.mu), tuple(found), growth
 
     def sums(self, factors: Sequence[Array] | None = None) -> ExpansionSums:
         """Gradient and Gauss-Newton Hessian of the barrier, without its weight.

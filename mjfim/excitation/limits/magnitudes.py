@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.optimize.barrier import Bounds
+from mjfim.optimize.cost_models import Bounds
 
 # Norm over its bound below which the limits of the derivatives at zero hold; the error is the
 # square of it.

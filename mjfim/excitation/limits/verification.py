@@ -23,7 +23,7 @@ from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
 from mjfim.model.units import LENGTH
 from mjfim.model.variants import unconstrained
-from mjfim.optimize.barrier import Bounds
+from mjfim.optimize.cost_models import Bounds
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage, LimitViolation
 from mjfim.records.trajectory import Trajectory

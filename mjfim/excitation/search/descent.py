@@ -23,9 +23,9 @@ from mjfim.excitation.search.inside import largest_share
 from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProblem, values_of
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.signals import independent_curves
+from mjfim.experiment.initial import independent_curves
 from mjfim.information.criteria import Criterion
-from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
+from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
@@ -472,7 +472,7 @@ def _direction_for(level: DescentLevel) -> tuple[Direction, DesignProblem]:
     # The metric of the paper also weighs the sensitivities psi, as states of the extended system.
     psi_weights = np.full(len(Q) * len(task.parameters), descent.psi_weight * task.dt)
     extended_Q = np.diag(np.concatenate([np.diag(Q), psi_weights]))
-    direction = ExtendedMetricDescent(extended_Q, R, extended_Q)
+    direction = MetricDescent(extended_Q, R, extended_Q, weighs_psi=True)
     return direction, ExtendedDesignProblem.of(level.problem)
 
 

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
-from mjfim.optimize.barrier import BarrierExpansion
+from mjfim.optimize.cost_models import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 

@@ -12,9 +12,9 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.signals import spline_basis
+from mjfim.experiment.initial import spline_basis
 from mjfim.optimize.projection_operator import Regulator
-from mjfim.plant.lumped_parameters import LumpedParameters
+from mjfim.plant.plant import LumpedParameters
 from mjfim.records.trajectory import Trajectory
 
 

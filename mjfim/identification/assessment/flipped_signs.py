@@ -18,7 +18,7 @@ from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.parallel.budget import Budget
-from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Noise
 from mjfim.records.check import join_names
 from mjfim.records.trajectory import Recording
 

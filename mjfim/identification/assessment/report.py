@@ -13,9 +13,8 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import first_ones, listed
-from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.assessment.accuracy import Accuracy, accuracy_of
 from mjfim.identification.assessment.fit_quality import FitQuality

@@ -25,7 +25,7 @@ from mjfim.identification.inverse_dynamics.motion import MeasuredMotion, measure
 from mjfim.identification.known_activations import bristles_of
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import dof_names
-from mjfim.model.sizes import translations
+from mjfim.model.elements import translations
 from mjfim.model.targets import ModelField
 from mjfim.model.variants import RELAXED, Relaxation
 from mjfim.plant.equation_of_motion import EquationOfMotion, EquationTerms, MotionPoints

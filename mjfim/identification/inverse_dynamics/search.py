@@ -19,8 +19,8 @@ from mjfim.experiment.system import System
 from mjfim.identification.inverse_dynamics.equations import MotionEquations, Rows
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.model.control_laws import LawField
+from mjfim.model.elements import model_length, translations
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.sizes import model_length, translations
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
 
 # Steps of differences, relative to the sizes of the parameters. Those of inertias may be long,

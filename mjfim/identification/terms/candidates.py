@@ -17,9 +17,14 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint, scalar_joints
-from mjfim.model.elements import element_name, names_of
+from mjfim.model.elements import (
+    LEAST_MOVE_PER_SAMPLE,
+    element_name,
+    force_sizes,
+    names_of,
+    position_sizes,
+)
 from mjfim.model.paths import resolve, unit_of
-from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import Term as LibraryTerm
 from mjfim.model.terms.term import TermTable

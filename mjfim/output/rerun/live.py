@@ -13,7 +13,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.arrays import Array, evenly_spread_indices
-from mjfim.experiment.labels import labels_of_model
+from mjfim.experiment.system import labels_of_model
 from mjfim.output import vocabulary
 from mjfim.output.panels import line
 from mjfim.output.playback import shown_positions

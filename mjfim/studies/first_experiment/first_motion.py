@@ -11,7 +11,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs, tangent_components
-from mjfim.model.sizes import control_sizes, translations
+from mjfim.model.elements import control_sizes, translations
 from mjfim.model.units import actuator_gear, commanded_joint
 from mjfim.studies.first_experiment.start import MARGIN, Start
 

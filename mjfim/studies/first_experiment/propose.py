@@ -17,10 +17,9 @@ from mjfim.excitation.limits.verification import verify, violations_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.model.elements import unnamed_count
+from mjfim.model.elements import position_sizes, unnamed_count
 from mjfim.model.loading import ModelSource, silence_mujoco_log
 from mjfim.model.model_files import is_urdf
-from mjfim.model.sizes import position_sizes
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.studies.first_experiment.candidates import (
     Candidate,

@@ -13,8 +13,7 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs
-from mjfim.model.elements import is_rk4
-from mjfim.model.sizes import control_sizes, translations
+from mjfim.model.elements import control_sizes, is_rk4, translations
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.studies.first_experiment.wishes import require_keyframe, resting_keyframes
 

@@ -23,14 +23,14 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
-from mjfim.plant.closed_form.affine_forces import (
+from mjfim.plant.equation_of_motion import (
     FORCE_FIELDS,
     AffineForces,
     ParameterChange,
     acts_on_joints,
     is_inertial,
 )
-from mjfim.plant.closed_form.rigid_body_motion import (
+from mjfim.plant.rigid_body_motion import (
     MOTION_FIELDS,
     JointTree,
     RigidBodyMotion,
@@ -304,7 +304,7 @@ class ClosedForm:
 
         def quotient(larger: Array, smaller: Array) -> Array:
             """Quotient by one parameter."""
-            return np.asarray((larger - smaller)[..., None] / distance)
+            return (larger - smaller)[..., None] / distance
 
         return ParameterChange(
             inertia=quotient(*inertias),

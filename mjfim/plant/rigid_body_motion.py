@@ -119,12 +119,12 @@ class RigidBodyMotion:
     def _summed_to(self, of_joints: Array) -> Array:
         """(n, nv, ...) sums over the joints between each joint and the world, itself included."""
         flat = of_joints.reshape(*of_joints.shape[:2], -1)
-        return np.asarray((self.tree.supports @ flat).reshape(of_joints.shape))
+        return (self.tree.supports @ flat).reshape(of_joints.shape)
 
     def _summed_behind(self, of_joints: Array) -> Array:
         """(n, nv, ...) sums over the joints that each joint moves, itself included."""
         flat = of_joints.reshape(*of_joints.shape[:2], -1)
-        return np.asarray((self.tree.supports.T @ flat).reshape(of_joints.shape))
+        return (self.tree.supports.T @ flat).reshape(of_joints.shape)
 
     # Forces
 
@@ -165,7 +165,7 @@ class RigidBodyMotion:
         diagonal = np.arange(lower.shape[1])
         upper = np.swapaxes(lower, 1, 2).copy()
         upper[:, diagonal, diagonal] = self.armature
-        return np.asarray(lower + upper)
+        return lower + upper
 
     @cached_property
     def _inertia_product(self) -> Array:
@@ -322,7 +322,7 @@ def _in_body(motion: Array, arm: Array, axes: Array) -> Array:
     turn = motion[..., :3]
     at_point = motion[..., 3:] + _cross(turn, arm)
     both = np.stack([turn, at_point], axis=-2) @ axes
-    return np.asarray(both.reshape(motion.shape))
+    return both.reshape(motion.shape)
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -22,12 +22,15 @@ from mjfim.plant.batch import (
     SubstepObservations,
     is_accepted,
 )
-from mjfim.plant.laws.law_commands import LawCommands, LawNumbers, Ticks, lead_time
-from mjfim.plant.laws.running_law import (
+from mjfim.plant.running_law import (
     InputContext,
+    LawCommands,
     LawMemory,
+    LawNumbers,
     LoopTrace,
     RunningLaws,
+    Ticks,
+    lead_time,
     memory_at_begin,
 )
 from mjfim.plant.state_space import StateSizes

@@ -1,1 +1,0 @@
-"""Distances of a robot to itself and to the world."""

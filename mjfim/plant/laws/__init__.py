@@ -1,1 +1,0 @@
-"""Control laws in the loop: simulations in which they compute the controls."""
