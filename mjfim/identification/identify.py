@@ -17,17 +17,22 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.fit_quality import fit_quality
 from mjfim.identification.assessment.report import FitResult, estimate_from
-from mjfim.identification.assessment.residual_tests import misfit_reasons
-from mjfim.identification.fit_problem import FitProblem, have_same_initial_states
+from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
+from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.horizons import choose_length
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.search import FitSearch, first_subset, of_subset, quick_subset
-from mjfim.identification.sensitivity_rows import sensitivity_rows
+from mjfim.identification.search import (
+    FitSearch,
+    FitTask,
+    Method,
+    first_subset,
+    of_subset,
+    quick_subset,
+    with_length,
+)
 from mjfim.identification.starts import SPREAD_STARTS, begin_fit, start_from_segments
-from mjfim.identification.task import FitTask, Method, with_length
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,

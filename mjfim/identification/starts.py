@@ -18,8 +18,7 @@ from mjfim.errors import SimulationDivergedError, listed
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
-from mjfim.identification.search import FitSearch, of_subset, quick_subset, restart_subset
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitSearch, FitTask, of_subset, quick_subset, restart_subset
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameter_ranges import make_physical
 from mjfim.model.parameters import ParameterSet

@@ -19,7 +19,7 @@ from mjfim.identification.assessment.report import _implausible_estimates
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import _unseen_directions
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitTask
 from mjfim.model.inertia import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.records.trajectory import Recording

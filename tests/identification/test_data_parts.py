@@ -11,9 +11,14 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.identification.assessment import term_tests
+from mjfim.identification.assessment.term_tests import (
+    DataPart,
+    TermTests,
+    find_missing_terms,
+    part_of_data,
+)
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.terms import TermTests, extended, find_missing_terms, score_tests
-from mjfim.identification.terms.extended import DataPart, part_of_data
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import TermTestData
 from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
@@ -24,7 +29,7 @@ RATE = 100.0
 @pytest.fixture(autouse=True)
 def few_samples_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """The recordings of these tests are short."""
-    monkeypatch.setattr(extended, "ENOUGH_SAMPLES", 10)
+    monkeypatch.setattr(term_tests, "ENOUGH_SAMPLES", 10)
 
 
 def problem_of(folder: Path, count: int, segments: float | str = "whole") -> FitProblem:
@@ -88,7 +93,7 @@ def test_too_many_recordings_are_not_cut_into_crumbs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem = problem_of(tmp_path, 6)
-    monkeypatch.setattr(extended, "ENOUGH_SAMPLES", 50)
+    monkeypatch.setattr(term_tests, "ENOUGH_SAMPLES", 50)
     part = part_of_data(problem, 100.0)
     assert part.recording_count == 2
     assert part.problem.sample_count == 100
@@ -138,7 +143,7 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
         problem.of_segments(first.segments), logs, first.unknowns(at)
     ).terms
 
-    monkeypatch.setattr(score_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
+    monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
     found = find_missing_terms(problem, logs, at)
     assert found.data is not None
     assert found.data.recordings == 4
@@ -153,7 +158,7 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     experiment = experiment_of(tmp_path, "tilt", fit={"bootstrap": 0})
     system = System.resolve(experiment)
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in (0, 1)]
-    monkeypatch.setattr(score_tests, "part_of_data", lambda problem, _: part_of_data(problem, 100))
+    monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 100))
     found = mjfim.select_terms(experiment, logs)
     assert not found.misfit
     words = "Terms that the model may lack were tested on 25 % of the data, from all 2 recordings."

@@ -10,7 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.identification.assessment.predictability import UnpredictableMotion, amplifications
+from mjfim.identification.assessment.poor_fit import UnpredictableMotion, amplifications
 from tests.range.plants import PLANTS, Setting
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import ks_2samp, kstest, norm, truncnorm
 
-from mjfim.identification.assessment import truncated_normal
-from mjfim.identification.assessment.truncated_normal import (
+from mjfim.identification.assessment import parameter_draws
+from mjfim.identification.assessment.parameter_draws import (
     MIN_SWEEPS,
     SWEEPS,
     MatrixBound,
@@ -93,7 +93,7 @@ def test_a_positive_definite_matrix_cuts_off_as_rejection_does(
     correlation: float, sweeps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A bound of a single variable holds as well."""
-    monkeypatch.setattr(truncated_normal, "SWEEPS", sweeps)
+    monkeypatch.setattr(parameter_draws, "SWEEPS", sweeps)
     mean, std = np.array([1.0, 0.3, 0.5]), np.array([1.0, 3.0, 0.5])
     covariance = covariance_of(std, correlation)
     lower, upper = np.array([-np.inf, -0.4, -np.inf]), INFINITE

@@ -18,24 +18,27 @@ from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.assessment.accuracy import Accuracy, accuracy_of
-from mjfim.identification.assessment.fit_quality import FitQuality
-from mjfim.identification.assessment.flipped_signs import (
+from mjfim.identification.assessment.honest_covariance import with_honest_covariance
+from mjfim.identification.assessment.poor_fit import (
     POOR_FIT,
+    UnpredictableMotion,
     flipped_signs,
     sentence_about_signs,
     sufficient_squares,
+    unpredictable_motion,
 )
-from mjfim.identification.assessment.honest_covariance import with_honest_covariance
-from mjfim.identification.assessment.predictability import UnpredictableMotion, unpredictable_motion
-from mjfim.identification.assessment.predictions import predict_unfitted
 from mjfim.identification.assessment.recording_comparison import compare_recordings
-from mjfim.identification.assessment.residual_tests import is_smaller_than_noise, misfit_reasons
+from mjfim.identification.assessment.residual_tests import (
+    FitQuality,
+    is_smaller_than_noise,
+    misfit_reasons,
+)
+from mjfim.identification.assessment.term_tests import TermTests, find_missing_terms
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.left_out import predict_unfitted
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.search import of_subset
+from mjfim.identification.search import FitTask, of_subset
 from mjfim.identification.starts import values_of_start
-from mjfim.identification.task import FitTask
-from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.information.null_space import NullSpace
 from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet

@@ -20,9 +20,12 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.inverse_dynamics.forces import MeasuredForce
-from mjfim.identification.inverse_dynamics.motion import MeasuredMotion, measured_motion
-from mjfim.identification.known_activations import bristles_of
+from mjfim.identification.inverse_dynamics.motion import (
+    MeasuredForce,
+    MeasuredMotion,
+    measured_motion,
+)
+from mjfim.identification.segments import bristles_of
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import dof_names
 from mjfim.model.sizes import translations

@@ -1,8 +1,11 @@
-"""Search for signals of a log whose sign is opposite to that of the model.
+"""Causes of a poor fit: signals with the wrong sign, and motions that no simulation follows.
 
 A control or an angle that counts in the other direction leaves residuals as large as the motion.
-Where a fit is so poor, the fit is repeated with one sign changed at a time. A sign looks flipped if
-the change makes the sum of squared residuals much smaller.
+Where a fit is so poor, it is repeated with one sign changed at a time. A sign looks flipped if the
+change makes the sum of squared residuals much smaller.
+
+Unstable and chaotic motions amplify a deviation exponentially. The residuals of one simulation over
+a long time then have many local minima, in which a fit ends. Shorter segments avoid that.
 """
 
 from __future__ import annotations
@@ -12,11 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.errors import RecordingError
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitTask
+from mjfim.identification.segments import MIN_SAMPLES
 from mjfim.information.null_space import NullSpace
-from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget
 from mjfim.plant.noise import Noise
 from mjfim.records.check import join_names
@@ -185,3 +190,138 @@ def _problem(task: FitTask, sign: Sign, noise: Noise) -> FitProblem | None:
         return flipped.problem().with_noise(noise)
     except RecordingError:
         return None
+
+
+# Largest number of samples of a motion along which the amplification is computed.
+MAX_SAMPLES = 20_000
+
+# Amplification over a segment above which shorter segments are recommended. A damped or a free
+# motion stays far below it, because deviations do not grow exponentially there.
+MAX_AMPLIFICATION = 1e3
+
+# Amplification over a segment of the recommended length.
+GOOD_AMPLIFICATION = 30.0
+
+# Amplification above which rounding errors alone change the whole motion.
+ROUNDING_AMPLIFICATION = 1e14
+
+# Smallest number of samples of a recommended segment.
+LEAST_SAMPLES = 2 * MIN_SAMPLES
+
+# Digits of a recommended length.
+LENGTH_DIGITS = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnpredictableMotion:
+    """A motion that is too unstable for the segments of a fit.
+
+    Attributes:
+        amplification: Common logarithm of the amplification of a small deviation.
+        length: Time within which it grows so much [s].
+        recommended: Length of segments over which deviations typically grow less than
+            `GOOD_AMPLIFICATION` times [s].
+    """
+
+    amplification: float
+    length: float
+    recommended: float
+
+    def __str__(self) -> str:
+        factor = f"1e{self.amplification:.0f}"
+        text = (
+            f"the motion is unstable or chaotic: a small deviation grows {factor}-fold within "
+            f"{self.length:.3g} s, so the residuals of one simulation have many local minima"
+        )
+        if self.amplification > np.log10(ROUNDING_AMPLIFICATION):
+            text += ", and rounding errors alone change it"
+        return (
+            f"{text}. State fit.segments = {self.recommended:g} in the experiment file: segments "
+            f"with free initial states, over which it typically grows less than "
+            f"{GOOD_AMPLIFICATION:.0f}-fold"
+        )
+
+
+def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> UnpredictableMotion | None:
+    """Compare the amplification along the longest recording with the segments of a fit.
+
+    Args:
+        problem: Problem with the segments.
+        at: The unknowns.
+
+    Returns:
+        The amplification, and a better length; None if the segments suit the motion, and with
+        control laws, of whose memory a state shows nothing.
+    """
+    if problem.system.laws is not None:
+        return None
+    longest = max(problem.segments, key=lambda segment: segment.samples)
+    samples = min(longest.samples, MAX_SAMPLES)
+    motion = problem.motion(at, longest.recording, longest.begin + samples)
+    if motion is None:
+        return None
+
+    rows = slice(longest.begin, longest.begin + samples + 1)
+    motion = replace(
+        motion,
+        t=motion.t[rows],
+        qpos=motion.qpos[rows],
+        qvel=motion.qvel[rows],
+        act=motion.act[rows],
+        ctrl=motion.ctrl[longest.begin : longest.begin + samples],
+    )
+    plant = problem.system.plant
+    try:
+        A, _, _, _ = plant.derivatives.jacobians(problem.theta(at), motion)
+    except SimulationDivergedError:
+        return None
+
+    # Deviations are relative to the size of the motion.
+    moves = plant.space.minus(motion.state, motion.state[:1])
+    typical = amplifications(A, np.abs(moves).max(axis=0))
+    if typical[-1] <= np.log10(MAX_AMPLIFICATION):
+        return None
+
+    good = np.flatnonzero(typical <= np.log10(GOOD_AMPLIFICATION))
+    samples = max(2 ** int(good[-1]) if len(good) else 1, LEAST_SAMPLES)
+    return UnpredictableMotion(
+        amplification=float(typical[-1]),
+        length=float(2 ** (len(typical) - 1) * plant.dt),
+        recommended=float(f"{samples * plant.dt:.{LENGTH_DIGITS}g}"),
+    )
+
+
+def amplifications(A: Array, sizes: Array) -> Array:
+    """Typical amplification of a deviation over windows of 1, 2, 4, ... samples.
+
+    Args:
+        A: (N, nx, nx) transition matrices.
+        sizes: (nx,) magnitude of each component of the state, to which deviations are relative;
+            components of size zero do not count.
+
+    Returns:
+        (n,) common logarithms of the spectral norms, averaged over all windows of a length; the
+        last window is the longest power of two within N samples.
+    """
+    moving = np.flatnonzero(sizes > 0.0)
+    if not len(moving):
+        return np.zeros(1)
+    scale = sizes[moving]
+    products = A[:, moving][:, :, moving] * scale / scale[:, None]
+    logarithms = np.zeros(len(products))
+
+    found = []
+    while True:
+        # Products are normalised, because their norms may exceed the largest number.
+        norms = np.linalg.norm(products, 2, axis=(1, 2))
+        products = products / np.where(norms > 0.0, norms, 1.0)[:, None, None]
+        with np.errstate(divide="ignore"):
+            logarithms = logarithms + np.log10(norms)
+        found.append(logarithms.mean())
+
+        pairs = len(products) // 2
+        if not pairs:
+            return np.array(found)
+        first, second = slice(0, 2 * pairs, 2), slice(1, 2 * pairs, 2)
+        products = products[second] @ products[first]
+        logarithms = logarithms[first] + logarithms[second]
