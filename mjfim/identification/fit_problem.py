@@ -30,7 +30,7 @@ from mjfim.identification.segments import (
     recorded_release,
     stated_segments,
 )
-from mjfim.identification.unknowns import Pins, PriorRows, UnknownLayout
+from mjfim.identification.unknowns import UnknownLayout
 from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -80,16 +80,12 @@ class FitProblem(SegmentSimulation):
         masks: (M, ny) for every recording, True for the measured values that count.
         noise: Noise of the outputs.
         loss: Loss of a whitened residual.
-        pins: Combinations that no recording determines, and their values.
-        with_priors: Whether priors of the parameters count.
         workers: Does the work on batches of segments; None for this process.
     """
 
     masks: tuple[np.ndarray, ...]
     noise: Noise
     loss: RobustLoss
-    pins: Pins
-    with_priors: bool
     workers: ProblemWorkers | None = None
 
     @classmethod
@@ -147,7 +143,7 @@ class FitProblem(SegmentSimulation):
             parameters,
             len(aligned),
             free_starts=free_starts,
-            bounded=not data_only,
+            data_only=data_only,
             held=settings.hold,
         )
         return cls(
@@ -159,8 +155,6 @@ class FitProblem(SegmentSimulation):
             masks=masks,
             noise=system.noise,
             loss=RobustLoss(kind=settings.loss, scale=settings.loss_scale),
-            pins=Pins.none(parameters),
-            with_priors=not data_only,
         )
 
     # ---- variants
@@ -178,8 +172,8 @@ class FitProblem(SegmentSimulation):
         return replace(self, layout=self.layout.unbounded())
 
     def with_shared_held(self) -> FitProblem:
-        """This problem with all shared parameters held, so that it needs no pins."""
-        return replace(self, layout=self.layout.without_shared(), pins=self.pins.released())
+        """This problem with all shared parameters held."""
+        return replace(self, layout=self.layout.without_shared())
 
     def with_noise(self, noise: Noise) -> FitProblem:
         """This problem with other noise.
@@ -254,10 +248,9 @@ class FitProblem(SegmentSimulation):
         return replace(
             self,
             segments=segments,
-            layout=UnknownLayout.of(parameters, count, free_starts=True, bounded=True, held=held),
+            layout=UnknownLayout.of(parameters, count, free_starts=True, held=held),
             start_directions=directions,
             masks=tuple(np.array(recording.measured) for recording in self.recordings),
-            pins=Pins.none(parameters),
         )
 
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
@@ -282,7 +275,7 @@ class FitProblem(SegmentSimulation):
         Returns:
             The problem.
         """
-        return replace(self, pins=Pins.of(self.system.parameters, theta, null_space))
+        return replace(self, layout=self.layout.pinned(theta, null_space))
 
     # ---- sizes
 
@@ -316,21 +309,15 @@ class FitProblem(SegmentSimulation):
         """Division of the rows into blocks."""
         return BlockDivision(segments=self.segments, row_count=self.row_count)
 
-    @cached_property
-    def prior_rows(self) -> PriorRows:
-        """Rows of priors and pins."""
-        return PriorRows(
-            layout=self.layout,
-            segment_count=len(self.segments),
-            start_sizes=np.abs(self.start_directions).T @ self.system.plant.sizes.state,
-            pins=self.pins,
-            with_priors=self.with_priors,
-        )
+    def private_prior_rows(self, at: UnknownValues) -> Array:
+        """(P, k, m) rows `[J_private, J_common, r]` on the private unknowns of every segment."""
+        sizes = np.abs(self.start_directions).T @ self.system.plant.sizes.state
+        return self.layout.private_rows(at, sizes)
 
     @property
     def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:
         """Rows of priors and pins along a step, where inertias of whole bodies are unknown."""
-        return self.prior_rows.along_step if self.layout.shared_bodies else None
+        return self.layout.common_rows_after if self.layout.shared_bodies else None
 
     # ---- unknowns
 
@@ -457,20 +444,10 @@ class FitProblem(SegmentSimulation):
             for loss in losses:
                 total += loss
 
-        return 0.5 * total + self.prior_cost(at)
-
-    def prior_cost(self, at: UnknownValues) -> float:
-        """Half of the sum of the squared priors and pins.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            The cost.
-        """
-        common = self.prior_rows.common(at)[:, -1]
-        private = self.prior_rows.private(at)[:, :, -1]
-        return 0.5 * (float(common @ common) + float(np.sum(private**2)))
+        # Priors and pins.
+        common = self.layout.common_rows(at)[:, -1]
+        private = self.private_prior_rows(at)[:, :, -1]
+        return 0.5 * total + 0.5 * (float(common @ common) + float(np.sum(private**2)))
 
     def condense(self, at: UnknownValues) -> Condensed | None:
         """Linearise about the unknowns and condense block by block.
@@ -494,8 +471,8 @@ class FitProblem(SegmentSimulation):
         return Condensed(
             blocks=blocks,
             segment_of_block=self.blocks.segment_of_block,
-            private_rows=self.prior_rows.private(at),
-            common_rows=self.prior_rows.common(at),
+            private_rows=self.private_prior_rows(at),
+            common_rows=self.layout.common_rows(at),
         )
 
     def outputs_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[SegmentRows] | None:

@@ -15,8 +15,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import jackknife_std, student_quantile
-from mjfim.identification.assessment.report import FitResult
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.left_out import (
     MAX_FOLDS,

@@ -17,7 +17,8 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.report import FitResult, estimate_from
+from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers

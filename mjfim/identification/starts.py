@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError, listed
+from mjfim.errors import SimulationDivergedError
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
@@ -118,12 +118,6 @@ def begin_fit(search: FitSearch, problem: FitProblem) -> BegunFit:
     raise divergence_at_start(task, problem, extreme)
 
 
-def values_of_start(task: FitTask) -> str:
-    """The parameters of the stated start and their values, for a message."""
-    names = task.system.parameters.names
-    return listed([f"{n} = {v:.6g}" for n, v in zip(names, task.start, strict=True)])
-
-
 def _other_starts(
     search: FitSearch, problem: FitProblem
 ) -> Iterator[tuple[Array, InverseDynamicsFit | None, str]]:
@@ -171,7 +165,7 @@ def divergence_at_start(task: FitTask, problem: FitProblem, extreme: str) -> Exc
     if not extreme:
         cause = f": {_why_diverged(problem, task.start)}"
     return SimulationDivergedError(
-        f"the simulation diverges at the start ({values_of_start(task)}){cause}"
+        f"the simulation diverges at the start ({task.start_in_words}){cause}"
     )
 
 

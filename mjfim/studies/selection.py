@@ -18,7 +18,8 @@ import numpy as np
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.report import FitResult, estimate_from
+from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.term_tests import find_missing_terms
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers

@@ -1,9 +1,13 @@
-"""Accuracy of an estimate: formal covariance, robust intervals, and poorly known parameters."""
+"""Result of the searches of an identification, and the accuracy of its estimate.
+
+That is the formal covariance, robust intervals, and the poorly known parameters.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -11,6 +15,7 @@ import scipy
 from mjfim.arrays import NORMAL_95, Array, scaled_to_unit_diagonal
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import between_covariance
+from mjfim.identification.assessment.residual_tests import FitQuality
 from mjfim.identification.assessment.robust_covariance import (
     block_length,
     inverse_root,
@@ -18,12 +23,14 @@ from mjfim.identification.assessment.robust_covariance import (
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.search import FitTask, of_subset
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.model.parameters import ParameterSet
-from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.records.check import ParameterGroup
-from mjfim.records.estimate import PriorDirections, Uncertainty
+from mjfim.records.estimate import HorizonStudy, PriorDirections, Restart, Uncertainty
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 
 # A combination is determined by the recordings where these leave at most this share of the standard
 # deviation of the prior.
@@ -264,7 +271,7 @@ def accuracy_of(
 
     # Information of the recordings alone about the parameters that they share. Only the priors on
     # the other unknowns, which are marginalised, count.
-    J = problem.prior_rows.of_parameters(solution.unknowns)[:, :-1]
+    J = layout.prior_rows(solution.unknowns)[:, :-1]
     of_data = solution.condensed.information(with_common_rows=False)
     data = np.zeros_like(formal)
     shared = np.arange(len(layout.shared))
@@ -370,3 +377,53 @@ def _poorly_known(
             remark += f"; it is confounded with {name} (correlation {correlation[other]:+.2f})"
 
         yield parameters.names[j], remark
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitResult:
+    """Result of the searches of one identification.
+
+    Attributes:
+        task: System, recordings and settings.
+        problem: The least-squares problem, with the noise of the last search.
+        solution: Its solution.
+        quality: Size and whiteness of its residuals.
+        null_space: Directions of theta about which neither recordings nor priors contain
+            information.
+        held_out: Problem of the held-out recordings; None without any.
+        subset: Indices of segments that are quick to simulate, evenly spread over the data.
+        restart: How the fit was repeated from fits over segments; None where it was not.
+        horizons: Lengths of segments that were compared; None where they were not.
+        inverse_dynamics: The fit to the equation of motion from which the search started, or None.
+        begun_instead: Where it began instead of the stated start, at which the model diverges, in
+            words; empty where it does not diverge there.
+    """
+
+    task: FitTask
+    problem: FitProblem
+    solution: Solution
+    quality: FitQuality
+    null_space: NullSpace
+    held_out: FitProblem | None
+    subset: np.ndarray
+    restart: Restart | None
+    horizons: HorizonStudy | None = None
+    inverse_dynamics: InverseDynamicsFit | None = None
+    begun_instead: str = ""
+
+    @property
+    def theta(self) -> Array:
+        """(p,) estimate, with the values of the first recording."""
+        return self.problem.theta(self.solution.unknowns)
+
+    @property
+    def quick(self) -> tuple[FitProblem, UnknownValues]:
+        """The problem of the segments that are quick to simulate, and its unknowns."""
+        return self.problem.of_segments(self.subset), of_subset(self.solution.unknowns, self.subset)
+
+    @cached_property
+    def accuracy(self) -> Accuracy:
+        """Accuracy of the estimate."""
+        rows = self.quality.correlation_rows(self.problem.row_count)
+        inflation = self.quality.inflation
+        return accuracy_of(self.problem, self.solution, self.null_space, rows, inflation)

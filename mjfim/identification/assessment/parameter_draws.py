@@ -17,7 +17,6 @@ independent draw. Every draw is the end of a chain of its own, so that the draws
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -27,10 +26,8 @@ from mjfim.errors import MAX_SAMPLES, ExperimentError, first_ones, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import InertiaCombinations
-from mjfim.identification.assessment.honest_covariance import (
-    covariance_root,
-    honest_covariance,
-)
+from mjfim.identification.assessment.honest_covariance import honest_covariance
+from mjfim.identification.assessment.robust_covariance import covariance_root
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.model.inertia import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
 from mjfim.model.parameters import ParameterSet
@@ -62,19 +59,6 @@ RANK_TOLERANCE = 1e-12
 SMALLEST_COEFFICIENT = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MatrixBound:
-    """A symmetric matrix that is positive definite inside the bound.
-
-    Attributes:
-        at_mean: (d, d) the matrix at the mean of the distribution, positive definite.
-        slopes: (p, d, d) its derivatives by the variables.
-    """
-
-    at_mean: Array
-    slopes: Array
-
-
 def draw_truncated_normal(
     mean: Array,
     covariance: Array,
@@ -83,7 +67,7 @@ def draw_truncated_normal(
     count: int,
     rng: np.random.Generator,
     *,
-    matrices: Sequence[MatrixBound] = (),
+    matrices: Sequence[tuple[Array, Array]] = (),
 ) -> Array:
     """Draw from a normal distribution that is truncated at bounds.
 
@@ -94,148 +78,78 @@ def draw_truncated_normal(
         upper: (p,) upper bounds; may be infinite.
         count: Number of draws n.
         rng: Source of random numbers.
-        matrices: Matrices that are positive definite inside the bounds; default: none.
+        matrices: Symmetric matrices that are positive definite inside the bounds, each as the
+            (d, d) matrix at the mean and its (p, d, d) derivatives by the variables; default: none.
 
     Returns:
         (n, p) draws inside the bounds.
     """
-    factor = _factor(covariance)
-    bounds = _Bounds.near(mean, factor, lower, upper)
-    cones = [_Cone.of(matrix, factor) for matrix in matrices]
-    if not len(bounds.distance) and not cones:
+    factor = covariance_root(covariance, RANK_TOLERANCE)
+
+    # Bounds within reach, as `normals @ z <= distance`, in standard deviations of their variable.
+    std = np.linalg.norm(factor, axis=1)
+    scale = np.where(std > 0.0, std, 1.0)
+    unit = factor / scale[:, None]
+    above, below = (upper - mean) / scale, (mean - lower) / scale
+    is_above, is_below = (std > 0.0) & (above < REACH), (std > 0.0) & (below < REACH)
+    normals = np.concatenate([unit[is_above], -unit[is_below]])
+    distance = np.concatenate([above[is_above], below[is_below]])
+
+    # Derivatives of the matrices by the coordinates z, in a basis in which each of them is the unit
+    # matrix at z = 0. This removes the units of its rows and columns.
+    cones = []
+    for at_mean, slopes in matrices:
+        inverse = np.linalg.inv(np.linalg.cholesky(at_mean))
+        cones.append(inverse @ np.tensordot(factor.T, slopes, axes=1) @ inverse.T)
+
+    if not len(distance) and not cones:
         z = rng.standard_normal((count, factor.shape[1]))
     else:
         z = np.zeros((count, factor.shape[1]))
-        for _ in range(_sweeps(z.size * len(cones))):
-            _sweep(z, bounds, cones, rng)
+        affordable = MAX_FACTORISED // max(z.size * len(cones), 1)
+        for _ in range(int(np.clip(affordable, MIN_SWEEPS, SWEEPS))):
+            _sweep(z, normals, distance, cones, rng)
 
     # Rounding may exceed a bound.
-    return np.asarray(np.clip(mean + z @ factor.T, lower, upper))
+    return np.clip(mean + z @ factor.T, lower, upper)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Bounds:
-    """The m bounds that draws can reach, as `normals @ z <= distance`.
-
-    Attributes:
-        normals: (m, k) coefficients of the k coordinates z.
-        distance: (m,) distances from the mean, not negative.
-    """
-
-    normals: Array
-    distance: Array
-
-    @staticmethod
-    def near(mean: Array, factor: Array, lower: Array, upper: Array) -> _Bounds:
-        """The bounds within reach. All are in standard deviations of their variable.
-
-        Args:
-            mean: (p,) mean.
-            factor: (p, k) factor of the covariance.
-            lower: (p,) lower bounds.
-            upper: (p,) upper bounds.
-        """
-        std = np.linalg.norm(factor, axis=1)
-        moves = std > 0.0
-        scale = np.where(moves, std, 1.0)
-        unit = factor / scale[:, None]
-
-        above = (upper - mean) / scale
-        below = (mean - lower) / scale
-        is_above, is_below = moves & (above < REACH), moves & (below < REACH)
-        return _Bounds(
-            normals=np.concatenate([unit[is_above], -unit[is_below]]),
-            distance=np.concatenate([above[is_above], below[is_below]]),
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Cone:
-    """Where a matrix is positive definite, in the k coordinates z.
-
-    Attributes:
-        slopes: (k, d, d) derivatives of the matrix by the coordinates, in a basis in which it is
-            the unit matrix at z = 0. This removes the units of its rows and columns.
-    """
-
-    slopes: Array
-
-    @staticmethod
-    def of(matrix: MatrixBound, factor: Array) -> _Cone:
-        """The bound in the coordinates z.
-
-        Args:
-            matrix: The bound in the variables.
-            factor: (p, k) factor of the covariance.
-        """
-        inverse = np.linalg.inv(np.linalg.cholesky(matrix.at_mean))
-        slopes = np.tensordot(factor.T, matrix.slopes, axes=1)
-        return _Cone(slopes=inverse @ slopes @ inverse.T)
-
-    def at(self, z: Array) -> Array:
-        """(n, d, d) matrices at (n, k) points."""
-        return np.asarray(np.eye(self.slopes.shape[1]) + np.tensordot(z, self.slopes, axes=1))
-
-    def room(self, matrices: Array, i: int) -> tuple[Array, Array]:
-        """(n,) moves down, not positive, and up, not negative, that one coordinate may make.
-
-        Args:
-            matrices: (n, d, d) matrices at the present points.
-            i: Index of the coordinate.
-        """
-        inverse = np.linalg.inv(np.linalg.cholesky(matrices))
-        eigenvalues = np.linalg.eigvalsh(inverse @ self.slopes[i] @ inverse.transpose(0, 2, 1))
-        with np.errstate(divide="ignore"):
-            down = -INSIDE / np.maximum(eigenvalues[:, -1], 0.0)
-            up = INSIDE / np.maximum(-eigenvalues[:, 0], 0.0)
-        return down, up
-
-
-def _sweeps(matrices: int) -> int:
-    """Number of sweeps, `MIN_SWEEPS` or more, each of which factorises a number of matrices."""
-    return int(np.clip(MAX_FACTORISED // max(matrices, 1), MIN_SWEEPS, SWEEPS))
-
-
-def _factor(covariance: Array) -> Array:
-    """(p, k) factor A of a covariance `A A'` of rank k."""
-    std = np.sqrt(np.diag(covariance))
-    scale = np.where(std > 0.0, std, 1.0)
-    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-
-    is_positive = eigenvalues > RANK_TOLERANCE * eigenvalues.max(initial=0.0)
-    root = np.sqrt(eigenvalues[is_positive])
-    return np.asarray(scale[:, None] * vectors[:, is_positive] * root)
-
-
-def _sweep(z: Array, bounds: _Bounds, cones: Sequence[_Cone], rng: np.random.Generator) -> None:
+def _sweep(
+    z: Array, normals: Array, distance: Array, cones: Sequence[Array], rng: np.random.Generator
+) -> None:
     """Draw every coordinate anew, given the others.
 
     Args:
         z: (n, k) present points of the chains, which are changed in place.
-        bounds: The bounds of single variables.
-        cones: The bounds by matrices.
+        normals: (m, k) coefficients of the bounds of single variables.
+        distance: (m,) their distances from the mean, not negative.
+        cones: (k, d, d) derivatives of each matrix by the coordinates.
         rng: Source of random numbers.
     """
-    distance = bounds.distance - z @ bounds.normals.T
-    matrices = [cone.at(z) for cone in cones]
+    room = distance - z @ normals.T
+    matrices = [np.eye(cone.shape[1]) + np.tensordot(z, cone, axes=1) for cone in cones]
     for i in range(z.shape[1]):
-        g = bounds.normals[:, i]
-        room = distance + z[:, i : i + 1] * g
+        g, before = normals[:, i], np.array(z[:, i])
+        room = room + before[:, None] * g
 
         # The present value is inside the bounds but for rounding.
         rises, falls = g > SMALLEST_COEFFICIENT, g < -SMALLEST_COEFFICIENT
         high = np.min(room[:, rises] / g[rises], axis=1, initial=np.inf)
         low = np.max(room[:, falls] / g[falls], axis=1, initial=-np.inf)
-        high, low = np.maximum(high, z[:, i]), np.minimum(low, z[:, i])
-        for cone, at in zip(cones, matrices, strict=True):
-            down, up = cone.room(at, i)
-            low, high = np.maximum(low, z[:, i] + down), np.minimum(high, z[:, i] + up)
+        high, low = np.maximum(high, before), np.minimum(low, before)
 
-        before = np.array(z[:, i])
+        # Moves until a matrix is no longer positive definite.
+        for cone, at in zip(cones, matrices, strict=True):
+            inverse = np.linalg.inv(np.linalg.cholesky(at))
+            eigenvalues = np.linalg.eigvalsh(inverse @ cone[i] @ inverse.transpose(0, 2, 1))
+            with np.errstate(divide="ignore"):
+                low = np.maximum(low, before - INSIDE / np.maximum(eigenvalues[:, -1], 0.0))
+                high = np.minimum(high, before + INSIDE / np.maximum(-eigenvalues[:, 0], 0.0))
+
         z[:, i] = _draw_between(low, high, rng)
         for cone, at in zip(cones, matrices, strict=True):
-            at += (z[:, i] - before)[:, None, None] * cone.slopes[i]
-        distance = room - z[:, i : i + 1] * g
+            at += (z[:, i] - before)[:, None, None] * cone[i]
+        room = room - z[:, i : i + 1] * g
 
 
 def _draw_between(low: Array, high: Array, rng: np.random.Generator) -> Array:
@@ -420,11 +334,17 @@ def _physical_draws(
     places = [
         (body, np.searchsorted(drawn, body.columns)) for body in unknown_bodies(system.parameters)
     ]
-    physical = [
-        bound
-        for body, place in places
-        if (bound := _physical_bound(body, place, centre)) is not None
-    ]
+
+    # Pseudo-inertias are linear in the barycentric coordinates, and these in the draws. Bodies that
+    # are not physical at the centre do not bound the draws.
+    physical = []
+    for body, place in places:
+        linear = body.linear(centre[place])
+        if body.is_physical(linear):
+            slopes = np.zeros((len(centre), *BARYCENTRIC_DERIVATIVES.shape[1:]))
+            by_draws = body.linear_slopes(centre[place])
+            slopes[place] = np.tensordot(by_draws, BARYCENTRIC_DERIVATIVES, axes=1)
+            physical.append((pseudo_inertia_of(linear), slopes))
     values = np.zeros((count, len(drawn)))
     missing = np.arange(count)
     replaced = 0
@@ -439,7 +359,7 @@ def _physical_draws(
             centre, covariance, lower, upper, len(missing), rng, matrices=matrices
         )
         is_physical = np.zeros(len(missing), dtype=bool)
-        for i, row in zip(missing, range(len(missing)), strict=True):
+        for row, i in enumerate(missing):
             robot = _moved(places, centre, tried[row])
             if robot is not None and _is_physical(system, estimate, drawn, robot):
                 values[i], is_physical[row] = robot, True
@@ -453,25 +373,6 @@ def _physical_draws(
         f"been replaced {MAX_ROUNDS} times; the recordings determine the inertias too poorly. "
         "State them as a whole (`inertial`) with a `cad_prior`, or with a narrower `prior`"
     )
-
-
-def _physical_bound(body: UnknownBody, place: np.ndarray, centre: Array) -> MatrixBound | None:
-    """The pseudo-inertia of a body as a bound of the draws; None if it is unphysical at the centre.
-
-    Args:
-        body: A body whose whole inertia is drawn.
-        place: (10,) places of its coordinates.
-        centre: (q,) centre of the distribution.
-    """
-    begin = centre[place]
-    linear = body.linear(begin)
-    if not body.is_physical(linear):
-        return None
-
-    # Pseudo-inertias are linear in the barycentric coordinates, and these in the draws.
-    slopes = np.zeros((len(centre), *BARYCENTRIC_DERIVATIVES.shape[1:]))
-    slopes[place] = np.tensordot(body.linear_slopes(begin), BARYCENTRIC_DERIVATIVES, axes=1)
-    return MatrixBound(at_mean=pseudo_inertia_of(linear), slopes=slopes)
 
 
 def _moved(

@@ -11,19 +11,18 @@ a long time then have many local minima, in which a fit ends. Shorter segments a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitTask
 from mjfim.identification.segments import MIN_SAMPLES
-from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget
-from mjfim.plant.noise import Noise
 from mjfim.records.check import join_names
 from mjfim.records.trajectory import Recording
 
@@ -48,63 +47,41 @@ ITERATIONS = 15
 TOLERANCE = 1e-2
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sign:
-    """Signals of a log that have one sign.
-
-    Attributes:
-        description: The signals in words.
-        control: Index of the control; None for measured outputs.
-        outputs: Names of the measured outputs; none for a control.
-    """
-
-    description: str
-    control: int | None = None
-    outputs: tuple[str, ...] = ()
-
-    def flipped(self, recording: Recording) -> Recording:
-        """Return a recording with the other sign.
-
-        Args:
-            recording: The recording.
-        """
-        ctrl, y = np.array(recording.ctrl), np.array(recording.y)
-        if self.control is not None:
-            ctrl[:, self.control] *= -1.0
-        for name in self.outputs:
-            y[:, recording.outputs.index(name)] *= -1.0
-        return replace(recording, ctrl=ctrl, y=y)
-
-
-def flipped_signs(
-    task: FitTask,
-    fitted: FitProblem,
-    enough: float,
-    segments: np.ndarray,
-    null_space: NullSpace,
-    budget: Budget,
-) -> tuple[str, ...]:
-    """Find the signs that look flipped after a poor fit.
+def flipped_signs(result: FitResult, budget: Budget) -> tuple[str, ...]:
+    """Find the signs that look flipped after a very poor fit.
 
     Args:
-        task: The task of the fit.
-        fitted: The problem of the fit, which has its noise.
-        enough: Largest sum of squared residuals in some segments that explains them.
-        segments: Indices of these segments.
-        null_space: Combinations of parameters that the fit held.
+        result: The fit.
         budget: Budget with the stop token.
 
     Returns:
-        The signals in words, each of which explains the residuals; empty where none does, and after
-        a request to stop.
+        The signals in words, each of which explains the residuals; empty where none does, where the
+        fit is not poor enough, and after a request to stop.
     """
+    task, quality, noise = result.task, result.quality, result.problem.noise
+    is_poor = task.noise_is_stated and quality.chi2 > POOR_FIT * quality.dof
+    if budget.stop.requested or not (is_poor or quality.unexplained):
+        return ()
+
+    # Largest sum of squared residuals with another sign that makes the stated sign doubtful.
+    problem, at = result.quick
+    squares = 2.0 * problem.cost(at)
+    enough = squares / MIN_IMPROVEMENT
+    if task.noise_is_stated:
+        of_noise = min(EXPLAINED * problem.value_count, squares / MIN_IMPROVEMENT_TO_NOISE)
+        enough = max(enough, of_noise)
+
     problems = []
-    for sign in _signs(task):
-        flipped = _problem(task, sign, fitted.noise)
-        if flipped is not None:
-            problem = flipped.pinned(task.start, null_space).of_segments(segments)
-            cost = problem.cost(problem.begin(task.start))
-            problems.append((cost if np.isfinite(cost) else np.inf, sign, problem))
+    for words, controls, outputs in _signs(task):
+        recordings = tuple(_flipped(each, controls, outputs) for each in task.recordings)
+        try:
+            flipped = replace(task, recordings=recordings).problem()
+        except RecordingError:
+            continue
+        problem = flipped.with_noise(noise).pinned(task.start, result.null_space)
+        problem = problem.of_segments(result.subset)
+        cost = problem.cost(problem.begin(task.start))
+        problems.append((cost if np.isfinite(cost) else np.inf, words, problem))
 
     # The fit is repeated with the signs that explain most at its start.
     problems.sort(key=lambda entry: entry[0])
@@ -112,13 +89,13 @@ def flipped_signs(
     settings = SearchSettings(
         max_iterations=ITERATIONS, tolerance=TOLERANCE, relinearise_at_end=False
     )
-    for cost, sign, problem in problems[:MAX_FITS]:
+    for cost, words, problem in problems[:MAX_FITS]:
         if budget.stop.requested:
             return ()
         if np.isfinite(cost):
             solution = minimise(problem, problem.begin(task.start), settings, budget)
             if solution is not None:
-                found.append((2.0 * solution.cost, sign.description))
+                found.append((2.0 * solution.cost, words))
 
     best = min((value for value, _ in found), default=np.inf)
     if best > enough or budget.stop.requested:
@@ -126,18 +103,12 @@ def flipped_signs(
     return tuple(words for value, words in found if value <= TIE * best)
 
 
-def sufficient_squares(squares: float, count: int, *, noise_is_stated: bool) -> float:
-    """Largest sum of squared residuals with another sign that makes the stated sign doubtful.
-
-    Args:
-        squares: Sum of squared residuals with the stated signs.
-        count: Number of residuals.
-        noise_is_stated: False where the noise is estimated from the residuals.
-    """
-    much_better = squares / MIN_IMPROVEMENT
-    if not noise_is_stated:
-        return much_better
-    return max(much_better, min(EXPLAINED * count, squares / MIN_IMPROVEMENT_TO_NOISE))
+def _flipped(recording: Recording, controls: Sequence[int], outputs: Sequence[str]) -> Recording:
+    """A recording with the other sign of some controls and outputs."""
+    ctrl, y = np.array(recording.ctrl), np.array(recording.y)
+    ctrl[:, list(controls)] *= -1.0
+    y[:, [recording.outputs.index(name) for name in outputs]] *= -1.0
+    return replace(recording, ctrl=ctrl, y=y)
 
 
 def sentence_about_signs(signs: Sequence[str]) -> str:
@@ -159,37 +130,27 @@ def sentence_about_signs(signs: Sequence[str]) -> str:
     )
 
 
-def _signs(task: FitTask) -> Iterator[Sign]:
-    """All signs that may be flipped: of controls, joints, and single outputs."""
+def _signs(task: FitTask) -> Iterator[tuple[str, Sequence[int], Sequence[str]]]:
+    """All signs that may be flipped, in words, with their controls and their measured outputs."""
     system = task.system
     for i, name in enumerate(system.inputs):
-        if not name.startswith(SIGNED_INPUTS):
-            continue
-        described = f"control {name.removeprefix('ctrl:')}" if name.startswith("ctrl:") else name
-        yield Sign(description=described, control=i)
+        if name.startswith(SIGNED_INPUTS):
+            is_control = name.startswith("ctrl:")
+            yield f"control {name.removeprefix('ctrl:')}" if is_control else name, [i], []
 
     measured = set.intersection(*(set(recording.outputs) for recording in task.recordings))
     names = [name for name in system.outputs.names if name in measured]
     sensors = {component.name for component in system.source.coordinates.sensors}
     for joint in system.coordinates:
         columns = (joint.position_column, joint.velocity_column)
-        own = tuple(name for name in columns if name in names)
+        own = [name for name in columns if name in names]
         if len(own) == len(columns):
-            yield Sign(description=f"joint {joint.name}", outputs=own)
+            yield f"joint {joint.name}", [], own
         for name in own:
-            yield Sign(description=name, outputs=(name,))
+            yield name, [], [name]
     for name in names:
         if name in sensors:
-            yield Sign(description=f"sensor {name}", outputs=(name,))
-
-
-def _problem(task: FitTask, sign: Sign, noise: Noise) -> FitProblem | None:
-    """The problem with another sign and the noise of the fit; None where it cannot be posed."""
-    flipped = replace(task, recordings=tuple(map(sign.flipped, task.recordings)))
-    try:
-        return flipped.problem().with_noise(noise)
-    except RecordingError:
-        return None
+            yield f"sensor {name}", [], [name]
 
 
 # Largest number of samples of a motion along which the amplification is computed.
@@ -212,37 +173,28 @@ LEAST_SAMPLES = 2 * MIN_SAMPLES
 LENGTH_DIGITS = 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class UnpredictableMotion:
-    """A motion that is too unstable for the segments of a fit.
+def sentence_about_instability(amplification: float, length: float, recommended: float) -> str:
+    """Advice about a motion that is too unstable for the segments of a fit.
 
-    Attributes:
+    Args:
         amplification: Common logarithm of the amplification of a small deviation.
         length: Time within which it grows so much [s].
         recommended: Length of segments over which deviations typically grow less than
             `GOOD_AMPLIFICATION` times [s].
     """
-
-    amplification: float
-    length: float
-    recommended: float
-
-    def __str__(self) -> str:
-        factor = f"1e{self.amplification:.0f}"
-        text = (
-            f"the motion is unstable or chaotic: a small deviation grows {factor}-fold within "
-            f"{self.length:.3g} s, so the residuals of one simulation have many local minima"
-        )
-        if self.amplification > np.log10(ROUNDING_AMPLIFICATION):
-            text += ", and rounding errors alone change it"
-        return (
-            f"{text}. State fit.segments = {self.recommended:g} in the experiment file: segments "
-            f"with free initial states, over which it typically grows less than "
-            f"{GOOD_AMPLIFICATION:.0f}-fold"
-        )
+    rounding = ""
+    if amplification > np.log10(ROUNDING_AMPLIFICATION):
+        rounding = ", and rounding errors alone change it"
+    return (
+        f"the motion is unstable or chaotic: a small deviation grows 1e{amplification:.0f}-fold "
+        f"within {length:.3g} s, so the residuals of one simulation have many local minima"
+        f"{rounding}. State fit.segments = {recommended:g} in the experiment file: segments with "
+        "free initial states, over which it typically grows less than "
+        f"{GOOD_AMPLIFICATION:.0f}-fold"
+    )
 
 
-def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> UnpredictableMotion | None:
+def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> str:
     """Compare the amplification along the longest recording with the segments of a fit.
 
     Args:
@@ -250,16 +202,16 @@ def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> Unpredictabl
         at: The unknowns.
 
     Returns:
-        The amplification, and a better length; None if the segments suit the motion, and with
-        control laws, of whose memory a state shows nothing.
+        Advice with the amplification and a better length; empty if the segments suit the motion,
+        and with control laws, of whose memory a state shows nothing.
     """
     if problem.system.laws is not None:
-        return None
+        return ""
     longest = max(problem.segments, key=lambda segment: segment.samples)
     samples = min(longest.samples, MAX_SAMPLES)
     motion = problem.motion(at, longest.recording, longest.begin + samples)
     if motion is None:
-        return None
+        return ""
 
     rows = slice(longest.begin, longest.begin + samples + 1)
     motion = replace(
@@ -274,20 +226,20 @@ def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> Unpredictabl
     try:
         A, _, _, _ = plant.derivatives.jacobians(problem.theta(at), motion)
     except SimulationDivergedError:
-        return None
+        return ""
 
     # Deviations are relative to the size of the motion.
     moves = plant.space.minus(motion.state, motion.state[:1])
     typical = amplifications(A, np.abs(moves).max(axis=0))
     if typical[-1] <= np.log10(MAX_AMPLIFICATION):
-        return None
+        return ""
 
     good = np.flatnonzero(typical <= np.log10(GOOD_AMPLIFICATION))
     samples = max(2 ** int(good[-1]) if len(good) else 1, LEAST_SAMPLES)
-    return UnpredictableMotion(
-        amplification=float(typical[-1]),
-        length=float(2 ** (len(typical) - 1) * plant.dt),
-        recommended=float(f"{samples * plant.dt:.{LENGTH_DIGITS}g}"),
+    return sentence_about_instability(
+        float(typical[-1]),
+        float(2 ** (len(typical) - 1) * plant.dt),
+        float(f"{samples * plant.dt:.{LENGTH_DIGITS}g}"),
     )
 
 

@@ -187,76 +187,57 @@ def _describe(test: Whiteness) -> str:
     return f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
 
 
-@dataclass(frozen=True, kw_only=True)
-class LargestResidual:
-    """The interval in which residuals are largest, among those of some outputs.
+def largest_interval(
+    output: str, recording: str, t: Array, z: Array
+) -> tuple[float, float, WorstResidual] | None:
+    """The interval of a recording in which the residuals of an output are largest.
 
-    Attributes:
-        total: Sum of the squares of all residuals.
-        squares: Sum of the squares in the interval.
-        worst: The interval, whose share is not known yet; None without residuals.
+    Args:
+        output: Name of the output.
+        recording: Name of the recording.
+        t: (M,) times of the rows [s].
+        z: (M,) whitened residuals, NaN where not measured.
+
+    Returns:
+        Sums of all squares and of those in the interval, and the interval, whose share is not known
+        yet; None without residuals.
     """
+    measured = np.isfinite(z)
+    if not measured.any():
+        return None
 
-    total: float = 0.0
-    squares: float = 0.0
-    worst: WorstResidual | None = None
+    # Windows of equal duration; round-off must not exclude the last row.
+    number = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
+    edges = np.linspace(t[0], t[-1] * (1 + 1e-12), number + 1)
+    rows = np.searchsorted(t, edges)
+    rows[0], rows[-1] = 0, len(t)
+    parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
+    counts = np.array([len(part) for part in parts])
+    squares = np.array([float(part @ part) for part in parts])
 
-    @property
-    def interval(self) -> WorstResidual | None:
-        """The interval with its share of the sum of squares; None without residuals."""
-        if self.worst is None:
-            return None
-        return replace(self.worst, share=self.squares / max(self.total, SMALLEST_SQUARES))
+    inside = _largest_windows(counts, squares)
+    within = float(squares[inside].sum())
+    worst = WorstResidual(
+        output=output,
+        recording=recording,
+        begin=edges[inside.start],
+        end=edges[inside.stop],
+        size=float(np.sqrt(within / max(counts[inside].sum(), 1))),
+        share=0.0,
+    )
+    return float(squares.sum()), within, worst
 
-    def with_output(
-        self,
-        output: str,
-        recordings: Sequence[str],
-        times: Sequence[Array],
-        whitened: Sequence[Array],
-    ) -> LargestResidual:
-        """The interval among those of one more output.
 
-        Args:
-            output: Name of the output.
-            recordings: Names of the recordings.
-            times: (M,) times of the rows of every recording [s].
-            whitened: (M,) whitened residuals of every recording, NaN where not measured.
-
-        Returns:
-            The larger one of the two intervals.
-        """
-        total, squares, worst = self.total, self.squares, self.worst
-        for name, t, z in zip(recordings, times, whitened, strict=True):
-            measured = np.isfinite(z)
-            if not measured.any():
-                continue
-
-            # Windows of equal duration; round-off must not exclude the last row.
-            number = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
-            edges = np.linspace(t[0], t[-1] * (1 + 1e-12), number + 1)
-            rows = np.searchsorted(t, edges)
-            rows[0], rows[-1] = 0, len(t)
-            parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
-            counts = np.array([len(part) for part in parts])
-            of_windows = np.array([float(part @ part) for part in parts])
-
-            total += float(of_windows.sum())
-            inside = _largest_windows(counts, of_windows)
-            within = float(of_windows[inside].sum())
-            count = max(counts[inside].sum(), 1)
-            size = float(np.sqrt(within / count))
-            if worst is None or size > worst.size:
-                squares = within
-                worst = WorstResidual(
-                    output=output,
-                    recording=name,
-                    begin=edges[inside.start],
-                    end=edges[inside.stop],
-                    size=size,
-                    share=0.0,
-                )
-        return LargestResidual(total=total, squares=squares, worst=worst)
+def worst_residual(
+    found: Sequence[tuple[float, float, WorstResidual] | None],
+) -> WorstResidual | None:
+    """The largest of some intervals with its share of all squares; None without residuals."""
+    known = [each for each in found if each is not None]
+    if not known:
+        return None
+    total = sum(squares for squares, _, _ in known)
+    _, within, worst = max(known, key=lambda each: each[2].size)
+    return replace(worst, share=within / max(total, SMALLEST_SQUARES))
 
 
 def _largest_windows(counts: np.ndarray, squares: Array) -> slice:
@@ -458,14 +439,12 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
     if predicted is None:
         raise SimulationDivergedError("the simulation diverges near the estimate")
 
-    recordings = [Path(recording.name).name for recording in problem.recordings]
-    times = [recording.t for recording in problem.recordings]
     squares = 0.0
     count = 0
     rms = {}
     unexplained = []
     whiteness = []
-    largest = LargestResidual()
+    largest = []
 
     names = problem.system.outputs.names
     for j, (name, series) in enumerate(
@@ -476,7 +455,10 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
         squares += sum(float(z @ z) for z in inliers)
         count += sum(map(len, inliers))
         whiteness.append(whiteness_of(name, series))
-        largest = largest.with_output(name, recordings, times, series)
+        largest += [
+            largest_interval(name, Path(recording.name).name, recording.t, z)
+            for recording, z in zip(problem.recordings, series, strict=True)
+        ]
 
         errors = problem.errors_of(j, predicted)
         if not len(errors):
@@ -498,7 +480,7 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
         dof=max(count - solution.condensed.rank, 1),
         rms=rms,
         whiteness=tuple(whiteness),
-        worst_residual=largest.interval,
+        worst_residual=worst_residual(largest),
         unexplained=tuple(unexplained),
     )
 
@@ -510,27 +492,18 @@ def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> Iter
         (M,) residuals of an output for every recording, NaN where no measured value counts.
     """
     noise = problem.noise
-    if noise.correlated:
-        yield from _correlated_residuals(problem, predicted)
-        return
-
     data = list(zip(predicted, problem.recordings, problem.masks, strict=True))
+    whitened = []
+    for y, recording, mask in data if noise.correlated else ():
+        z = np.full(y.shape, np.nan)
+        z[mask] = noise.whiten_present(np.where(mask, recording.y - y, 0.0), mask)
+        whitened.append(z)
+
     for j, sigma in enumerate(noise.sigma):
-        series = []
-        for y, recording, mask in data:
+        series = [z[:, j] for z in whitened]
+        for y, recording, mask in () if noise.correlated else data:
             z = recording.y[:, j] - y[:, j]
             z /= sigma
             z[~mask[:, j]] = np.nan
             series.append(z)
         yield series
-
-
-def _correlated_residuals(problem: FitProblem, predicted: Sequence[Array]) -> Iterator[list[Array]]:
-    """Whitened residuals, output by output, where the noise of the outputs is correlated."""
-    whitened = []
-    for y, recording, mask in zip(predicted, problem.recordings, problem.masks, strict=True):
-        z = np.full(y.shape, np.nan)
-        difference = np.where(mask, recording.y - y, 0.0)
-        z[mask] = problem.noise.whiten_present(difference, mask)
-        whitened.append(z)
-    yield from ([z[:, j] for z in whitened] for j in range(len(problem.noise.sigma)))

@@ -24,7 +24,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.assessment.residual_tests import whiteness_of
-from mjfim.identification.inverse_dynamics.equations import MotionEquations, Rows
+from mjfim.identification.inverse_dynamics.equations import MotionEquations
 from mjfim.identification.inverse_dynamics.motion import measured_forces
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.model.control_laws import LawField
@@ -103,7 +103,7 @@ class FoundEquations:
 
     Attributes:
         x: (p,) linear coordinates.
-        rows: The rows there.
+        rows: (3, R) the rows there (`MotionEquations.rows`).
         slopes: (R, p) their derivatives by the linear coordinates.
         sigma: (E,) standard deviations of the equations [N or N m].
         weights: (R,) weights of the rows.
@@ -112,7 +112,7 @@ class FoundEquations:
     """
 
     x: Array
-    rows: Rows
+    rows: Array
     slopes: Array
     sigma: Array
     weights: Array
@@ -121,7 +121,12 @@ class FoundEquations:
 
     def residual(self, x: Array) -> Array:
         """(R,) residuals that the linearisation predicts for linear coordinates: (p,)."""
-        return np.asarray(self.rows.residual + self.slopes @ (x - self.x))
+        return np.asarray(_residual(self.rows) + self.slopes @ (x - self.x))
+
+
+def _residual(rows: Array) -> Array:
+    """(R,) explained minus measured forces of rows: (3, R) [N or N m]."""
+    return np.asarray(rows[0] - rows[1])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -194,7 +199,7 @@ class EquationSearch:
             if is_enough and not is_needed:
                 break
             found = self._searched(start)
-            scaled = found.rows.residual / self.forces[self.of_row]
+            scaled = _residual(found.rows) / self.forces[self.of_row]
             cost = float(scaled @ scaled)
             if best is None or cost < least:
                 best, least = found, cost
@@ -244,9 +249,9 @@ class EquationSearch:
                     return self._ended(at, x, rows, success=True)
 
             # A step that raises the cost is shortened.
-            before = self._cost(at.rows.residual, at.x, weights)
+            before = self._cost(_residual(at.rows), at.x, weights)
             for _ in range(MAX_HALVINGS):
-                if self._cost(rows.residual, x, weights) < before:
+                if self._cost(_residual(rows), x, weights) < before:
                     break
                 x = 0.5 * (x + at.x)
                 rows = self._rows(x)
@@ -255,7 +260,7 @@ class EquationSearch:
             at = self._linearised(x, rows, weights)
         return self._ended(at, at.x, at.rows, success=False)
 
-    def _ended(self, at: FoundEquations, x: Array, rows: Rows, *, success: bool) -> FoundEquations:
+    def _ended(self, at: FoundEquations, x: Array, rows: Array, *, success: bool) -> FoundEquations:
         """The result at x: (p,), whose rows are known; impossible bodies move towards the start."""
         halvings = 0
         while halvings < MAX_HALVINGS and self.impossible(self.coordinates.theta(x)):
@@ -263,16 +268,16 @@ class EquationSearch:
             halvings += 1
         if halvings:
             success, rows = False, self._rows(x)
-        sigma, weights = self._weights(rows.residual)
+        sigma, weights = self._weights(_residual(rows))
         return replace(at, x=x, rows=rows, sigma=sigma, weights=weights, success=success)
 
     # ---- rows
 
-    def _rows(self, x: Array) -> Rows:
+    def _rows(self, x: Array) -> Array:
         """The rows at x: (p,)."""
         return self.equations.rows(self.coordinates.theta(x)[None])[0]
 
-    def _linearised(self, x: Array, rows: Rows, weights: Array) -> FoundEquations:
+    def _linearised(self, x: Array, rows: Array, weights: Array) -> FoundEquations:
         """Linearise about a point x: (p,) whose rows are known."""
         active, coordinates, parameters = self.active, self.coordinates, self.parameters
         theta = coordinates.theta(x)
@@ -285,10 +290,10 @@ class EquationSearch:
 
         points = np.repeat(theta[None], len(active), axis=0)
         points[np.arange(len(points)), active] += steps[active]
-        differences = np.zeros((len(rows.residual), len(x)))
+        differences = np.zeros((rows.shape[1], len(x)))
         moves = np.diag(steps)
         for j, point, found in zip(active, points, self.equations.rows(points), strict=True):
-            differences[:, j] = found.residual - rows.residual
+            differences[:, j] = _residual(found) - _residual(rows)
             moves[:, j] = coordinates.linear(point) - x
         return FoundEquations(
             x=x,
@@ -300,12 +305,12 @@ class EquationSearch:
             success=False,
         )
 
-    def _agrees(self, at: FoundEquations, rows: Rows, x: Array, weights: Array) -> bool:
+    def _agrees(self, at: FoundEquations, rows: Array, x: Array, weights: Array) -> bool:
         """Whether rows at x: (p,) are those that a linearisation predicts, with weights: (R,)."""
         predicted = at.residual(x)
-        error = np.linalg.norm(weights * (rows.residual - predicted))
+        error = np.linalg.norm(weights * (_residual(rows) - predicted))
         residual = np.linalg.norm(weights * predicted)
-        force = np.linalg.norm(weights * rows.explained)
+        force = np.linalg.norm(weights * rows[0])
         return bool(error <= max(LINEAR * residual, ROUNDING * force))
 
     def _cost(self, residual: Array, x: Array, weights: Array) -> float:
@@ -364,7 +369,7 @@ class EquationSearch:
     def _minimum(self, at: FoundEquations, weights: Array, begin: Array) -> Array:
         """(p,) minimum of the squared rows of a linearisation and of the priors."""
         # The triangle of the rows has equal inner products.
-        rows = np.concatenate([at.slopes, at.rows.residual[:, None]], axis=1)
+        rows = np.concatenate([at.slopes, _residual(at.rows)[:, None]], axis=1)
         R = triangle(weights[:, None] * rows)
 
         def all_rows(x: Array) -> tuple[Array, Array]:
@@ -487,15 +492,15 @@ def _inverse(information: Array, active: np.ndarray) -> Array:
     return found
 
 
-def _force_sizes(system: System, rows: Rows, equations: MotionEquations) -> Array:
+def _force_sizes(system: System, rows: Array, equations: MotionEquations) -> Array:
     """(E,) sizes of the forces of the equations, which hardly depend on the start [N or N m]."""
     arms = np.where(translations(system.model), 1.0, model_length(system.model))
     count = len(equations.equations)
     measured, needed = np.zeros(count), np.zeros(count)
     for i in np.unique(equations.equation_of_row).tolist():
         own = equations.equation_of_row == i
-        measured[i] = float(np.sqrt(np.mean(rows.measured[own] ** 2)))
-        needed[i] = float(np.sqrt(np.mean(rows.explained[own] ** 2)))
+        measured[i] = float(np.sqrt(np.mean(rows[1][own] ** 2)))
+        needed[i] = float(np.sqrt(np.mean(rows[0][own] ** 2)))
 
     # The law of an actuator is compared with its own force.
     sizes = np.where(measured > 0.0, measured, needed)
@@ -585,7 +590,7 @@ def fit_equations(
     _require_rows(search, recordings)
 
     found = search.run()
-    taken = equations.model.system.plant.engine_steps + system.plant.engine_steps - steps
+    taken = equations.system.plant.engine_steps + system.plant.engine_steps - steps
     return replace(
         _record(search, found, recordings), seconds=time.perf_counter() - begun, steps=taken
     )
@@ -682,21 +687,21 @@ def _equation_fits(
         own = np.flatnonzero(search.of_row == i)
         if not len(own):
             continue
-        residual = rows.residual[own] * found.weights[own]
+        residual = _residual(rows)[own] * found.weights[own]
         parts = [residual[recording[own] == k] for k in np.unique(recording[own])]
         drawn = own[recording[own] == shown]
         drawn = drawn[evenly_spread_indices(len(drawn), SHOWN_ROWS)]
-        parts_of_force = rows.measured[own], rows.inertial[own]
+        parts_of_force = rows[1][own], rows[2][own]
         yield EquationFit(
             name=equation.name,
             unit=equation.unit,
-            residual=float(np.sqrt(np.mean(rows.residual[own] ** 2))),
+            residual=float(np.sqrt(np.mean(_residual(rows)[own] ** 2))),
             size=max(float(np.sqrt(np.mean(part**2))) for part in parts_of_force),
             rows=len(own),
             cutoff=equations.cutoff(i),
             sigma=float(found.sigma[i]),
             correlation=max(whiteness_of(equation.name, parts).time, 1.0),
             t=times[drawn],
-            measured=rows.measured[drawn],
-            explained=rows.explained[drawn],
+            measured=rows[1][drawn],
+            explained=rows[0][drawn],
         )

@@ -340,7 +340,23 @@ def measured_motion(
     space, lag = system.space, engine_lag(system.model)
     curves = _curves(system, recording)
     y = recording.y - system.parameters.bias_derivative(recording.y.shape[1]) @ theta
-    splines = {curve.key: _spline(system, recording, y, curve, lag) for curve in curves}
+    splines: dict[int, RegressionSpline] = {}
+    for key, curve in curves.items():
+        readings = []
+        for derivative, output in enumerate(curve[:2]):
+            if output is not None:
+                known = recording.measured[:, output]
+                readings.append(
+                    Readings(
+                        t=recording.t[known] - derivative * lag,
+                        values=y[known, output],
+                        sigma=float(system.noise.sigma[output]),
+                        derivative=derivative,
+                    )
+                )
+        # Where only its slope is measured, a curve begins as the experiment says.
+        anchor = float(system.nominal_initial_state[key]) if key >= 0 else 0.0
+        splines[key] = fit_spline(readings, anchor)
 
     # Points are as dense as the finest spline needs, but no denser than the rows.
     duration = float(recording.t[-1])
@@ -353,15 +369,15 @@ def measured_motion(
 
     usable = np.ones((len(t), space.nv), dtype=bool)
     spacing, speed_sigma = np.zeros(space.nv), np.zeros(space.nv)
-    for curve in curves:
-        spline, dofs = splines[curve.key], list(curve.dofs)
-        measured = recording.measured[:, curve.outputs].any(axis=1)
+    for key, (*outputs, dofs) in curves.items():
+        spline, own = splines[key], list(dofs)
+        measured = recording.measured[:, [output for output in outputs if output is not None]]
         reach = REACH * max(spline.spacing, step)
-        usable[:, dofs] &= _is_near(t, recording.t[measured], reach)[:, None]
-        spacing[dofs] = np.maximum(spacing[dofs], spline.spacing)
+        usable[:, own] &= _is_near(t, recording.t[measured.any(axis=1)], reach)[:, None]
+        spacing[own] = np.maximum(spacing[own], spline.spacing)
         # The angular velocity is twice a combination of the slopes of a unit quaternion.
-        sigma = spline.slope_sigma * (2.0 if curve.in_quaternion else 1.0)
-        speed_sigma[dofs] = np.maximum(speed_sigma[dofs], sigma)
+        sigma = spline.slope_sigma * (2.0 if len(dofs) > 1 else 1.0)
+        speed_sigma[own] = np.maximum(speed_sigma[own], sigma)
     return MeasuredMotion(
         recording=recording,
         t=t,
@@ -383,58 +399,37 @@ def engine_lag(model: mujoco.MjModel) -> float:
 # ---- curves
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Curve:
-    """A number that changes with time, and the outputs that measure it or its slope.
-
-    Attributes:
-        key: Address in qpos; negative for the integral of an angular velocity.
-        values: Output that measures it; None for none.
-        slopes: Output that measures its slope; None for none.
-        dofs: Degrees of freedom that it moves.
-        in_quaternion: Whether it is a component of a quaternion.
-    """
-
-    key: int
-    values: int | None
-    slopes: int | None
-    dofs: tuple[int, ...]
-    in_quaternion: bool = False
-
-    @property
-    def outputs(self) -> list[int]:
-        """The outputs."""
-        return [output for output in (self.values, self.slopes) if output is not None]
+# A number that changes with time: the outputs that measure it and its slope, if any does, and the
+# degrees of freedom that it moves, three for a component of a quaternion. Its key is its address in
+# qpos, or negative for the integral of an angular velocity.
+Curves = dict[int, tuple[int | None, int | None, tuple[int, ...]]]
 
 
-def _curves(system: System, recording: AlignedRecording) -> list[_Curve]:
+def _curves(system: System, recording: AlignedRecording) -> Curves:
     """The curves of all degrees of freedom. Raises RecordingError where one was not measured."""
     space = system.space
     has_values = np.asarray(recording.measured.any(axis=0))
     outputs = outputs_by_state(system.model, system.outputs)
     output_of = {address: i for address, i in outputs.items() if has_values[i]}
 
-    curves = [
-        _Curve(key=q, values=output_of.get(q), slopes=output_of.get(space.nq + v), dofs=(v,))
+    curves: Curves = {
+        q: (output_of.get(q), output_of.get(space.nq + v), (v,))
         for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True)
-    ]
+    }
     for q, v in space.quaternions:
         dofs = tuple(range(v, v + 3))
-        curves += [
-            _Curve(
-                key=q + i, values=output_of.get(q + i), slopes=None, dofs=dofs, in_quaternion=True
-            )
-            for i in range(4)
-        ]
+        curves |= {q + i: (output_of.get(q + i), None, dofs) for i in range(4)}
         # Measured angular velocities replace the slopes of the quaternion.
         rates = [output_of.get(space.nq + dof) for dof in dofs]
         if None not in rates:
-            curves += [
-                _Curve(key=-1 - dof, values=None, slopes=output, dofs=(dof,))
-                for dof, output in zip(dofs, rates, strict=True)
-            ]
+            curves |= {
+                -1 - dof: (None, output, (dof,)) for dof, output in zip(dofs, rates, strict=True)
+            }
 
-    missing = sorted({dof for curve in curves if not curve.outputs for dof in curve.dofs})
+    known = {
+        key: [output for output in curve[:2] if output is not None] for key, curve in curves.items()
+    }
+    missing = sorted({dof for key, curve in curves.items() if not known[key] for dof in curve[2]})
     if missing:
         names = dof_names(system.model)
         unmeasured = listed([names[dof] for dof in missing])
@@ -444,33 +439,13 @@ def _curves(system: System, recording: AlignedRecording) -> list[_Curve]:
             'columns such as `qpos:<joint>`, or state fit.start = "measured"'
         )
     counts = recording.measured.sum(axis=0)
-    fewest = min(int(counts[output]) for curve in curves for output in curve.outputs)
+    fewest = min(int(counts[output]) for outputs_of in known.values() for output in outputs_of)
     if fewest < FEWEST_READINGS:
         raise RecordingError(
             f"{recording.name}: a degree of freedom has only {fewest} measured values; "
             f"velocities and accelerations need at least {FEWEST_READINGS}"
         )
     return curves
-
-
-def _spline(
-    system: System, recording: AlignedRecording, y: Array, curve: _Curve, lag: float
-) -> RegressionSpline:
-    """The spline of a curve; where only its slope is measured, it begins as the experiment says."""
-    readings = []
-    for derivative, output in enumerate((curve.values, curve.slopes)):
-        if output is not None:
-            known = recording.measured[:, output]
-            readings.append(
-                Readings(
-                    t=recording.t[known] - derivative * lag,
-                    values=y[known, output],
-                    sigma=float(system.noise.sigma[output]),
-                    derivative=derivative,
-                )
-            )
-    anchor = float(system.nominal_initial_state[curve.key]) if curve.key >= 0 else 0.0
-    return fit_spline(readings, anchor)
 
 
 def _is_near(t: Array, readings: Array, reach: float) -> np.ndarray:
