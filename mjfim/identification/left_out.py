@@ -409,9 +409,20 @@ def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
     else:
         groups = min(MAX_FOLDS, len(rows) // MIN_SEGMENTS_PER_PART)
     times = [float(recording.t[group[0]]) for group in np.array_split(rows, groups)]
+    return stretches_of(recording.name, 0, times)
+
+
+def stretches_of(name: str, recording: int, times: Sequence[float]) -> tuple[LeftOutPart, ...]:
+    """Stretches of a recording, each of which ends where the next one begins.
+
+    Args:
+        name: Name of the recording.
+        recording: Its index.
+        times: Times at which the stretches begin [s].
+    """
     return tuple(
         LeftOutPart(
-            name=f"{recording.name} from {begin:.3g} s", recordings=(0,), begin=begin, end=end
+            name=f"{name} from {begin:.3g} s", recordings=(recording,), begin=begin, end=end
         )
         for begin, end in zip(times, [*times[1:], np.inf], strict=True)
     )
