@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import pairwise, zip_longest
 from typing import Protocol, TypeVar
 
@@ -19,7 +19,6 @@ from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.segment_simulation import (
-    BlockDivision,
     SegmentBatch,
     SegmentRows,
     SegmentSimulation,
@@ -280,11 +279,6 @@ class FitProblem(SegmentSimulation):
     # ---- sizes
 
     @property
-    def row_count(self) -> int:
-        """Number of rows of all recordings."""
-        return sum(len(recording.t) for recording in self.recordings)
-
-    @property
     def value_count(self) -> int:
         """Number of measured values that count."""
         return int(sum(mask.sum() for mask in self.masks))
@@ -303,11 +297,6 @@ class FitProblem(SegmentSimulation):
                 indices.append(i)
 
         return np.array(indices, dtype=np.intp)
-
-    @cached_property
-    def blocks(self) -> BlockDivision:
-        """Division of the rows into blocks."""
-        return BlockDivision(segments=self.segments, row_count=self.row_count)
 
     def private_prior_rows(self, at: UnknownValues) -> Array:
         """(P, k, m) rows `[J_private, J_common, r]` on the private unknowns of every segment."""
@@ -459,7 +448,7 @@ class FitProblem(SegmentSimulation):
             The linearisation; None where a perturbed simulation diverges.
         """
         m = self.private_count + self.layout.column_count + 1
-        blocks = np.zeros((self.blocks.count, m, m))
+        blocks = np.zeros((self.block_count, m, m))
 
         batches = self.batches(derivatives=True)
         for found in self.of_batches(FitProblem.blocks_of_batch, batches, at):
@@ -470,7 +459,7 @@ class FitProblem(SegmentSimulation):
 
         return Condensed(
             blocks=blocks,
-            segment_of_block=self.blocks.segment_of_block,
+            segment_of_block=self.segment_of_block,
             private_rows=self.private_prior_rows(at),
             common_rows=self.layout.common_rows(at),
         )
@@ -523,7 +512,7 @@ class FitProblem(SegmentSimulation):
             weighted = np.column_stack([J, r]) * self.loss.weight(r)[:, None]
 
             # Values are added to the triangle of the block of their row.
-            block = self.blocks.of_rows(rows)[place]
+            block = self.blocks_of(rows)[place]
             edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
             for first, last in pairwise(edges):
                 index = int(block[first])

@@ -231,7 +231,7 @@ def fit_without(
     at, condensed = solution.unknowns, solution.condensed
     cost = others.cost(own(at))
     starts = [(cost, own(at))]
-    remaining = condensed.without_blocks(problem.blocks.containing(masks))
+    remaining = condensed.without_blocks(problem.blocks_containing(masks))
     values = problem.common_values(at)
     lower, upper = problem.lower - values, problem.upper - values
     first = 0.0

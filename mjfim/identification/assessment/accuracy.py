@@ -37,67 +37,40 @@ from mjfim.records.inverse_dynamics import InverseDynamicsFit
 DETERMINED_SHARE = 0.5
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class InertiaCombinations:
-    """Combinations of the k inertial coordinates with a CAD prior, by how well they are determined.
+def inertia_combinations(
+    parameters: ParameterSet, theta: Array, data: Array
+) -> tuple[np.ndarray, np.ndarray, Array] | None:
+    """Compare the information of the recordings about inertias with that of their CAD prior.
 
-    Attributes:
-        columns: (k,) indices in theta of the coordinates.
-        left: (k,) share of the standard deviation of the prior that the recordings leave.
-        axes: (k, k) directions of the coordinates, one in each column, in which recordings and
-            prior are uncorrelated and the prior has the standard deviation 1 [theta-unit].
-        prior_std: (k,) standard deviations of the prior [theta-unit].
+    Args:
+        parameters: The p parameters.
+        theta: (p,) estimate [theta-unit].
+        data: (p, p) information of the recordings alone about the parameters that they share.
+
+    Returns:
+        (k,) indices in theta of the coordinates with a CAD prior, (k,) True for their combinations
+        that the recordings determine, and (k, k) directions of the coordinates, one in each column,
+        in which recordings and prior are uncorrelated and the prior has the standard deviation 1
+        [theta-unit]. None without a CAD prior.
     """
+    is_shared = ~parameters.recording_specific
+    prior = CadPrior.of(parameters).of_bodies(is_shared)
+    columns = prior.columns
+    if not len(columns):
+        return None
 
-    columns: np.ndarray
-    left: Array
-    axes: Array
-    prior_std: Array
+    # Other parameters are estimated as well, so that their uncertainty counts.
+    others = np.setdiff1d(np.flatnonzero(is_shared), columns)
+    kept = np.concatenate([columns, others])
+    stated = parameters.prior_information[np.ix_(kept, kept)]
+    about = marginal(data[np.ix_(kept, kept)], stated, np.arange(len(columns)))
 
-    @staticmethod
-    def of(parameters: ParameterSet, theta: Array, data: Array) -> InertiaCombinations | None:
-        """Compare the information of the recordings about inertias with that of their CAD prior.
-
-        Args:
-            parameters: The p parameters.
-            theta: (p,) estimate [theta-unit].
-            data: (p, p) information of the recordings alone about the parameters that they share.
-
-        Returns:
-            The combinations; None without a CAD prior.
-        """
-        is_shared = ~parameters.recording_specific
-        prior = CadPrior.of(parameters).of_bodies(is_shared)
-        columns = prior.columns
-        if not len(columns):
-            return None
-
-        # Other parameters are estimated as well, so that their uncertainty counts.
-        others = np.setdiff1d(np.flatnonzero(is_shared), columns)
-        kept = np.concatenate([columns, others])
-        stated = parameters.prior_information[np.ix_(kept, kept)]
-        about = marginal(data[np.ix_(kept, kept)], stated, np.arange(len(columns)))
-
-        # Eigenvalues of the information relative to the prior do not depend on the coordinates.
-        information = prior.information(theta)[np.ix_(columns, columns)]
-        known, scale = scaled_to_unit_diagonal(information)
-        ratios, vectors = scipy.linalg.eigh(about / np.outer(scale, scale), known)
-        return InertiaCombinations(
-            columns=columns,
-            left=1.0 / np.sqrt(1.0 + np.maximum(ratios, 0.0)),
-            axes=vectors / scale[:, None],
-            prior_std=np.sqrt(np.diag(np.linalg.inv(known))) / scale,
-        )
-
-    @property
-    def is_determined(self) -> np.ndarray:
-        """(k,) True for the combinations that the recordings determine."""
-        return np.asarray(self.left <= DETERMINED_SHARE)
-
-    @property
-    def undetermined(self) -> Array:
-        """(m, k) weights of the coordinates in the combinations that the prior determines."""
-        return np.asarray(np.linalg.inv(self.axes)[~self.is_determined])
+    # Eigenvalues of the information relative to the prior do not depend on the coordinates.
+    information = prior.information(theta)[np.ix_(columns, columns)]
+    known, scale = scaled_to_unit_diagonal(information)
+    ratios, vectors = scipy.linalg.eigh(about / np.outer(scale, scale), known)
+    left = 1.0 / np.sqrt(1.0 + np.maximum(ratios, 0.0))
+    return columns, left <= DETERMINED_SHARE, vectors / scale[:, None]
 
 
 def prior_directions(
@@ -114,17 +87,17 @@ def prior_directions(
     Returns:
         The combinations; None without a CAD prior, or where the recordings determine all of them.
     """
-    found = InertiaCombinations.of(parameters, theta, data)
-    if found is None or found.is_determined.all():
+    found = inertia_combinations(parameters, theta, data)
+    if found is None or found[1].all():
         return None
 
-    columns = found.columns
-    is_prior = std[columns] > DETERMINED_SHARE * found.prior_std
+    columns, is_determined, axes = found
+    is_prior = std[columns] > DETERMINED_SHARE * np.linalg.norm(axes, axis=1)
     groups = [parameters.parameters[j].group for j in columns.tolist()]
     return PriorDirections(
         bodies=tuple(dict.fromkeys(groups)),
         count=len(columns),
-        determined=int(found.is_determined.sum()),
+        determined=int(is_determined.sum()),
         parameters=tuple(parameters.names[j] for j in columns[is_prior].tolist()),
     )
 
@@ -242,8 +215,8 @@ def accuracy_of(
         robust = robust_uncertainty(
             solution.condensed,
             problem.common_values(solution.unknowns),
-            problem.blocks.recording_of_block,
-            problem.blocks.mean_rows,
+            problem.recording_of_block,
+            problem.mean_block_rows,
             min_rows=independent_rows(problem, correlation_rows),
             draws=settings.bootstrap,
             rng=np.random.default_rng(settings.seed),

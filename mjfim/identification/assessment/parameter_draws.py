@@ -25,7 +25,7 @@ from mjfim.arrays import Array
 from mjfim.errors import MAX_SAMPLES, ExperimentError, first_ones, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.accuracy import InertiaCombinations
+from mjfim.identification.assessment.accuracy import inertia_combinations
 from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.assessment.robust_covariance import covariance_root
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
@@ -296,13 +296,14 @@ def _undetermined(parameters: ParameterSet, estimate: Estimate, drawn: np.ndarra
     """
     found = None
     if len(estimate.data) == len(parameters):
-        found = InertiaCombinations.of(parameters, estimate.theta, estimate.data)
+        found = inertia_combinations(parameters, estimate.theta, estimate.data)
     if found is None:
         return np.zeros((0, len(drawn)))
 
-    of_inertias = found.undetermined
+    columns, is_determined, axes = found
+    of_inertias = np.linalg.inv(axes)[~is_determined]
     weights = np.zeros((len(of_inertias), len(drawn)))
-    weights[:, np.searchsorted(drawn, found.columns)] = of_inertias
+    weights[:, np.searchsorted(drawn, columns)] = of_inertias
     return weights
 
 

@@ -509,9 +509,9 @@ def compare_recordings(
         return None
 
     condensed = solution.condensed
-    recording_of_block = problem.blocks.recording_of_block
+    recording_of_block = problem.recording_of_block
     min_rows = independent_rows(problem, correlation_rows)
-    blocks = independent_blocks(condensed, recording_of_block, problem.blocks.mean_rows, min_rows)
+    blocks = independent_blocks(condensed, recording_of_block, problem.mean_block_rows, min_rows)
     evidence = recording_evidence(condensed, blocks, recording_of_block, layout.own_columns)
     # Parameters of the robot that are stated to differ have their values already.
     stated = [i for i, j in enumerate(layout.per_recording) if parameters.changes_model[j]]

@@ -26,6 +26,7 @@ from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.term_candidates import Candidate, candidates_of
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.search import of_subset
 from mjfim.identification.segments import KnownActivations, Segment, spread_over_data
 from mjfim.model.coordinates import state_names, tangent_names
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -163,35 +164,7 @@ def _private_names(problem: FitProblem) -> list[str]:
     return [str(names[np.flatnonzero(column)[0]]) for column in directions.T]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DataPart:
-    """A part of the data of a problem.
-
-    Attributes:
-        problem: The problem of the part.
-        segments: Indices of its segments among those of the whole problem.
-        share: Share of the samples of the whole problem, 0 to 1.
-    """
-
-    problem: FitProblem
-    segments: np.ndarray
-    share: float
-
-    @property
-    def recording_count(self) -> int:
-        """Number of recordings with samples in the part."""
-        return len({segment.recording for segment in self.problem.segments})
-
-    def unknowns(self, at: UnknownValues) -> UnknownValues:
-        """The unknowns of the part.
-
-        Args:
-            at: Unknowns of the whole problem.
-        """
-        return replace(at, private=at.private[self.segments])
-
-
-def part_of_data(problem: FitProblem, max_samples: float) -> DataPart:
+def part_of_data(problem: FitProblem, max_samples: float) -> tuple[FitProblem, np.ndarray]:
     """Some segments of each recording, and of these the first parts where that is still too much.
 
     First parts begin at the initial states of the problem. Other parts of a recording would begin
@@ -202,18 +175,17 @@ def part_of_data(problem: FitProblem, max_samples: float) -> DataPart:
         max_samples: Number of samples of the part, at most.
 
     Returns:
-        The part; all data where they are few enough.
+        The problem of the part, that of all data where they are few enough, and the indices of its
+        segments among all.
     """
     if problem.sample_count <= max_samples:
-        everything = np.arange(len(problem.segments))
-        return DataPart(problem=problem, segments=everything, share=1.0)
+        return problem, np.arange(len(problem.segments))
 
     chosen = _spread_segments(problem, max_samples)
     part = problem.of_segments(chosen)
     if part.sample_count > max_samples:
         part = part.of_first_parts(max_samples / part.sample_count)
-    share = part.sample_count / problem.sample_count
-    return DataPart(problem=part, segments=chosen, share=share)
+    return part, chosen
 
 
 def _spread_segments(problem: FitProblem, max_samples: float) -> np.ndarray:
@@ -343,13 +315,13 @@ def find_missing_terms(
     ]
     largest = max((sum(len(each.tested) for each in group) for group in groups), default=0)
     columns = problem.layout.column_count + problem.private_count + largest
-    part = part_of_data(problem, MAX_SIMULATED / columns)
-    at = part.unknowns(at)
+    part, segments = part_of_data(problem, MAX_SIMULATED / columns)
+    at = of_subset(at, segments)
     search = _TermSearch(
-        problem=part.problem,
+        problem=part,
         recordings=recordings,
         at=at,
-        squares=2.0 * part.problem.cost(at),
+        squares=2.0 * part.cost(at),
         count=sum(len(group) for group in groups),
     )
     found, untested = search.by_score(groups)
@@ -358,8 +330,8 @@ def find_missing_terms(
     return TermTests(
         terms=first_terms(_by_significance(found)),
         data=TermTestData(
-            share=part.share,
-            recordings=part.recording_count,
+            share=part.sample_count / problem.sample_count,
+            recordings=len({segment.recording for segment in part.segments}),
             count=len(problem.recordings),
             untested=tuple(dict.fromkeys(untested)),
             impossible=tuple(impossible),
@@ -434,43 +406,23 @@ def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
     return np.asarray(np.sqrt(np.mean(motion.qvel**2, axis=0)))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Linearisation:
-    """Normal equations of parameters and candidates, columns scaled to length 1.
+# Normal equations of the m tested numbers of some candidates after the parameters are eliminated:
+# (m, m) information and (m,) gradient, for columns of length 1, and (m,) lengths of the columns.
+Linearisation = tuple[Array, Array, Array]
 
-    Attributes:
-        H: (m, m) information.
-        g: (m,) gradient.
-        norms: (m,) lengths of the columns.
-        columns: Columns of the tested numbers of each candidate.
-        others: Columns of the parameters.
-        inverse: Pseudo-inverse of their information.
+
+def _score_test(linearisation: Linearisation, columns: Sequence[int]) -> tuple[Array, float] | None:
+    """Score test of some columns; None where the parameters may stand for one of them.
+
+    Returns:
+        Estimated changes of the numbers, and the reduction of the sum of squares.
     """
-
-    H: Array
-    g: Array
-    norms: Array
-    columns: list[list[int]]
-    others: np.ndarray
-    inverse: Array
-
-    def tested(self, columns: Sequence[int]) -> tuple[Array, float] | None:
-        """Score test of some columns; None where the parameters may stand for one of them.
-
-        Returns:
-            Estimated changes of the numbers, and the reduction of the sum of squares.
-        """
-        H, others, tested = self.H, self.others, np.array(columns)
-
-        # Information and score after the parameters are eliminated.
-        response = self.inverse @ H[np.ix_(others, tested)]
-        information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
-        score = self.g[tested] - self.g[others] @ response
-        least = MIN_REMAINING_SHARE * np.diag(H)[tested]
-        if not (np.diag(information) > least).all():
-            return None
-        step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
-        return step / self.norms[tested], float(-score @ step)
+    chosen = np.array(columns)
+    information, score = linearisation[0][np.ix_(chosen, chosen)], linearisation[1][chosen]
+    if not (np.diag(information) > MIN_REMAINING_SHARE).all():
+        return None
+    step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
+    return step / linearisation[2][chosen], float(-score @ step)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -522,7 +474,7 @@ class _TermSearch:
 
     def _linearised(
         self, candidates: Sequence[Candidate]
-    ) -> Iterator[tuple[Sequence[Candidate], _Linearisation | None]]:
+    ) -> Iterator[tuple[Sequence[Candidate], Linearisation | None]]:
         """Linearise by a group of candidates, and by parts of it where one of them prevents it."""
         linearisation = self._linearise(candidates)
         if linearisation is not None or len(candidates) <= 1:
@@ -532,7 +484,7 @@ class _TermSearch:
         yield from self._linearised(candidates[:middle])
         yield from self._linearised(candidates[middle:])
 
-    def _linearise(self, candidates: Sequence[Candidate]) -> _Linearisation | None:
+    def _linearise(self, candidates: Sequence[Candidate]) -> Linearisation | None:
         """Linearise by parameters and candidates; None where the extended model diverges."""
         parameters: dict[str, Any] = {}
         tables: dict[str, Any] = {}
@@ -558,26 +510,27 @@ class _TermSearch:
 
         names = wider.system.parameters.names
         column_of = {names[j]: i for i, j in enumerate(wider.layout.parameter_of_column.tolist())}
-        columns = [
-            [column_of[f"?{i}.{k}"] for k in range(len(candidate.tested))]
+        tested = [
+            column_of[f"?{i}.{k}"]
             for i, candidate in enumerate(candidates)
+            for k in range(len(candidate.tested))
         ]
-        tested = [column for of_candidate in columns for column in of_candidate]
         rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
         norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
         J = rows[:, :-1] / norms
-        H = J.T @ J
+        H, g = J.T @ J, J.T @ rows[:, -1]
+
         # The parameters are eliminated by the pseudo-inverse of their information.
         others = np.setdiff1d(np.arange(len(H)), tested)
         about_others = H[np.ix_(others, others)]
         inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
-        return _Linearisation(
-            H=H, g=J.T @ rows[:, -1], norms=norms, columns=columns, others=others, inverse=inverse
-        )
+        response = inverse @ H[np.ix_(others, tested)]
+        information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
+        return information, g[tested] - g[others] @ response, norms[tested]
 
     def _term(
         self,
-        linearisation: _Linearisation,
+        linearisation: Linearisation,
         candidates: Sequence[Candidate],
         indices: Sequence[int],
     ) -> Term | None:
@@ -586,10 +539,11 @@ class _TermSearch:
         Of several, those are left out that would have a value that makes no sense.
         """
         left = list(indices)
+        ends = list(itertools.accumulate((len(each.tested) for each in candidates), initial=0))
         fewest = 1 if len(left) == 1 else FEWEST_JOINTS
         while len({candidates[i].joint for i in left}) >= fewest:
-            columns = [column for i in left for column in linearisation.columns[i]]
-            found = linearisation.tested(columns)
+            columns = [column for i in left for column in range(ends[i], ends[i + 1])]
+            found = _score_test(linearisation, columns)
             if found is None:
                 return None
             values, explained = found
