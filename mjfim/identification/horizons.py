@@ -175,7 +175,7 @@ def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
     if count >= MAX_FOLDS:
         return tuple(left_out_parts(problem))
 
-    parts = []
+    parts: list[LeftOutPart] = []
     for i, recording in enumerate(problem.recordings):
         bounds = np.linspace(0.0, float(recording.t[-1]), -(-MAX_FOLDS // count) + 1)
         parts += stretches_of(recording.name, i, bounds[:-1].tolist())

@@ -60,7 +60,7 @@ def flipped_signs(result: FitResult, budget: Budget) -> tuple[str, ...]:
     """
     task, quality, noise = result.task, result.quality, result.problem.noise
     is_poor = task.noise_is_stated and quality.chi2 > POOR_FIT * quality.dof
-    if budget.stop.requested or not (is_poor or quality.unexplained):
+    if not (is_poor or quality.unexplained):
         return ()
 
     # Largest sum of squared residuals with another sign that makes the stated sign doubtful.

@@ -183,7 +183,7 @@ def estimate_from(
     if (reasons or quality.unexplained or not solution.success) and not solution.interrupted:
         unpredictable = unpredictable_motion(problem, solution.unknowns)
     interrupted = budget.stop.requested
-    flipped = flipped_signs(result, budget)
+    flipped = () if interrupted else flipped_signs(result, budget)
 
     # The most serious ones first.
     warnings = (

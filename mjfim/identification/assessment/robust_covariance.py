@@ -74,7 +74,7 @@ class Blocks:
         """
         of_recording = self.recording == k
         scores = self.scores[of_recording] + self.information[of_recording] @ step
-        return scores - scores.sum(axis=0) / max(len(scores), 1)
+        return np.asarray(scores - scores.sum(axis=0) / max(len(scores), 1))
 
 
 def recording_evidence(

@@ -510,11 +510,13 @@ class _TermSearch:
 
         names = wider.system.parameters.names
         column_of = {names[j]: i for i, j in enumerate(wider.layout.parameter_of_column.tolist())}
-        tested = [
-            column_of[f"?{i}.{k}"]
-            for i, candidate in enumerate(candidates)
-            for k in range(len(candidate.tested))
-        ]
+        tested = np.array(
+            [
+                column_of[f"?{i}.{k}"]
+                for i, candidate in enumerate(candidates)
+                for k in range(len(candidate.tested))
+            ]
+        )
         rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
         norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
         J = rows[:, :-1] / norms
