@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from mjfim.experiment.schema import Experiment
     from mjfim.experiment.system import simulate
     from mjfim.identification.assessment.parameter_draws import draw_parameters
-    from mjfim.identification.assessment.predictions import predict
     from mjfim.identification.identify import identify
     from mjfim.identification.inverse_dynamics import inverse_dynamics
+    from mjfim.identification.left_out import predict
     from mjfim.output.live import live
     from mjfim.output.models.sysid import export_sysid
     from mjfim.output.robots.export import export_design
@@ -105,7 +105,7 @@ MODULES = {
     "shortest_experiment": "mjfim.excitation.shortest_horizon",
     "Experiment": "mjfim.experiment.schema",
     "simulate": "mjfim.experiment.system",
-    "predict": "mjfim.identification.assessment.predictions",
+    "predict": "mjfim.identification.left_out",
     "identify": "mjfim.identification.identify",
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",
     "draw_parameters": "mjfim.identification.assessment.parameter_draws",

@@ -17,8 +17,8 @@ from mjfim.excitation.shortest_horizon import require_reachable
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.assessment.report import _warnings_of_bounds, _warnings_of_search
+from mjfim.identification.search import _start
 from mjfim.identification.starts import divergence_at_start
-from mjfim.identification.task import _start
 from mjfim.output.campaign_folder import accuracy_sentence
 from mjfim.output.pages.robots import MAX_MISSED_LIMITS, _limit_sentences
 from mjfim.records.campaign import missed_targets

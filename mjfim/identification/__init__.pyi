@@ -1,6 +1,6 @@
 from .assessment.parameter_draws import complete_theta
 from .fit_problem import FitProblem
-from .task import FitTask
+from .search import FitTask
 
 __all__ = [
     "FitProblem",

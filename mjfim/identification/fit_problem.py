@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from itertools import pairwise
+from functools import partial
+from itertools import pairwise, zip_longest
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError
+from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.segment_simulation import (
-    BlockDivision,
     SegmentBatch,
     SegmentRows,
     SegmentSimulation,
@@ -33,9 +32,14 @@ from mjfim.identification.segments import (
 from mjfim.identification.unknowns import Pins, PriorRows, UnknownLayout
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step, triangle
+from mjfim.identification.unknowns import UnknownLayout
+from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
+from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.plant.outputs import Noise
+from mjfim.plant.derivatives import SENSITIVITY_STEP
+from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Recording
 
 T = TypeVar("T")
@@ -78,16 +82,12 @@ class FitProblem(SegmentSimulation):
         masks: (M, ny) for every recording, True for the measured values that count.
         noise: Noise of the outputs.
         loss: Loss of a whitened residual.
-        pins: Combinations that no recording determines, and their values.
-        with_priors: Whether priors of the parameters count.
         workers: Does the work on batches of segments; None for this process.
     """
 
     masks: tuple[np.ndarray, ...]
     noise: Noise
     loss: RobustLoss
-    pins: Pins
-    with_priors: bool
     workers: ProblemWorkers | None = None
 
     @classmethod
@@ -145,7 +145,7 @@ class FitProblem(SegmentSimulation):
             parameters,
             len(aligned),
             free_starts=free_starts,
-            bounded=not data_only,
+            data_only=data_only,
             held=settings.hold,
         )
         return cls(
@@ -157,8 +157,6 @@ class FitProblem(SegmentSimulation):
             masks=masks,
             noise=system.noise,
             loss=RobustLoss(kind=settings.loss, scale=settings.loss_scale),
-            pins=Pins.none(parameters),
-            with_priors=not data_only,
         )
 
     # ---- variants
@@ -176,8 +174,8 @@ class FitProblem(SegmentSimulation):
         return replace(self, layout=self.layout.unbounded())
 
     def with_shared_held(self) -> FitProblem:
-        """This problem with all shared parameters held, so that it needs no pins."""
-        return replace(self, layout=self.layout.without_shared(), pins=self.pins.released())
+        """This problem with all shared parameters held."""
+        return replace(self, layout=self.layout.without_shared())
 
     def with_noise(self, noise: Noise) -> FitProblem:
         """This problem with other noise.
@@ -252,10 +250,9 @@ class FitProblem(SegmentSimulation):
         return replace(
             self,
             segments=segments,
-            layout=UnknownLayout.of(parameters, count, free_starts=True, bounded=True, held=held),
+            layout=UnknownLayout.of(parameters, count, free_starts=True, held=held),
             start_directions=directions,
             masks=tuple(np.array(recording.measured) for recording in self.recordings),
-            pins=Pins.none(parameters),
         )
 
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
@@ -280,14 +277,9 @@ class FitProblem(SegmentSimulation):
         Returns:
             The problem.
         """
-        return replace(self, pins=Pins.of(self.system.parameters, theta, null_space))
+        return replace(self, layout=self.layout.pinned(theta, null_space))
 
     # ---- sizes
-
-    @property
-    def row_count(self) -> int:
-        """Number of rows of all recordings."""
-        return sum(len(recording.t) for recording in self.recordings)
 
     @property
     def value_count(self) -> int:
@@ -309,26 +301,15 @@ class FitProblem(SegmentSimulation):
 
         return np.array(indices, dtype=np.intp)
 
-    @cached_property
-    def blocks(self) -> BlockDivision:
-        """Division of the rows into blocks."""
-        return BlockDivision(segments=self.segments, row_count=self.row_count)
-
-    @cached_property
-    def prior_rows(self) -> PriorRows:
-        """Rows of priors and pins."""
-        return PriorRows(
-            layout=self.layout,
-            segment_count=len(self.segments),
-            start_sizes=np.abs(self.start_directions).T @ self.system.plant.sizes.state,
-            pins=self.pins,
-            with_priors=self.with_priors,
-        )
+    def private_prior_rows(self, at: UnknownValues) -> Array:
+        """(P, k, m) rows `[J_private, J_common, r]` on the private unknowns of every segment."""
+        sizes = np.abs(self.start_directions).T @ self.system.plant.sizes.state
+        return self.layout.private_rows(at, sizes)
 
     @property
     def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:
         """Rows of priors and pins along a step, where inertias of whole bodies are unknown."""
-        return self.prior_rows.along_step if self.layout.shared_bodies else None
+        return self.layout.common_rows_after if self.layout.shared_bodies else None
 
     # ---- unknowns
 
@@ -455,20 +436,10 @@ class FitProblem(SegmentSimulation):
             for loss in losses:
                 total += loss
 
-        return 0.5 * total + self.prior_cost(at)
-
-    def prior_cost(self, at: UnknownValues) -> float:
-        """Half of the sum of the squared priors and pins.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            The cost.
-        """
-        common = self.prior_rows.common(at)[:, -1]
-        private = self.prior_rows.private(at)[:, :, -1]
-        return 0.5 * (float(common @ common) + float(np.sum(private**2)))
+        # Priors and pins.
+        common = self.layout.common_rows(at)[:, -1]
+        private = self.private_prior_rows(at)[:, :, -1]
+        return 0.5 * total + 0.5 * (float(common @ common) + float(np.sum(private**2)))
 
     def condense(self, at: UnknownValues) -> Condensed | None:
         """Linearise about the unknowns and condense block by block.
@@ -480,7 +451,7 @@ class FitProblem(SegmentSimulation):
             The linearisation; None where a perturbed simulation diverges.
         """
         m = self.private_count + self.layout.column_count + 1
-        blocks = np.zeros((self.blocks.count, m, m))
+        blocks = np.zeros((self.block_count, m, m))
 
         batches = self.batches(derivatives=True)
         for found in self.of_batches(FitProblem.blocks_of_batch, batches, at):
@@ -491,9 +462,9 @@ class FitProblem(SegmentSimulation):
 
         return Condensed(
             blocks=blocks,
-            segment_of_block=self.blocks.segment_of_block,
-            private_rows=self.prior_rows.private(at),
-            common_rows=self.prior_rows.common(at),
+            segment_of_block=self.segment_of_block,
+            private_rows=self.private_prior_rows(at),
+            common_rows=self.layout.common_rows(at),
         )
 
     def outputs_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[SegmentRows] | None:
@@ -544,7 +515,7 @@ class FitProblem(SegmentSimulation):
             weighted = np.column_stack([J, r]) * self.loss.weight(r)[:, None]
 
             # Values are added to the triangle of the block of their row.
-            block = self.blocks.of_rows(rows)[place]
+            block = self.blocks_of(rows)[place]
             edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
             for first, last in pairwise(edges):
                 index = int(block[first])
@@ -661,3 +632,97 @@ def _counted_values(recording: AlignedRecording, free_starts: bool) -> np.ndarra
     if not free_starts:
         mask[0] = False
     return mask
+
+
+def sensitivity_rows(
+    problem: FitProblem,
+    at: UnknownValues,
+    *,
+    with_error: bool = True,
+    wanted: np.ndarray | None = None,
+) -> list[tuple[Array, Array]]:
+    """Condensed rows of the whitened sensitivity G, and their change with a longer step.
+
+    The longer difference step shows the error of the differences. Where the whole initial state is
+    free, rows are projected onto the complement of its derivatives.
+
+    Args:
+        problem: The problem.
+        at: The unknowns.
+        with_error: False for changes of zero and one-sided differences, at a quarter of the cost.
+        wanted: (p,) True for the parameters whose columns are wanted; default: all of them.
+
+    Returns:
+        (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at
+        most 2p + 2n.
+
+    Raises:
+        SimulationDivergedError: A perturbed simulation diverges.
+    """
+    if wanted is None:
+        wanted = np.ones(len(problem.system.parameters), dtype=bool)
+    work: BatchWork[dict[int, Array]] = partial(_of_batch, with_error=with_error)
+    batches = list(
+        problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)
+    )
+    condensed: dict[int, Array] = {}
+    for batch, of_batch in zip(batches, problem.of_batches(work, batches, at), strict=True):
+        if of_batch is None:
+            recordings = {problem.segments[segment].recording for segment in batch.segments}
+            names = [problem.recordings[index].name for index in sorted(recordings)]
+            raise SimulationDivergedError(
+                f"{' or '.join(names)}: the simulation diverges under the recorded control"
+            )
+        condensed.update(of_batch)
+    n = problem.private_count if problem.layout.free_starts else 0
+
+    found = []
+    for segment in sorted(condensed):
+        J, change = np.split(condensed[segment], 2, axis=1)
+        by_theta = J[:, n:]
+        change_by_theta = change[:, n:]
+
+        # A free initial state explains everything in the span of its derivatives.
+        Q = np.linalg.qr(J[:, :n])[0]
+        remaining = by_theta - Q @ (Q.T @ by_theta)
+        remaining_change = change_by_theta - Q @ (Q.T @ change_by_theta)
+        found.append((remaining, remaining_change))
+    return found
+
+
+def _of_batch(
+    problem: FitProblem, at: UnknownValues, batch: SegmentBatch, *, with_error: bool
+) -> dict[int, Array] | None:
+    """Condense the whitened sensitivity of a batch, and its change with a longer step.
+
+    Returns:
+        (k, 2 (n+p)) triangle of each segment by its index; None where a perturbed simulation
+        diverges. Changes are zero without an error.
+    """
+    fine = problem.rows_of_batch(at, batch)
+    coarse: Iterator[SegmentRows | None] = iter(())
+    if with_error:
+        coarse = problem.rows_of_batch(at, replace(batch, step=COARSER_STEP_FACTOR * batch.step))
+
+    def sensitivity(rows: SegmentRows) -> Array:
+        """(k, n+p) derivatives by the initial state where that is free, then by theta."""
+        common, private = rows.jacobians
+        both = [private, common] if problem.layout.free_starts else [common]
+        G = np.concatenate(both, axis=2)
+        return problem.noise.whiten_present(G, problem.mask_of(rows))
+
+    condensed: dict[int, Array] = {}
+    for rows, coarse_rows in zip_longest(fine, coarse):
+        if rows is None:
+            return None
+
+        # Without a simulation with the longer step, the change is unknown.
+        J = sensitivity(rows)
+        change = np.zeros_like(J)
+        if coarse_rows is not None:
+            change = sensitivity(coarse_rows) - J
+
+        both = np.concatenate([J, change], axis=1)
+        earlier = condensed.get(rows.segment, both[:0])
+        condensed[rows.segment] = triangle(np.concatenate([earlier, both]))
+    return condensed

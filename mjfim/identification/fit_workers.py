@@ -13,9 +13,9 @@ import uuid
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 
@@ -47,47 +47,17 @@ MAP_MODE: Literal["r"] | None = None if os.name == "nt" else "r"
 KEPT_PROBLEMS = 8
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SharedRecording:
-    """A recording, or the folder of its arrays."""
+# A recording, and the folder of its arrays where these are files.
+_SharedRecording = tuple[AlignedRecording, Path | None]
 
-    recording: AlignedRecording
-    folder: Path | None
+# A problem of this process alone in parts, each of which is sent once: the rest, its system and its
+# recordings.
+_SharedProblem = tuple[
+    FitProblem, SharedValue[SystemOrder], tuple[SharedValue[_SharedRecording], ...]
+]
 
-    def made(self) -> AlignedRecording:
-        """The recording, whose arrays are read from the files when they are used."""
-        if self.folder is None:
-            return self.recording
-        arrays: dict[str, Any] = {}
-        for name in ARRAYS:
-            loaded = np.load(self.folder / f"{name}.npy", mmap_mode=MAP_MODE, allow_pickle=False)
-            arrays[name] = loaded.view(np.ndarray)
-        return replace(self.recording, **arrays)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SharedProblem:
-    """A problem in parts, each of which is sent once. It can be pickled."""
-
-    problem: FitProblem
-    system: SharedValue[SystemOrder]
-    recordings: tuple[SharedValue[_SharedRecording], ...]
-
-    def made(self) -> FitProblem:
-        """The problem in a worker."""
-        require_values([self.system, *self.recordings])
-        system = _systems.get(self.system.digest, lambda: self.system.value.system())
-        recordings = tuple(each.value.made() for each in self.recordings)
-        return _with_parts(self.problem, system, recordings)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Order(Generic[T]):
-    """A work on a problem."""
-
-    problem: SharedValue[_SharedProblem]
-    work: ProblemWork[T]
-
+# A problem and a work on it.
+_Order = tuple[SharedValue[_SharedProblem], ProblemWork[T]]
 
 # The latest systems and problems of a worker.
 _systems: KeptPerThread[System] = KeptPerThread(KEPT_PROBLEMS)
@@ -97,10 +67,29 @@ _problems: KeptPerThread[FitProblem] = KeptPerThread(KEPT_PROBLEMS)
 @one_blas_thread()
 def _carry_out(order: _Order[T]) -> tuple[T, int]:
     """Do a work in a worker, and count its engine steps."""
-    problem = _problems.get(order.problem.digest, lambda: order.problem.value.made())
+    shared, work = order
+    problem = _problems.get(shared.digest, lambda: _made(*shared.value))
     before = problem.system.plant.engine_steps
-    result = order.work(problem, Budget(stop=pool_stop_token()))
+    result = work(problem, Budget(stop=pool_stop_token()))
     return result, problem.system.plant.engine_steps - before
+
+
+def _made(
+    problem: FitProblem,
+    system: SharedValue[SystemOrder],
+    recordings: tuple[SharedValue[_SharedRecording], ...],
+) -> FitProblem:
+    """The problem in a worker; arrays of recordings are read from files when they are used."""
+    require_values([system, *recordings])
+    found = []
+    for recording, folder in (each.value for each in recordings):
+        arrays: dict[str, Any] = {}
+        for name in () if folder is None else ARRAYS:
+            loaded = np.load(f"{folder}/{name}.npy", mmap_mode=MAP_MODE, allow_pickle=False)
+            arrays[name] = loaded.view(np.ndarray)
+        found.append(replace(recording, **arrays))
+    made = _systems.get(system.digest, lambda: system.value.system())
+    return _with_parts(problem, made, tuple(found))
 
 
 def _with_parts(
@@ -166,7 +155,7 @@ class FitWorkers:
 
         def here(order: _Order[T]) -> tuple[T, int]:
             """Do the work of a lost worker; the simulator counts its steps."""
-            return order.work(alone, budget), 0
+            return order[1](alone, budget), 0
 
         orders = self._orders(problem, works)
         for found in results(_carry_out, orders, self._executor, budget, here):
@@ -175,7 +164,7 @@ class FitWorkers:
     def _orders(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> list[_Order[T]]:
         """Orders for works on a problem."""
         shared = self._shared(problem, self._executor.threads_for(len(works)))
-        return [_Order(problem=shared, work=work) for work in works]
+        return [(shared, work) for work in works]
 
     def _counted(self, problem: FitProblem, found: tuple[T, int]) -> T:
         """A result of a worker, whose engine steps are added to those of the problem."""
@@ -191,11 +180,8 @@ class FitWorkers:
             if key not in self._systems:
                 order = SystemOrder.of(problem.system, threads)
                 self._systems[key] = SharedValue(uuid.uuid4().hex, order)
-            parts = _SharedProblem(
-                problem=_with_parts(problem, None, ()),
-                system=self._systems[key],
-                recordings=tuple(self._shared_recording(each) for each in problem.recordings),
-            )
+            recordings = tuple(self._shared_recording(each) for each in problem.recordings)
+            parts = (_with_parts(problem, None, ()), self._systems[key], recordings)
             size = sum(mask.nbytes for mask in problem.masks)
             known[threads] = SharedValue(uuid.uuid4().hex, parts, size)
         return known[threads]
@@ -214,8 +200,7 @@ class FitWorkers:
                 nothing = np.zeros(0)
                 rest = replace(recording, t=nothing, y=nothing, ctrl=nothing)
                 size = 0
-            shared = _SharedRecording(recording=rest, folder=folder)
-            self._recordings[recording] = SharedValue(uuid.uuid4().hex, shared, size)
+            self._recordings[recording] = SharedValue(uuid.uuid4().hex, (rest, folder), size)
         return self._recordings[recording]
 
     def _written(self, recording: AlignedRecording) -> Path:

@@ -9,14 +9,13 @@ relative error over all these times, so that no time dominates because its error
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import jackknife_std, student_quantile
-from mjfim.identification.assessment.report import FitResult
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.left_out import (
     MAX_FOLDS,
@@ -27,6 +26,7 @@ from mjfim.identification.left_out import (
     joined_losses,
     left_out_parts,
     losses_of,
+    stretches_of,
 )
 from mjfim.identification.search import FitSearch
 from mjfim.identification.segments import spread_over_data
@@ -53,23 +53,6 @@ SIGNIFICANCE = 0.01
 CONFIDENCE = 0.95
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _LengthFit:
-    """Fit over segments of one length.
-
-    Attributes:
-        length: Length of the segments [s]; None for whole recordings.
-        problem: The problem of segments of this length.
-        theta: (p,) estimate.
-        without: (K, p) estimates without each part of the data.
-    """
-
-    length: float | None
-    problem: FitProblem
-    theta: Array
-    without: Array
-
-
 def choose_length(
     search: FitSearch, problem: FitProblem, whole: FitResult
 ) -> tuple[HorizonStudy, float | None, Array] | None:
@@ -88,15 +71,20 @@ def choose_length(
     system = search.task.system
     if system.parameters.initial_state_derivative(system.space.nx).any():
         return None
-    problems = _problems(search, problem, whole)
+    tried = _problems(search, problem, whole)
     parts = _parts(problem)
-    fits: list[_LengthFit] = []
-    for number, (length, part) in enumerate(problems):
-        begin_stage("comparing lengths of the segments", number, len(problems))
+    lengths: list[float | None] = []
+    problems: list[FitProblem] = []
+    fits: list[Array] = []
+    for number, (length, part) in enumerate(tried):
+        begin_stage("comparing lengths of the segments", number, len(tried))
         found = _fitted(search, whole, length, part, parts)
         if search.interrupted:
             return None
-        fits += [] if found is None else [found]
+        if found is not None:
+            lengths.append(length)
+            problems.append(part)
+            fits.append(found)
     if len(fits) < 2:
         return None
 
@@ -107,11 +95,11 @@ def choose_length(
         [
             joined_losses(
                 [
-                    losses_of(each.problem, theta, part, blocks, sigma, budget)
-                    for part, theta in zip(parts, fit.without, strict=True)
+                    losses_of(each, theta, part, blocks, sigma, budget)
+                    for part, theta in zip(parts, fit[1:], strict=True)
                 ]
             )
-            for each in fits
+            for each in problems
         ]
         for fit in fits
     ]
@@ -119,18 +107,26 @@ def choose_length(
         return None
     chosen = _chosen([_over_all_horizons(losses, i) for i in range(len(fits))])
     longest = max(float(recording.t[-1]) for recording in problem.recordings)
+    differences = [fit - fits[chosen] for fit in fits]
     study = HorizonStudy(
-        lengths=np.array([longest if fit.length is None else fit.length for fit in fits]),
+        lengths=np.array([longest if length is None else length for length in lengths]),
         errors=np.array([[each.error for each in row] for row in losses]),
         chosen=chosen,
-        is_whole=fits[-1].length is None,
+        is_whole=lengths[-1] is None,
         parameters=system.parameters.names,
         units=tuple(system.units),
-        theta=np.array([fit.theta for fit in fits]),
-        half_widths=np.array([_half_width(fit.without, CONFIDENCE) for fit in fits]),
-        is_apart=np.array([_is_apart(fit, fits[chosen]) for fit in fits]),
+        theta=np.array([fit[0] for fit in fits]),
+        half_widths=np.array([_half_width(fit[1:], CONFIDENCE) for fit in fits]),
+        # Whether estimates differ by more than the scatter of their differences explains.
+        is_apart=np.array(
+            [
+                (np.abs(each[0]) > _half_width(each[1:], 1.0 - SIGNIFICANCE))
+                & (len(parts) >= MIN_PARTS)
+                for each in differences
+            ]
+        ),
     )
-    return study, fits[chosen].length, fits[chosen].theta
+    return study, lengths[chosen], fits[chosen][0]
 
 
 def _problems(
@@ -153,26 +149,24 @@ def _fitted(
     length: float | None,
     problem: FitProblem,
     parts: Sequence[LeftOutPart],
-) -> _LengthFit | None:
-    """Fit segments of a length, also without each part; None where a simulation diverges."""
+) -> Array | None:
+    """(K+1, p) estimates over segments of a length, of all data and without each of K parts.
+
+    None where a simulation diverges.
+    """
     name = "whole recordings" if length is None else f"segments of {length:.2g} s"
     begin = search.with_initial_states(problem, problem.begin(whole.theta))
     try:
         weighted, solution = search.solve(problem, begin, f"comparison, {name}", is_rough=True)
     except SimulationDivergedError:
         return None
-    without = []
+    estimates = [weighted.theta(solution.unknowns)]
     for part in parts:
         others = fit_without(weighted, search.budget, solution=solution, part=part)
         if others is None:
             return None
-        without.append(weighted.theta(others))
-    return _LengthFit(
-        length=length,
-        problem=problem,
-        theta=weighted.theta(solution.unknowns),
-        without=np.array(without),
-    )
+        estimates.append(weighted.theta(others))
+    return np.array(estimates)
 
 
 def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
@@ -181,13 +175,10 @@ def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
     if count >= MAX_FOLDS:
         return tuple(left_out_parts(problem))
 
-    parts = []
+    parts: list[LeftOutPart] = []
     for i, recording in enumerate(problem.recordings):
         bounds = np.linspace(0.0, float(recording.t[-1]), -(-MAX_FOLDS // count) + 1)
-        ends = [*bounds[1:-1].tolist(), np.inf]
-        for begin, end in zip(bounds[:-1].tolist(), ends, strict=True):
-            name = f"{recording.name} from {begin:.3g} s"
-            parts.append(LeftOutPart(name=name, recordings=(i,), begin=begin, end=end))
+        parts += stretches_of(recording.name, i, bounds[:-1].tolist())
     return tuple(parts)
 
 
@@ -243,11 +234,3 @@ def _half_width(without: Array, confidence: float) -> Array:
     if len(without) < 2:
         return np.full(without.shape[1], np.nan)
     return student_quantile(len(without), confidence) * jackknife_std(without)
-
-
-def _is_apart(fit: _LengthFit, chosen: _LengthFit) -> np.ndarray:
-    """(p,) whether estimates differ by more than the scatter of their differences explains."""
-    if fit is chosen or len(fit.without) < MIN_PARTS:
-        return np.zeros(len(fit.theta), dtype=bool)
-    allowed = _half_width(fit.without - chosen.without, 1.0 - SIGNIFICANCE)
-    return np.asarray(np.abs(fit.theta - chosen.theta) > allowed)

@@ -17,17 +17,23 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.fit_quality import fit_quality
-from mjfim.identification.assessment.report import FitResult, estimate_from
-from mjfim.identification.assessment.residual_tests import misfit_reasons
-from mjfim.identification.fit_problem import FitProblem, have_same_initial_states
+from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.report import estimate_from
+from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
+from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.horizons import choose_length
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.search import FitSearch, first_subset, of_subset, quick_subset
-from mjfim.identification.sensitivity_rows import sensitivity_rows
+from mjfim.identification.search import (
+    FitSearch,
+    FitTask,
+    Method,
+    first_subset,
+    of_subset,
+    quick_subset,
+    with_length,
+)
 from mjfim.identification.starts import SPREAD_STARTS, begin_fit, start_from_segments
-from mjfim.identification.task import FitTask, Method, with_length
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -176,8 +182,7 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
     """
     stated = search.task
     problem, held_out = _problems(stated, workers)
-    begun = begin_fit(search, problem)
-    search = begun.search
+    search, dynamics, instead = begin_fit(search, problem)
     task = search.task
 
     # Combinations of parameters that no recording determines are held at their start values.
@@ -206,8 +211,8 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
         held_out=held_out,
         subset=subset,
         restart=None,
-        inverse_dynamics=begun.inverse_dynamics,
-        begun_instead=begun.instead,
+        inverse_dynamics=dynamics,
+        begun_instead=instead,
     )
 
     # A result that does not explain the data may be a local minimum: fits over short segments give
@@ -244,39 +249,53 @@ def _with_solution(fit: FitResult, problem: FitProblem, solution: Solution) -> F
     return replace(fit, problem=problem, solution=solution, quality=quality)
 
 
+def _fitted_from(
+    search: FitSearch,
+    problem: FitProblem,
+    begin: UnknownValues,
+    phase: str,
+    fit: FitResult,
+    cost_to_beat: float = np.inf,
+) -> FitResult | None:
+    """A fit with the solution over a problem from other unknowns; None where it diverges."""
+    placed = search.with_initial_states(problem, begin)
+    try:
+        found = search.solve(problem, placed, phase, cost_to_beat=cost_to_beat)
+        return _with_solution(fit, *found)
+    except SimulationDivergedError:
+        return None
+
+
 def _restarted(
     search: FitSearch, problem: FitProblem, fit: FitResult, *, is_spread: bool
 ) -> FitResult:
     """The fit, or its repetition from fits over segments if that costs less."""
-    segments = start_from_segments(search, problem, fit.null_space, spread=is_spread)
-    if not segments.lengths:
+    start, lengths, dynamics = start_from_segments(
+        search, problem, fit.null_space, spread=is_spread
+    )
+    if not lengths:
         return fit
     before = fit.solution.cost
     restart = Restart(
-        lengths=segments.lengths,
+        lengths=lengths,
         cost_before=before,
         cost=before,
-        by_dynamics=segments.inverse_dynamics is not None,
+        by_dynamics=dynamics is not None,
         starts=SPREAD_STARTS if is_spread else 1,
     )
-    if not is_spread:
-        fit = replace(fit, inverse_dynamics=fit.inverse_dynamics or segments.inverse_dynamics)
-    if segments.start is None:
-        return replace(fit, restart=fit.restart or restart)
-    try:
-        placed = search.with_initial_states(problem, segments.start)
-        weighted, solution = search.solve(problem, placed, "again all data", cost_to_beat=before)
-        again = _with_solution(fit, weighted, solution)
-    except SimulationDivergedError:
-        return replace(fit, restart=fit.restart or restart)
+    fit = replace(fit, inverse_dynamics=fit.inverse_dynamics or dynamics)
+    again = None
+    if start is not None:
+        again = _fitted_from(search, problem, start, "again all data", fit, before)
 
     # Costs can be compared only with the same noise. Of two equal fits, that which has converged.
-    cost = fit.problem.cost(solution.unknowns)
-    converges = solution.success and not fit.solution.success
-    if before - cost > SAME_COST or (converges and before - cost > -SAME_COST):
-        if fit.restart is not None:
-            restart = replace(restart, cost_before=fit.restart.cost_before)
-        return replace(again, restart=replace(restart, cost=cost))
+    if again is not None:
+        cost = fit.problem.cost(again.solution.unknowns)
+        converges = again.solution.success and not fit.solution.success
+        if before - cost > SAME_COST or (converges and before - cost > -SAME_COST):
+            first = restart if fit.restart is None else fit.restart
+            restart = replace(restart, cost_before=first.cost_before, cost=cost)
+            return replace(again, restart=restart)
     return replace(fit, restart=fit.restart or restart)
 
 
@@ -292,11 +311,9 @@ def _over_chosen_length(search: FitSearch, problem: FitProblem, fit: FitResult) 
     task = with_length(search.task, length)
     cut = cut.pinned(task.start, fit.null_space)
     chosen = replace(search, task=task)
-    begin = chosen.with_initial_states(cut, cut.begin(theta))
-    try:
-        weighted, solution = chosen.solve(cut, begin, f"segments of {length:.2g} s")
-        found = _with_solution(fit, weighted, solution)
-    except SimulationDivergedError:
+    words = f"segments of {length:.2g} s"
+    found = _fitted_from(chosen, cut, cut.begin(theta), words, fit)
+    if found is None:
         return replace(fit, horizons=replace(study, why_not_used=DIVERGED))
     return replace(
         found,

@@ -35,6 +35,13 @@ SAMPLES_FOR_ONE_SIDED = 100_000
 ONE_SIDED_STEP_FACTOR = 0.1
 
 
+# Smallest number of rows of a block.
+MIN_BLOCK_ROWS = 8
+
+# Approximate largest number of blocks into which all rows are divided.
+MAX_BLOCKS = 1024
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentRows:
     """Predictions of k rows of one segment.
@@ -444,28 +451,15 @@ class SegmentSimulation:
                 common = common + interpolation.derivative(y)[..., None] * delay_derivative
         return interpolation.apply(y), common, private
 
-
-# Smallest number of rows of a block.
-MIN_BLOCK_ROWS = 8
-
-# Approximate largest number of blocks into which all rows are divided.
-MAX_BLOCKS = 1024
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BlockDivision:
-    """Blocks of rows; every segment is divided evenly into its blocks.
-
-    Attributes:
-        segments: The P segments.
-        row_count: Number of rows of all recordings, on which the length of a block depends.
-    """
-
-    segments: Sequence[Segment]
-    row_count: int
+    # ---- blocks of rows; every segment is divided evenly into its blocks
 
     @property
-    def count(self) -> int:
+    def row_count(self) -> int:
+        """Number of rows of all recordings, on which the length of a block depends."""
+        return sum(len(recording.t) for recording in self.recordings)
+
+    @property
+    def block_count(self) -> int:
         """Number of blocks B."""
         return int(self._offsets[-1])
 
@@ -481,12 +475,12 @@ class BlockDivision:
         return np.repeat(recordings, np.diff(self._offsets))
 
     @property
-    def mean_rows(self) -> np.ndarray:
+    def mean_block_rows(self) -> np.ndarray:
         """(B,) mean number of rows of every block."""
         counts = np.diff(self._offsets)
         return np.repeat(self._rows_per_segment / counts, counts)
 
-    def of_rows(self, rows: SegmentRows) -> np.ndarray:
+    def blocks_of(self, rows: SegmentRows) -> np.ndarray:
         """Blocks of some rows of a segment.
 
         Args:
@@ -498,13 +492,13 @@ class BlockDivision:
         begin = self.segments[rows.segment].rows.start
         return self._block_of_row(rows.segment, rows.rows - begin)
 
-    def containing(self, masks: Sequence[np.ndarray]) -> np.ndarray:
+    def blocks_containing(self, masks: Sequence[np.ndarray]) -> np.ndarray:
         """(B,) True for the blocks that contain a marked value.
 
         Args:
             masks: (M, ny) for every recording, True for the marked values.
         """
-        found = np.zeros(self.count, dtype=bool)
+        found = np.zeros(self.block_count, dtype=bool)
         for index, segment in enumerate(self.segments):
             rows = np.flatnonzero(masks[segment.recording][segment.rows].any(axis=1))
             found[self._block_of_row(index, rows)] = True

@@ -8,18 +8,17 @@ minima, so that fits over longer and longer segments lead from a poor start to a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError, listed
+from mjfim.errors import SimulationDivergedError
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
-from mjfim.identification.search import FitSearch, of_subset, quick_subset, restart_subset
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitSearch, FitTask, of_subset, quick_subset, restart_subset
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet, make_physical
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
@@ -74,53 +73,38 @@ AT_SPREAD_START = f"at the best of {SPREAD_STARTS} starts spread about it"
 # ---- where a fit begins
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BegunFit:
-    """The searches of a fit, and where they start.
-
-    Attributes:
-        search: The searches; the start of their task is that of the fit.
-        inverse_dynamics: The fit to the equation of motion, if there was one.
-        instead: Where the search begins, in words, if the model diverges at the stated start.
-    """
-
-    search: FitSearch
-    inverse_dynamics: InverseDynamicsFit | None = None
-    instead: str = ""
-
-
-def begin_fit(search: FitSearch, problem: FitProblem) -> BegunFit:
+def begin_fit(
+    search: FitSearch, problem: FitProblem
+) -> tuple[FitSearch, InverseDynamicsFit | None, str]:
     """Find a start at which the model does not diverge.
+
+    Returns:
+        The searches from this start, the fit to the equation of motion at which they begin, if
+        there was one, and where they begin instead of the stated start, in words, if the model
+        diverges at that.
 
     Raises:
         SimulationDivergedError: The simulation diverges at the start, and no other start is found.
     """
-    task = search.task
+    task, dynamics = search.task, None
     is_asked = task.settings.start == "inverse_dynamics"
     if is_asked:
         begin_stage("fitting the equation of motion")
-        found = fit_equations(problem.system, problem.recordings, task.start)
-        if _is_finite(problem, found.theta):
-            return BegunFit(search=_from(search, found.theta), inverse_dynamics=found)
+        dynamics = fit_equations(problem.system, problem.recordings, task.start)
+        if _is_finite(problem, dynamics.theta):
+            return _from(search, dynamics.theta), dynamics, ""
     begin_stage("simulating the segments from the initial guess")
     if _is_finite(problem, task.start):
-        return BegunFit(search=search, inverse_dynamics=found if is_asked else None)
+        return search, dynamics, ""
 
     # An extreme value is a fault of the log, for which no start helps. The method of the paper
     # starts where it is told.
     extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
     if not extreme and task.method != "newton" and not is_asked:
-        for theta, dynamics, words in _other_starts(search, problem):
+        for theta, found, words in _other_starts(search, problem):
             if _is_finite(problem, theta):
-                begun = _from(search, theta)
-                return BegunFit(search=begun, inverse_dynamics=dynamics, instead=words)
+                return _from(search, theta), found, words
     raise divergence_at_start(task, problem, extreme)
-
-
-def values_of_start(task: FitTask) -> str:
-    """The parameters of the stated start and their values, for a message."""
-    names = task.system.parameters.names
-    return listed([f"{n} = {v:.6g}" for n, v in zip(names, task.start, strict=True)])
 
 
 def _other_starts(
@@ -139,7 +123,7 @@ def _other_starts(
         if theta is not None:
             yield theta, None, AT_SPREAD_START
         return
-    start = start_from_segments(search, problem, spread=True).start
+    start = start_from_segments(search, problem, spread=True)[0]
     if start is not None:
         yield problem.theta(start), None, AT_SPREAD_START
 
@@ -170,7 +154,7 @@ def divergence_at_start(task: FitTask, problem: FitProblem, extreme: str) -> Exc
     if not extreme:
         cause = f": {_why_diverged(problem, task.start)}"
     return SimulationDivergedError(
-        f"the simulation diverges at the start ({values_of_start(task)}){cause}"
+        f"the simulation diverges at the start ({task.start_in_words}){cause}"
     )
 
 
@@ -278,28 +262,13 @@ def _best_spread_start(search: FitSearch, problem: FitProblem, theta: Array) -> 
 # ---- fits over longer and longer segments
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SegmentFits:
-    """Fits over longer and longer segments.
-
-    Attributes:
-        start: Unknowns of the whole recordings at the best of them; None without any.
-        lengths: Lengths of the segments [s].
-        inverse_dynamics: The fit to the equation of motion at which they began, if they did.
-    """
-
-    start: UnknownValues | None = None
-    lengths: tuple[float, ...] = ()
-    inverse_dynamics: InverseDynamicsFit | None = None
-
-
 def start_from_segments(
     search: FitSearch,
     problem: FitProblem,
     null_space: NullSpace | None = None,
     *,
     spread: bool = False,
-) -> SegmentFits:
+) -> tuple[UnknownValues | None, tuple[float, ...], InverseDynamicsFit | None]:
     """Fit longer and longer segments, and take the result that costs least over whole recordings.
 
     Args:
@@ -307,9 +276,13 @@ def start_from_segments(
         problem: The problem of the whole recordings.
         null_space: Directions that no recording determines, which are held.
         spread: Begin at the best of many starts instead of a fit to the equation of motion.
+
+    Returns:
+        Unknowns of the whole recordings at the best result, None without any, the lengths of the
+        segments [s], and the fit to the equation of motion at which they began, if they did.
     """
-    found = SegmentFits()
-    best, least = None, np.inf
+    used: list[float] = []
+    best, least, dynamics = None, np.inf, None
     theta = np.array(search.task.start)
     lengths = segment_lengths(problem.recordings)
     for length in lengths:
@@ -319,11 +292,11 @@ def start_from_segments(
         if null_space is not None:
             part = part.pinned(theta, null_space)
         part = part.of_segments(restart_subset(part))
-        if not found.lengths:
+        if not used:
             first, dynamics = _first_start(search, part, spread=spread)
             if first is None:
                 break
-            theta, found = first, replace(found, inverse_dynamics=dynamics)
+            theta = first
         settings = replace(
             SEGMENT_SEARCH,
             max_iterations=_iterations(problem, part, len(lengths)),
@@ -335,11 +308,11 @@ def start_from_segments(
             continue
         theta = part.theta(solution.unknowns)
         whole = replace(problem.begin(theta), per_recording=solution.unknowns.per_recording)
-        found = replace(found, lengths=(*found.lengths, length))
+        used.append(length)
         cost = problem.cost(whole)
         if cost < least:
             best, least = whole, cost
-    return replace(found, start=best)
+    return best, tuple(used), dynamics
 
 
 def _first_start(

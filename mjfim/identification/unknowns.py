@@ -1,4 +1,4 @@
-"""Layout of the unknowns of a fit: shared by recordings, per recording, or private to segments.
+"""Unknowns of a fit and priors on them: shared, per recording, or private to segments.
 
 The common columns of a linearisation are the parameters that all recordings share, then those of
 the first recording, then those of the second, and so on. Deviations of initial states are private
@@ -20,6 +20,10 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 
+# Standard deviation of the prior on a free initial state, relative to the natural sizes of the
+# state. This weak prior keeps components finite that no output determines.
+FREE_START_SIGMA = 1e3
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UnknownLayout:
@@ -35,6 +39,10 @@ class UnknownLayout:
         upper: (c,) upper bounds of the common unknowns [theta-unit].
         free_starts: True where the whole initial state of every segment is private, and theta holds
             none of it.
+        with_priors: Whether priors of the parameters count.
+        pins: (k, p) coefficients of combinations that no recording determines and that are held,
+            each over the magnitude of the parameter.
+        pinned_at: (p,) parameters at which these combinations are held.
     """
 
     parameters: ParameterSet
@@ -45,6 +53,9 @@ class UnknownLayout:
     lower: Array
     upper: Array
     free_starts: bool
+    with_priors: bool
+    pins: Array
+    pinned_at: Array
 
     @staticmethod
     def of(
@@ -52,7 +63,7 @@ class UnknownLayout:
         recordings: int,
         *,
         free_starts: bool,
-        bounded: bool,
+        data_only: bool = False,
         held: Collection[str] = (),
     ) -> UnknownLayout:
         """The layout of the unknowns of a fit.
@@ -61,7 +72,7 @@ class UnknownLayout:
             parameters: The parameters.
             recordings: Number of recordings.
             free_starts: Whether initial states are measured and then free.
-            bounded: Whether the parameters have bounds.
+            data_only: Whether to leave priors and bounds out.
             held: Names of parameters that are no unknowns.
 
         Returns:
@@ -82,8 +93,24 @@ class UnknownLayout:
             lower=parameters.lower[columns],
             upper=parameters.upper[columns],
             free_starts=free_starts,
+            with_priors=not data_only,
+            pins=np.zeros((0, len(parameters))),
+            pinned_at=parameters.guess,
         )
-        return layout if bounded else layout.unbounded()
+        return layout.unbounded() if data_only else layout
+
+    def pinned(self, theta: Array, null_space: NullSpace) -> UnknownLayout:
+        """This layout with the directions held about which there is no information.
+
+        A pin has the weight of a prior whose standard deviation is the magnitude of the parameters.
+
+        Args:
+            theta: (p,) parameters at which the combinations are held.
+            null_space: Directions of theta about which there is no information.
+        """
+        magnitude = self.parameters.magnitude
+        orthonormal = np.linalg.qr(null_space.directions / magnitude[:, None])[0]
+        return replace(self, pins=orthonormal.T / magnitude, pinned_at=np.array(theta))
 
     def unbounded(self) -> UnknownLayout:
         """This layout without bounds."""
@@ -91,10 +118,14 @@ class UnknownLayout:
         return replace(self, lower=-infinite, upper=infinite)
 
     def without_shared(self) -> UnknownLayout:
-        """This layout with the shared parameters held, so that they have no columns."""
+        """This layout with the shared parameters held: they have no columns, and need no pins."""
         count = len(self.shared)
         return replace(
-            self, shared=self.shared[:0], lower=self.lower[count:], upper=self.upper[count:]
+            self,
+            shared=self.shared[:0],
+            lower=self.lower[count:],
+            upper=self.upper[count:],
+            pins=self.pins[:0],
         )
 
     @property
@@ -249,149 +280,65 @@ class UnknownLayout:
         columns[..., first : first + e] = G[..., self.per_recording]
         return columns
 
+    # ---- priors and pins
+
     def prior_rows(self, at: UnknownValues) -> Array:
-        """Rows of prior knowledge on the common unknowns.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (l, c+1) rows `[J, r]`, with residuals in standard deviations of the prior.
-        """
-        index = self.parameter_of_column
-        weight = self.parameters.prior_weight[index]
-
-        deviation = self.common_values(at) - self.parameters.guess[index]
-        rows = np.column_stack([np.diag(weight), weight * deviation])[weight > 0.0]
-
-        # Parameters that an earlier estimate knows are shared by all recordings.
-        earlier = self.parameters.earlier_rows
-        if earlier is None:
-            return np.asarray(rows)
-        residual = earlier @ (self.theta_of_recording(at, 0) - self.parameters.guess)
-        known = np.column_stack([self.to_columns(earlier, 0), residual])
-        return np.concatenate([rows, known])
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pins:
-    """Rows that hold combinations of parameters which no recording determines.
-
-    Attributes:
-        rows: (k, p) coefficients of the combinations, each over the magnitude of the parameter.
-        theta: (p,) parameters at which the combinations are held.
-    """
-
-    rows: Array
-    theta: Array
-
-    @classmethod
-    def none(cls, parameters: ParameterSet) -> Pins:
-        """No combination is held.
-
-        Args:
-            parameters: The parameters.
-        """
-        return cls(rows=np.zeros((0, len(parameters))), theta=np.array(parameters.guess))
-
-    @classmethod
-    def of(cls, parameters: ParameterSet, theta: Array, null_space: NullSpace) -> Pins:
-        """Hold the directions about which there is no information.
-
-        A pin has the weight of a prior whose standard deviation is the magnitude of the parameters.
-
-        Args:
-            parameters: The parameters.
-            theta: (p,) parameters at which the combinations are held.
-            null_space: Directions of theta about which there is no information.
-        """
-        magnitude = parameters.magnitude
-        orthonormal = np.linalg.qr(null_space.directions / magnitude[:, None])[0]
-        return cls(rows=orthonormal.T / magnitude, theta=np.array(theta))
-
-    def residual(self, theta: Array) -> Array:
-        """Differences of the combinations from their held values.
-
-        Args:
-            theta: (p,) parameters.
-
-        Returns:
-            (k,) differences.
-        """
-        return np.asarray(self.rows @ (theta - self.theta))
-
-    def released(self) -> Pins:
-        """These pins without any combination."""
-        return Pins(rows=self.rows[:0], theta=self.theta)
-
-
-# Standard deviation of the prior on a free initial state, relative to the natural sizes of the
-# state. This weak prior keeps components finite that no output determines.
-FREE_START_SIGMA = 1e3
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PriorRows:
-    """Rows of priors and pins on the unknowns of a simulation.
-
-    Attributes:
-        layout: Layout of the unknowns.
-        segment_count: Number of segments.
-        start_sizes: (n,) natural sizes of the private unknowns of a segment.
-        pins: Combinations that no recording determines, and their values.
-        with_priors: Whether priors of the parameters count.
-    """
-
-    layout: UnknownLayout
-    segment_count: int
-    start_sizes: Array
-    pins: Pins
-    with_priors: bool
-
-    def common(self, at: UnknownValues) -> Array:
-        """Rows on the common unknowns.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (l, c+1) rows `[J, r]`.
-        """
-        layout = self.layout
-        rows = np.zeros((0, layout.column_count + 1))
-        if self.with_priors:
-            rows = self.of_parameters(at)
-        if self._pins_involve_private:
-            return rows
-
-        residual = self.pins.residual(layout.theta(at))
-        columns = layout.to_columns(self.pins.rows, 0)
-        return np.concatenate([rows, np.column_stack([columns, residual])])
-
-    def of_parameters(self, at: UnknownValues) -> Array:
         """Rows of the priors on the common unknowns, without pins.
 
         Args:
             at: The unknowns.
 
         Returns:
-            (l, c+1) rows `[J, r]`: the stated priors, then those from the model's inertias.
+            (l, c+1) rows `[J, r]`, with residuals in standard deviations: the stated priors, then
+            those from the model's inertias.
         """
-        layout = self.layout
-        rows = [layout.prior_rows(at)]
-        is_own = np.zeros(len(layout.parameters), dtype=bool)
-        is_own[layout.per_recording] = True
+        parameters, index = self.parameters, self.parameter_of_column
+        weight = parameters.prior_weight[index]
+        deviation = self.common_values(at) - parameters.guess[index]
+        rows = [np.column_stack([np.diag(weight), weight * deviation])[weight > 0.0]]
+
+        # Parameters that an earlier estimate knows are shared by all recordings.
+        earlier = parameters.earlier_rows
+        if earlier is not None:
+            residual = earlier @ (self.theta_of_recording(at, 0) - parameters.guess)
+            rows.append(np.column_stack([self.to_columns(earlier, 0), residual]))
 
         # An inertia with a value for each recording has a prior in each of them.
-        rows.append(self._cad_rows(self._cad.of_bodies(~is_own), at, 0))
-        own = self._cad.of_bodies(is_own)
-        rows += [self._cad_rows(own, at, k) for k in range(layout.recordings) if own.bodies]
+        is_own = np.isin(np.arange(len(parameters)), self.per_recording)
+        for is_wanted, count in ((~is_own, 1), (is_own, self.recordings)):
+            prior = self._cad.of_bodies(is_wanted)
+            for recording in range(count if prior.bodies else 0):
+                found = prior.rows(self.theta_of_recording(at, recording))
+                columns = self.to_columns(found[:, :-1], recording)
+                rows.append(np.column_stack([columns, found[:, -1]]))
         return np.concatenate(rows)
 
-    def along_step(self, at: UnknownValues, common: Array) -> Array | None:
+    @cached_property
+    def _cad(self) -> CadPrior:
+        """Priors from the model's inertias."""
+        return CadPrior.of(self.parameters)
+
+    @property
+    def _pins_involve_private(self) -> bool:
+        """True where pins involve private unknowns."""
+        return bool(self.pins[:, self.private].any())
+
+    def _pin_rows(self, at: UnknownValues) -> Array:
+        """(k, c+1) rows `[J, r]` of the pins on the common unknowns."""
+        residual = self.pins @ (self.theta(at) - self.pinned_at)
+        return np.column_stack([self.to_columns(self.pins, 0), residual])
+
+    def common_rows(self, at: UnknownValues) -> Array:
+        """(l, c+1) rows `[J, r]` of priors and pins on the common unknowns."""
+        rows = np.zeros((0, self.column_count + 1))
+        if self.with_priors:
+            rows = self.prior_rows(at)
+        return rows if self._pins_involve_private else np.concatenate([rows, self._pin_rows(at)])
+
+    def common_rows_after(self, at: UnknownValues, common: Array) -> Array | None:
         """Rows on the common unknowns at the end of a step of them, with derivatives by that step.
 
-        Inertias move along straight lines of their barycentric coordinates (`UnknownLayout.moved`).
+        Inertias move along straight lines of their barycentric coordinates, as in `moved`.
 
         Args:
             at: Unknowns at the begin of the step.
@@ -400,15 +347,13 @@ class PriorRows:
         Returns:
             (l, c+1) rows `[J, r]`; None where a body is not physical at the end.
         """
-        layout = self.layout
         theta = np.array(at.theta)
-        own = np.array(at.per_recording)
-        count = len(layout.shared)
-        theta[layout.shared] += common[:count]
-        own += common[count:].reshape(own.shape)
+        count = len(self.shared)
+        theta[self.shared] += common[:count]
+        own = at.per_recording + common[count:].reshape(at.per_recording.shape)
 
         follows = np.eye(len(theta))
-        for body in layout.shared_bodies:
+        for body in self.shared_bodies:
             begin = at.theta[body.columns]
             step = theta[body.columns] - begin
             if not body.is_physical_after(begin, step):
@@ -420,42 +365,28 @@ class PriorRows:
             at_end, at_begin = body.linear_slopes(theta[body.columns]), body.linear_slopes(begin)
             follows[np.ix_(body.columns, body.columns)] = np.linalg.solve(at_end.T, at_begin.T)
 
-        end = replace(at, theta=theta, per_recording=own)
-        rows = self.common(end)
-        shared = np.ix_(layout.shared, layout.shared)
-        rows[:, :count] = rows[:, :count] @ follows[shared]
+        rows = self.common_rows(replace(at, theta=theta, per_recording=own))
+        rows[:, :count] = rows[:, :count] @ follows[np.ix_(self.shared, self.shared)]
         return rows
 
-    def _cad_rows(self, prior: CadPrior, at: UnknownValues, recording: int) -> Array:
-        """(l, c+1) rows of the priors on inertias, with the values of one recording."""
-        layout = self.layout
-        found = prior.rows(layout.theta_of_recording(at, recording))
-        columns = layout.to_columns(found[:, :-1], recording)
-        return np.column_stack([columns, found[:, -1]])
-
-    @cached_property
-    def _cad(self) -> CadPrior:
-        """Priors from the model's inertias."""
-        return CadPrior.of(self.layout.parameters)
-
-    def private(self, at: UnknownValues) -> Array:
+    def private_rows(self, at: UnknownValues, start_sizes: Array) -> Array:
         """Rows on the private unknowns of every segment.
 
         Args:
             at: The unknowns.
+            start_sizes: (n,) natural sizes of the private unknowns of a segment.
 
         Returns:
             (P, k, m) rows `[J_private, J_common, r]`.
         """
-        layout, count = self.layout, self.segment_count
-        n = len(self.start_sizes)
-        m = n + layout.column_count + 1
+        count, n = at.private.shape
+        m = n + self.column_count + 1
         diagonal = np.arange(n)
 
         # A weak prior on a free initial state, for components that no output determines.
-        if layout.free_starts:
+        if self.free_starts:
             rows = np.zeros((count, n, m))
-            sigma = FREE_START_SIGMA * self.start_sizes
+            sigma = FREE_START_SIGMA * start_sizes
             rows[:, diagonal, diagonal] = 1.0 / sigma
             rows[:, :, -1] = at.private / sigma
             return rows
@@ -463,21 +394,15 @@ class PriorRows:
             return np.zeros((count, 0, m))
 
         # Stated priors on the deviations of the initial state.
-        parameters, private = layout.parameters, layout.private
+        parameters, private = self.parameters, self.private
         weight = parameters.prior_weight[private] * self.with_priors
-        pin_count = len(self.pins.rows) if self._pins_involve_private else 0
+        pin_count = len(self.pins) if self._pins_involve_private else 0
         rows = np.zeros((count, n + pin_count, m))
         rows[:, diagonal, diagonal] = weight
         rows[:, :n, -1] = weight * (at.private - parameters.guess[private])
 
         # Pins that involve private unknowns belong to the first segment.
         if pin_count:
-            rows[0, n:, :n] = self.pins.rows[:, private]
-            rows[0, n:, n:-1] = layout.to_columns(self.pins.rows, 0)
-            rows[0, n:, -1] = self.pins.residual(layout.theta(at))
+            rows[0, n:, :n] = self.pins[:, private]
+            rows[0, n:, n:] = self._pin_rows(at)
         return rows
-
-    @cached_property
-    def _pins_involve_private(self) -> bool:
-        """True where pins involve private unknowns."""
-        return bool(self.pins.rows[:, self.layout.private].any())

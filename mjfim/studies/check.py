@@ -37,7 +37,11 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, SystemOrder
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.experiment.system import System
+from mjfim.experiment.system_order import SystemOrder
+from mjfim.identification.fit_problem import FitProblem, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.search import refuse_same_data
 from mjfim.identification.segments import recorded_release
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import refuse_same_data

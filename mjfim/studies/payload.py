@@ -19,12 +19,15 @@ from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import ExperimentError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import honest_covariance
-from mjfim.identification.assessment.report import FitResult, estimate_from
+from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.identify import Callback, fit_task, identify_system
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask, with_length
 from mjfim.model.terms.library import AXES
+from mjfim.identification.search import FitSearch, FitTask, with_length
+from mjfim.model.terms.base import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate

@@ -19,7 +19,11 @@ from mjfim.identification.assessment.honest_covariance import (
     agreeing_covariance,
     stretched_formal_covariance,
 )
-from mjfim.identification.assessment.random_effects import between_variance, f_tail, satterthwaite
+from mjfim.identification.assessment.recording_comparison import (
+    between_variance,
+    f_tail,
+    satterthwaite,
+)
 from mjfim.records.check import join_names
 from mjfim.records.estimate import Estimate
 from mjfim.records.robots import RobotComparison

@@ -12,13 +12,13 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import (
     student_quantile,
     with_honest_covariance,
 )
-from mjfim.identification.assessment.report import FitResult
+from mjfim.identification.assessment.term_tests import TermTests
 from mjfim.identification.left_out import HeldOutLosses
-from mjfim.identification.terms import TermTests
 from mjfim.model.parameters import Parameter, ParameterSet
 from mjfim.model.paths import ParameterPath
 from mjfim.records.estimate import Estimate

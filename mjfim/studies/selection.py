@@ -18,14 +18,14 @@ import numpy as np
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.report import FitResult, estimate_from
+from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.report import estimate_from
+from mjfim.identification.assessment.term_tests import find_missing_terms
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
 from mjfim.identification.left_out import Reduction, held_out_losses
-from mjfim.identification.search import FitSearch
-from mjfim.identification.task import FitTask, with_length
-from mjfim.identification.terms import find_missing_terms
+from mjfim.identification.search import FitSearch, FitTask, with_length
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate

@@ -57,8 +57,7 @@ from mjfim.identification.assessment.residual_tests import misfit_reasons
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import fit_task, identify_system
 from mjfim.identification.linear_coordinates import LinearCoordinates
-from mjfim.identification.search import FitSearch
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitSearch, FitTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
 from mjfim.parallel.budget import Budget

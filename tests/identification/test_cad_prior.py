@@ -19,7 +19,7 @@ from mjfim.identification.assessment.report import _implausible_estimates
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import _unseen_directions
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitTask
 from mjfim.model.inertia import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.records.trajectory import Recording
@@ -134,7 +134,7 @@ def test_inertias_move_along_straight_lines_of_barycentric_coordinates(
     far = layout.moved(begin, replace(step, common=100.0 * common), 1.0).theta
     assert not body.is_physical_after(begin.theta[body.columns], 100.0 * common[:10])
     assert body.is_physical(body.linear(far[body.columns]))
-    assert problem.prior_rows.along_step(begin, 100.0 * common) is None
+    assert problem.layout.common_rows_after(begin, 100.0 * common) is None
 
 
 def test_a_step_to_a_rod_ends_before_it(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_rows_along_a_step_have_the_derivatives_of_differences(
     parameters = problem.system.parameters
     begin = problem.begin(moved(parameters.guess, 0.01))
     common = 0.02 * parameters.magnitude * np.random.default_rng(7).standard_normal(20)
-    along = problem.prior_rows.along_step
+    along = problem.layout.common_rows_after
     rows = along(begin, common)
     assert rows is not None
     step = 1e-6

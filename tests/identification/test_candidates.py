@@ -9,10 +9,10 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.identification.assessment.term_candidates import candidates_of
+from mjfim.identification.assessment.term_tests import find_missing_terms
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
-from mjfim.identification.terms import find_missing_terms
-from mjfim.identification.terms.candidates import candidates_of
 from tests.support.closed_loop import arm_experiment
 
 LAW = {"kp": 40.0, "kd": 2.0, "rate": 500.0}

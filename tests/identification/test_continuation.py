@@ -11,8 +11,8 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
+from mjfim.identification.search import FitTask
 from mjfim.identification.starts import MIN_ROWS, segment_lengths
-from mjfim.identification.task import FitTask
 from mjfim.parallel.budget import StopToken
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent

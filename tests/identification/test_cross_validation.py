@@ -9,7 +9,6 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
 from mjfim.identification import left_out
-from mjfim.identification.assessment import predictions
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
 from mjfim.parallel.budget import Budget
@@ -86,11 +85,11 @@ def test_predictions_of_some_segments_say_how_many(
     task = DesignTask.resolve(experiment, threads=1)
     problem = FitProblem.of(task.system, [recorded(task, seed) for seed in range(2)])
     solution = least_squares(problem, task.theta)
-    everything = predictions.predict_unfitted(problem, solution, None, Budget())
+    everything = left_out.predict_unfitted(problem, solution, None, Budget())
     assert [found.name for found in everything] == ["simulated"] * 2
 
     monkeypatch.setattr(left_out, "MAX_SAMPLES", problem.sample_count // 2)
-    some = predictions.predict_unfitted(problem, solution, None, Budget())
+    some = left_out.predict_unfitted(problem, solution, None, Budget())
     assert [found.name for found in some] == ["simulated (2 of 4 segments)"] * 2
 
 

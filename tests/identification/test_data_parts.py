@@ -11,9 +11,15 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.identification.assessment import term_tests
+from mjfim.identification.assessment.term_tests import (
+    DataPart,
+    TermTests,
+    find_missing_terms,
+    part_of_data,
+)
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.terms import TermTests, extended, find_missing_terms, score_tests
-from mjfim.identification.terms.extended import DataPart, part_of_data
+from mjfim.identification.search import of_subset
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import TermTestData
 from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
@@ -24,7 +30,7 @@ RATE = 100.0
 @pytest.fixture(autouse=True)
 def few_samples_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """The recordings of these tests are short."""
-    monkeypatch.setattr(extended, "ENOUGH_SAMPLES", 10)
+    monkeypatch.setattr(term_tests, "ENOUGH_SAMPLES", 10)
 
 
 def problem_of(folder: Path, count: int, segments: float | str = "whole") -> FitProblem:
@@ -38,18 +44,18 @@ def problem_of(folder: Path, count: int, segments: float | str = "whole") -> Fit
 def test_a_part_has_the_begin_of_each_recording(tmp_path: Path) -> None:
     problem = problem_of(tmp_path, 4)
     assert [segment.samples for segment in problem.segments] == [200] * 4
-    part = part_of_data(problem, 136.0)
-    found = part.problem.segments
+    part, segments = part_of_data(problem, 136.0)
+    found = part.segments
     assert [segment.recording for segment in found] == [0, 1, 2, 3]
     assert [segment.begin for segment in found] == [0] * 4
     assert {segment.samples for segment in found} == {34}
-    assert part.problem.sample_count == 136
-    assert part.share == pytest.approx(0.17)
-    assert part.recording_count == 4
+    assert part.sample_count == 136
+    assert part.sample_count / problem.sample_count == pytest.approx(0.17)
+    assert len({segment.recording for segment in part.segments}) == 4
 
     # The part has the residuals that these rows have among all.
     at = problem.begin(problem.system.parameters.guess)
-    predicted, whole = part.problem.predict(part.unknowns(at)), problem.predict(at)
+    predicted, whole = part.predict(of_subset(at, segments)), problem.predict(at)
     assert predicted is not None and whole is not None
     for y, complete, segment in zip(predicted, whole, found, strict=True):
         np.testing.assert_allclose(y[segment.rows], complete[segment.rows])
@@ -60,14 +66,14 @@ def test_a_part_has_segments_of_each_recording(tmp_path: Path) -> None:
     problem = problem_of(tmp_path, 3, 0.25)
     assert len(problem.segments) == 24
     for share in (0.05, 0.13, 0.3, 0.6):
-        part = part_of_data(problem, share * problem.sample_count)
-        assert part.recording_count == 3
-        assert 0.8 * share < part.share <= 1.01 * share
+        part, segments = part_of_data(problem, share * problem.sample_count)
+        assert len({segment.recording for segment in part.segments}) == 3
+        assert 0.8 * share < part.sample_count / problem.sample_count <= 1.01 * share
 
         # The unknowns are those of its segments.
         at = problem.begin(problem.system.parameters.guess)
         at = replace(at, private=np.arange(at.private.size, dtype=float).reshape(24, -1))
-        for segment, private in zip(part.problem.segments, part.unknowns(at).private, strict=True):
+        for segment, private in zip(part.segments, of_subset(at, segments).private, strict=True):
             index = int(np.flatnonzero((at.private == private).all(axis=1))[0])
             original = problem.segments[index]
             assert (segment.recording, segment.begin) == (original.recording, original.begin)
@@ -75,24 +81,24 @@ def test_a_part_has_segments_of_each_recording(tmp_path: Path) -> None:
 
 def test_one_long_recording_is_cut_and_little_data_is_not(tmp_path: Path) -> None:
     problem = problem_of(tmp_path, 1)
-    part = part_of_data(problem, 50.0)
-    assert part.problem.sample_count == 50
-    assert part.share == 0.25
+    part, segments = part_of_data(problem, 50.0)
+    assert part.sample_count == 50
+    assert part.sample_count / problem.sample_count == 0.25
 
-    everything = part_of_data(problem, 200.0)
-    assert everything.problem is problem
-    assert everything.share == 1.0
+    everything, segments = part_of_data(problem, 200.0)
+    assert everything is problem
+    assert len(segments) == len(problem.segments)
 
 
 def test_too_many_recordings_are_not_cut_into_crumbs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem = problem_of(tmp_path, 6)
-    monkeypatch.setattr(extended, "ENOUGH_SAMPLES", 50)
-    part = part_of_data(problem, 100.0)
-    assert part.recording_count == 2
-    assert part.problem.sample_count == 100
-    assert part.problem.segments[0].recording < 3 <= part.problem.segments[1].recording
+    monkeypatch.setattr(term_tests, "ENOUGH_SAMPLES", 50)
+    part, _ = part_of_data(problem, 100.0)
+    assert len({segment.recording for segment in part.segments}) == 2
+    assert part.sample_count == 100
+    assert part.segments[0].recording < 3 <= part.segments[1].recording
 
 
 @pytest.mark.parametrize(
@@ -138,7 +144,7 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
         problem.of_segments(first.segments), logs, first.unknowns(at)
     ).terms
 
-    monkeypatch.setattr(score_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
+    monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
     found = find_missing_terms(problem, logs, at)
     assert found.data is not None
     assert found.data.recordings == 4
@@ -153,7 +159,7 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     experiment = experiment_of(tmp_path, "tilt", fit={"bootstrap": 0})
     system = System.resolve(experiment)
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in (0, 1)]
-    monkeypatch.setattr(score_tests, "part_of_data", lambda problem, _: part_of_data(problem, 100))
+    monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 100))
     found = mjfim.select_terms(experiment, logs)
     assert not found.misfit
     words = "Terms that the model may lack were tested on 25 % of the data, from all 2 recordings."

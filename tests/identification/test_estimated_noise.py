@@ -13,8 +13,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.search import FitSearch
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitSearch, FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.plant.outputs import Noise

@@ -15,8 +15,8 @@ import pytest
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification import segment_simulation
-from mjfim.identification.assessment.fit_quality import fit_quality
-from mjfim.identification.task import FitTask
+from mjfim.identification.assessment.residual_tests import fit_quality
+from mjfim.identification.search import FitTask
 from mjfim.output.archive import write_recording
 from mjfim.recordings.read import read_recording
 from mjfim.records.trajectory import Recording

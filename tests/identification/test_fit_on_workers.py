@@ -21,11 +21,10 @@ from mjfim.identification import (
     search,
     segment_simulation,
 )
-from mjfim.identification.assessment import predictions
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import least_squares
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget, StopToken
 from tests.support.executors import LosingThreads, move_to, processes
@@ -202,11 +201,11 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
         problem, problem.system.parameters.guess, SearchSettings(max_iterations=2)
     )
     begin = plant.engine_steps
-    alone = predictions.predict_unfitted(problem, solution, None, Budget())
+    alone = left_out.predict_unfitted(problem, solution, None, Budget())
     steps = plant.engine_steps
     with LosingThreads() as threads:
         divided = problem.on_workers(FitWorkers(threads))
-        found = predictions.predict_unfitted(divided, solution, None, Budget())
+        found = left_out.predict_unfitted(divided, solution, None, Budget())
 
     assert [part.name for part in found] == [part.name for part in alone]
     assert [part.name for part in found][:2] == (

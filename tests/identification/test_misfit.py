@@ -7,11 +7,12 @@ import pytest
 from scipy.stats import chi2
 
 from mjfim.identification.assessment.residual_tests import (
-    LargestResidual,
     autocorrelated,
     is_larger_than_noise,
     is_smaller_than_noise,
+    largest_interval,
     misfit_reasons,
+    worst_residual,
 )
 from mjfim.records.estimate import Whiteness, WorstResidual
 from tests.support.numerics import Array
@@ -21,10 +22,13 @@ NAMES = ("angle", "speed", "force")
 
 def worst_of(recordings: str, times: list[Array], z: list[Array]) -> WorstResidual | None:
     """The interval with the largest residuals, found output by output as a fit does."""
-    largest = LargestResidual()
-    for j, output in enumerate(NAMES):
-        largest = largest.with_output(output, recordings, times, [part[:, j] for part in z])
-    return largest.interval
+    return worst_residual(
+        [
+            largest_interval(output, name, t, part[:, j])
+            for j, output in enumerate(NAMES)
+            for name, t, part in zip(recordings, times, z, strict=True)
+        ]
+    )
 
 
 def white(seed: int = 0) -> tuple[list[Array], list[Array]]:

@@ -10,10 +10,13 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
+from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
+from mjfim.identification.assessment import term_tests
+from mjfim.identification.assessment.term_candidates import Candidate, Effect
+from mjfim.identification.assessment.term_tests import find_missing_terms
 from mjfim.identification.identify import identify_system
-from mjfim.identification.task import FitTask
-from mjfim.identification.terms import find_missing_terms, score_tests
-from mjfim.identification.terms.candidates import Candidate, Effect
+from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array
 from tests.support.paths import ROOT
@@ -135,14 +138,14 @@ def test_a_complete_model_has_no_missing_terms() -> None:
 
 def with_failing(failing: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
     """Test a further candidate between the others."""
-    usual = score_tests.candidates_of
+    usual = term_tests.candidates_of
 
     def extended(system: System, speeds: Array) -> tuple[list[Candidate], list[str]]:
         """The candidates, of which the third one fails."""
         found, impossible = usual(system, speeds)
         return [*found[:2], failing, *found[2:]], impossible
 
-    monkeypatch.setattr(score_tests, "candidates_of", extended)
+    monkeypatch.setattr(term_tests, "candidates_of", extended)
 
 
 @pytest.mark.parametrize("path", ["joint/pivot:stiffness", "joint/pivot:nothing"])

@@ -12,7 +12,7 @@ import pytest
 import mjfim
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.system import System
-from mjfim.identification.terms.candidates import Candidate, candidates_of
+from mjfim.identification.assessment.term_candidates import Candidate, candidates_of
 from tests.support.closed_loop import ARM
 
 DAMPINGS: dict[str, Any] = {

@@ -10,7 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.identification.assessment.predictability import UnpredictableMotion, amplifications
+from mjfim.identification.assessment.poor_fit import amplifications, sentence_about_instability
 from tests.range.plants import PLANTS, Setting
 
 
@@ -36,7 +36,7 @@ def test_a_motion_that_stands_still_amplifies_nothing() -> None:
 
 def test_rounding_errors_are_mentioned_where_they_change_the_motion() -> None:
     def text(amplification: float) -> str:
-        return str(UnpredictableMotion(amplification=amplification, length=8.0, recommended=0.25))
+        return sentence_about_instability(amplification, 8.0, 0.25)
 
     assert "grows 1e5-fold within 8 s" in text(5.0)
     assert "rounding" not in text(5.0)

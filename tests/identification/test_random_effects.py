@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import chi2, f, kstest
 
-from mjfim.identification.assessment.random_effects import (
+from mjfim.identification.assessment.recording_comparison import (
     Information,
     between_variance,
     difference,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.identification.inverse_dynamics.spline import Readings, RegressionSpline, fit_spline
+from mjfim.identification.inverse_dynamics.motion import Readings, RegressionSpline, fit_spline
 from tests.support.numerics import Array
 
 RATE, SECONDS = 200.0, 10.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import RecordingError
-from mjfim.identification.task import refuse_same_data
+from mjfim.identification.search import refuse_same_data
 from mjfim.records.trajectory import Recording
 
 

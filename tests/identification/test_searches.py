@@ -14,9 +14,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.search import FitSearch, first_subset
+from mjfim.identification.search import FitSearch, FitTask, first_subset
 from mjfim.identification.segment_simulation import SegmentBatch
-from mjfim.identification.task import FitTask
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
     SearchSettings,

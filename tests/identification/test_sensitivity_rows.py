@@ -15,11 +15,10 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
 from mjfim.identification import segment_simulation
-from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_problem import FitProblem, sensitivity_rows
 from mjfim.identification.identify import _unseen_directions
+from mjfim.identification.search import FitTask
 from mjfim.identification.segment_simulation import SegmentBatch
-from mjfim.identification.sensitivity_rows import sensitivity_rows
-from mjfim.identification.task import FitTask
 from tests.support.paths import MODELS
 
 

@@ -14,7 +14,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitTask
 from mjfim.parallel.budget import StopToken
 from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS

@@ -14,11 +14,11 @@ import scipy
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align
+from mjfim.identification.assessment import term_tests
+from mjfim.identification.assessment.term_candidates import Candidate, Effect
+from mjfim.identification.assessment.term_tests import equivalent_sigmas, find_missing_terms
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.known_activations import KnownActivations
-from mjfim.identification.terms import find_missing_terms, score_tests
-from mjfim.identification.terms.candidates import Candidate, Effect
-from mjfim.identification.terms.score_tests import equivalent_sigmas
+from mjfim.identification.segments import KnownActivations
 from mjfim.model.terms.library import KINDS
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.studies.selected_models import selected_term
@@ -218,7 +218,7 @@ def test_many_candidates_are_tested_in_groups(
     whole = find_missing_terms(problem, logs, at).terms
     assert "output:delay" in {term.path for term in whole}
 
-    monkeypatch.setattr(score_tests, "MAX_TESTED", 4)
+    monkeypatch.setattr(term_tests, "MAX_TESTED", 4)
     in_groups = find_missing_terms(problem, logs, at).terms
 
     # The last one may be any of several terms with the same effect, here a gain or a payload.
@@ -233,8 +233,8 @@ def test_groups_hold_all_candidates_in_their_order(counts: list[int]) -> None:
     candidates = [
         Candidate(description=str(i), tested=(number,) * count) for i, count in enumerate(counts)
     ]
-    groups = score_tests.in_groups(candidates)
+    groups = term_tests.in_groups(candidates)
     sizes = [sum(len(each.tested) for each in group) for group in groups]
     assert [each for group in groups for each in group] == candidates
-    assert max(sizes, default=0) <= score_tests.MAX_TESTED
-    assert len(groups) <= sum(counts) // score_tests.MAX_TESTED + 1
+    assert max(sizes, default=0) <= term_tests.MAX_TESTED
+    assert len(groups) <= sum(counts) // term_tests.MAX_TESTED + 1

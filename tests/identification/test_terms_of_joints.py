@@ -11,13 +11,13 @@ import pytest
 import mjfim
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.system import System
-from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.terms.score_tests import (
+from mjfim.identification.assessment.term_tests import (
     MAX_NAMED_TERMS,
     TermTests,
     find_missing_terms,
     first_terms,
 )
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording

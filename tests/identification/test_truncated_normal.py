@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import ks_2samp, kstest, norm, truncnorm
 
-from mjfim.identification.assessment import truncated_normal
-from mjfim.identification.assessment.truncated_normal import (
+from mjfim.identification.assessment import parameter_draws
+from mjfim.identification.assessment.parameter_draws import (
     MIN_SWEEPS,
     SWEEPS,
-    MatrixBound,
     draw_truncated_normal,
 )
 from tests.support.numerics import Array
@@ -93,11 +92,11 @@ def test_a_positive_definite_matrix_cuts_off_as_rejection_does(
     correlation: float, sweeps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A bound of a single variable holds as well."""
-    monkeypatch.setattr(truncated_normal, "SWEEPS", sweeps)
+    monkeypatch.setattr(parameter_draws, "SWEEPS", sweeps)
     mean, std = np.array([1.0, 0.3, 0.5]), np.array([1.0, 3.0, 0.5])
     covariance = covariance_of(std, correlation)
     lower, upper = np.array([-np.inf, -0.4, -np.inf]), INFINITE
-    bound = MatrixBound(at_mean=np.tensordot(mean, SLOPES, axes=1), slopes=SLOPES)
+    bound = (np.tensordot(mean, SLOPES, axes=1), SLOPES)
     rng = np.random.default_rng(6)
     drawn = draw_truncated_normal(mean, covariance, lower, upper, 800, rng, matrices=[bound])
 
@@ -119,7 +118,7 @@ def test_units_of_a_matrix_do_not_change_the_draws() -> None:
     at_mean = np.tensordot(mean, SLOPES, axes=1)
     drawn = []
     for units in (np.ones((2, 2)), np.outer([1e-6, 1e4], [1e-6, 1e4])):
-        bound = MatrixBound(at_mean=at_mean * units, slopes=SLOPES * units)
+        bound = (at_mean * units, SLOPES * units)
         rng = np.random.default_rng(7)
         drawn.append(
             draw_truncated_normal(mean, covariance, -INFINITE, INFINITE, 50, rng, matrices=[bound])

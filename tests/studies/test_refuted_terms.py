@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from mjfim.identification.terms import TermTests
+from mjfim.identification.assessment.term_tests import TermTests
 from mjfim.records.terms import Decision, Selection, SelectionStep, TermNumber
 from tests.support import results
 

@@ -1,9 +1,13 @@
-"""Accuracy of an estimate: formal covariance, robust intervals, and poorly known parameters."""
+"""Result of the searches of an identification, and the accuracy of its estimate.
+
+That is the formal covariance, robust intervals, and the poorly known parameters.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -11,6 +15,7 @@ import scipy
 from mjfim.arrays import NORMAL_95, Array, scaled_to_unit_diagonal
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import between_covariance
+from mjfim.identification.assessment.residual_tests import FitQuality
 from mjfim.identification.assessment.robust_covariance import (
     block_length,
     inverse_root,
@@ -19,78 +24,54 @@ from mjfim.identification.assessment.robust_covariance import (
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.information.criteria import marginal, standard_deviations
+from mjfim.identification.search import FitTask, of_subset
+from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.model.parameters import ParameterSet
-from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.records.check import ParameterGroup
-from mjfim.records.estimate import PriorDirections, Uncertainty
+from mjfim.records.estimate import HorizonStudy, PriorDirections, Restart, Uncertainty
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 
 # A combination is determined by the recordings where these leave at most this share of the standard
 # deviation of the prior.
 DETERMINED_SHARE = 0.5
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class InertiaCombinations:
-    """Combinations of the k inertial coordinates with a CAD prior, by how well they are determined.
+def inertia_combinations(
+    parameters: ParameterSet, theta: Array, data: Array
+) -> tuple[np.ndarray, np.ndarray, Array] | None:
+    """Compare the information of the recordings about inertias with that of their CAD prior.
 
-    Attributes:
-        columns: (k,) indices in theta of the coordinates.
-        left: (k,) share of the standard deviation of the prior that the recordings leave.
-        axes: (k, k) directions of the coordinates, one in each column, in which recordings and
-            prior are uncorrelated and the prior has the standard deviation 1 [theta-unit].
-        prior_std: (k,) standard deviations of the prior [theta-unit].
+    Args:
+        parameters: The p parameters.
+        theta: (p,) estimate [theta-unit].
+        data: (p, p) information of the recordings alone about the parameters that they share.
+
+    Returns:
+        (k,) indices in theta of the coordinates with a CAD prior, (k,) True for their combinations
+        that the recordings determine, and (k, k) directions of the coordinates, one in each column,
+        in which recordings and prior are uncorrelated and the prior has the standard deviation 1
+        [theta-unit]. None without a CAD prior.
     """
+    is_shared = ~parameters.recording_specific
+    prior = CadPrior.of(parameters).of_bodies(is_shared)
+    columns = prior.columns
+    if not len(columns):
+        return None
 
-    columns: np.ndarray
-    left: Array
-    axes: Array
-    prior_std: Array
+    # Other parameters are estimated as well, so that their uncertainty counts.
+    others = np.setdiff1d(np.flatnonzero(is_shared), columns)
+    kept = np.concatenate([columns, others])
+    stated = parameters.prior_information[np.ix_(kept, kept)]
+    about = marginal(data[np.ix_(kept, kept)], stated, np.arange(len(columns)))
 
-    @staticmethod
-    def of(parameters: ParameterSet, theta: Array, data: Array) -> InertiaCombinations | None:
-        """Compare the information of the recordings about inertias with that of their CAD prior.
-
-        Args:
-            parameters: The p parameters.
-            theta: (p,) estimate [theta-unit].
-            data: (p, p) information of the recordings alone about the parameters that they share.
-
-        Returns:
-            The combinations; None without a CAD prior.
-        """
-        is_shared = ~parameters.recording_specific
-        prior = CadPrior.of(parameters).of_bodies(is_shared)
-        columns = prior.columns
-        if not len(columns):
-            return None
-
-        # Other parameters are estimated as well, so that their uncertainty counts.
-        others = np.setdiff1d(np.flatnonzero(is_shared), columns)
-        kept = np.concatenate([columns, others])
-        stated = parameters.prior_information[np.ix_(kept, kept)]
-        about = marginal(data[np.ix_(kept, kept)], stated, np.arange(len(columns)))
-
-        # Eigenvalues of the information relative to the prior do not depend on the coordinates.
-        information = prior.information(theta)[np.ix_(columns, columns)]
-        known, scale = scaled_to_unit_diagonal(information)
-        ratios, vectors = scipy.linalg.eigh(about / np.outer(scale, scale), known)
-        return InertiaCombinations(
-            columns=columns,
-            left=1.0 / np.sqrt(1.0 + np.maximum(ratios, 0.0)),
-            axes=vectors / scale[:, None],
-            prior_std=np.sqrt(np.diag(np.linalg.inv(known))) / scale,
-        )
-
-    @property
-    def is_determined(self) -> np.ndarray:
-        """(k,) True for the combinations that the recordings determine."""
-        return np.asarray(self.left <= DETERMINED_SHARE)
-
-    @property
-    def undetermined(self) -> Array:
-        """(m, k) weights of the coordinates in the combinations that the prior determines."""
-        return np.asarray(np.linalg.inv(self.axes)[~self.is_determined])
+    # Eigenvalues of the information relative to the prior do not depend on the coordinates.
+    information = prior.information(theta)[np.ix_(columns, columns)]
+    known, scale = scaled_to_unit_diagonal(information)
+    ratios, vectors = scipy.linalg.eigh(about / np.outer(scale, scale), known)
+    left = 1.0 / np.sqrt(1.0 + np.maximum(ratios, 0.0))
+    return columns, left <= DETERMINED_SHARE, vectors / scale[:, None]
 
 
 def prior_directions(
@@ -107,17 +88,17 @@ def prior_directions(
     Returns:
         The combinations; None without a CAD prior, or where the recordings determine all of them.
     """
-    found = InertiaCombinations.of(parameters, theta, data)
-    if found is None or found.is_determined.all():
+    found = inertia_combinations(parameters, theta, data)
+    if found is None or found[1].all():
         return None
 
-    columns = found.columns
-    is_prior = std[columns] > DETERMINED_SHARE * found.prior_std
+    columns, is_determined, axes = found
+    is_prior = std[columns] > DETERMINED_SHARE * np.linalg.norm(axes, axis=1)
     groups = [parameters.parameters[j].group for j in columns.tolist()]
     return PriorDirections(
         bodies=tuple(dict.fromkeys(groups)),
         count=len(columns),
-        determined=int(found.is_determined.sum()),
+        determined=int(is_determined.sum()),
         parameters=tuple(parameters.names[j] for j in columns[is_prior].tolist()),
     )
 
@@ -235,8 +216,8 @@ def accuracy_of(
         robust = robust_uncertainty(
             solution.condensed,
             problem.common_values(solution.unknowns),
-            problem.blocks.recording_of_block,
-            problem.blocks.mean_rows,
+            problem.recording_of_block,
+            problem.mean_block_rows,
             min_rows=independent_rows(problem, correlation_rows),
             draws=settings.bootstrap,
             rng=np.random.default_rng(settings.seed),
@@ -264,7 +245,7 @@ def accuracy_of(
 
     # Information of the recordings alone about the parameters that they share. Only the priors on
     # the other unknowns, which are marginalised, count.
-    J = problem.prior_rows.of_parameters(solution.unknowns)[:, :-1]
+    J = layout.prior_rows(solution.unknowns)[:, :-1]
     of_data = solution.condensed.information(with_common_rows=False)
     data = np.zeros_like(formal)
     shared = np.arange(len(layout.shared))
@@ -370,3 +351,53 @@ def _poorly_known(
             remark += f"; it is confounded with {name} (correlation {correlation[other]:+.2f})"
 
         yield parameters.names[j], remark
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitResult:
+    """Result of the searches of one identification.
+
+    Attributes:
+        task: System, recordings and settings.
+        problem: The least-squares problem, with the noise of the last search.
+        solution: Its solution.
+        quality: Size and whiteness of its residuals.
+        null_space: Directions of theta about which neither recordings nor priors contain
+            information.
+        held_out: Problem of the held-out recordings; None without any.
+        subset: Indices of segments that are quick to simulate, evenly spread over the data.
+        restart: How the fit was repeated from fits over segments; None where it was not.
+        horizons: Lengths of segments that were compared; None where they were not.
+        inverse_dynamics: The fit to the equation of motion from which the search started, or None.
+        begun_instead: Where it began instead of the stated start, at which the model diverges, in
+            words; empty where it does not diverge there.
+    """
+
+    task: FitTask
+    problem: FitProblem
+    solution: Solution
+    quality: FitQuality
+    null_space: NullSpace
+    held_out: FitProblem | None
+    subset: np.ndarray
+    restart: Restart | None
+    horizons: HorizonStudy | None = None
+    inverse_dynamics: InverseDynamicsFit | None = None
+    begun_instead: str = ""
+
+    @property
+    def theta(self) -> Array:
+        """(p,) estimate, with the values of the first recording."""
+        return self.problem.theta(self.solution.unknowns)
+
+    @property
+    def quick(self) -> tuple[FitProblem, UnknownValues]:
+        """The problem of the segments that are quick to simulate, and its unknowns."""
+        return self.problem.of_segments(self.subset), of_subset(self.solution.unknowns, self.subset)
+
+    @cached_property
+    def accuracy(self) -> Accuracy:
+        """Accuracy of the estimate."""
+        rows = self.quality.correlation_rows(self.problem.row_count)
+        inflation = self.quality.inflation
+        return accuracy_of(self.problem, self.solution, self.null_space, rows, inflation)

@@ -25,7 +25,11 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import NORMAL_95, Array
-from mjfim.identification.assessment.robust_covariance import LEVEL, covering_covariance
+from mjfim.identification.assessment.robust_covariance import (
+    LEVEL,
+    covariance_root,
+    covering_covariance,
+)
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate, HorizonStudy, Uncertainty
 
@@ -261,15 +265,6 @@ def _stretch(root: Array, j: int, factor: float) -> None:
         return
     axis = root[j] / np.linalg.norm(root[j])
     root += (factor - 1.0) * np.outer(root @ axis, axis)
-
-
-def covariance_root(covariance: Array) -> Array:
-    """(p, p) factor A of a covariance `A A'`: (p, p), which may be singular."""
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    scale = np.where(std > 0.0, std, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    sizes = np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(scale[:, None] * vectors * sizes)
 
 
 def _covering(covariance: Array, deviations: Array) -> Array:

@@ -1,12 +1,17 @@
 """Draws of the parameters from the uncertainty of an estimate, for domain randomisation.
 
-The distribution is normal about the estimate, with its honest covariance
-(`honest_covariance.py`), and truncated at the bounds. Inertias of whole bodies
-move along straight lines of their barycentric coordinates, along which forces are linear, so that
-combinations that the recordings know well stay known in the drawn robots. Combinations that only
-the CAD prior determines stay at the estimate. Draws with an unphysical inertia are replaced: where
-whole inertias are parameters, by draws from the distribution that is truncated at the inertias that
-no body has, a convex region of the barycentric coordinates, and else by further draws.
+The distribution is normal about the estimate, with its honest covariance (`honest_covariance.py`),
+and truncated at the bounds. Inertias of whole bodies move along straight lines of their barycentric
+coordinates, along which forces are linear, so that combinations that the recordings know well stay
+known in the drawn robots. Combinations that only the CAD prior determines stay at the estimate.
+Draws with an unphysical inertia are replaced: where whole inertias are parameters, by draws from
+the distribution that is truncated at the inertias that no body has, a convex region of the
+barycentric coordinates, and else by further draws.
+
+Truncated draws are made by Gibbs sampling (Robert, Simulation of truncated normal variables,
+Statistics and Computing, 1995) in coordinates in which the untruncated distribution is standard
+normal. There, correlations slow nothing down, and without a bound in reach each sweep is an
+independent draw. Every draw is the end of a chain of its own, so that the draws are independent.
 """
 
 from __future__ import annotations
@@ -14,23 +19,152 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import MAX_SAMPLES, ExperimentError, first_ones, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.accuracy import InertiaCombinations
-from mjfim.identification.assessment.honest_covariance import (
-    covariance_root,
-    honest_covariance,
-)
-from mjfim.identification.assessment.truncated_normal import MatrixBound, draw_truncated_normal
+from mjfim.identification.assessment.accuracy import inertia_combinations
+from mjfim.identification.assessment.honest_covariance import honest_covariance
+from mjfim.identification.assessment.robust_covariance import covariance_root
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.model.inertia import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import ModelField
 from mjfim.records.estimate import Estimate, ParameterDraws
 from mjfim.records.events import begin_stage
+
+# Bounds farther from the mean than this are left out [standard deviations]; the probability beyond
+# them is 1e-15.
+REACH = 8.0
+
+# Sweeps of a chain over all coordinates.
+SWEEPS = 200
+
+# Many chains with many matrices take fewer sweeps, so that about this number of matrices is
+# factorised. The fewest sweeps are made in any case, because a chain has to forget its begin. They
+# may exceed the number: 1000 draws of the whole inertias of seven bodies, with 76 coordinates, take
+# 26.6 million matrices.
+MAX_FACTORISED = 10_000_000
+MIN_SWEEPS = 50
+
+# Share of the way to a matrix that is not positive definite that one move may go.
+INSIDE = 1.0 - 1e-6
+
+# Eigenvalues of the correlation matrix below this share of the largest one count as zero.
+RANK_TOLERANCE = 1e-12
+
+# Coefficients of a bound below this share of the largest one do not limit a coordinate.
+SMALLEST_COEFFICIENT = 1e-12
+
+
+def draw_truncated_normal(
+    mean: Array,
+    covariance: Array,
+    lower: Array,
+    upper: Array,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    matrices: Sequence[tuple[Array, Array]] = (),
+) -> Array:
+    """Draw from a normal distribution that is truncated at bounds.
+
+    Args:
+        mean: (p,) mean of the untruncated distribution, inside the bounds or on them.
+        covariance: (p, p) covariance of the untruncated distribution; it may be singular.
+        lower: (p,) lower bounds; may be infinite.
+        upper: (p,) upper bounds; may be infinite.
+        count: Number of draws n.
+        rng: Source of random numbers.
+        matrices: Symmetric matrices that are positive definite inside the bounds, each as the
+            (d, d) matrix at the mean and its (p, d, d) derivatives by the variables; default: none.
+
+    Returns:
+        (n, p) draws inside the bounds.
+    """
+    factor = covariance_root(covariance, RANK_TOLERANCE)
+
+    # Bounds within reach, as `normals @ z <= distance`, in standard deviations of their variable.
+    std = np.linalg.norm(factor, axis=1)
+    scale = np.where(std > 0.0, std, 1.0)
+    unit = factor / scale[:, None]
+    above, below = (upper - mean) / scale, (mean - lower) / scale
+    is_above, is_below = (std > 0.0) & (above < REACH), (std > 0.0) & (below < REACH)
+    normals = np.concatenate([unit[is_above], -unit[is_below]])
+    distance = np.concatenate([above[is_above], below[is_below]])
+
+    # Derivatives of the matrices by the coordinates z, in a basis in which each of them is the unit
+    # matrix at z = 0. This removes the units of its rows and columns.
+    cones = []
+    for at_mean, slopes in matrices:
+        inverse = np.linalg.inv(np.linalg.cholesky(at_mean))
+        cones.append(inverse @ np.tensordot(factor.T, slopes, axes=1) @ inverse.T)
+
+    if not len(distance) and not cones:
+        z = rng.standard_normal((count, factor.shape[1]))
+    else:
+        z = np.zeros((count, factor.shape[1]))
+        affordable = MAX_FACTORISED // max(z.size * len(cones), 1)
+        for _ in range(int(np.clip(affordable, MIN_SWEEPS, SWEEPS))):
+            _sweep(z, normals, distance, cones, rng)
+
+    # Rounding may exceed a bound.
+    return np.clip(mean + z @ factor.T, lower, upper)
+
+
+def _sweep(
+    z: Array, normals: Array, distance: Array, cones: Sequence[Array], rng: np.random.Generator
+) -> None:
+    """Draw every coordinate anew, given the others.
+
+    Args:
+        z: (n, k) present points of the chains, which are changed in place.
+        normals: (m, k) coefficients of the bounds of single variables.
+        distance: (m,) their distances from the mean, not negative.
+        cones: (k, d, d) derivatives of each matrix by the coordinates.
+        rng: Source of random numbers.
+    """
+    room = distance - z @ normals.T
+    matrices = [np.eye(cone.shape[1]) + np.tensordot(z, cone, axes=1) for cone in cones]
+    for i in range(z.shape[1]):
+        g, before = normals[:, i], np.array(z[:, i])
+        room = room + before[:, None] * g
+
+        # The present value is inside the bounds but for rounding.
+        rises, falls = g > SMALLEST_COEFFICIENT, g < -SMALLEST_COEFFICIENT
+        high = np.min(room[:, rises] / g[rises], axis=1, initial=np.inf)
+        low = np.max(room[:, falls] / g[falls], axis=1, initial=-np.inf)
+        high, low = np.maximum(high, before), np.minimum(low, before)
+
+        # Moves until a matrix is no longer positive definite.
+        for cone, at in zip(cones, matrices, strict=True):
+            inverse = np.linalg.inv(np.linalg.cholesky(at))
+            eigenvalues = np.linalg.eigvalsh(inverse @ cone[i] @ inverse.transpose(0, 2, 1))
+            with np.errstate(divide="ignore"):
+                low = np.maximum(low, before - INSIDE / np.maximum(eigenvalues[:, -1], 0.0))
+                high = np.minimum(high, before + INSIDE / np.maximum(-eigenvalues[:, 0], 0.0))
+
+        z[:, i] = _draw_between(low, high, rng)
+        for cone, at in zip(cones, matrices, strict=True):
+            at += (z[:, i] - before)[:, None, None] * cone[i]
+        room = room - z[:, i : i + 1] * g
+
+
+def _draw_between(low: Array, high: Array, rng: np.random.Generator) -> Array:
+    """(n,) draws from the standard normal distribution between bounds: (n,) each."""
+    # The distribution function has all digits in the lower tail only, so that intervals in the
+    # upper half are mirrored.
+    is_mirrored = high > -low
+    begin = np.where(is_mirrored, -high, low)
+    end = np.where(is_mirrored, -low, high)
+
+    p_begin, p_end = scipy.special.ndtr(begin), scipy.special.ndtr(end)
+    u = rng.random(len(low))
+    drawn = np.clip(scipy.special.ndtri(p_begin + u * (p_end - p_begin)), begin, end)
+    return np.asarray(np.where(is_mirrored, -drawn, drawn))
+
 
 # Number of times that draws with an unphysical inertia are replaced before the search for physical
 # ones is given up.
@@ -162,13 +296,14 @@ def _undetermined(parameters: ParameterSet, estimate: Estimate, drawn: np.ndarra
     """
     found = None
     if len(estimate.data) == len(parameters):
-        found = InertiaCombinations.of(parameters, estimate.theta, estimate.data)
+        found = inertia_combinations(parameters, estimate.theta, estimate.data)
     if found is None:
         return np.zeros((0, len(drawn)))
 
-    of_inertias = found.undetermined
+    columns, is_determined, axes = found
+    of_inertias = np.linalg.inv(axes)[~is_determined]
     weights = np.zeros((len(of_inertias), len(drawn)))
-    weights[:, np.searchsorted(drawn, found.columns)] = of_inertias
+    weights[:, np.searchsorted(drawn, columns)] = of_inertias
     return weights
 
 
@@ -200,11 +335,17 @@ def _physical_draws(
     places = [
         (body, np.searchsorted(drawn, body.columns)) for body in unknown_bodies(system.parameters)
     ]
-    physical = [
-        bound
-        for body, place in places
-        if (bound := _physical_bound(body, place, centre)) is not None
-    ]
+
+    # Pseudo-inertias are linear in the barycentric coordinates, and these in the draws. Bodies that
+    # are not physical at the centre do not bound the draws.
+    physical = []
+    for body, place in places:
+        linear = body.linear(centre[place])
+        if body.is_physical(linear):
+            slopes = np.zeros((len(centre), *BARYCENTRIC_DERIVATIVES.shape[1:]))
+            by_draws = body.linear_slopes(centre[place])
+            slopes[place] = np.tensordot(by_draws, BARYCENTRIC_DERIVATIVES, axes=1)
+            physical.append((pseudo_inertia_of(linear), slopes))
     values = np.zeros((count, len(drawn)))
     missing = np.arange(count)
     replaced = 0
@@ -219,7 +360,7 @@ def _physical_draws(
             centre, covariance, lower, upper, len(missing), rng, matrices=matrices
         )
         is_physical = np.zeros(len(missing), dtype=bool)
-        for i, row in zip(missing, range(len(missing)), strict=True):
+        for row, i in enumerate(missing):
             robot = _moved(places, centre, tried[row])
             if robot is not None and _is_physical(system, estimate, drawn, robot):
                 values[i], is_physical[row] = robot, True
@@ -233,25 +374,6 @@ def _physical_draws(
         f"been replaced {MAX_ROUNDS} times; the recordings determine the inertias too poorly. "
         "State them as a whole (`inertial`) with a `cad_prior`, or with a narrower `prior`"
     )
-
-
-def _physical_bound(body: UnknownBody, place: np.ndarray, centre: Array) -> MatrixBound | None:
-    """The pseudo-inertia of a body as a bound of the draws; None if it is unphysical at the centre.
-
-    Args:
-        body: A body whose whole inertia is drawn.
-        place: (10,) places of its coordinates.
-        centre: (q,) centre of the distribution.
-    """
-    begin = centre[place]
-    linear = body.linear(begin)
-    if not body.is_physical(linear):
-        return None
-
-    # Pseudo-inertias are linear in the barycentric coordinates, and these in the draws.
-    slopes = np.zeros((len(centre), *BARYCENTRIC_DERIVATIVES.shape[1:]))
-    slopes[place] = np.tensordot(body.linear_slopes(begin), BARYCENTRIC_DERIVATIVES, axes=1)
-    return MatrixBound(at_mean=pseudo_inertia_of(linear), slopes=slopes)
 
 
 def _moved(

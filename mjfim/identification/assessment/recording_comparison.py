@@ -3,6 +3,16 @@
 Each recording suggests values of its own, one Gauss-Newton step from the common estimate, by its
 part of the last linearisation; nothing is simulated. Whether recordings agree is tested with
 information matrices, so that recordings may determine some directions of the parameters only.
+
+Single quantities are averaged by random effects. Estimate y_k of recording k is the mean, plus a
+deviation of this recording with the variance tau², plus an error with the known variance v_k. tau²
+is estimated by the method of Paule & Mandel (Consensus values and weighting factors, 1982), which
+chooses it so that the weighted squares of the deviations are as large as expected.
+
+The interval for what another recording suggests is that of Student's distribution for a new
+observation, with the weighted scatter of the recordings. With equal variances it is exact, for any
+tau², while intervals of random effects for the value without its error are too short where
+recordings are few.
 """
 
 from __future__ import annotations
@@ -16,26 +26,225 @@ import scipy
 
 from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.identification.assessment.accuracy import independent_rows
-from mjfim.identification.assessment.random_effects import (
-    Information,
-    between_variance,
-    difference,
-    f_tail,
-    random_effects,
-    satterthwaite,
-    t_quantile,
-    total_of,
-)
 from mjfim.identification.assessment.robust_covariance import (
-    RecordingEvidence,
+    Blocks,
     independent_blocks,
     recording_evidence,
+    weighted,
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.criteria import standard_deviations
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Uncertainty
 from mjfim.records.robots import OddParameter, OddRecording, RecordingComparison
+
+# Newton steps for tau², of which the weighted squares are a decreasing function.
+MAX_NEWTON_STEPS = 60
+
+# Relative change of tau² at which the steps end, and relative excess of the squares that counts.
+TAU_TOLERANCE = 1e-10
+
+# Confidence level of intervals.
+LEVEL = 0.95
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RandomEffects:
+    """Means of q quantities over recordings.
+
+    Attributes:
+        count: (q,) number of recordings that estimate each quantity.
+        mean: (q,) means; NaN where no recording estimates the quantity.
+        variance: (q,) variances of the means.
+        tau2: (q,) variances between recordings.
+        share: (q,) I²: share of the scatter that is between recordings, 0 to 1.
+        p: (q,) p-values of the hypothesis that there is no scatter between recordings; 1 where
+            fewer than two recordings estimate the quantity.
+        prediction: (q, 2) 95 % intervals of what another recording suggests; infinite with fewer
+            than three.
+    """
+
+    count: np.ndarray
+    mean: Array
+    variance: Array
+    tau2: Array
+    share: Array
+    p: Array
+    prediction: Array
+
+
+def random_effects(values: Array, variances: Array, freedom: float) -> RandomEffects:
+    """Average estimates of several recordings.
+
+    Args:
+        values: (K, q) estimates; NaN where a recording gives none.
+        variances: (K, q) their variances.
+        freedom: Degrees of freedom of the variances.
+    """
+    known = np.isfinite(values) & np.isfinite(variances) & (variances > 0.0)
+    count = known.sum(axis=0)
+
+    # Cochran's Q, by the F distribution because the variances are estimated as well.
+    weights, _, deviation = weighted(values, variances, known, np.zeros(values.shape[1]))
+    squares = np.sum(weights * deviation**2, axis=0)
+    others = np.maximum(count - 1, 1)
+    p = np.where(count > 1, scipy.special.fdtrc(others, freedom, squares / others), 1.0)
+    share = np.maximum(1.0 - others / np.maximum(squares, others), 0.0)
+
+    tau2 = between_variance(values, variances)
+    weights, mean, deviation = weighted(values, variances, known, tau2)
+    scatter, total = np.sum(weights * deviation**2, axis=0), weights.sum(axis=0)
+    mean = np.where(count > 0, mean, np.nan)
+    variance = np.where(count > 0, 1.0 / np.where(count > 0, total, 1.0), np.inf)
+
+    # Another recording, with the mean weight of the present ones. Its interval is not known with
+    # fewer than three of them.
+    enough = count > 2
+    new_variance = (1.0 + count) / np.where(enough, total, 1.0)
+    reach = t_quantile(others) * np.sqrt(scatter / others * new_variance)
+    reach = np.where(enough, reach, np.inf)
+    return RandomEffects(
+        count=count,
+        mean=mean,
+        variance=variance,
+        tau2=tau2,
+        share=np.asarray(np.where(count > 1, share, 0.0)),
+        p=p,
+        prediction=np.column_stack([mean - reach, mean + reach]),
+    )
+
+
+def between_variance(values: Array, variances: Array) -> Array:
+    """Variances between recordings, by the method of Paule & Mandel.
+
+    Args:
+        values: (K, q) estimates; NaN where a recording gives none.
+        variances: (K, q) their variances.
+
+    Returns:
+        (q,) variances tau²; 0 where the variances explain the scatter.
+    """
+    known = np.isfinite(values) & np.isfinite(variances) & (variances > 0.0)
+    expected = known.sum(axis=0) - 1
+    tau2 = np.zeros(values.shape[1])
+    moves = expected > 0
+
+    for _ in range(MAX_NEWTON_STEPS):
+        weights, _, deviation = weighted(values, variances, known, tau2)
+        squares = np.sum(weights * deviation**2, axis=0)
+        slope = np.sum(weights**2 * deviation**2, axis=0)
+
+        # Where the variances explain the scatter, tau² stays 0.
+        moves = moves & (np.abs(squares - expected) > TAU_TOLERANCE * expected) & (slope > 0.0)
+        step = np.where(moves, (squares - expected) / np.where(moves, slope, 1.0), 0.0)
+        new = np.maximum(tau2 + step, 0.0)
+        if (np.abs(new - tau2) <= TAU_TOLERANCE * new).all():
+            break
+        tau2 = new
+    return tau2
+
+
+# ---- several quantities at once
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Information:
+    """Knowledge about s unknowns, possibly in some directions only.
+
+    Attributes:
+        matrix: (s, s) information A.
+        vector: (s,) information times estimate, `A theta`.
+    """
+
+    matrix: Array
+    vector: Array
+
+    def __add__(self, other: Information) -> Information:
+        return Information(matrix=self.matrix + other.matrix, vector=self.vector + other.vector)
+
+    def with_scatter(self, tau2: Array) -> Information:
+        """Knowledge about the mean of recordings that scatter.
+
+        The information is `(A^-1 + T)^-1 = A (1 + T A)^-1`, which exists for a singular A as well.
+
+        Args:
+            tau2: (s, s) covariance T between recordings.
+        """
+        if not tau2.any():
+            return self
+        left = np.eye(len(tau2)) + self.matrix @ tau2
+        matrix = np.linalg.solve(left, self.matrix)
+        vector = np.asarray(np.linalg.solve(left, self.vector), dtype=np.float64)
+        return Information(matrix=0.5 * (matrix + matrix.T), vector=vector)
+
+
+def total_of(parts: list[Information]) -> Information:
+    """Add what several recordings say.
+
+    Args:
+        parts: At least one part.
+    """
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return total
+
+
+def difference(parts: list[Information], tolerance: float) -> tuple[float, int]:
+    """Sum of squares by which parts contradict each other, and its degrees of freedom.
+
+    It is the increase of the weighted squares if all parts have the same unknowns. Directions about
+    which at most one part knows anything contribute nothing. If the parts agree, it has a
+    chi-squared distribution.
+
+    Args:
+        parts: The parts; their matrices have a common scale.
+        tolerance: Eigenvalues below this number count as zero.
+    """
+    squares, rank = 0.0, 0
+    for sign, part in (*((1, part) for part in parts), (-1, total_of(parts))):
+        eigenvalues, vectors = np.linalg.eigh(part.matrix)
+        is_known = eigenvalues > tolerance
+        along = vectors[:, is_known].T @ part.vector
+        squares += sign * float(np.sum(along**2 / eigenvalues[is_known]))
+        rank += sign * int(is_known.sum())
+    return max(squares, 0.0), rank
+
+
+# ---- distributions
+
+
+def satterthwaite(share: Array, within: float, between: int | np.ndarray) -> Array:
+    """Degrees of freedom of variances of two parts (Satterthwaite 1946).
+
+    Args:
+        share: (s,) share of the part between recordings, 0 to 1.
+        within: Degrees of freedom of the part within recordings.
+        between: Degrees of freedom of the part between recordings, one number or (s,).
+    """
+    share = np.clip(share, 0.0, 1.0)
+    return np.asarray(1.0 / ((1.0 - share) ** 2 / within + share**2 / np.maximum(between, 1)))
+
+
+def t_quantile(freedom: np.ndarray) -> Array:
+    """Half widths of 95 % intervals of Student's distribution [standard deviations].
+
+    Args:
+        freedom: (s,) degrees of freedom.
+    """
+    return np.asarray(scipy.special.stdtrit(freedom, 0.5 + LEVEL / 2.0))
+
+
+def f_tail(squares: float, dof: int, freedom: float) -> float:
+    """Probability that a sum of squares is larger by chance; 1 where there is nothing to test.
+
+    Args:
+        squares: Sum of squares in units of its variances.
+        dof: Its degrees of freedom.
+        freedom: Degrees of freedom of the variances.
+    """
+    return float(scipy.special.fdtrc(dof, freedom, squares / dof)) if dof > 0 else 1.0
+
 
 # Eigenvalues of the scaled information of all recordings below this share of the largest one, and
 # of one recording over that of all, count as zero.
@@ -87,7 +296,7 @@ class RecordingViews:
         return _estimate(self.theta, self.directions, total)
 
 
-def recording_views(theta: Array, evidence: RecordingEvidence) -> RecordingViews:
+def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
     """Find what single recordings say about the unknowns that they share.
 
     Args:
@@ -96,7 +305,14 @@ def recording_views(theta: Array, evidence: RecordingEvidence) -> RecordingViews
     """
     equations = [evidence.normal_equations(k) for k in range(evidence.count)]
     H = np.sum([information for information, _ in equations], axis=0)
-    directions, is_determined = _unit_information(H)
+    scaled, scale = scaled_to_unit_diagonal(H)
+    eigenvalues, vectors = np.linalg.eigh(scaled)
+    is_known = eigenvalues > TOTAL_TOLERANCE * eigenvalues.max(initial=0.0)
+    directions = vectors[:, is_known] / np.sqrt(eigenvalues[is_known]) / scale[:, None]
+
+    # Unknowns that a direction without information moves are not determined.
+    is_determined = np.linalg.norm(vectors[:, ~is_known], axis=1) <= UNKNOWN_SHARE
+    known_theta = np.where(is_determined, theta, np.nan)
 
     # Each recording in the coordinates z, and its estimate.
     informations = [directions.T @ each @ directions for each, _ in equations]
@@ -104,16 +320,33 @@ def recording_views(theta: Array, evidence: RecordingEvidence) -> RecordingViews
         -_inverse(each) @ (directions.T @ g)
         for each, (_, g) in zip(informations, equations, strict=True)
     ]
-    inflation, own = _inflation(evidence, directions, informations, steps)
+    scatters = []
+    for k, step in enumerate(steps):
+        # An interrupted fit may have used no segment of a recording.
+        centred = evidence.centred_scores(k, directions @ step) @ directions
+        count = len(centred)
+        scatters.append(centred.T @ centred * (count / max(count - 1, 1)))
 
-    # Scores of a recording scatter more than its information says by these factors.
+    # Scores scatter within all recordings together at least as the information says, because a few
+    # blocks often scatter little by chance.
+    eigenvalues, vectors = np.linalg.eigh(np.sum(scatters, axis=0))
+    pooled = vectors * np.maximum(eigenvalues, 1.0) @ vectors.T
+
+    # Scores of a recording scatter more than its information says by a factor of at least 1.
     parts = []
-    for information, step, factor in zip(informations, steps, own, strict=True):
-        root = _root(information)
-        matrix = root @ np.linalg.inv(inflation) @ root / factor
+    for k, (information, step, scatter) in enumerate(
+        zip(informations, steps, scatters, strict=True)
+    ):
+        eigenvalues, vectors = np.linalg.eigh(information)
+        root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
+        inverse = _inverse(information)
+        expected = float(np.sum(inverse * (root @ pooled @ root)))
+        factor = 1.0
+        if np.sum(evidence.recording == k) > 1 and expected > 0.0:
+            factor = max(float(np.sum(inverse * scatter)) / expected, 1.0)
+        matrix = root @ np.linalg.inv(pooled) @ root / factor
         parts.append(Information(matrix=0.5 * (matrix + matrix.T), vector=matrix @ step))
 
-    known_theta = np.where(is_determined, theta, np.nan)
     found = [_estimate(known_theta, directions, part) for part in parts]
     return RecordingViews(
         theta=known_theta,
@@ -125,74 +358,11 @@ def recording_views(theta: Array, evidence: RecordingEvidence) -> RecordingViews
     )
 
 
-def _unit_information(H: Array) -> tuple[Array, np.ndarray]:
-    """(s, r) directions W with `W' H W = 1`, and (s,) True for the determined unknowns.
-
-    Args:
-        H: (s, s) information of rank r.
-    """
-    scaled, scale = scaled_to_unit_diagonal(H)
-    eigenvalues, vectors = np.linalg.eigh(scaled)
-    is_known = eigenvalues > TOTAL_TOLERANCE * eigenvalues.max(initial=0.0)
-    directions = vectors[:, is_known] / np.sqrt(eigenvalues[is_known]) / scale[:, None]
-
-    # Unknowns that a direction without information moves are not determined.
-    is_determined = np.linalg.norm(vectors[:, ~is_known], axis=1) <= UNKNOWN_SHARE
-    return directions, is_determined
-
-
-def _inflation(
-    evidence: RecordingEvidence,
-    directions: Array,
-    informations: Sequence[Array],
-    steps: Sequence[Array],
-) -> tuple[Array, list[float]]:
-    """Scatter of the scores within recordings, over what the information says.
-
-    Args:
-        evidence: What the recordings say.
-        directions: (s, r) directions with unit information.
-        informations: (r, r) information of each recording in these directions.
-        steps: (r,) step of each recording to its own estimate.
-
-    Returns:
-        (r, r) covariance of the scores of all recordings together, whose eigenvalues are at least
-        1, and for each recording a factor of at least 1 by which its scores scatter more.
-    """
-    scatters = []
-    for k, step in enumerate(steps):
-        # Scores at the estimate of the recording, so that differences between recordings do not
-        # count as scatter within one.
-        of_recording = evidence.recording == k
-        scores = evidence.scores[of_recording] @ directions
-        moved = evidence.information[of_recording] @ directions
-        scores = scores + np.einsum("sr,bsq,q->br", directions, moved, step)
-
-        # An interrupted fit may have used no segment of a recording.
-        count = len(scores)
-        centred = scores - scores.sum(axis=0) / max(count, 1)
-        scatters.append(centred.T @ centred * (count / max(count - 1, 1)))
-
-    # A few blocks often scatter little by chance.
-    eigenvalues, vectors = np.linalg.eigh(np.sum(scatters, axis=0))
-    pooled = vectors * np.maximum(eigenvalues, 1.0) @ vectors.T
-
-    factors = []
-    for k, (scatter, information) in enumerate(zip(scatters, informations, strict=True)):
-        root, inverse = _root(information), _inverse(information)
-        expected = float(np.sum(inverse * (root @ pooled @ root)))
-        found = float(np.sum(inverse * scatter))
-        usable = np.sum(evidence.recording == k) > 1 and expected > 0.0
-        factors.append(max(found / expected, 1.0) if usable else 1.0)
-    return pooled, factors
-
-
 def _estimate(theta: Array, directions: Array, part: Information) -> tuple[Array, Array]:
     """(s,) estimate of a part, and (s,) standard deviations; NaN and infinite where it has none."""
     eigenvalues, vectors = np.linalg.eigh(part.matrix)
     is_known = eigenvalues > TOLERANCE
-    along = vectors[:, is_known]
-    inverse = along / eigenvalues[is_known] @ along.T
+    inverse = _inverse(part.matrix)
 
     # A parameter is known if no unknown direction moves it.
     size = np.linalg.norm(directions, axis=1)
@@ -214,12 +384,6 @@ def _inverse(information: Array) -> Array:
     return np.asarray(along / eigenvalues[is_known] @ along.T)
 
 
-def _root(information: Array) -> Array:
-    """Symmetric square root of an information."""
-    eigenvalues, vectors = np.linalg.eigh(information)
-    return np.asarray(vectors * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T)
-
-
 # Probability to name an odd recording where all are equal.
 ODD_LEVEL = 0.01
 
@@ -228,25 +392,6 @@ NAMED_LEVEL, MAX_NAMED = 0.05, 3
 
 # Fewest recordings among which one can be odd.
 FEWEST = 3
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Difference:
-    """Difference of one recording from others.
-
-    Attributes:
-        index: Index of the recording.
-        p: p-value, corrected for the number of tests of all recordings.
-        each: (s,) p-values of single parameters, corrected likewise.
-        others: (s,) mean of the others.
-        others_std: (s,) its standard deviation, without the scatter between them.
-    """
-
-    index: int
-    p: float
-    each: Array
-    others: Array
-    others_std: Array
 
 
 def odd_recordings(
@@ -273,38 +418,41 @@ def odd_recordings(
     found: list[OddRecording] = []
 
     while len(remaining) >= FEWEST and len(found) < most:
-        worst = min((_left_out(views, k, remaining) for k in remaining), key=lambda each: each.p)
-        if worst.p > ODD_LEVEL:
+        tests = {k: _left_out(views, k, remaining) for k in remaining}
+        worst = min(remaining, key=lambda k: tests[k][0])
+        p, each, others = tests[worst]
+        if p > ODD_LEVEL:
             break
-        remaining.remove(worst.index)
-        order = np.argsort(worst.each, kind="stable")[:MAX_NAMED]
+        remaining.remove(worst)
         named = [
             OddParameter(
                 name=parameters[j],
                 unit=units[j],
-                value=float(views.values[worst.index, j]),
-                std=float(views.std[worst.index, j]),
-                others=float(worst.others[j]),
-                others_std=float(worst.others_std[j]),
-                p=float(worst.each[j]),
+                value=float(views.values[worst, j]),
+                std=float(views.std[worst, j]),
+                others=float(others.mean[j]),
+                others_std=float(np.sqrt(others.variance[j])),
+                p=float(each[j]),
                 is_single=bool(is_single[j]),
             )
-            for j in order
-            if worst.each[j] <= NAMED_LEVEL
+            for j in np.argsort(each, kind="stable")[:MAX_NAMED]
+            if each[j] <= NAMED_LEVEL
         ]
         found.append(
-            OddRecording(
-                index=worst.index,
-                name=recordings[worst.index],
-                p=worst.p,
-                parameters=tuple(named),
-            )
+            OddRecording(index=worst, name=recordings[worst], p=p, parameters=tuple(named))
         )
     return found
 
 
-def _left_out(views: RecordingViews, k: int, remaining: Sequence[int]) -> _Difference:
-    """Test whether recording k differs from the other remaining ones."""
+def _left_out(
+    views: RecordingViews, k: int, remaining: Sequence[int]
+) -> tuple[float, Array, RandomEffects]:
+    """Test whether recording k differs from the other remaining ones.
+
+    Returns:
+        The p-value, corrected for the number of tests of all recordings, (s,) p-values of single
+        parameters, corrected likewise, and the means of the others.
+    """
     others = [i for i in remaining if i != k]
     values, variances = views.values[others], views.std[others] ** 2
     tau2 = between_variance(values, variances)
@@ -333,9 +481,7 @@ def _left_out(views: RecordingViews, k: int, remaining: Sequence[int]) -> _Diffe
     tests = 2.0 * len(remaining)
     each = np.minimum(tests * max(int(is_known.sum()), 1) * each, 1.0)
     p = min(tests * joint, float(each.min(initial=1.0)), 1.0)
-    return _Difference(
-        index=k, p=p, each=each, others=effects.mean, others_std=np.sqrt(effects.variance)
-    )
+    return p, each, effects
 
 
 def compare_recordings(
@@ -363,9 +509,9 @@ def compare_recordings(
         return None
 
     condensed = solution.condensed
-    recording_of_block = problem.blocks.recording_of_block
+    recording_of_block = problem.recording_of_block
     min_rows = independent_rows(problem, correlation_rows)
-    blocks = independent_blocks(condensed, recording_of_block, problem.blocks.mean_rows, min_rows)
+    blocks = independent_blocks(condensed, recording_of_block, problem.mean_block_rows, min_rows)
     evidence = recording_evidence(condensed, blocks, recording_of_block, layout.own_columns)
     # Parameters of the robot that are stated to differ have their values already.
     stated = [i for i, j in enumerate(layout.per_recording) if parameters.changes_model[j]]
@@ -397,7 +543,7 @@ def compare_recordings(
 
 def compare_evidence(
     theta: Array,
-    evidence: RecordingEvidence,
+    evidence: Blocks,
     *,
     recordings: Sequence[str],
     parameters: Sequence[str],

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,42 +15,34 @@ from mjfim.errors import first_ones, listed
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification.aligned_recording import changes_within_samples
-from mjfim.identification.assessment.accuracy import Accuracy, accuracy_of
-from mjfim.identification.assessment.fit_quality import FitQuality
-from mjfim.identification.assessment.flipped_signs import (
-    POOR_FIT,
+from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.honest_covariance import with_honest_covariance
+from mjfim.identification.assessment.poor_fit import (
     flipped_signs,
     sentence_about_signs,
-    sufficient_squares,
+    unpredictable_motion,
 )
-from mjfim.identification.assessment.honest_covariance import with_honest_covariance
-from mjfim.identification.assessment.predictability import UnpredictableMotion, unpredictable_motion
-from mjfim.identification.assessment.predictions import predict_unfitted
 from mjfim.identification.assessment.recording_comparison import compare_recordings
-from mjfim.identification.assessment.residual_tests import is_smaller_than_noise, misfit_reasons
+from mjfim.identification.assessment.residual_tests import (
+    is_smaller_than_noise,
+    misfit_reasons,
+)
+from mjfim.identification.assessment.term_tests import TermTests, find_missing_terms
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.left_out import predict_unfitted
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.search import of_subset
-from mjfim.identification.starts import values_of_start
-from mjfim.identification.task import FitTask
-from mjfim.identification.terms import TermTests, find_missing_terms
-from mjfim.information.null_space import NullSpace
 from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
-from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
     ControlLawInLoop,
     Estimate,
-    HorizonStudy,
     Prediction,
-    Restart,
 )
 from mjfim.records.events import begin_stage
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
 
@@ -138,83 +129,6 @@ MAX_MOTION_SAMPLES = 200_000
 ROUNDING = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FitResult:
-    """Result of the searches of one identification.
-
-    Attributes:
-        task: System, recordings and settings.
-        problem: The least-squares problem, with the noise of the last search.
-        solution: Its solution.
-        quality: Size and whiteness of its residuals.
-        null_space: Directions of theta about which neither recordings nor priors contain
-            information.
-        held_out: Problem of the held-out recordings; None without any.
-        subset: Indices of segments that are quick to simulate, evenly spread over the data.
-        restart: How the fit was repeated from fits over segments; None where it was not.
-        horizons: Lengths of segments that were compared; None where they were not.
-        inverse_dynamics: The fit to the equation of motion from which the search started, or None.
-        begun_instead: Where it began instead of the stated start, at which the model diverges, in
-            words; empty where it does not diverge there.
-    """
-
-    task: FitTask
-    problem: FitProblem
-    solution: Solution
-    quality: FitQuality
-    null_space: NullSpace
-    held_out: FitProblem | None
-    subset: np.ndarray
-    restart: Restart | None
-    horizons: HorizonStudy | None = None
-    inverse_dynamics: InverseDynamicsFit | None = None
-    begun_instead: str = ""
-
-    @property
-    def theta(self) -> Array:
-        """(p,) estimate, with the values of the first recording."""
-        return self.problem.theta(self.solution.unknowns)
-
-    @property
-    def quick(self) -> tuple[FitProblem, UnknownValues]:
-        """The problem of the segments that are quick to simulate, and its unknowns."""
-        return self.problem.of_segments(self.subset), of_subset(self.solution.unknowns, self.subset)
-
-    @cached_property
-    def accuracy(self) -> Accuracy:
-        """Accuracy of the estimate."""
-        rows = self.quality.correlation_rows(self.problem.row_count)
-        inflation = self.quality.inflation
-        return accuracy_of(self.problem, self.solution, self.null_space, rows, inflation)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Findings:
-    """Everything about a fit that its warnings depend on.
-
-    Attributes:
-        result: The fit.
-        comparison: Comparison of the recordings, or None.
-        tests: Tests of terms that the model may lack.
-        reasons: Reasons for a misfit, in sentences; empty where there is none.
-        at_bound: Names of the parameters at a bound or beyond it.
-        outside: True where a parameter is beyond a bound.
-        interrupted: True after a request to stop.
-        unpredictable: A motion that is too unstable for the segments of a poor fit, or None.
-        flipped: Signals whose sign looks flipped, in words.
-    """
-
-    result: FitResult
-    comparison: RecordingComparison | None
-    tests: TermTests
-    reasons: tuple[str, ...]
-    at_bound: tuple[str, ...]
-    outside: bool
-    interrupted: bool
-    unpredictable: UnpredictableMotion | None
-    flipped: tuple[str, ...]
-
-
 def estimate_from(
     result: FitResult,
     budget: Budget,
@@ -261,22 +175,27 @@ def estimate_from(
     accuracy = result.accuracy
     rows = quality.correlation_rows(problem.row_count)
     at_bound, outside = _at_bounds(parameters, result.theta, task.settings.hold)
+    comparison = compare_recordings(problem, solution, rows, accuracy.robust)
 
     # A good fit needs no advice.
-    is_poor = bool(reasons or quality.unexplained) or not solution.success
-    unpredictable = None
-    if is_poor and not solution.interrupted:
+    unpredictable = ""
+    if (reasons or quality.unexplained or not solution.success) and not solution.interrupted:
         unpredictable = unpredictable_motion(problem, solution.unknowns)
-    findings = _Findings(
-        result=result,
-        comparison=compare_recordings(problem, solution, rows, accuracy.robust),
-        tests=tests,
-        reasons=reasons,
-        at_bound=at_bound,
-        outside=outside,
-        interrupted=budget.stop.requested,
-        unpredictable=unpredictable,
-        flipped=_flipped_signs(result, budget),
+    interrupted = budget.stop.requested
+    flipped = () if interrupted else flipped_signs(result, budget)
+
+    # The most serious ones first.
+    warnings = (
+        *([sentence_about_signs(flipped)] if flipped else []),
+        *_warnings_of_search(result, unpredictable, interrupted=interrupted),
+        *_warnings_of_misfit(result, reasons),
+        *_warnings_of_recordings(result, comparison),
+        *_warnings_of_bounds(at_bound, outside=outside),
+        *probable_degrees(system.experiment, system.source),
+        *_places_of_misfit(result, reasons, tests),
+        *_implausible_estimates(parameters, result.theta),
+        *_warnings_of_poorly_known(accuracy.poorly_known),
+        *_warnings_of_data(result),
     )
     undetermined = accuracy.singular or accuracy.single_unidentifiable
     per_recording = zip(
@@ -304,7 +223,7 @@ def estimate_from(
         at_bound=at_bound,
         predicted=quality.predicted,
         recordings=_as_aligned(problem, task.recordings),
-        warnings=tuple(_warnings(findings)),
+        warnings=warnings,
         combinations=tuple(str(group) for group in accuracy.groups),
         data=accuracy.data_information,
         std_sandwich=accuracy.sandwich,
@@ -321,7 +240,7 @@ def estimate_from(
         predictions=predictions,
         robust_uncertainty=accuracy.robust,
         motion=problem.motion(solution.unknowns, 0, MAX_MOTION_SAMPLES),
-        interrupted=findings.interrupted,
+        interrupted=interrupted,
         labels=labels_of_system(system),
         trace=np.array([task.start, *(problem.theta(each) for each in solution.iterates)]),
         nominal=_nominal_outputs(result),
@@ -332,24 +251,10 @@ def estimate_from(
         horizons=result.horizons,
         held=task.settings.hold,
         inverse_dynamics=result.inverse_dynamics,
-        recording_comparison=findings.comparison,
+        recording_comparison=comparison,
         prior_directions=accuracy.prior_directions,
     )
     return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
-
-
-def _flipped_signs(result: FitResult, budget: Budget) -> tuple[str, ...]:
-    """Signals whose sign looks flipped; only a very poor fit can have any."""
-    quality, noise_is_stated = result.quality, result.task.noise_is_stated
-    is_poor = noise_is_stated and quality.chi2 > POOR_FIT * quality.dof
-    if budget.stop.requested or not (is_poor or quality.unexplained):
-        return ()
-    problem, at = result.quick
-    squares = 2.0 * problem.cost(at)
-    enough = sufficient_squares(squares, problem.value_count, noise_is_stated=noise_is_stated)
-    return flipped_signs(
-        result.task, result.problem, enough, result.subset, result.null_space, budget
-    )
 
 
 def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
@@ -426,32 +331,18 @@ def _as_aligned(problem: FitProblem, recordings: Sequence[Recording]) -> tuple[R
     )
 
 
-def _warnings(findings: _Findings) -> Iterator[str]:
-    """Sentences that a user should read besides the numbers, the most serious ones first."""
-    result = findings.result
-    if findings.flipped:
-        yield sentence_about_signs(findings.flipped)
-    yield from _warnings_of_search(findings)
-    yield from _warnings_of_misfit(findings)
-    yield from _warnings_of_recordings(findings)
-    yield from _warnings_of_bounds(findings)
-    yield from probable_degrees(result.task.system.experiment, result.task.system.source)
-
-    # Where the misfit is, and where it may come from.
-    if findings.reasons and findings.result.quality.worst_residual is not None:
-        yield str(findings.result.quality.worst_residual)
-    if findings.reasons:
+def _places_of_misfit(result: FitResult, reasons: Sequence[str], tests: TermTests) -> Iterator[str]:
+    """Where a misfit is, and where it may come from."""
+    if reasons and result.quality.worst_residual is not None:
+        yield str(result.quality.worst_residual)
+    if reasons:
         yield from _warnings_of_rate(result)
-    for term in findings.tests.named:
+    for term in tests.named:
         yield f"the model may lack {term}"
-    if findings.tests.data is not None and findings.tests.data.untested:
-        yield f"terms that the model may lack: {findings.tests.data.untested_sentence}"
-    if findings.reasons and findings.tests.data is not None and findings.tests.data.impossible:
-        yield f"terms that the model may lack: {findings.tests.data.impossible_sentence}"
-
-    yield from _implausible_estimates(result.task.system.parameters, result.theta)
-    yield from _warnings_of_poorly_known(findings.result.accuracy.poorly_known)
-    yield from _warnings_of_data(findings)
+    if tests.data is not None and tests.data.untested:
+        yield f"terms that the model may lack: {tests.data.untested_sentence}"
+    if reasons and tests.data is not None and tests.data.impossible:
+        yield f"terms that the model may lack: {tests.data.impossible_sentence}"
 
 
 def _warnings_of_poorly_known(found: Sequence[tuple[str, str]]) -> Iterator[str]:
@@ -469,14 +360,11 @@ def _warnings_of_poorly_known(found: Sequence[tuple[str, str]]) -> Iterator[str]
     )
 
 
-def _warnings_of_data(findings: _Findings) -> Iterator[str]:
+def _warnings_of_data(result: FitResult) -> Iterator[str]:
     """Remarks about poor data, each with the recordings for which it holds."""
-    result = findings.result
     channels = result.task.system.channels
     names: dict[str, list[str]] = {}
-    for recording, predicted in zip(
-        result.task.recordings, findings.result.quality.predicted, strict=True
-    ):
+    for recording, predicted in zip(result.task.recordings, result.quality.predicted, strict=True):
         for remark in plausibility_remarks(channels, recording, predicted):
             names.setdefault(remark, []).append(Path(recording.name).name)
     for remark, recordings in names.items():
@@ -510,20 +398,21 @@ def _dividing_timestep(period: float, timestep: float) -> float:
     return period / math.ceil(period / timestep * (1.0 - ROUNDING))
 
 
-def _warnings_of_search(findings: _Findings) -> Iterator[str]:
+def _warnings_of_search(
+    result: FitResult, unpredictable: str, *, interrupted: bool
+) -> Iterator[str]:
     """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
-    result = findings.result
     quality, accuracy = result.quality, result.accuracy
     if result.begun_instead:
         yield (
-            f"the model diverges at the start ({values_of_start(result.task)}): the search began "
+            f"the model diverges at the start ({result.task.start_in_words}): the search began "
             f"{result.begun_instead} instead"
         )
 
-    if findings.unpredictable is not None:
-        yield str(findings.unpredictable)
+    if unpredictable:
+        yield unpredictable
 
-    if findings.interrupted and not result.solution.interrupted:
+    if interrupted and not result.solution.interrupted:
         yield "interrupted after the search: there are no predictions of data that were not fitted"
 
     if quality.unexplained:
@@ -543,14 +432,13 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
         yield "the recordings do not determine all parameters: the information is singular"
 
 
-def _warnings_of_misfit(findings: _Findings) -> Iterator[str]:
+def _warnings_of_misfit(result: FitResult, reasons: Sequence[str]) -> Iterator[str]:
     """Warnings about residuals that differ from the stated noise."""
-    quality = findings.result.quality
-    noise_is_stated = findings.result.task.noise_is_stated
-    if findings.reasons:
+    quality, noise_is_stated = result.quality, result.task.noise_is_stated
+    if reasons:
         wrong = "The model or the noise is" if noise_is_stated else "The model is"
         yield (
-            f"misfit: {'; '.join(findings.reasons)}. {wrong} wrong, "
+            f"misfit: {'; '.join(reasons)}. {wrong} wrong, "
             "and the formal standard deviations are not the accuracy"
         )
     elif noise_is_stated and is_smaller_than_noise(quality.chi2, quality.dof):
@@ -558,17 +446,19 @@ def _warnings_of_misfit(findings: _Findings) -> Iterator[str]:
         yield f"residuals are only {ratio:.2f} times the stated noise: the stated σ is too large"
 
 
-def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:
+def _warnings_of_recordings(
+    result: FitResult, comparison: RecordingComparison | None
+) -> Iterator[str]:
     """Warnings about recordings that contradict each other."""
-    for odd in () if findings.comparison is None else findings.comparison.odd:
+    for odd in () if comparison is None else comparison.odd:
         yield str(odd)
 
-    robust = findings.result.accuracy.robust
+    robust = result.accuracy.robust
     if robust is None or not robust.apart:
         return
 
-    names = findings.result.task.system.parameters.names
-    index = findings.result.problem.layout.parameter_of_column
+    names = result.task.system.parameters.names
+    index = result.problem.layout.parameter_of_column
     apart = [names[index[column]] for column in robust.apart]
     yield (
         f"recordings disagree on {listed(apart)} by more than the scatter within each recording: "
@@ -576,12 +466,12 @@ def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:
     )
 
 
-def _warnings_of_bounds(findings: _Findings) -> Iterator[str]:
+def _warnings_of_bounds(at_bound: Sequence[str], *, outside: bool) -> Iterator[str]:
     """Warnings about parameters at their bounds."""
-    names = listed(findings.at_bound)
-    if findings.outside:
+    names = listed(at_bound)
+    if outside:
         yield f"outside its bounds, which the method newton ignores: {names}; use least_squares"
-    elif findings.at_bound:
+    elif at_bound:
         yield f"at a bound: {names}; formal standard deviations are not valid there"
 
 

@@ -1,15 +1,19 @@
-"""Tests of residuals: are they white noise of the stated size, and where are they largest?"""
+"""Residuals of a fit: are they white noise of the stated size, and where are they largest?"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import scipy
 
 from mjfim.arrays import Array
+from mjfim.errors import SimulationDivergedError
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Whiteness, WorstResidual
 
 # Number of values whose products are computed at once, at least, and times the largest lag.
@@ -183,76 +187,57 @@ def _describe(test: Whiteness) -> str:
     return f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
 
 
-@dataclass(frozen=True, kw_only=True)
-class LargestResidual:
-    """The interval in which residuals are largest, among those of some outputs.
+def largest_interval(
+    output: str, recording: str, t: Array, z: Array
+) -> tuple[float, float, WorstResidual] | None:
+    """The interval of a recording in which the residuals of an output are largest.
 
-    Attributes:
-        total: Sum of the squares of all residuals.
-        squares: Sum of the squares in the interval.
-        worst: The interval, whose share is not known yet; None without residuals.
+    Args:
+        output: Name of the output.
+        recording: Name of the recording.
+        t: (M,) times of the rows [s].
+        z: (M,) whitened residuals, NaN where not measured.
+
+    Returns:
+        Sums of all squares and of those in the interval, and the interval, whose share is not known
+        yet; None without residuals.
     """
+    measured = np.isfinite(z)
+    if not measured.any():
+        return None
 
-    total: float = 0.0
-    squares: float = 0.0
-    worst: WorstResidual | None = None
+    # Windows of equal duration; round-off must not exclude the last row.
+    number = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
+    edges = np.linspace(t[0], t[-1] * (1 + 1e-12), number + 1)
+    rows = np.searchsorted(t, edges)
+    rows[0], rows[-1] = 0, len(t)
+    parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
+    counts = np.array([len(part) for part in parts])
+    squares = np.array([float(part @ part) for part in parts])
 
-    @property
-    def interval(self) -> WorstResidual | None:
-        """The interval with its share of the sum of squares; None without residuals."""
-        if self.worst is None:
-            return None
-        return replace(self.worst, share=self.squares / max(self.total, SMALLEST_SQUARES))
+    inside = _largest_windows(counts, squares)
+    within = float(squares[inside].sum())
+    worst = WorstResidual(
+        output=output,
+        recording=recording,
+        begin=edges[inside.start],
+        end=edges[inside.stop],
+        size=float(np.sqrt(within / max(counts[inside].sum(), 1))),
+        share=0.0,
+    )
+    return float(squares.sum()), within, worst
 
-    def with_output(
-        self,
-        output: str,
-        recordings: Sequence[str],
-        times: Sequence[Array],
-        whitened: Sequence[Array],
-    ) -> LargestResidual:
-        """The interval among those of one more output.
 
-        Args:
-            output: Name of the output.
-            recordings: Names of the recordings.
-            times: (M,) times of the rows of every recording [s].
-            whitened: (M,) whitened residuals of every recording, NaN where not measured.
-
-        Returns:
-            The larger one of the two intervals.
-        """
-        total, squares, worst = self.total, self.squares, self.worst
-        for name, t, z in zip(recordings, times, whitened, strict=True):
-            measured = np.isfinite(z)
-            if not measured.any():
-                continue
-
-            # Windows of equal duration; round-off must not exclude the last row.
-            number = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
-            edges = np.linspace(t[0], t[-1] * (1 + 1e-12), number + 1)
-            rows = np.searchsorted(t, edges)
-            rows[0], rows[-1] = 0, len(t)
-            parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
-            counts = np.array([len(part) for part in parts])
-            of_windows = np.array([float(part @ part) for part in parts])
-
-            total += float(of_windows.sum())
-            inside = _largest_windows(counts, of_windows)
-            within = float(of_windows[inside].sum())
-            count = max(counts[inside].sum(), 1)
-            size = float(np.sqrt(within / count))
-            if worst is None or size > worst.size:
-                squares = within
-                worst = WorstResidual(
-                    output=output,
-                    recording=name,
-                    begin=edges[inside.start],
-                    end=edges[inside.stop],
-                    size=size,
-                    share=0.0,
-                )
-        return LargestResidual(total=total, squares=squares, worst=worst)
+def worst_residual(
+    found: Sequence[tuple[float, float, WorstResidual] | None],
+) -> WorstResidual | None:
+    """The largest of some intervals with its share of all squares; None without residuals."""
+    known = [each for each in found if each is not None]
+    if not known:
+        return None
+    total = sum(squares for squares, _, _ in known)
+    _, within, worst = max(known, key=lambda each: each[2].size)
+    return replace(worst, share=within / max(total, SMALLEST_SQUARES))
 
 
 def _largest_windows(counts: np.ndarray, squares: Array) -> slice:
@@ -387,3 +372,138 @@ def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float
         statistic = length * float(joined @ joined) / variance
         yield statistic / len(joined), float(scipy.special.chdtrc(len(joined), statistic))
         length *= RUN_RATIO
+
+
+# Ratio of the root mean square residual to the standard deviation of the measured values, above
+# which the fit does not explain a motion.
+UNEXPLAINED_SHARE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitQuality:
+    """Residuals of a fit.
+
+    Attributes:
+        predicted: (M, ny) outputs of the fitted model for every recording [y-unit].
+        chi2: Sum of squared whitened residuals; with a robust loss, of those that are not outliers.
+        dof: Degrees of freedom of `chi2`.
+        rms: Root mean square residual of every measured output [y-unit].
+        whiteness: Test of the residuals of every output.
+        worst_residual: Interval in which residuals are largest; None without residuals.
+        unexplained: Names of the outputs whose motion the fit hardly explains.
+    """
+
+    predicted: tuple[Array, ...]
+    chi2: float
+    dof: int
+    rms: dict[str, float]
+    whiteness: tuple[Whiteness, ...]
+    worst_residual: WorstResidual | None
+    unexplained: tuple[str, ...]
+
+    @property
+    def inflation(self) -> float:
+        """Ratio of the variance of sums of the residuals to that of the noise, at least 1.
+
+        It is that of residuals that are as large and as correlated everywhere as on average.
+        """
+        longest = max((test.time for test in self.whiteness), default=1.0)
+        return max(self.chi2 / self.dof, 1.0) * max(longest, 1.0)
+
+    def correlation_rows(self, rows: int) -> list[float]:
+        """Autocorrelation times of the residuals.
+
+        Args:
+            rows: Number of rows of all recordings.
+
+        Returns:
+            One time for every output, in rows of the recordings.
+        """
+        return [test.time * rows / max(test.count, 1) for test in self.whiteness]
+
+
+def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
+    """Assess the residuals of a solution.
+
+    Args:
+        problem: The least-squares problem.
+        solution: Its solution.
+
+    Returns:
+        The quality of the fit.
+
+    Raises:
+        SimulationDivergedError: The simulation diverges at the solution.
+    """
+    predicted = problem.predict(solution.unknowns)
+    if predicted is None:
+        raise SimulationDivergedError("the simulation diverges near the estimate")
+
+    squares = 0.0
+    count = 0
+    rms = {}
+    unexplained = []
+    whiteness = []
+    largest = []
+
+    names = problem.system.outputs.names
+    for j, (name, series) in enumerate(
+        zip(names, _whitened_residuals(problem, predicted), strict=True)
+    ):
+        # Outliers do not have the distribution of the noise. A comparison with NaN is False.
+        inliers = [z[np.abs(z) <= problem.loss.outlier_threshold] for z in series]
+        squares += sum(float(z @ z) for z in inliers)
+        count += sum(map(len, inliers))
+        whiteness.append(whiteness_of(name, series))
+        largest += [
+            largest_interval(name, Path(recording.name).name, recording.t, z)
+            for recording, z in zip(problem.recordings, series, strict=True)
+        ]
+
+        errors = problem.errors_of(j, predicted)
+        if not len(errors):
+            continue
+
+        # Residuals that are nearly as large as the motion, and larger than the noise.
+        rms[name] = float(np.sqrt(np.mean(errors**2)))
+        values = [
+            recording.y[mask[:, j], j]
+            for recording, mask in zip(problem.recordings, problem.masks, strict=True)
+        ]
+        large = rms[name] > UNEXPLAINED_SHARE * float(np.std(np.concatenate(values)))
+        if large and float(np.nanmean(np.concatenate(series) ** 2)) > 1.0 / UNEXPLAINED_SHARE**2:
+            unexplained.append(name)
+
+    return FitQuality(
+        predicted=tuple(predicted),
+        chi2=squares / problem.loss.inlier_mean_square,
+        dof=max(count - solution.condensed.rank, 1),
+        rms=rms,
+        whiteness=tuple(whiteness),
+        worst_residual=worst_residual(largest),
+        unexplained=tuple(unexplained),
+    )
+
+
+def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> Iterator[list[Array]]:
+    """Whitened measured minus predicted values, output by output, so that memory holds one of them.
+
+    Yields:
+        (M,) residuals of an output for every recording, NaN where no measured value counts.
+    """
+    noise = problem.noise
+    data = list(zip(predicted, problem.recordings, problem.masks, strict=True))
+    whitened = []
+    for y, recording, mask in data if noise.correlated else ():
+        z = np.full(y.shape, np.nan)
+        z[mask] = noise.whiten_present(np.where(mask, recording.y - y, 0.0), mask)
+        whitened.append(z)
+
+    for j, sigma in enumerate(noise.sigma):
+        series = [z[:, j] for z in whitened]
+        for y, recording, mask in () if noise.correlated else data:
+            z = recording.y[:, j] - y[:, j]
+            z /= sigma
+            z[~mask[:, j]] = np.nan
+            series.append(z)
+        yield series

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array, scaled_pseudo_inverse, scaled_to_unit_diagonal
+from mjfim.arrays import NORMAL_95, Array, scaled_pseudo_inverse, scaled_to_unit_diagonal
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 
@@ -36,38 +36,17 @@ OWN_TOLERANCE = 1e-14
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blocks:
-    """Scores and information of B blocks that count as independent.
+    """Scores and information of B blocks that count as independent, about c unknowns.
+
+    They are all common unknowns of a fit, or those that all K recordings share: there, unknowns
+    that belong to a single recording are eliminated, and follow at their optimum.
 
     Attributes:
         scores: (B, c) gradient of half of each block's squared residuals.
         information: (B, c, c) information of each block.
-        prior_rows: (l, c) Jacobian of the priors.
         recording: (B,) index of the recording.
-    """
-
-    scores: Array
-    information: Array
-    prior_rows: Array
-    recording: np.ndarray
-
-    @property
-    def prior_information(self) -> Array:
-        """(c, c) information of the priors."""
-        return np.asarray(self.prior_rows.T @ self.prior_rows)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RecordingEvidence:
-    """Evidence of single recordings about the s unknowns that all K recordings share.
-
-    Unknowns that belong to a single recording are eliminated: they follow at their optimum.
-
-    Attributes:
-        scores: (B, s) gradient of half of the squared residuals of each independent block.
-        information: (B, s, s) information of each block.
-        recording: (B,) index of the recording of each block.
-        priors: K arrays (l_k, s+1) of rows `[J, r]` of the priors on unknowns that belong to the
-            recording.
+        priors: Rows `[J, r]` of priors: one array (l, c+1) of all of them, or K arrays of those on
+            unknowns that belong to each recording.
     """
 
     scores: Array
@@ -77,21 +56,30 @@ class RecordingEvidence:
 
     @property
     def count(self) -> int:
-        """Number of recordings K."""
+        """Number of recordings K, whose priors are apart."""
         return len(self.priors)
 
     def normal_equations(self, k: int) -> tuple[Array, Array]:
-        """(s, s) information H and (s,) gradient g of half of the squares of recording k."""
+        """(c, c) information H and (c,) gradient g of half of the squares of recording k."""
         of_recording = self.recording == k
         J, r = self.priors[k][:, :-1], self.priors[k][:, -1]
         H = self.information[of_recording].sum(axis=0) + J.T @ J
         g = self.scores[of_recording].sum(axis=0) + J.T @ r
         return H, g
 
+    def centred_scores(self, k: int, step: Array) -> Array:
+        """(b, c) scores of recording k after a step (c,) to its own estimate, less their mean.
+
+        At this estimate, differences between recordings do not count as scatter within one.
+        """
+        of_recording = self.recording == k
+        scores = self.scores[of_recording] + self.information[of_recording] @ step
+        return np.asarray(scores - scores.sum(axis=0) / max(len(scores), 1))
+
 
 def recording_evidence(
     condensed: Condensed, blocks: Blocks, recording: np.ndarray, own: np.ndarray
-) -> RecordingEvidence:
+) -> Blocks:
     """Collect what single recordings say about the unknowns that all of them share.
 
     Args:
@@ -128,7 +116,7 @@ def recording_evidence(
         information[of_recording] = follows.T @ blocks.information[of_recording] @ follows
         priors.append(np.column_stack([rows[:, :-1] @ follows, rows[:, -1]]))
 
-    return RecordingEvidence(
+    return Blocks(
         scores=scores,
         information=information,
         recording=blocks.recording,
@@ -162,8 +150,8 @@ def independent_blocks(
     return Blocks(
         scores=scores,
         information=information,
-        prior_rows=np.concatenate([condensed.common_rows, known])[:, :-1],
         recording=recording_of_label,
+        priors=(np.concatenate([condensed.common_rows, known]),),
     )
 
 
@@ -271,21 +259,20 @@ def robust_uncertainty(
     """
     blocks = independent_blocks(condensed, recording, rows, min_rows)
     count = len(blocks.scores)
+    prior_rows = blocks.priors[0][:, :-1]
+    prior = prior_rows.T @ prior_rows
+    of_data = blocks.information.sum(axis=0)
 
     # Sandwich and formal covariance.
-    H = blocks.information.sum(axis=0) + blocks.prior_information
-    root = inverse_root(H)
-    inverse = root @ root.T
-    centred = blocks.scores - blocks.scores.mean(axis=0)
-    along = centred @ root
+    root = inverse_root(of_data + prior)
+    along = (blocks.scores - blocks.scores.mean(axis=0)) @ root
     scatter = along.T @ along * (count / max(count - 1, 1))
-    of_scatter = _in_unknowns(scatter + root.T @ blocks.prior_information @ root, root)
+    of_scatter = _in_unknowns(scatter + root.T @ prior @ root, root)
     sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
-    formal = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    formal = np.sqrt(np.maximum(np.diag(root @ root.T), 0.0))
 
     # Larger and correlated residuals widen what the data say, but not the priors.
-    data = inflation * blocks.information.sum(axis=0) + blocks.prior_information
-    of_noise = _in_unknowns(root.T @ data @ root, root)
+    of_noise = _in_unknowns(root.T @ (inflation * of_data + prior) @ root, root)
 
     replicates = _bootstrap(blocks, draws, rng)
 
@@ -294,24 +281,32 @@ def robust_uncertainty(
         own = np.zeros((int(blocks.recording.max()) + 1, 0), dtype=int)
     evidence = recording_evidence(condensed, blocks, recording, own)
     shared = np.setdiff1d(np.arange(len(theta)), own)
-    of_shared, between_shared, apart_shared = _compare_recordings(theta[shared], evidence)
-
+    of_shared, between_shared, apart = _compare_recordings(theta[shared], evidence)
     each = np.full((len(of_shared), len(theta)), np.nan)
     each[:, shared] = of_shared
     between = np.zeros(len(theta))
     between[shared] = between_shared
-    apart = tuple(int(shared[j]) for j in apart_shared)
 
-    interval = _interval(theta, formal, sandwich, between, replicates, count)
+    # The hull of the formal, the sandwich and the bootstrap interval. Quantiles of Student's
+    # distribution allow for the number of blocks from which the sandwich covariance comes.
+    upper_tail = 0.5 + LEVEL / 2.0
+    student = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail))
+    half_width = np.maximum(
+        NORMAL_95 * np.hypot(formal, between), student * np.hypot(sandwich, between)
+    )
+    low, high = theta - half_width, theta + half_width
+    if len(replicates):
+        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, upper_tail], axis=0)
+        low, high = np.minimum(low, theta + tails[0]), np.maximum(high, theta + tails[1])
     return Uncertainty(
         sandwich=sandwich,
-        interval=interval,
+        interval=np.column_stack([low, high]),
         between=between,
-        apart=apart,
+        apart=tuple(shared[apart].tolist()),
         each=each,
         blocks=count,
         draws=theta + replicates,
-        covariance=covering_covariance(of_noise, _student_factor(count) ** 2 * of_scatter),
+        covariance=covering_covariance(of_noise, (student / NORMAL_95) ** 2 * of_scatter),
     )
 
 
@@ -354,56 +349,25 @@ def covering_covariance(first: Array, second: Array) -> Array:
     Returns:
         (c, c) covariance; it is larger than both only where they differ in their axes.
     """
-    scale = np.sqrt(np.maximum(np.diag(first), SMALLEST_VARIANCE))
-    values, vectors = np.linalg.eigh(first / np.outer(scale, scale))
-    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    root = covariance_root(first)
     relative = np.linalg.pinv(root, rcond=INVERSE_TOLERANCE)
     ratios, axes = np.linalg.eigh(relative @ second @ relative.T)
     spread = root @ axes
     return np.asarray((spread * np.maximum(ratios, 1.0)) @ spread.T)
 
 
-def _student_factor(count: int) -> float:
-    """Ratio of the quantiles of Student's distribution, from a number of blocks, and the normal."""
-    upper_tail = 0.5 + LEVEL / 2.0
-    student = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail))
-    return student / float(scipy.special.ndtri(upper_tail))
-
-
-def _interval(
-    theta: Array,
-    formal: Array,
-    sandwich: Array,
-    between: Array,
-    replicates: Array,
-    count: int,
-) -> Array:
-    """(c, 2) hull of the formal, the sandwich and the bootstrap interval.
+def covariance_root(covariance: Array, tolerance: float = 0.0) -> Array:
+    """(p, k) factor A of a covariance `A A'`: (p, p), which may be singular.
 
     Args:
-        theta: (c,) estimate.
-        formal: (c,) formal standard deviations.
-        sandwich: (c,) standard deviations of the sandwich covariance.
-        between: (c,) standard deviations between recordings.
-        replicates: (n, c) steps to the bootstrap estimates.
-        count: Number of blocks from which the sandwich covariance was computed.
+        covariance: (p, p) the covariance.
+        tolerance: Eigenvalues of the correlations below this share of the largest one are left out.
     """
-    upper_tail = 0.5 + LEVEL / 2.0
-    normal_quantile = float(scipy.special.ndtri(upper_tail))
-    student_quantile = _student_factor(count) * normal_quantile
-
-    half_width = np.maximum(
-        normal_quantile * np.hypot(formal, between),
-        student_quantile * np.hypot(sandwich, between),
-    )
-    low = theta - half_width
-    high = theta + half_width
-
-    if len(replicates):
-        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, upper_tail], axis=0)
-        low = np.minimum(low, theta + tails[0])
-        high = np.maximum(high, theta + tails[1])
-    return np.column_stack([low, high])
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scale = np.where(std > 0.0, std, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values >= tolerance * values.max(initial=0.0)
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
 
 def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
@@ -413,7 +377,8 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
     """
     count, c = blocks.scores.shape
     total = blocks.scores.sum(axis=0)
-    prior_information = blocks.prior_information
+    prior_rows = blocks.priors[0][:, :-1]
+    prior_information = prior_rows.T @ prior_rows
     probabilities = np.full(count, 1.0 / count)
 
     steps = [np.zeros((0, c))]
@@ -425,8 +390,7 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
         g = weights @ blocks.scores - total
 
         # Priors are drawn as well, from their normal distribution.
-        prior_noise = rng.standard_normal((n, len(blocks.prior_rows)))
-        g = g + prior_noise @ blocks.prior_rows
+        g = g + rng.standard_normal((n, len(prior_rows))) @ prior_rows
 
         usable = _condition_number(H) < MAX_CONDITION_OF_DRAW
         solved = np.linalg.solve(H[usable], g[usable][..., None])
@@ -434,9 +398,7 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
     return np.concatenate(steps)
 
 
-def _compare_recordings(
-    theta: Array, evidence: RecordingEvidence
-) -> tuple[Array, Array, tuple[int, ...]]:
+def _compare_recordings(theta: Array, evidence: Blocks) -> tuple[Array, Array, np.ndarray]:
     """Separate estimates from each recording, and their differences beyond their scatter.
 
     The variance between recordings is estimated by the method of DerSimonian & Laird (1986).
@@ -446,7 +408,7 @@ def _compare_recordings(
         evidence: What single recordings say about these unknowns.
 
     Returns:
-        (K, s) estimates, (s,) standard deviations between recordings, and the indices of unknowns
+        (K, s) estimates, (s,) standard deviations between recordings, and (s,) True for unknowns
         on which they disagree.
     """
     c, K = len(theta), evidence.count
@@ -458,7 +420,6 @@ def _compare_recordings(
     for k in range(K):
         # Normal equations of the recording and of the priors on its private unknowns, one
         # Gauss-Newton step away from the common estimate.
-        of_recording = evidence.recording == k
         H, g = evidence.normal_equations(k)
         if _condition_number(H) > MAX_CONDITION_OF_RECORDING:
             continue
@@ -466,11 +427,7 @@ def _compare_recordings(
         step = -inverse @ g
         each[k] = theta + step
         formal[k] = np.diag(inverse)
-
-        # Scores at the estimate from this recording, so that differences between recordings do not
-        # count as scatter within one.
-        scores = evidence.scores[of_recording] + evidence.information[of_recording] @ step
-        centred = scores - scores.mean(axis=0)
+        centred = evidence.centred_scores(k, step)
         correction = len(centred) / max(len(centred) - 1, 1)
         variance[k] = np.diag(inverse @ (centred.T @ centred * correction) @ inverse)
         total += H
@@ -486,23 +443,38 @@ def _compare_recordings(
     inflation = np.maximum(np.diag(inverse @ scatter @ inverse) / expected, 1.0)
     variance = np.maximum(variance, formal * inflation)
 
-    between = np.zeros(c)
-    apart = []
-    for j in range(c):
-        estimated = np.isfinite(each[:, j])
-        others = int(estimated.sum()) - 1
-        if others < 1:
-            continue
+    # Compare the weighted scatter of the estimates with the scatter that their variances explain.
+    known = np.isfinite(each)
+    others = np.maximum(known.sum(axis=0) - 1, 1)
+    w, _, deviation = weighted(each, variance, known, np.zeros(c))
+    found = np.sum(w * deviation**2, axis=0)
+    apart = scipy.special.fdtrc(others, freedom, found / others) < SIGNIFICANCE
+    sums = w.sum(axis=0)
+    free = np.where(apart, sums - np.sum(w**2, axis=0) / np.where(apart, sums, 1.0), 1.0)
+    between = np.where(apart, np.sqrt(np.maximum(found - others, 0.0) / free), 0.0)
+    return each, between, apart
 
-        # Compare the weighted scatter of the estimates with the scatter that their variances
-        # explain.
-        y, w = each[estimated, j], 1.0 / variance[estimated, j]
-        mean = np.sum(w * y) / w.sum()
-        found = float(np.sum(w * (y - mean) ** 2))
-        if scipy.special.fdtrc(others, freedom, found / others) < SIGNIFICANCE:
-            apart.append(j)
-            between[j] = np.sqrt(max(found - others, 0.0) / (w.sum() - np.sum(w**2) / w.sum()))
-    return each, between, tuple(apart)
+
+def weighted(
+    values: Array, variances: Array, known: np.ndarray, tau2: Array
+) -> tuple[Array, Array, Array]:
+    """Average estimates of recordings that scatter.
+
+    Args:
+        values: (K, q) estimates.
+        variances: (K, q) their variances.
+        known: (K, q) True where there is an estimate.
+        tau2: (q,) further variances, between recordings.
+
+    Returns:
+        (K, q) weights, zero where there is no estimate, (q,) weighted means, and (K, q) deviations
+        from them.
+    """
+    weights = np.where(known, 1.0 / (np.where(known, variances, 1.0) + tau2), 0.0)
+    total = weights.sum(axis=0)
+    finite = np.where(known, values, 0.0)
+    mean = np.sum(weights * finite, axis=0) / np.where(total > 0.0, total, 1.0)
+    return weights, mean, np.where(known, values - mean, 0.0)
 
 
 def _condition_number(H: Array) -> Array:

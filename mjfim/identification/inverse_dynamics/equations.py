@@ -9,8 +9,9 @@ joint limits, do not count, nor do those far from any reading.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,9 +21,12 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.inverse_dynamics.forces import MeasuredForce
-from mjfim.identification.inverse_dynamics.motion import MeasuredMotion, measured_motion
-from mjfim.identification.known_activations import bristles_of
+from mjfim.identification.inverse_dynamics.motion import (
+    MeasuredForce,
+    MeasuredMotion,
+    measured_motion,
+)
+from mjfim.identification.segments import bristles_of
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import dof_names
 from mjfim.model.elements import translations
@@ -80,43 +84,6 @@ class Equation:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Windows:
-    """Averages of a series of n points.
-
-    Attributes:
-        weights: (k, n) their weights.
-        t: (k,) middles of the windows [s].
-        length: Length of a window [s].
-    """
-
-    weights: scipy.sparse.csr_array
-    t: Array
-    length: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Rows:
-    """Averages of all equations along all recordings, at one value of the parameters.
-
-    The rows of one recording follow each other, and within it those of one equation.
-
-    Attributes:
-        explained: (R,) forces that the model needs or predicts [N or N m].
-        measured: (R,) forces that act in the model or are measured [N or N m].
-        inertial: (R,) the inertial part of the needed forces [N or N m].
-    """
-
-    explained: Array
-    measured: Array
-    inertial: Array
-
-    @property
-    def residual(self) -> Array:
-        """(R,) explained minus measured forces [N or N m]."""
-        return self.explained - self.measured
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class RecordedEquations:
     """The equations along one recording.
 
@@ -125,29 +92,86 @@ class RecordedEquations:
         forces: (n, f) measured forces.
         has_force: (f,) True for those that the recording holds.
         moments: (n, f, nv) forces on the degrees of freedom per measured force.
-        windows: Windows of each equation.
+        windows: (k, n) weights of the points in the averages of each equation.
+        times: (k,) middles of these windows [s].
+        lengths: Lengths of the windows of each equation [s].
     """
 
     motion: MeasuredMotion
     forces: Array
     has_force: np.ndarray
     moments: Array
-    windows: tuple[Windows, ...]
+    windows: tuple[scipy.sparse.csr_array, ...]
+    times: tuple[Array, ...]
+    lengths: tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EquationModel:
-    """A system whose equation of motion is evaluated along motions.
+class MotionEquations:
+    """The equations of a system along all recordings as functions of the parameters.
+
+    Rows are averages of all equations. Those of one recording follow each other, and within it
+    those of one equation.
 
     Attributes:
         system: The system, without control laws.
         laws: The control laws whose inputs a recording holds; None without any.
         friction_speeds: (nv,) speeds below which the sign of dry friction is not sure.
+        forces: The measured forces.
+        equations: The equations: of the degrees of freedom, and laws of measured forces.
+        recorded: The equations along each recording.
     """
 
     system: System
     laws: ControlLaws | None
     friction_speeds: Array
+    forces: tuple[MeasuredForce, ...]
+    equations: tuple[Equation, ...]
+    recorded: tuple[RecordedEquations, ...] = ()
+
+    @staticmethod
+    def of(
+        system: System,
+        recordings: Sequence[AlignedRecording],
+        theta: Array,
+        *,
+        forces: tuple[MeasuredForce, ...],
+        laws: ControlLaws | None,
+    ) -> MotionEquations:
+        """The equations along recordings, without contacts and limits.
+
+        Args:
+            system: The system without control laws.
+            recordings: The recordings.
+            theta: (p,) parameters at which windows are chosen.
+            forces: The measured forces.
+            laws: The control laws of the recordings; None without any.
+        """
+        durations = np.array([float(recording.t[-1]) for recording in recordings])
+        shares = MOST_POINTS * durations / durations.sum()
+        motions = [
+            measured_motion(system, recording, theta, max(int(share), 2))
+            for recording, share in zip(recordings, shares, strict=True)
+        ]
+        sigma = np.max([motion.speed_sigma for motion in motions], axis=0)
+        fastest = np.max([np.abs(motion.qvel).max(axis=0) for motion in motions], axis=0)
+        stated = MotionEquations(
+            system=system,
+            laws=laws,
+            friction_speeds=np.maximum(UNSURE_SIGMAS * sigma, SLOW_SHARE * fastest),
+            forces=forces,
+            equations=tuple(_equations(system, forces)),
+        )
+        relaxed = system.with_variant(RELAXED, Relaxation(constraints=True))
+        found = replace(stated, system=relaxed)
+        recorded = []
+        for motion in motions:
+            # Contacts and stops act in the stated model.
+            compiled = system.plant.model(theta)
+            (points,) = stated.points([compiled], motion, theta[None])
+            constrained = stated.equation.constrained(compiled, points)
+            recorded.append(_recorded(found, motion, theta, constrained))
+        return replace(found, recorded=tuple(recorded))
 
     @cached_property
     def equation(self) -> EquationOfMotion:
@@ -223,70 +247,11 @@ class EquationModel:
                     found[list(field.rows)] = True
         return found
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MotionEquations:
-    """The equations along all recordings as functions of the parameters.
-
-    Attributes:
-        model: The system without contacts and limits.
-        forces: The measured forces.
-        equations: The equations: of the degrees of freedom, and laws of measured forces.
-        recorded: The equations along each recording.
-    """
-
-    model: EquationModel
-    forces: tuple[MeasuredForce, ...]
-    equations: tuple[Equation, ...]
-    recorded: tuple[RecordedEquations, ...]
-
-    @staticmethod
-    def of(
-        system: System,
-        recordings: Sequence[AlignedRecording],
-        theta: Array,
-        *,
-        forces: tuple[MeasuredForce, ...],
-        laws: ControlLaws | None,
-    ) -> MotionEquations:
-        """The equations along recordings.
-
-        Args:
-            system: The system without control laws.
-            recordings: The recordings.
-            theta: (p,) parameters at which windows are chosen.
-            forces: The measured forces.
-            laws: The control laws of the recordings; None without any.
-        """
-        durations = np.array([float(recording.t[-1]) for recording in recordings])
-        shares = MOST_POINTS * durations / durations.sum()
-        motions = [
-            measured_motion(system, recording, theta, max(int(share), 2))
-            for recording, share in zip(recordings, shares, strict=True)
-        ]
-        sigma = np.max([motion.speed_sigma for motion in motions], axis=0)
-        fastest = np.max([np.abs(motion.qvel).max(axis=0) for motion in motions], axis=0)
-        slow = np.asarray(np.maximum(UNSURE_SIGMAS * sigma, SLOW_SHARE * fastest))
-        relaxed = system.with_variant(RELAXED, Relaxation(constraints=True))
-        model = EquationModel(system=relaxed, laws=laws, friction_speeds=slow)
-        # Contacts and stops act in the stated model.
-        stated = EquationModel(system=system, laws=laws, friction_speeds=slow)
-        equations = tuple(_equations(system, forces))
-        recorded = []
-        for motion in motions:
-            compiled = system.plant.model(theta)
-            (points,) = stated.points([compiled], motion, theta[None])
-            constrained = stated.equation.constrained(compiled, points)
-            recorded.append(_recorded(model, forces, equations, motion, theta, constrained))
-        return MotionEquations(
-            model=model, forces=forces, equations=equations, recorded=tuple(recorded)
-        )
-
     # ---- rows
 
     def _of_rows(self, values: Sequence[Sequence[float]]) -> np.ndarray:
         """(R,) a number for each row, from one for each recording and equation."""
-        counts = [[len(windows.t) for windows in each.windows] for each in self.recorded]
+        counts = [[len(t) for t in each.times] for each in self.recorded]
         return np.repeat(np.array(values).ravel(), np.array(counts).ravel())
 
     @cached_property
@@ -302,7 +267,7 @@ class MotionEquations:
     @property
     def times(self) -> Array:
         """(R,) time of each row [s]."""
-        return np.concatenate([windows.t for each in self.recorded for windows in each.windows])
+        return np.concatenate([t for each in self.recorded for t in each.times])
 
     @property
     def usual_speeds(self) -> Array:
@@ -312,28 +277,28 @@ class MotionEquations:
 
     def cutoff(self, equation: int) -> float:
         """Frequency up to which an equation is used, the lowest of all recordings [Hz]."""
-        return 1.0 / max(each.windows[equation].length for each in self.recorded)
+        return 1.0 / max(each.lengths[equation] for each in self.recorded)
 
-    def rows(self, thetas: Array) -> list[Rows]:
+    def rows(self, thetas: Array) -> list[Array]:
         """Rows at several values of the parameters.
 
         Args:
             thetas: (k, p) parameters.
 
         Returns:
-            The rows; NaN where a model does not compile.
+            (3, R) for each of them: forces that the model needs or predicts, forces that act in the
+            model or are measured, and the inertial part of the needed ones [N or N m]; NaN where a
+            model does not compile.
         """
-        models, compiled = self.model.system.plant.try_models(thetas)
+        models, compiled = self.system.plant.try_models(thetas)
         found: list[list[Array]] = [[] for _ in thetas]
         for each in self.recorded:
-            points = self.model.points(models, each.motion, thetas)
+            points = self.points(models, each.motion, thetas)
             for parts, model, of_model in zip(found, models, points, strict=True):
-                parts.append(self._averaged(each, self.model.equation.terms(model, of_model)))
-        rows = []
-        for parts, is_compiled in zip(found, compiled, strict=True):
-            values = np.concatenate(parts, axis=1)
-            explained, measured, inertial = values if is_compiled else np.full_like(values, np.nan)
-            rows.append(Rows(explained=explained, measured=measured, inertial=inertial))
+                parts.append(self._averaged(each, self.equation.terms(model, of_model)))
+        rows = [np.concatenate(parts, axis=1) for parts in found]
+        for values in itertools.compress(rows, np.logical_not(compiled)):
+            values[:] = np.nan
         return rows
 
     def _averaged(self, each: RecordedEquations, terms: EquationTerms) -> Array:
@@ -360,7 +325,7 @@ class MotionEquations:
                 series = [terms.needed[:, dof], measured[:, dof], terms.inertial[:, dof]]
             else:
                 series = [modelled[:, place], each.forces[:, place], nothing]
-            parts.append(np.stack([windows.weights @ values for values in series]))
+            parts.append(np.stack([windows @ values for values in series]))
         return np.concatenate(parts, axis=1)
 
 
@@ -375,14 +340,10 @@ def _equations(system: System, forces: Sequence[MeasuredForce]) -> Iterator[Equa
 
 
 def _recorded(
-    of: EquationModel,
-    forces: Sequence[MeasuredForce],
-    equations: Sequence[Equation],
-    motion: MeasuredMotion,
-    theta: Array,
-    constrained: np.ndarray,
+    of: MotionEquations, motion: MeasuredMotion, theta: Array, constrained: np.ndarray
 ) -> RecordedEquations:
     """The equations along one recording, with windows that suit its motion."""
+    forces = of.forces
     model = of.system.plant.model(theta)
     (points,) = of.points([model], motion, theta[None])
 
@@ -410,7 +371,7 @@ def _recorded(
     slow = (np.abs(motion.qvel) < of.friction_speeds) & of.has_friction
 
     windows = []
-    for equation in equations:
+    for equation in of.equations:
         dof, place = equation.dof, equation.force
         if dof >= 0:
             found = _windows(motion, spacing[dof], usable[:, dof], slow[:, dof])
@@ -424,14 +385,20 @@ def _recorded(
         forces=measured,
         has_force=np.asarray(near.any(axis=0)),
         moments=moments,
-        windows=tuple(windows),
+        windows=tuple(weights for weights, _, _ in windows),
+        times=tuple(t for _, t, _ in windows),
+        lengths=tuple(length for _, _, length in windows),
     )
 
 
 def _windows(
     motion: MeasuredMotion, spacing: float, usable: np.ndarray, slow: np.ndarray
-) -> Windows:
-    """Windows of an equation, most of which are not at rest where that is possible."""
+) -> tuple[scipy.sparse.csr_array, Array, float]:
+    """Windows of an equation, most of which are not at rest where that is possible.
+
+    Returns:
+        (k, n) weights of the points, (k,) middles of the windows, and their length [s].
+    """
     length = WINDOW_PER_SPACING * max(spacing, motion.step)
     length = min(length, LONGEST_WINDOW * float(motion.t[-1]))
     half = max(round(0.5 * length / motion.step), 1) - 1
@@ -451,4 +418,4 @@ def _windows(
         kept = possible & (resting <= share)
         if kept.sum() >= FEWEST_WINDOWS * possible.sum():
             break
-    return Windows(weights=weights[kept], t=motion.t[centres[kept]], length=length)
+    return weights[kept], motion.t[centres[kept]], length

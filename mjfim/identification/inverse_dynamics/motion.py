@@ -1,26 +1,250 @@
-"""Positions, velocities and accelerations of a robot from the measured values of a recording.
+"""Measured motion of a robot: positions, velocities and accelerations, and forces of its actuators.
 
 A regression spline is fitted to each coordinate of the state that is measured, to its velocity, or
-to both. The velocity of the engine's state is half a timestep older than the position, because the
-integrators that are implicit in the velocity change the velocity first.
+to both. It has degree 5 and equidistant knots. The number of these has the smallest information
+criterion of Schwarz, n log(mean square) + m log n: more of them follow noise, fewer do not follow
+the motion. The velocity of the engine's state is half a timestep older than the position, because
+the integrators that are implicit in the velocity change the velocity first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError, listed
+from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.inverse_dynamics.spline import Readings, RegressionSpline, fit_spline
-from mjfim.model.coordinates import dof_names
-from mjfim.model.elements import is_rk4
+from mjfim.model.coordinates import actuator_names, dof_names
+from mjfim.model.elements import element_name, is_rk4
+from mjfim.model.units import acts_at_joint
 from mjfim.plant.outputs import outputs_by_state
+
+# Degree of the spline. Its second derivative is a cubic spline.
+DEGREE = 5
+
+# Largest number of coefficients over the number of times with a value. With more, a spline through
+# values without noise swings between them.
+MOST_COEFFICIENTS = 0.5
+
+# Smallest number of knot intervals.
+FEWEST_INTERVALS = 8
+
+# Number of halvings of the distance of the knots without improvement after which the search ends.
+HALVINGS_WITHOUT_IMPROVEMENT = 3
+
+# Weight of a smooth continuation over gaps, relative to that of the data.
+CONTINUATION = 1e-10
+
+# Smallest mean square of the residuals over that of the data: what rounding leaves.
+ROUNDING = 1e-26
+
+# Values farther from the spline than this multiple of the median distance, as a standard deviation,
+# are left out.
+OUTLIER = 8.0
+
+# Rounds in which outliers are left out, at most: a spline through outliers hides smaller ones.
+MAX_OUTLIER_ROUNDS = 3
+
+# Standard deviation of normal noise over its median absolute value.
+SIGMA_PER_MEDIAN = 1.4826
+
+# Number of frequencies at which the noise of a derivative is integrated.
+FREQUENCIES = 400
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Readings:
+    """Measured values of a curve, or of its slope.
+
+    Attributes:
+        t: (n,) their times, which increase [s].
+        values: (n,) the values [unit, or unit/s].
+        sigma: Standard deviation of their noise.
+        derivative: 0 for values, 1 for slopes.
+    """
+
+    t: Array
+    values: Array
+    sigma: float
+    derivative: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RegressionSpline:
+    """A fitted spline.
+
+    Attributes:
+        curve: The spline.
+        spacing: Distance of its knots [s].
+        variance: Mean square of the residuals over the stated variances.
+        weights: Values and slopes per second, over the variances of their noise.
+    """
+
+    curve: scipy.interpolate.BSpline
+    spacing: float
+    variance: float
+    weights: tuple[float, float]
+
+    def at(self, t: Array, derivative: int = 0) -> Array:
+        """(n,) values of a derivative at the times t: (n,)."""
+        return np.asarray(self.curve(t, nu=derivative))
+
+    @property
+    def slope_sigma(self) -> float:
+        """Standard deviation of the slope by the noise of the readings [unit/s].
+
+        The spline passes all frequencies up to pi / spacing.
+        """
+        limit = np.pi / self.spacing
+        omega = (np.arange(FREQUENCIES) + 0.5) / FREQUENCIES * limit
+        of_values, of_slopes = self.weights
+        density = omega**2 / (of_values + of_slopes * omega**2)
+        variance = self.variance * float(density.mean()) * limit / np.pi
+        return float(np.sqrt(variance))
+
+
+def fit_spline(
+    readings: Sequence[Readings], anchor: float = 0.0, *, spacing: float | None = None
+) -> RegressionSpline:
+    """Fit a spline to readings of a curve.
+
+    Args:
+        readings: Values, slopes or both.
+        anchor: First value of a curve of which only the slope is measured [unit].
+        spacing: Distance of the knots, nearly [s]; None where the readings choose it.
+    """
+    left = list(readings)
+    spline = _chosen(left, anchor, spacing)
+    # Single wrong values, as of a disturbed encoder, would draw a spline to them, and hide where
+    # the noise begins.
+    for _ in range(MAX_OUTLIER_ROUNDS):
+        kept = [_without_outliers(spline, reading) for reading in left]
+        if all(len(after.t) == len(before.t) for after, before in zip(kept, left, strict=True)):
+            break
+        left = kept
+        spline = _chosen(left, anchor, spacing)
+    return spline
+
+
+def _without_outliers(spline: RegressionSpline, reading: Readings) -> Readings:
+    """The readings that are not far from their spline."""
+    distance = np.abs(reading.values - spline.at(reading.t, reading.derivative))
+    usual = SIGMA_PER_MEDIAN * float(np.median(distance))
+    kept = (distance <= OUTLIER * usual) | (usual == 0.0)
+    return replace(reading, t=reading.t[kept], values=reading.values[kept])
+
+
+def _chosen(readings: Sequence[Readings], anchor: float, spacing: float | None) -> RegressionSpline:
+    """The spline with a distance of the knots, or that with the smallest criterion."""
+    times = np.unique(np.concatenate([reading.t for reading in readings]))
+    duration = float(times[-1] - times[0])
+    most = max(int(MOST_COEFFICIENTS * len(times)) - DEGREE, 1)
+    if spacing is not None:
+        count = int(np.clip(round(duration / spacing), 1, most))
+        return _fitted(readings, anchor, times, count)[1]
+
+    intervals, since = min(FEWEST_INTERVALS, most), 0
+    least, best, chosen = np.inf, None, intervals
+    while since < HALVINGS_WITHOUT_IMPROVEMENT:
+        criterion, spline = _fitted(readings, anchor, times, intervals)
+        since += 1
+        if best is None or criterion < least:
+            least, best, chosen, since = criterion, spline, intervals, 0
+        if intervals == most:
+            break
+        intervals = min(2 * intervals, most)
+    for factor in (np.sqrt(0.5), np.sqrt(2.0)):
+        criterion, spline = _fitted(
+            readings, anchor, times, int(np.clip(round(factor * chosen), 1, most))
+        )
+        if best is None or criterion < least:
+            least, best = criterion, spline
+    assert best is not None
+    return best
+
+
+def _fitted(
+    readings: Sequence[Readings], anchor: float, times: Array, intervals: int
+) -> tuple[float, RegressionSpline]:
+    """The information criterion of the spline with a number of knot intervals, and this spline."""
+    begin, duration = float(times[0]), float(times[-1] - times[0])
+    spacing, size = duration / intervals, intervals + DEGREE
+    knots = np.asarray(begin + spacing * np.arange(-DEGREE, size + 1), dtype=np.float64)
+
+    # Normal equations, whose matrix has a band.
+    bases = [_basis(reading, knots) / reading.sigma for reading in readings]
+    values = [reading.values / reading.sigma for reading in readings]
+    largest = max(reading.sigma for reading in readings)
+    normal = largest**2 * sum(basis.T @ basis for basis in bases)
+    right = largest**2 * sum(basis.T @ value for basis, value in zip(bases, values, strict=True))
+    # Slopes show a curve up to a constant, which one more row holds for now.
+    without_values = all(reading.derivative for reading in readings)
+    if without_values:
+        first = scipy.sparse.csr_array(([1.0], ([0], [0])), (size, size))
+        normal = normal + float(normal.diagonal().mean()) * first
+    coefficients = _solved(normal, right)
+    if without_values:
+        coefficients += anchor - float(
+            scipy.interpolate.BSpline(knots, coefficients, DEGREE)(begin)
+        )
+
+    # The variance of the noise is unknown to the criterion.
+    squares = sum(
+        max(float(np.sum((value - basis @ coefficients) ** 2)), ROUNDING * float(value @ value))
+        for basis, value in zip(bases, values, strict=True)
+    )
+    count = sum(len(reading.t) for reading in readings)
+    mean = max(squares / count, float(np.finfo(float).tiny))
+    of_values, of_slopes = (
+        sum(len(r.t) / r.sigma**2 / duration for r in readings if r.derivative == derivative)
+        for derivative in (0, 1)
+    )
+    spline = RegressionSpline(
+        curve=scipy.interpolate.BSpline(knots, coefficients, DEGREE),
+        spacing=spacing,
+        variance=mean * count / max(count - size, 1),
+        weights=(of_values, of_slopes),
+    )
+    return float(count * np.log(mean) + size * np.log(count)), spline
+
+
+def _basis(reading: Readings, knots: Array) -> scipy.sparse.csr_array:
+    """(n, size) values at the times of readings of the B-splines, or of their derivatives."""
+    t = np.clip(reading.t, knots[DEGREE], knots[-DEGREE - 1])
+    if not reading.derivative:
+        design = scipy.interpolate.BSpline.design_matrix(t, knots, DEGREE)
+        return scipy.sparse.csr_array(design)
+    # The derivative of a spline has the differences of its coefficients as coefficients.
+    lower = scipy.interpolate.BSpline.design_matrix(t, knots[1:-1], DEGREE - 1)
+    differences = _differences(len(knots) - DEGREE - 1, 1)
+    return scipy.sparse.csr_array(lower @ differences / (knots[1] - knots[0]))
+
+
+def _differences(size: int, order: int) -> scipy.sparse.csr_array:
+    """(size - order, size) matrix of differences between successive coefficients."""
+    found = scipy.sparse.eye_array(size, format="csr")
+    for _ in range(order):
+        found = found[1:] - found[:-1]
+    return scipy.sparse.csr_array(found)
+
+
+def _solved(normal: scipy.sparse.csr_array, right: Array) -> Array:
+    """(m,) solution of normal equations, with a smooth continuation where there are no data."""
+    size = len(right)
+    change = _differences(size, min(DEGREE // 2 + 1, size - 1))
+    continuation = CONTINUATION * float(normal.diagonal().mean())
+    total = normal + continuation * (change.T @ change)
+    band = np.zeros((DEGREE + 1, size))
+    for offset in range(min(DEGREE + 1, size)):
+        band[DEGREE - offset, offset:] = total.diagonal(offset)
+    return np.asarray(scipy.linalg.solveh_banded(band, right))
+
 
 # Number of points of the motion for each interval between the knots of the finest spline.
 POINTS_PER_INTERVAL = 4
@@ -116,7 +340,23 @@ def measured_motion(
     space, lag = system.space, engine_lag(system.model)
     curves = _curves(system, recording)
     y = recording.y - system.parameters.bias_derivative(recording.y.shape[1]) @ theta
-    splines = {curve.key: _spline(system, recording, y, curve, lag) for curve in curves}
+    splines: dict[int, RegressionSpline] = {}
+    for key, curve in curves.items():
+        readings = []
+        for derivative, output in enumerate(curve[:2]):
+            if output is not None:
+                known = recording.measured[:, output]
+                readings.append(
+                    Readings(
+                        t=recording.t[known] - derivative * lag,
+                        values=y[known, output],
+                        sigma=float(system.noise.sigma[output]),
+                        derivative=derivative,
+                    )
+                )
+        # Where only its slope is measured, a curve begins as the experiment says.
+        anchor = float(system.nominal_initial_state[key]) if key >= 0 else 0.0
+        splines[key] = fit_spline(readings, anchor)
 
     # Points are as dense as the finest spline needs, but no denser than the rows.
     duration = float(recording.t[-1])
@@ -129,15 +369,15 @@ def measured_motion(
 
     usable = np.ones((len(t), space.nv), dtype=bool)
     spacing, speed_sigma = np.zeros(space.nv), np.zeros(space.nv)
-    for curve in curves:
-        spline, dofs = splines[curve.key], list(curve.dofs)
-        measured = recording.measured[:, curve.outputs].any(axis=1)
+    for key, (*outputs, dofs) in curves.items():
+        spline, own = splines[key], list(dofs)
+        measured = recording.measured[:, [output for output in outputs if output is not None]]
         reach = REACH * max(spline.spacing, step)
-        usable[:, dofs] &= _is_near(t, recording.t[measured], reach)[:, None]
-        spacing[dofs] = np.maximum(spacing[dofs], spline.spacing)
+        usable[:, own] &= _is_near(t, recording.t[measured.any(axis=1)], reach)[:, None]
+        spacing[own] = np.maximum(spacing[own], spline.spacing)
         # The angular velocity is twice a combination of the slopes of a unit quaternion.
-        sigma = spline.slope_sigma * (2.0 if curve.in_quaternion else 1.0)
-        speed_sigma[dofs] = np.maximum(speed_sigma[dofs], sigma)
+        sigma = spline.slope_sigma * (2.0 if len(dofs) > 1 else 1.0)
+        speed_sigma[own] = np.maximum(speed_sigma[own], sigma)
     return MeasuredMotion(
         recording=recording,
         t=t,
@@ -159,58 +399,37 @@ def engine_lag(model: mujoco.MjModel) -> float:
 # ---- curves
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Curve:
-    """A number that changes with time, and the outputs that measure it or its slope.
-
-    Attributes:
-        key: Address in qpos; negative for the integral of an angular velocity.
-        values: Output that measures it; None for none.
-        slopes: Output that measures its slope; None for none.
-        dofs: Degrees of freedom that it moves.
-        in_quaternion: Whether it is a component of a quaternion.
-    """
-
-    key: int
-    values: int | None
-    slopes: int | None
-    dofs: tuple[int, ...]
-    in_quaternion: bool = False
-
-    @property
-    def outputs(self) -> list[int]:
-        """The outputs."""
-        return [output for output in (self.values, self.slopes) if output is not None]
+# A number that changes with time: the outputs that measure it and its slope, if any does, and the
+# degrees of freedom that it moves, three for a component of a quaternion. Its key is its address in
+# qpos, or negative for the integral of an angular velocity.
+Curves = dict[int, tuple[int | None, int | None, tuple[int, ...]]]
 
 
-def _curves(system: System, recording: AlignedRecording) -> list[_Curve]:
+def _curves(system: System, recording: AlignedRecording) -> Curves:
     """The curves of all degrees of freedom. Raises RecordingError where one was not measured."""
     space = system.space
     has_values = np.asarray(recording.measured.any(axis=0))
     outputs = outputs_by_state(system.model, system.outputs)
     output_of = {address: i for address, i in outputs.items() if has_values[i]}
 
-    curves = [
-        _Curve(key=q, values=output_of.get(q), slopes=output_of.get(space.nq + v), dofs=(v,))
+    curves: Curves = {
+        q: (output_of.get(q), output_of.get(space.nq + v), (v,))
         for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True)
-    ]
+    }
     for q, v in space.quaternions:
         dofs = tuple(range(v, v + 3))
-        curves += [
-            _Curve(
-                key=q + i, values=output_of.get(q + i), slopes=None, dofs=dofs, in_quaternion=True
-            )
-            for i in range(4)
-        ]
+        curves |= {q + i: (output_of.get(q + i), None, dofs) for i in range(4)}
         # Measured angular velocities replace the slopes of the quaternion.
         rates = [output_of.get(space.nq + dof) for dof in dofs]
         if None not in rates:
-            curves += [
-                _Curve(key=-1 - dof, values=None, slopes=output, dofs=(dof,))
-                for dof, output in zip(dofs, rates, strict=True)
-            ]
+            curves |= {
+                -1 - dof: (None, output, (dof,)) for dof, output in zip(dofs, rates, strict=True)
+            }
 
-    missing = sorted({dof for curve in curves if not curve.outputs for dof in curve.dofs})
+    known = {
+        key: [output for output in curve[:2] if output is not None] for key, curve in curves.items()
+    }
+    missing = sorted({dof for key, curve in curves.items() if not known[key] for dof in curve[2]})
     if missing:
         names = dof_names(system.model)
         unmeasured = listed([names[dof] for dof in missing])
@@ -220,33 +439,13 @@ def _curves(system: System, recording: AlignedRecording) -> list[_Curve]:
             'columns such as `qpos:<joint>`, or state fit.start = "measured"'
         )
     counts = recording.measured.sum(axis=0)
-    fewest = min(int(counts[output]) for curve in curves for output in curve.outputs)
+    fewest = min(int(counts[output]) for outputs_of in known.values() for output in outputs_of)
     if fewest < FEWEST_READINGS:
         raise RecordingError(
             f"{recording.name}: a degree of freedom has only {fewest} measured values; "
             f"velocities and accelerations need at least {FEWEST_READINGS}"
         )
     return curves
-
-
-def _spline(
-    system: System, recording: AlignedRecording, y: Array, curve: _Curve, lag: float
-) -> RegressionSpline:
-    """The spline of a curve; where only its slope is measured, it begins as the experiment says."""
-    readings = []
-    for derivative, output in enumerate((curve.values, curve.slopes)):
-        if output is not None:
-            known = recording.measured[:, output]
-            readings.append(
-                Readings(
-                    t=recording.t[known] - derivative * lag,
-                    values=y[known, output],
-                    sigma=float(system.noise.sigma[output]),
-                    derivative=derivative,
-                )
-            )
-    anchor = float(system.nominal_initial_state[curve.key]) if curve.key >= 0 else 0.0
-    return fit_spline(readings, anchor)
 
 
 def _is_near(t: Array, readings: Array, reach: float) -> np.ndarray:
@@ -296,3 +495,86 @@ def _turning(quaternion: Array, change: Array) -> Array:
     axis, d_axis = quaternion[:, 1:], change[:, 1:]
     imaginary = w * d_axis - dw * axis - np.cross(axis, d_axis)
     return np.asarray(2.0 * imaginary / np.sum(quaternion**2, axis=1, keepdims=True))
+
+
+# Sensors of forces of single actuators, and of all actuators on a joint.
+ACTUATOR_FORCE = int(mujoco.mjtSensor.mjSENS_ACTUATORFRC)
+JOINT_FORCE = int(mujoco.mjtSensor.mjSENS_JOINTACTFRC)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredForce:
+    """A measured force of actuators.
+
+    Attributes:
+        output: Index of the output.
+        actuator: Address of the force of a single actuator; -1 for all on a joint.
+        dof: Degree of freedom of the joint; -1 for a single actuator.
+        name: Name of the actuator or joint.
+        is_modelled: Whether the log shows the controls that the model needs for it.
+    """
+
+    output: int
+    actuator: int
+    dof: int
+    name: str
+    is_modelled: bool
+
+    @property
+    def is_of_joint(self) -> bool:
+        """True for the force of all actuators on a joint."""
+        return self.dof >= 0
+
+
+def measured_forces(
+    system: System, recordings: Sequence[AlignedRecording]
+) -> tuple[MeasuredForce, ...]:
+    """Forces of actuators that are measured in a recording, those of joints last.
+
+    Raises:
+        ExperimentError: The control of an actuator is computed by a control law, and a recording
+            does not hold its force.
+    """
+    model = system.model
+    names = actuator_names(model)
+    laws = () if system.laws is None else system.laws.laws
+    controlled = [names.index(law.actuator) for law in laws]
+    by_address = {output.sensor: i for i, output in enumerate(system.outputs.outputs)}
+    found = []
+    for sensor in range(model.nsensor):
+        output = by_address.get(int(model.sensor_adr[sensor]))
+        kind, element = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
+        if output is None or kind not in (JOINT_FORCE, ACTUATOR_FORCE):
+            continue
+        if not any(recording.measured[:, output].any() for recording in recordings):
+            continue
+        of_joint = kind == JOINT_FORCE
+        found.append(
+            MeasuredForce(
+                output=output,
+                actuator=-1 if of_joint else int(model.actuator_outadr[element]),
+                dof=int(model.jnt_dofadr[element]) if of_joint else -1,
+                name=element_name(model, "joint" if of_joint else "actuator", element),
+                is_modelled=not controlled if of_joint else element not in controlled,
+            )
+        )
+    for law, actuator in zip(laws, controlled, strict=True):
+        outputs = [force.output for force in found if _contains(model, force, actuator)]
+        for recording in recordings:
+            if recording.measured[:, outputs].sum() < FEWEST_READINGS:
+                raise ExperimentError(
+                    f"{system.experiment.source}: controllers.{law.actuator}: the equation of "
+                    f"motion needs the control of {law.actuator}, which this law computes, or its "
+                    f"measured force, which {recording.name} does not hold; add a sensor "
+                    "`actuatorfrc` or `jointactuatorfrc` to the model and its column to the log, "
+                    'or remove fit.start = "inverse_dynamics"'
+                )
+    return tuple(sorted(found, key=lambda force: force.is_of_joint))
+
+
+def _contains(model: mujoco.MjModel, force: MeasuredForce, actuator: int) -> bool:
+    """Whether a measured force contains all of the force of an actuator."""
+    if not force.is_of_joint:
+        return force.actuator == int(model.actuator_outadr[actuator])
+    at_joint = acts_at_joint(model, actuator)
+    return at_joint and force.dof == int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])

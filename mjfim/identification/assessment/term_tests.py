@@ -1,10 +1,10 @@
-"""Tests of physical terms that a model may lack.
+"""Tests of physical terms that a model may lack, on all data of a fit or on a part of them.
 
-Most candidates (`mjfim/identification/terms/candidates.py`) have score tests. Each of their numbers
-has a column of sensitivities at the estimate. With the score g and the information I of the numbers
-of a term, both after the parameters are eliminated, the term would reduce the sum of squared
-residuals by `g' I^-1 g`, which is chi-squared distributed where the model is complete, and its
-estimated size is `-I^-1 g`. The columns are those of an extended model that has many of them.
+Most candidates (`mjfim/identification/assessment/term_candidates.py`) have score tests. Each of
+their numbers has a column of sensitivities at the estimate. With the score g and the information I
+of the numbers of a term, both after the parameters are eliminated, the term would reduce the sum of
+squared residuals by `g' I^-1 g`, which is chi-squared distributed where the model is complete, and
+its estimated size is `-I^-1 g`. The columns are those of an extended model that has many of them.
 
 Terms that change the coordinates of the model, such as an elastic joint, have no such test. They
 are screened by simulations with some of their values.
@@ -22,16 +22,193 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, ModelError
+from mjfim.experiment.system import System
+from mjfim.identification.assessment.term_candidates import Candidate, candidates_of
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.terms.candidates import Candidate, candidates_of
-from mjfim.identification.terms.extended import (
-    extended_problem,
-    part_of_data,
-    with_stated_residuals,
-)
+from mjfim.identification.search import of_subset
+from mjfim.identification.segments import KnownActivations, Segment, spread_over_data
+from mjfim.model.coordinates import state_names, tangent_names
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.terms import Term, TermNumber, TermTestData
 from mjfim.records.trajectory import Recording
+
+# Number of samples of a segment that tell enough. Where the part would contain fewer of each
+# recording, it contains fewer recordings.
+ENOUGH_SAMPLES = 500
+
+
+def extended_problem(
+    problem: FitProblem,
+    recordings: Sequence[Recording],
+    at: UnknownValues,
+    parameters: dict[str, Any],
+    tables: dict[str, Any],
+) -> tuple[FitProblem, UnknownValues] | None:
+    """The problem of a model with further parameters and terms, and the solution in it.
+
+    Rows, noise and initial states are those of the stated problem. New parameters have their
+    guesses, new coordinates are at rest, and new activations follow from the recordings.
+
+    Args:
+        problem: The problem of some segments of the stated system.
+        recordings: All recordings.
+        at: Its solution.
+        parameters: Tables of the further parameters by name.
+        tables: Tables of the library of terms by name.
+
+    Returns:
+        The problem and its unknowns; None where the model cannot have the terms.
+    """
+    system = problem.system
+    try:
+        extended = System.resolve(
+            system.experiment.replace(parameters=parameters, terms=tables),
+            threads=system.threads,
+            source=system.source,
+        )
+    except (ExperimentError, ModelError):
+        return None
+    names = extended.parameters.names
+    theta = np.array(extended.parameters.guess)
+    theta[[names.index(name) for name in system.parameters.names]] = at.theta
+
+    # The rows are those of the solution; a delay as a parameter would let the segments begin
+    # earlier.
+    wider: FitProblem | None = FitProblem.of(extended, recordings)
+    if wider is not None and problem.layout.free_starts and not wider.layout.free_starts:
+        wider = wider.cut(None)
+    if wider is None:
+        return None
+    wider = replace(
+        wider,
+        segments=_extended_segments(problem, wider),
+        masks=problem.masks,
+        noise=problem.noise,
+        difference_step=problem.difference_step,
+        central=problem.central,
+        workers=problem.workers,
+    )
+    private = _extended_private(problem, wider, at)
+    return wider, replace(at, theta=theta, private=private)
+
+
+def with_stated_residuals(
+    problem: FitProblem, at: UnknownValues, wider: FitProblem, begin: UnknownValues
+) -> FitProblem | None:
+    """The problem of an extended model whose residuals are those of the stated one.
+
+    Even the smallest size of a term may change the residuals. The readings follow this change.
+
+    Args:
+        problem: The stated problem.
+        at: Its solution.
+        wider: The extended problem.
+        begin: The solution in it.
+
+    Returns:
+        The extended problem; None where a simulation diverges.
+    """
+    stated, extended = problem.predict(at), wider.predict(begin)
+    if stated is None or extended is None:
+        return None
+    recordings = tuple(
+        replace(recording, y=recording.y + np.nan_to_num(after - before))
+        for recording, before, after in zip(wider.recordings, stated, extended, strict=True)
+    )
+    return replace(wider, recordings=recordings)
+
+
+def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment, ...]:
+    """The segments of a problem with initial states of the extended model."""
+    system = wider.system
+    space, known = system.space, KnownActivations.of(system)
+    stated, names = state_names(problem.system.model), state_names(system.model)
+    if stated == names:
+        return problem.segments
+
+    common = [names.index(name) for name in stated]
+    first = space.nq + space.nv
+    added = [k for k, address in enumerate(known.addresses) if first + address not in common]
+    places = [first + known.addresses[k] for k in added]
+
+    segments = []
+    for segment in problem.segments:
+        start = np.array(system.plant.nominal_initial_state)
+        start[common] = segment.start
+        _, qvel, _ = space.split(start)
+        recording = wider.recordings[segment.recording]
+        values = known.at(recording, np.array([segment.begin]), qvel[None])[0]
+        start[places] = values[added]
+        segments.append(replace(segment, start=start))
+    return tuple(segments)
+
+
+def _extended_private(problem: FitProblem, wider: FitProblem, at: UnknownValues) -> Array:
+    """(P, n) private unknowns of the extended model; those of new coordinates are zero."""
+    before, after = _private_names(problem), _private_names(wider)
+    if before == after:
+        return at.private
+
+    private = np.zeros((len(at.private), len(after)))
+    private[:, [after.index(name) for name in before]] = at.private
+    return private
+
+
+def _private_names(problem: FitProblem) -> list[str]:
+    """Names of the private unknowns of a segment."""
+    if not problem.layout.free_starts:
+        return [problem.system.parameters.names[i] for i in problem.layout.private]
+    names = np.array(tangent_names(problem.system.model))
+    directions = problem.start_directions
+    return [str(names[np.flatnonzero(column)[0]]) for column in directions.T]
+
+
+def part_of_data(problem: FitProblem, max_samples: float) -> tuple[FitProblem, np.ndarray]:
+    """Some segments of each recording, and of these the first parts where that is still too much.
+
+    First parts begin at the initial states of the problem. Other parts of a recording would begin
+    at states that are unknown.
+
+    Args:
+        problem: Problem of all segments.
+        max_samples: Number of samples of the part, at most.
+
+    Returns:
+        The problem of the part, that of all data where they are few enough, and the indices of its
+        segments among all.
+    """
+    if problem.sample_count <= max_samples:
+        return problem, np.arange(len(problem.segments))
+
+    chosen = _spread_segments(problem, max_samples)
+    part = problem.of_segments(chosen)
+    if part.sample_count > max_samples:
+        part = part.of_first_parts(max_samples / part.sample_count)
+    return part, chosen
+
+
+def _spread_segments(problem: FitProblem, max_samples: float) -> np.ndarray:
+    """Indices of segments of as many recordings as possible, at least one of each of these."""
+    samples = np.array([segment.samples for segment in problem.segments])
+    of_recording = np.array([segment.recording for segment in problem.segments])
+
+    # Of too many recordings, some have to be enough.
+    recordings = np.unique(of_recording)
+    least = min(float(samples.mean()), ENOUGH_SAMPLES)
+    possible = max(int(max_samples / least), 1)
+    if possible < len(recordings):
+        recordings = recordings[spread_over_data(len(recordings), possible)]
+
+    # The segments of each recording are spread over its time.
+    share = max_samples / samples[np.isin(of_recording, recordings)].sum()
+    chosen = []
+    for recording in recordings:
+        segments = np.flatnonzero(of_recording == recording)
+        wanted = min(max(round(share * len(segments)), 1), len(segments))
+        chosen.append(segments[spread_over_data(len(segments), wanted)])
+    return np.concatenate(chosen)
+
 
 # Probability, over all candidates, that one is reported although the model is complete.
 SIGNIFICANCE = 1e-3
@@ -138,13 +315,13 @@ def find_missing_terms(
     ]
     largest = max((sum(len(each.tested) for each in group) for group in groups), default=0)
     columns = problem.layout.column_count + problem.private_count + largest
-    part = part_of_data(problem, MAX_SIMULATED / columns)
-    at = part.unknowns(at)
+    part, segments = part_of_data(problem, MAX_SIMULATED / columns)
+    at = of_subset(at, segments)
     search = _TermSearch(
-        problem=part.problem,
+        problem=part,
         recordings=recordings,
         at=at,
-        squares=2.0 * part.problem.cost(at),
+        squares=2.0 * part.cost(at),
         count=sum(len(group) for group in groups),
     )
     found, untested = search.by_score(groups)
@@ -153,8 +330,8 @@ def find_missing_terms(
     return TermTests(
         terms=first_terms(_by_significance(found)),
         data=TermTestData(
-            share=part.share,
-            recordings=part.recording_count,
+            share=part.sample_count / problem.sample_count,
+            recordings=len({segment.recording for segment in part.segments}),
             count=len(problem.recordings),
             untested=tuple(dict.fromkeys(untested)),
             impossible=tuple(impossible),
@@ -229,43 +406,23 @@ def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
     return np.asarray(np.sqrt(np.mean(motion.qvel**2, axis=0)))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Linearisation:
-    """Normal equations of parameters and candidates, columns scaled to length 1.
+# Normal equations of the m tested numbers of some candidates after the parameters are eliminated:
+# (m, m) information and (m,) gradient, for columns of length 1, and (m,) lengths of the columns.
+Linearisation = tuple[Array, Array, Array]
 
-    Attributes:
-        H: (m, m) information.
-        g: (m,) gradient.
-        norms: (m,) lengths of the columns.
-        columns: Columns of the tested numbers of each candidate.
-        others: Columns of the parameters.
-        inverse: Pseudo-inverse of their information.
+
+def _score_test(linearisation: Linearisation, columns: Sequence[int]) -> tuple[Array, float] | None:
+    """Score test of some columns; None where the parameters may stand for one of them.
+
+    Returns:
+        Estimated changes of the numbers, and the reduction of the sum of squares.
     """
-
-    H: Array
-    g: Array
-    norms: Array
-    columns: list[list[int]]
-    others: np.ndarray
-    inverse: Array
-
-    def tested(self, columns: Sequence[int]) -> tuple[Array, float] | None:
-        """Score test of some columns; None where the parameters may stand for one of them.
-
-        Returns:
-            Estimated changes of the numbers, and the reduction of the sum of squares.
-        """
-        H, others, tested = self.H, self.others, np.array(columns)
-
-        # Information and score after the parameters are eliminated.
-        response = self.inverse @ H[np.ix_(others, tested)]
-        information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
-        score = self.g[tested] - self.g[others] @ response
-        least = MIN_REMAINING_SHARE * np.diag(H)[tested]
-        if not (np.diag(information) > least).all():
-            return None
-        step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
-        return step / self.norms[tested], float(-score @ step)
+    chosen = np.array(columns)
+    information, score = linearisation[0][np.ix_(chosen, chosen)], linearisation[1][chosen]
+    if not (np.diag(information) > MIN_REMAINING_SHARE).all():
+        return None
+    step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
+    return step / linearisation[2][chosen], float(-score @ step)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -317,7 +474,7 @@ class _TermSearch:
 
     def _linearised(
         self, candidates: Sequence[Candidate]
-    ) -> Iterator[tuple[Sequence[Candidate], _Linearisation | None]]:
+    ) -> Iterator[tuple[Sequence[Candidate], Linearisation | None]]:
         """Linearise by a group of candidates, and by parts of it where one of them prevents it."""
         linearisation = self._linearise(candidates)
         if linearisation is not None or len(candidates) <= 1:
@@ -327,7 +484,7 @@ class _TermSearch:
         yield from self._linearised(candidates[:middle])
         yield from self._linearised(candidates[middle:])
 
-    def _linearise(self, candidates: Sequence[Candidate]) -> _Linearisation | None:
+    def _linearise(self, candidates: Sequence[Candidate]) -> Linearisation | None:
         """Linearise by parameters and candidates; None where the extended model diverges."""
         parameters: dict[str, Any] = {}
         tables: dict[str, Any] = {}
@@ -353,26 +510,29 @@ class _TermSearch:
 
         names = wider.system.parameters.names
         column_of = {names[j]: i for i, j in enumerate(wider.layout.parameter_of_column.tolist())}
-        columns = [
-            [column_of[f"?{i}.{k}"] for k in range(len(candidate.tested))]
-            for i, candidate in enumerate(candidates)
-        ]
-        tested = [column for of_candidate in columns for column in of_candidate]
+        tested = np.array(
+            [
+                column_of[f"?{i}.{k}"]
+                for i, candidate in enumerate(candidates)
+                for k in range(len(candidate.tested))
+            ]
+        )
         rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
         norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
         J = rows[:, :-1] / norms
-        H = J.T @ J
+        H, g = J.T @ J, J.T @ rows[:, -1]
+
         # The parameters are eliminated by the pseudo-inverse of their information.
         others = np.setdiff1d(np.arange(len(H)), tested)
         about_others = H[np.ix_(others, others)]
         inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
-        return _Linearisation(
-            H=H, g=J.T @ rows[:, -1], norms=norms, columns=columns, others=others, inverse=inverse
-        )
+        response = inverse @ H[np.ix_(others, tested)]
+        information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
+        return information, g[tested] - g[others] @ response, norms[tested]
 
     def _term(
         self,
-        linearisation: _Linearisation,
+        linearisation: Linearisation,
         candidates: Sequence[Candidate],
         indices: Sequence[int],
     ) -> Term | None:
@@ -381,10 +541,11 @@ class _TermSearch:
         Of several, those are left out that would have a value that makes no sense.
         """
         left = list(indices)
+        ends = list(itertools.accumulate((len(each.tested) for each in candidates), initial=0))
         fewest = 1 if len(left) == 1 else FEWEST_JOINTS
         while len({candidates[i].joint for i in left}) >= fewest:
-            columns = [column for i in left for column in linearisation.columns[i]]
-            found = linearisation.tested(columns)
+            columns = [column for i in left for column in range(ends[i], ends[i + 1])]
+            found = _score_test(linearisation, columns)
             if found is None:
                 return None
             values, explained = found
