@@ -161,7 +161,7 @@ class _Lab:
         from mjfim.files import write_json
         from mjfim.output.archive import write_design
         from mjfim.output.campaign_folder import SETTINGS_FILE
-        from mjfim.studies.redesign import restate_experiment
+        from mjfim.studies.campaign import restate_experiment
 
         # A call that continues the campaign needs the settings as soon as there is a round.
         if settings and not self.folder.has_rounds:
