@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from mjfim.identification.identify import identify
     from mjfim.identification.inverse_dynamics import inverse_dynamics
     from mjfim.identification.left_out import predict
+    from mjfim.output.export.design import export_design
+    from mjfim.output.export.sysid import export_sysid
     from mjfim.output.live import live
-    from mjfim.output.models.sysid import export_sysid
-    from mjfim.output.robots.export import export_design
-    from mjfim.output.video.video import save_video
+    from mjfim.output.video import save_video
     from mjfim.parallel import ExecutorLike, Pool, Workers
     from mjfim.parallel.budget import Budget, StopToken
     from mjfim.records.campaign import Campaign
@@ -109,10 +109,10 @@ MODULES = {
     "identify": "mjfim.identification.identify",
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",
     "draw_parameters": "mjfim.identification.assessment.parameter_draws",
-    "export_design": "mjfim.output.robots.export",
-    "export_sysid": "mjfim.output.models.sysid",
+    "export_design": "mjfim.output.export.design",
+    "export_sysid": "mjfim.output.export.sysid",
     "live": "mjfim.output.live",
-    "save_video": "mjfim.output.video.video",
+    "save_video": "mjfim.output.video",
     "ExecutorLike": "mjfim.parallel",
     "Pool": "mjfim.parallel",
     "Workers": "mjfim.parallel",

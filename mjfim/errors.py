@@ -54,6 +54,10 @@ class RecordingError(MjfimError):
     """A recording, a control table or a design archive cannot be used."""
 
 
+class NoVideoError(MjfimError):
+    """There is no video, for a reason that its message states; the work goes on without it."""
+
+
 class OutputError(MjfimError):
     """A result cannot be written where the user wants it without the loss of other files."""
 

@@ -34,7 +34,7 @@ from typing import Any, Literal
 import tomlkit
 from PIL import Image
 
-from mjfim.output.vocabulary import TERMS
+from mjfim.output.page import TERMS
 from scripts.rerun_screenshot import Shot, every_tab, screenshot
 from scripts.verbs import call_verb
 

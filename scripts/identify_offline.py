@@ -56,8 +56,8 @@ def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.identification.identify import identify_system
+    from mjfim.output.export.mjcf import write_identified
     from mjfim.output.manifest import OutputGuard, claimed
-    from mjfim.output.models.mjcf import write_identified
     from mjfim.recordings.read import read_recording
 
     # The experiment file says what is unknown, where to start, and how noisy each output is.

@@ -20,7 +20,7 @@ from mjfim.identification.assessment.report import _warnings_of_bounds, _warning
 from mjfim.identification.search import _start
 from mjfim.identification.starts import divergence_at_start
 from mjfim.output.campaign_folder import accuracy_sentence
-from mjfim.output.pages.robots import MAX_MISSED_LIMITS, _limit_sentences
+from mjfim.output.pages.studies import MAX_MISSED_LIMITS, _limit_sentences
 from mjfim.records.campaign import missed_targets
 from mjfim.records.check import (
     Combination,

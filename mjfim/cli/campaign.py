@@ -63,8 +63,8 @@ def campaign(
     from mjfim.excitation.task import DesignTask
     from mjfim.experiment.packing import input_files
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
-    from mjfim.output.campaign_parameters import CampaignParameters
-    from mjfim.output.pages.robots import campaign_page
+    from mjfim.output.pages.studies import campaign_page
+    from mjfim.output.words import CampaignParameters
     from mjfim.records.campaign import CampaignStatus
 
     task = DesignTask.resolve(with_target_accuracies(stated, wanted), threads=run.threads)
@@ -161,7 +161,7 @@ class _Lab:
         from mjfim.files import write_json
         from mjfim.output.archive import write_design
         from mjfim.output.campaign_folder import SETTINGS_FILE
-        from mjfim.studies.redesign import restate_experiment
+        from mjfim.studies.campaign import restate_experiment
 
         # A call that continues the campaign needs the settings as soon as there is a round.
         if settings and not self.folder.has_rounds:

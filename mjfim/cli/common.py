@@ -26,17 +26,16 @@ from mjfim.errors import (
     MjfimError,
     ModelWarning,
     NoResultError,
+    NoVideoError,
     RecordingError,
     UndrawnWarning,
     UnfinishedError,
 )
 from mjfim.files import observed_by, remove_temporary_files
-from mjfim.output.drawing import PictureFormat, write_optional
 from mjfim.output.live import ADDRESS, HERE
-from mjfim.output.page import Page
-from mjfim.output.report import REPORT
-from mjfim.output.terminal import render
-from mjfim.output.video.video import NoVideoError, require_format, write_video
+from mjfim.output.manifest import write_optional
+from mjfim.output.page import REPORT, Page, PictureFormat, render
+from mjfim.output.video import require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
     NOTHING_SENTENCE,
@@ -46,7 +45,7 @@ from mjfim.parallel.budget import (
 
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
-    from mjfim.output.video.film import Filmed
+    from mjfim.output.film import Filmed
     from mjfim.parallel import Workers
     from mjfim.records.base import ShownRecord
 
@@ -366,7 +365,7 @@ def permit_processes() -> None:
 def draw_elsewhere() -> None:
     """Let another process draw the pictures of the running verb's result."""
     if _may_start_processes:
-        from mjfim.output.drawing import drawing_elsewhere
+        from mjfim.output.plots.pictures import drawing_elsewhere
 
         _claims.enter_context(drawing_elsewhere())
 
@@ -538,7 +537,7 @@ def _say_what_is_there(folder: Path | None) -> None:
         say_from_program(NOTHING_SENTENCE)
         return
 
-    from mjfim.output.report.build import kinds_in  # takes a while to import
+    from mjfim.output.report import kinds_in  # takes a while to import
 
     sentence = (
         f"interrupted; {folder}/ holds only a part of the results, but each file in it is complete"

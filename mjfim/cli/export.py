@@ -10,7 +10,7 @@ import typer
 import mjfim
 from mjfim.cli.common import ExperimentOfDesign, Force, claim_file, claim_folder, keep_result, verb
 from mjfim.cli.progress import progress, say
-from mjfim.output.robots import TARGETS
+from mjfim.output.export import TARGETS
 
 
 @verb()
@@ -47,14 +47,14 @@ def export(
     """Write a design for ROS 2 or LeRobot, or as a stand-alone Python program that plays it."""
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.folders import find_experiment_file
-    from mjfim.output.robots.export import (
+    from mjfim.output.export.design import (
         exported_files,
         is_folder,
         require_options,
         write_export,
     )
-    from mjfim.output.robots.plan import RobotPlan
+    from mjfim.output.export.plan import RobotPlan
+    from mjfim.output.folders import find_experiment_file
 
     require_options(to, positions, storage, unit)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder

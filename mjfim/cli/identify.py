@@ -81,10 +81,9 @@ def identify(
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output.archive import summary_with_origin
-    from mjfim.output.folders import estimate_files, parts_of_identified
+    from mjfim.output.folders import estimate_files, parts_of_identified, sample_files
     from mjfim.output.pages import page_of
     from mjfim.output.pages.files import log_section
-    from mjfim.output.robot_samples import sample_files
     from mjfim.recordings.read import read_log, recording_paths
 
     system = System.resolve(stated, threads=run.threads)

@@ -11,11 +11,11 @@ from mjfim.cli.common import Force, ModelFile, claim_file, verb
 from mjfim.cli.progress import out, progress, say
 from mjfim.errors import ExperimentError
 from mjfim.files import replacing
-from mjfim.studies.first_experiment.wishes import GROUPS, Group
+from mjfim.studies import GROUPS, Group
 
 if TYPE_CHECKING:
-    from mjfim.studies.first_experiment.propose import Proposal
-    from mjfim.studies.first_experiment.wishes import Wishes
+    from mjfim.studies.first_candidates import Wishes
+    from mjfim.studies.first_experiment import Proposal
 
 
 @verb()
@@ -55,9 +55,8 @@ def init(
     """Write a first experiment file for a model, with a comment for every choice."""
     from mjfim.cli.questions import ask as ask_for
     from mjfim.model.model_files import is_urdf
-    from mjfim.studies.first_experiment.document import experiment_text
-    from mjfim.studies.first_experiment.propose import propose_experiment
-    from mjfim.studies.first_experiment.wishes import Wishes
+    from mjfim.studies.first_candidates import Wishes
+    from mjfim.studies.first_experiment import experiment_text, propose_experiment
 
     file = output or Path(f"{model.stem}.toml")
     companion = file.with_name(f"{file.stem}_motors.xml")
@@ -89,7 +88,7 @@ def init(
 
 def _groups(text: str) -> list[Group]:
     """Groups of parameters of the option `--parameters`."""
-    from mjfim.studies.first_experiment.wishes import groups_of
+    from mjfim.studies.first_candidates import groups_of
 
     try:
         return groups_of(text)

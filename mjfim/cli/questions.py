@@ -12,16 +12,16 @@ from typing import TypeVar
 import typer
 
 from mjfim.errors import ExperimentError, listed
-from mjfim.studies.first_experiment.candidates import require_carrier
-from mjfim.studies.first_experiment.propose import Proposal, wanted_times
-from mjfim.studies.first_experiment.wishes import (
-    GROUPS,
+from mjfim.studies import GROUPS
+from mjfim.studies.first_candidates import (
     Wishes,
     groups_of,
+    require_carrier,
     require_keyframe,
     require_rate,
     resting_keyframes,
 )
+from mjfim.studies.first_experiment import Proposal, wanted_times
 
 Answer = TypeVar("Answer")
 

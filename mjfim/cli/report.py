@@ -9,8 +9,7 @@ import typer
 
 from mjfim.cli.common import Force, Pictures, claim_file, keep_result, verb
 from mjfim.cli.progress import say
-from mjfim.output.drawing import PictureFormat
-from mjfim.output.report import REPORT
+from mjfim.output.page import REPORT, PictureFormat
 
 
 @verb()
@@ -30,7 +29,7 @@ def report(
     """Write the report of a folder of results again, without computing anything anew."""
     # The parts of a report take a while to import; other verbs need them only when they write.
     from mjfim.output.folders import missing_pictures, write_pictures
-    from mjfim.output.report.build import kinds_in, write_report
+    from mjfim.output.report import kinds_in, write_report
 
     kinds_in(folder)
     drawn = missing_pictures(folder) if missing else {}

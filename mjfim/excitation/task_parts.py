@@ -24,10 +24,9 @@ from mjfim.files import read_json
 from mjfim.information.criteria import marginal
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import joint_dofs, joint_names
-from mjfim.model.parameter_ranges import sample_parameters
+from mjfim.model.parameters import sample_parameters
 from mjfim.model.variants import Relaxation
 from mjfim.plant.batch import BatchSimulator
-from mjfim.model.parameters import sample_parameters
 from mjfim.recordings.control_table import read_control
 from mjfim.records.trajectory import Trajectory
 

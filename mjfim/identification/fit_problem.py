@@ -29,17 +29,13 @@ from mjfim.identification.segments import (
     recorded_release,
     stated_segments,
 )
-from mjfim.identification.unknowns import Pins, PriorRows, UnknownLayout
-from mjfim.information.null_space import NullSpace
-from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step, triangle
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
-from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
+from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.plant.outputs import Noise
-from mjfim.plant.derivatives import SENSITIVITY_STEP
-from mjfim.plant.noise import Noise
+from mjfim.plant.plant import SENSITIVITY_STEP
 from mjfim.records.trajectory import Recording
 
 T = TypeVar("T")

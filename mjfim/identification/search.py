@@ -17,9 +17,7 @@ from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
 from mjfim.identification.segments import spread_over_data
-from mjfim.identification.task import FitTask
 from mjfim.model.parameters import sample_parameters
-from mjfim.model.parameter_ranges import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
     SearchSettings,
     Solution,

@@ -24,9 +24,9 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording
+from mjfim.model.elements import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
-from mjfim.model.terms.extension import FILTERS
+from mjfim.model.terms.term import FILTERS
 from mjfim.model.units import actuator_gear
 from mjfim.plant.outputs import outputs_by_state
 

@@ -23,21 +23,19 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import as_json, read_json, replacing, write_json
 from mjfim.output.archive import check_fits, origin_of
-from mjfim.output.campaign_parameters import CampaignParameters
-from mjfim.output.drawing import PictureFormat, write_optional
+from mjfim.output.export.mjcf import write_identified
 from mjfim.output.folders import (
     DESIGN_ARCHIVE,
     IDENTIFIED,
     parts_of_identified,
     write_pictures,
 )
-from mjfim.output.manifest import fingerprint
-from mjfim.output.models.mjcf import write_identified
+from mjfim.output.manifest import fingerprint, write_optional
+from mjfim.output.page import REPORT, PictureFormat
 from mjfim.output.plots import studies
 from mjfim.output.plots.pictures import Pictures
-from mjfim.output.plots.words import format_with_uncertainty
-from mjfim.output.report import REPORT
-from mjfim.output.report.build import write_report
+from mjfim.output.report import write_report
+from mjfim.output.words import CampaignParameters, format_with_uncertainty
 from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound
 from mjfim.records.design import Design

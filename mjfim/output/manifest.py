@@ -2,7 +2,7 @@
 
 A folder with results holds a manifest, `.mjfim.json`. It lists the size and the SHA-256 sum of each
 file that a verb of the command line wrote there. A file that is not listed, or has other contents,
-belongs to the user.
+belongs to the user. Files that cannot be drawn are left out.
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from mjfim.errors import OutputError, RecordingError
+from mjfim.errors import MjfimError, OutputError, RecordingError, UndrawnWarning
 from mjfim.files import guarded_by, read_json, replacing
+from mjfim.parallel.budget import run_optional
 
 # Name of the manifest, and of the locks of a manifest and of a folder.
 MANIFEST = ".mjfim.json"
@@ -289,3 +291,36 @@ else:
         except OSError:
             pass  # this file system has no locks; a run without a lock is better than none
         return True
+
+
+def write_optional(name: str, write: Callable[[], object]) -> None:
+    """Write a file that may be missing: it is left out when the user presses Ctrl-C twice.
+
+    A fault of the program while it is drawn is a warning, which the command line shows as one
+    sentence. Tests make an error of it, and `python -W error -m mjfim` shows where the fault is.
+
+    Args:
+        name: Name of the file.
+        write: Draws and writes it.
+
+    Raises:
+        MjfimError: The file may not be written.
+        OSError: The file cannot be written.
+    """
+
+    def guarded() -> None:
+        """Write the file."""
+        try:
+            write()
+        except (MjfimError, OSError):
+            raise
+        except Exception as error:
+            fault = ": ".join(part for part in (type(error).__name__, str(error)) if part)
+            message = (
+                f"could not draw {name}, because of a fault in mjfim ({fault}); the result "
+                "stands, and its data are written (python -W error -m mjfim shows the place of "
+                "the fault)"
+            )
+            warnings.warn(message, UndrawnWarning, stacklevel=2)
+
+    run_optional(guarded)

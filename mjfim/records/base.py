@@ -31,7 +31,7 @@ MAX_VALUE_LENGTH = 48
 MAX_ENTRIES = 4
 
 # Modules that show records as HTML, and that draw their figures.
-PRESENTATION = "mjfim.output.report.build"
+PRESENTATION = "mjfim.output.report"
 PICTURES = "mjfim.output.plots.pictures"
 
 T = TypeVar("T")

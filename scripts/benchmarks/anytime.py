@@ -30,7 +30,7 @@ from rich.table import Table
 import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.schema import Experiment
-from mjfim.output.vocabulary import DESIGNED, OTHER
+from mjfim.output.page import DESIGNED, OTHER
 from mjfim.parallel.budget import measured_by, stop_on_interrupt
 from mjfim.records.comparison import DESIGN
 from mjfim.studies.baselines import TITLES

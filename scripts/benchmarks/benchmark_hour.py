@@ -22,10 +22,6 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.experiment.signals import multisine
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.system import System, simulate_system
 from mjfim.output.archive import write_recording

@@ -43,7 +43,7 @@ from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
-from mjfim.output.models.sysid import silenced, sysid_problem
+from mjfim.output.export.sysid import silenced, sysid_problem
 from mjfim.parallel import cores
 from mjfim.records.trajectory import Recording
 

@@ -24,7 +24,7 @@ from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from mjfim.records.events import FitEvent, StudyEvent
-from mjfim.studies import derivative_test
+from mjfim.studies import check as study_check
 from mjfim.studies import monte_carlo as trials
 from tests.support.cli import (
     DESIGN,
@@ -140,13 +140,13 @@ def test_an_interrupted_check_is_written_and_marked_as_incomplete(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The accuracies are there; what is missing is named, and nothing is called sufficient."""
-    whole = derivative_test.recursion_error
+    whole = study_check.recursion_error
 
     def recursion_error(*arguments: Any) -> float:
         interrupt()
         return whole(*arguments)
 
-    monkeypatch.setattr(derivative_test, "recursion_error", recursion_error)
+    monkeypatch.setattr(study_check, "recursion_error", recursion_error)
     result = run("check", study, "-o", tmp_path / "out")
     assert result.exit_code == 1
     assert "this check is incomplete; it lacks the test of the derivatives" in result.stdout

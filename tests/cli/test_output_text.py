@@ -12,8 +12,7 @@ import pytest
 
 from mjfim.cli.common import replace_unencodable_characters
 from mjfim.cli.progress import errors, out
-from mjfim.output.page import Row, Table
-from mjfim.output.terminal import render
+from mjfim.output.page import Row, Table, render
 from tests.support.cli import PROCESS, loads, misused, run, write_experiment
 from tests.support.pages import page_with
 from tests.support.paths import ROOT

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
+from mjfim.output.page import REPORT
 from mjfim.output.plots import draw
 from mjfim.output.plots.pictures import picture_names
-from mjfim.output.report import REPORT
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from tests.support import results
 from tests.support.cli import misused, run

@@ -21,9 +21,9 @@ from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
-from mjfim.output.labels import complete_labels
 from mjfim.output.pages.files import experiment_page
 from mjfim.output.plots.design import limits as limits_picture
+from mjfim.output.words import complete_labels
 from mjfim.studies.inventory import stated_experiment
 from tests.support.limits import barrier_check
 from tests.support.numerics import Array, make_task

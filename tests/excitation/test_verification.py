@@ -12,7 +12,7 @@ import pytest
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, _clearance_usage, verify
 from mjfim.excitation.task import DesignTask
-from mjfim.output.playback import reference_columns, simulate_playback
+from mjfim.output.archive import reference_columns, simulate_playback
 from tests.support.numerics import CART_PENDULUM, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.

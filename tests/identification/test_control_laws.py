@@ -19,7 +19,7 @@ from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import least_squares
-from mjfim.output.models.mjcf import write_identified
+from mjfim.output.export.mjcf import write_identified
 from mjfim.recordings.read import read_recording
 from mjfim.records.trajectory import Recording
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate

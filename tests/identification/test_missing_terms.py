@@ -10,8 +10,6 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
 from mjfim.identification.assessment import term_tests
 from mjfim.identification.assessment.term_candidates import Candidate, Effect
 from mjfim.identification.assessment.term_tests import find_missing_terms

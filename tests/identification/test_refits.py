@@ -12,10 +12,6 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.assessment.report import FitResult, estimate_from
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
-from mjfim.identification.assessment.accuracy import FitResult
-from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.term_tests import TermTests
 from mjfim.identification.identify import fit_task, refit_task
 from mjfim.identification.search import FitSearch, FitTask

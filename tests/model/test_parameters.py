@@ -19,7 +19,7 @@ from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
 from mjfim.model.paths import KINDS, ParameterPath, fields_of, resolve
 from mjfim.model.targets import ModelField, RotationField, SpecField
 from mjfim.model.variants import PlantModel
-from mjfim.output.models.mjcf import write_identified
+from mjfim.output.export.mjcf import write_identified
 from tests.support.numerics import make_task
 from tests.support.specs import write_spec
 

@@ -15,7 +15,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import TermKind
 from mjfim.model.terms.library import KINDS
-from mjfim.output.models.mjcf import write_identified
+from mjfim.output.export.mjcf import write_identified
 from tests.support.terms import (
     DAMPING,
     EXAMPLES,

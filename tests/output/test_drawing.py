@@ -13,17 +13,17 @@ from typing import Any
 import pytest
 
 from mjfim.errors import MjfimError
-from mjfim.output import drawing
-from mjfim.output.drawing import PictureFormat, begin_pictures, drawing_elsewhere
+from mjfim.output.page import PictureFormat
+from mjfim.output.plots import pictures
 from mjfim.output.plots.draw import content
-from mjfim.output.plots.pictures import pictures_of
+from mjfim.output.plots.pictures import begin_pictures, drawing_elsewhere, pictures_of
 from tests.support import results
 
 
 def test_a_picture_that_cannot_be_drawn_names_its_reason() -> None:
     without_figures: object = object()
     with pytest.raises(MjfimError, match="a object has no figures"):
-        drawing._contents(without_figures, PictureFormat.PNG)  # type: ignore[arg-type]
+        pictures._contents(without_figures, PictureFormat.PNG)  # type: ignore[arg-type]
 
 
 class FaultyPool:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.output.models.mjcf import identified_files, write_identified
+from mjfim.output.export.mjcf import identified_files, write_identified
 from tests.output.test_mjcf import assert_is_identified_model, changes, task_of
 
 # A robot of five files: settings with defaults, an arm in the tree, and inside it a hand, all in

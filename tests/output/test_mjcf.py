@@ -16,7 +16,7 @@ from mjfim.errors import MjfimError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.model.paths import KINDS, fields_of
-from mjfim.output.models.mjcf import same_dynamics, write_identified
+from mjfim.output.export.mjcf import same_dynamics, write_identified
 from tests.support.examples import design_file
 from tests.support.numerics import make_task, shared_model
 from tests.support.paths import MODELS, SHARED_MODELS

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 import pytest
 
 import mjfim
-from mjfim.output import notebook_progress
-from mjfim.output.notebook_progress import NotebookProgress
+from mjfim.output import progress_text
+from mjfim.output.progress_text import NotebookProgress
 from mjfim.records import events
 from mjfim.records.events import Event, FitEvent, StudyEvent
 from tests.support.paths import MODELS
@@ -39,8 +39,8 @@ def places(monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
         return found[-1]
 
     monkeypatch.setattr(events, "in_notebook", lambda: True)
-    monkeypatch.setattr(notebook_progress, "display", display)
-    monkeypatch.setattr(notebook_progress, "UPDATE_SECONDS", 0.0)
+    monkeypatch.setattr("IPython.display.display", display)
+    monkeypatch.setattr(progress_text, "UPDATE_SECONDS", 0.0)
     return found
 
 
@@ -104,7 +104,7 @@ def test_a_program_that_is_no_notebook_shows_nothing(
 
 
 def test_an_error_is_said_where_the_bar_was(places: list[Shown]) -> None:
-    with pytest.raises(ZeroDivisionError), notebook_progress.progress("dividing"):
+    with pytest.raises(ZeroDivisionError), progress_text.progress("dividing"):
         _ = 1 / 0
     assert "dividing (ended by an error after 0.0 s)" in places[0][-1]
 
@@ -124,7 +124,7 @@ def test_the_share_of_a_study_is_drawn_and_text_is_escaped(places: list[Shown]) 
 def test_updates_that_come_too_soon_are_left_out(
     places: list[Shown], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notebook_progress, "UPDATE_SECONDS", 1e6)
+    monkeypatch.setattr(progress_text, "UPDATE_SECONDS", 1e6)
     show = NotebookProgress("identifying")
     for i in range(100):
         show(FitEvent(phase="all data", iteration=i, cost=1.0, step=1.0))

@@ -10,7 +10,8 @@ import pytest
 
 from mjfim.errors import OutputError, UndrawnWarning
 from mjfim.output import folders
-from mjfim.output.drawing import PictureFormat, write_optional
+from mjfim.output.manifest import write_optional
+from mjfim.output.page import PictureFormat
 from tests.support import results
 
 

@@ -14,9 +14,9 @@ from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.output.page import Emphasis, Level, Listing, Row, Table, named, number
 from mjfim.output.pages import page_of
-from mjfim.output.pages.accuracy import improvement, relative
-from mjfim.output.pages.estimate_parts import selection_parts
-from mjfim.output.rerun.text import as_markdown
+from mjfim.output.pages.estimate import selection_parts
+from mjfim.output.rerun.documents import as_markdown
+from mjfim.output.words import improvement, relative
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.design import CombinationAccuracy, Status

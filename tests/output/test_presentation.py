@@ -14,14 +14,13 @@ from matplotlib.figure import Figure
 
 import mjfim
 from mjfim.errors import MjfimError
-from mjfim.output.drawing import PictureFormat
 from mjfim.output.folders import DESIGN_FILES, estimate_files, study_files, write_pictures
 from mjfim.output.manifest import OutputGuard, claimed
-from mjfim.output.page import Emphasis, Listing, Row, Table, Text
+from mjfim.output.page import Emphasis, Listing, PictureFormat, Row, Table, Text
 from mjfim.output.pages import page_of
 from mjfim.output.panels import Picture
 from mjfim.output.plots.pictures import Pictures
-from mjfim.output.report.build import STYLES, template
+from mjfim.output.report import STYLES, template
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import Design
 from mjfim.records.robustness import RobotConditions, Robustness

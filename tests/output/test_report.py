@@ -16,6 +16,7 @@ import pytest
 
 from mjfim.errors import RecordingError
 from mjfim.files import write_json
+from mjfim.output.page import REPORT
 from mjfim.output.pages import page_of
 from mjfim.output.panels import (
     Axis,
@@ -31,9 +32,8 @@ from mjfim.output.panels import (
     vline,
 )
 from mjfim.output.plots.pictures import pictures_of
-from mjfim.output.report import REPORT
-from mjfim.output.report.build import KINDS, Media, media_in, report_of, write_report
-from mjfim.output.report.plotly import group_of, packed, thinned
+from mjfim.output.plots.plotly import group_of, packed, thinned
+from mjfim.output.report import KINDS, Media, media_in, report_of, write_report
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import LimitUsage

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from mjfim.output.report.build import report_of
-from mjfim.output.vocabulary import DESIGNED
+from mjfim.output.page import DESIGNED
+from mjfim.output.report import report_of
 from mjfim.records.base import ShownRecord
 from tests.support import results
 

@@ -26,8 +26,7 @@ from mjfim.output.rerun.camera import (
     seen_points,
 )
 from mjfim.output.rerun.plots import round_numbers
-from mjfim.output.rerun.scene import body_poses, entity_path
-from mjfim.output.rerun.shapes import INFINITE_REACH, OUTLINE, SOLID
+from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses, entity_path
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
 from mjfim.records.trajectory import Trajectory

@@ -13,7 +13,7 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.experiment import System
 from mjfim.output import archive
-from mjfim.output.robots.ros2 import yaml_number
+from mjfim.output.export.trajectories import yaml_number
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats.read import read_table
 from tests.output.conftest import Designed, designed

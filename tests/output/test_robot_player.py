@@ -17,8 +17,8 @@ import pytest
 
 import mjfim
 from mjfim.experiment import System
-from mjfim.output.robots.export import write_player
-from mjfim.output.robots.plan import RobotPlan
+from mjfim.output.export.design import write_player
+from mjfim.output.export.plan import RobotPlan
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats.read import read_table
 from tests.output.conftest import Designed

@@ -14,12 +14,12 @@ import pytest
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.parameter_draws import complete_theta, draw_parameters_system
-from mjfim.output import robot_samples
+from mjfim.output import folders
+from mjfim.output.export.mjcf import same_dynamics, write_identified
+from mjfim.output.folders import clear_samples, sample_files, write_samples
 from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
-from mjfim.output.models.mjcf import same_dynamics, write_identified
 from mjfim.output.page import Text
-from mjfim.output.pages.estimate_parts import sample_parts
-from mjfim.output.robot_samples import clear_samples, sample_files, write_samples
+from mjfim.output.pages.estimate import sample_parts
 from mjfim.records.estimate import Estimate, PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
 from tests.support.paths import MODELS
@@ -129,7 +129,7 @@ def test_all_models_are_written_or_none(
             raise mjfim.errors.ModelError("the link has a fault")
         return write(path, *arguments)
 
-    monkeypatch.setattr(robot_samples, "write_identified", fail)
+    monkeypatch.setattr(folders, "write_identified", fail)
     with claimed(tmp_path, OutputGuard([], force=False), exclusive=True):
         (remark,) = write_samples(tmp_path, estimate, system)
     assert remark == "no models of drawn robots were written: the link has a fault"

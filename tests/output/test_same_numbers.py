@@ -16,11 +16,10 @@ from matplotlib.text import Text
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.output import archive
-from mjfim.output.page import number
+from mjfim.output.page import REPORT, number
 from mjfim.output.pages import page_of
-from mjfim.output.pages.accuracy import relative
-from mjfim.output.report import REPORT
-from mjfim.output.report.build import write_report
+from mjfim.output.report import write_report
+from mjfim.output.words import relative
 from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.design import Design

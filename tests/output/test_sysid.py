@@ -16,8 +16,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.output.models.mjcf import same_dynamics
-from mjfim.output.models.sysid import SysidProblem, silenced, sysid_problem
+from mjfim.output.export.mjcf import same_dynamics
+from mjfim.output.export.sysid import SysidProblem, silenced, sysid_problem
 from mjfim.records.trajectory import Recording
 from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import Array, body_task, filtered_task

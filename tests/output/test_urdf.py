@@ -13,8 +13,8 @@ import pytest
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.model.model_files import urdf_sources
+from mjfim.output.export.mjcf import identified_files, same_dynamics, write_identified
 from mjfim.output.manifest import MANIFEST
-from mjfim.output.models.mjcf import identified_files, same_dynamics, write_identified
 from tests.output.test_mjcf import changes
 from tests.support.cli import names, run
 from tests.support.numerics import Array

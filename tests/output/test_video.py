@@ -14,12 +14,12 @@ from PIL import Image
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError
+from mjfim.errors import NoVideoError, RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
-from mjfim.output import vocabulary
-from mjfim.output.video.film import Film, film_of, film_of_motions, film_speed, positions_at
-from mjfim.output.video.video import NoVideoError, Video, render, report_video, require_format
+from mjfim.output.film import Film, film_of, film_of_motions, film_speed, positions_at
+from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED
+from mjfim.output.video import Video, render, report_video, require_format
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import MODELS
 
@@ -64,7 +64,7 @@ def swinging(seconds: float, amplitude: float = 0.5) -> Trajectory:
 
 def identified(model: mujoco.MjModel, *motions: Trajectory) -> Film:
     """A film of an identified motion, with a measured one as a ghost."""
-    terms = (vocabulary.IDENTIFIED, vocabulary.MEASURED)
+    terms = (IDENTIFIED, MEASURED)
     return film_of_motions(model, [list(zip(terms, motions, strict=False))])
 
 
@@ -93,7 +93,7 @@ class TestFilm:
         )
 
     def test_initial_is_beside_designed(self, swing: mujoco.MjModel) -> None:
-        motions = [[(vocabulary.INITIAL, swinging(4.0))], [(vocabulary.DESIGNED, swinging(4.0))]]
+        motions = [[(INITIAL, swinging(4.0))], [(DESIGNED, swinging(4.0))]]
         film = film_of_motions(swing, motions)
         assert film.caption == "The initial motion beside the designed motion, in real time."
 
@@ -209,7 +209,7 @@ class TestVideo:
     def test_mp4_shows_both_motions(self, swing: mujoco.MjModel, tmp_path: Path) -> None:
         av = pytest.importorskip("av", reason="mp4 needs the extra `video`")
         still, moving = swinging(4.0, 0.0), swinging(4.0, 1.0)
-        motions = [[(vocabulary.INITIAL, still)], [(vocabulary.DESIGNED, moving)]]
+        motions = [[(INITIAL, still)], [(DESIGNED, moving)]]
         video = drawn(film_of_motions(swing, motions), "mp4")
 
         assert video.media_type == "video/mp4"

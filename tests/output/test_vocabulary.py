@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mjfim.output.vocabulary import TERMS, Term
+from mjfim.output.page import TERMS, Term
 from tests.support.paths import ROOT
 
 PAGE = ROOT / "docs" / "reference" / "words-and-colours.md"
@@ -40,10 +40,10 @@ def test_the_page_has_the_words_colours_and_meanings(term: Term) -> None:
     (row,) = [row for row in rows if row.startswith(f"| {term.word} |")]
     assert set(re.findall(r"#[0-9a-f]{6}", row)) == {term.colour}
 
-    import mjfim.output.vocabulary as vocabulary
+    import mjfim.output.page as shown
 
     meaning = row.rstrip("| ").rpartition("|")[2].strip()
-    assert vocabulary.__doc__ is not None and meaning in vocabulary.__doc__
+    assert shown.__doc__ is not None and meaning in shown.__doc__
 
 
 def sentences_of_modules() -> Iterator[tuple[str, str]]:

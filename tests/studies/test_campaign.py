@@ -35,7 +35,7 @@ from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.trajectory import Recording
 from mjfim.studies import campaign as campaign_module
-from mjfim.studies.redesign import restate_experiment
+from mjfim.studies.campaign import restate_experiment
 from tests.support.cli import PROCESS, misused, read, run
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS

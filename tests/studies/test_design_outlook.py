@@ -11,7 +11,7 @@ import pytest
 import mjfim
 from mjfim.errors import MjfimError, SimulationDivergedError
 from mjfim.excitation.design import design_task
-from mjfim.studies import derivative_test
+from mjfim.studies import check as study_check
 from mjfim.studies.check import check_task
 from tests.support import stiff_servos
 from tests.support.numerics import cart_task
@@ -127,7 +127,7 @@ def test_a_motion_without_a_regulator_fails_the_self_test_without_a_traceback(
     def unstable(*_: object) -> float:
         raise np.linalg.LinAlgError("the Riccati recursion lost positive definiteness")
 
-    monkeypatch.setattr(derivative_test, "slope_error", unstable)
+    monkeypatch.setattr(study_check, "slope_error", unstable)
     found = check_task(stiff_arm_task(tmp_path, amplitude=1e-3))
     assert np.isinf(found.self_test.slope)
     assert not found.self_test.passed

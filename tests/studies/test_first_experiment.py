@@ -14,9 +14,14 @@ from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.studies.check import check
-from mjfim.studies.first_experiment.document import experiment_text
-from mjfim.studies.first_experiment.propose import Proposal, identifiable, propose_experiment
-from mjfim.studies.first_experiment.start import (
+from mjfim.studies.first_candidates import Wishes
+from mjfim.studies.first_experiment import (
+    Proposal,
+    experiment_text,
+    identifiable,
+    propose_experiment,
+)
+from mjfim.studies.first_motion import (
     RATE_RANGE,
     _candidates,
     _rate,
@@ -24,7 +29,6 @@ from mjfim.studies.first_experiment.start import (
     reach,
     time_scale,
 )
-from mjfim.studies.first_experiment.wishes import Wishes
 from tests.support.cli import MODELS
 
 URDF = """

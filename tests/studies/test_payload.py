@@ -14,8 +14,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.studies.payload import PayloadTask
-from mjfim.studies.payload_experiment import RobotExperiment
+from mjfim.studies.payload import PayloadTask, RobotExperiment
 from tests.identification.test_parameter_draws import estimated
 
 # Two hinges about different axes, so that gravity and inertia show every coordinate of a load.

@@ -23,8 +23,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
-from mjfim.output.pages.robots import robustness_sentences
-from mjfim.output.playback import design_columns, reference_columns, simulate_playback
+from mjfim.output.archive import design_columns, reference_columns, simulate_playback
+from mjfim.output.pages.studies import robustness_sentences
 from mjfim.recordings.control_table import read_playback
 from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.records.trajectory import Playback, Recording

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from mjfim.output.page import Level, Page, Part, Section, Text, Verdict
-from mjfim.output.terminal import render
+from mjfim.output.page import Level, Page, Part, Section, Text, Verdict, render
 
 
 def printed(page: Page, width: int = 200, *, verbose: bool = False) -> str:

@@ -23,9 +23,8 @@ from mjfim.identification.assessment.robust_covariance import (
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.information.criteria import marginal, standard_deviations
 from mjfim.identification.search import FitTask, of_subset
-from mjfim.information.marginal import marginal, standard_deviations
+from mjfim.information.criteria import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues

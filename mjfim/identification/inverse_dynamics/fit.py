@@ -28,8 +28,8 @@ from mjfim.identification.inverse_dynamics.equations import MotionEquations
 from mjfim.identification.inverse_dynamics.motion import measured_forces
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.model.control_laws import LawField
+from mjfim.model.elements import model_length, translations
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.sizes import model_length, translations
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
 from mjfim.parallel import one_blas_thread
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit

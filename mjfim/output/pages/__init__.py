@@ -10,15 +10,15 @@ from mjfim.records.base import ShownRecord
 
 # The module and the function that describe each kind of record. A verb imports those it needs.
 PAGES = {
-    "Campaign": ("robots", "campaign_page"),
-    "Check": ("check", "check_page"),
+    "Campaign": ("studies", "campaign_page"),
+    "Check": ("design", "check_page"),
     "Comparison": ("studies", "comparison_page"),
     "Design": ("design", "design_page"),
     "Estimate": ("estimate", "estimate_page"),
-    "InverseDynamicsFit": ("equation", "equation_page"),
+    "InverseDynamicsFit": ("studies", "equation_page"),
     "MonteCarloStudy": ("studies", "study_page"),
-    "RobotComparison": ("robots", "robots_page"),
-    "Robustness": ("robots", "robustness_page"),
+    "RobotComparison": ("studies", "robots_page"),
+    "Robustness": ("studies", "robustness_page"),
 }
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjfim.output.page import (
+    NOMINAL,
     Level,
     Listing,
     Page,
@@ -18,7 +19,6 @@ from mjfim.output.page import (
     named,
     number,
 )
-from mjfim.output.vocabulary import NOMINAL
 from mjfim.recordings.summary import ColumnSummary, LogSummary
 from mjfim.records.inventory import Inventory, StatedExperiment
 

@@ -10,7 +10,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
-from mjfim.output.pages.accuracy import BEST_CASE, improvement, relative, size_sentence
+from mjfim.output.archive import shown_positions
+from mjfim.output.page import DESIGNED, INITIAL
 from mjfim.output.panels import (
     SERIES,
     Axis,
@@ -31,9 +32,16 @@ from mjfim.output.panels import (
     vline,
     words,
 )
-from mjfim.output.playback import shown_positions
-from mjfim.output.plots.words import as_sentence, format_number, quotient_unit, shorten
-from mjfim.output.vocabulary import DESIGNED, INITIAL
+from mjfim.output.words import (
+    BEST_CASE,
+    as_sentence,
+    format_number,
+    improvement,
+    quotient_unit,
+    relative,
+    shorten,
+    size_sentence,
+)
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.labels import Labels
 from mjfim.records.trajectory import Trajectory

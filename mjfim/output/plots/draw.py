@@ -29,9 +29,9 @@ from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from mjfim.errors import MjfimError
 from mjfim.files import replacing
 from mjfim.model.coordinates import split_unit
-from mjfim.output.drawing import PictureFormat
+from mjfim.output.page import PictureFormat
 from mjfim.output.panels import ROLES, Axis, Cells, Mark, Panel, Picture
-from mjfim.output.plots.words import format_number, shorten
+from mjfim.output.words import format_number, shorten
 
 # The settings of matplotlib belong to the whole process, so one thread draws at a time.
 STYLE_LOCK = threading.RLock()

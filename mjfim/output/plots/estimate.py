@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices
 from mjfim.model.coordinates import split_unit
+from mjfim.output.page import IDENTIFIED, MEASURED, NOMINAL
 from mjfim.output.panels import (
     Axis,
     Mark,
@@ -29,14 +30,13 @@ from mjfim.output.panels import (
     row_axis,
     vline,
 )
-from mjfim.output.plots.words import (
+from mjfim.output.words import (
     chi_squared_quantiles,
     format_number,
     format_with_uncertainty,
     shorten,
     without_zeros,
 )
-from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
 from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
 from mjfim.records.labels import Labels, with_unit

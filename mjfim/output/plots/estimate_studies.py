@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array
+from mjfim.output.page import DESIGNED, IDENTIFIED, MEASURED, NOMINAL
 from mjfim.output.panels import (
     Axis,
     Mark,
@@ -24,8 +25,7 @@ from mjfim.output.panels import (
     vline,
     vspan,
 )
-from mjfim.output.plots.words import as_sentence, format_number, normal_density, shorten
-from mjfim.output.vocabulary import DESIGNED, IDENTIFIED, MEASURED, NOMINAL
+from mjfim.output.words import as_sentence, format_number, normal_density, shorten
 from mjfim.records.estimate import Estimate, HorizonStudy
 from mjfim.records.labels import with_unit
 from mjfim.records.robots import RecordingComparison

@@ -1,25 +1,31 @@
 """The pictures of every kind of result, by the names of their files without the ending.
 
-Nothing here imports matplotlib: a picture is data until `mjfim.output.plots.draw` draws it.
+A picture is data until `mjfim.output.plots.draw` draws it; nothing here imports matplotlib. It
+takes longer to import than a short design takes, and it draws in one thread. So another process may
+draw the pictures, while this one computes and writes files: interruptions and files of the user are
+treated as everywhere else.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import partial, singledispatch
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mjfim.errors import MjfimError, unknown
-from mjfim.output.campaign_parameters import CampaignParameters
-from mjfim.output.labels import complete_labels
+from mjfim.output.page import PictureFormat
 from mjfim.output.panels import Picture
 from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
 from mjfim.output.plots import estimate_studies, studies
+from mjfim.output.words import CampaignParameters, complete_labels
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -33,6 +39,10 @@ from mjfim.records.robustness import Robustness
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from mjfim.parallel import Pool
+    from mjfim.records.base import ShownRecord
+
 
 # Pictures of a design, and of an estimate beside those of its fits and predictions.
 DESIGN_PICTURES = (
@@ -244,3 +254,87 @@ def _(campaign: Campaign) -> Pictures:
         return {}
     parameters = CampaignParameters.recorded(campaign)
     return {"campaign": partial(studies.campaign, campaign, parameters)}
+
+
+# Messages for developers, which a user does not see.
+_log = logging.getLogger(__name__)
+
+# Fewest processors with which another process saves time.
+FEWEST_CORES = 2
+
+# Errors of a computer that cannot start another process, as without shared semaphores or memory.
+NO_PROCESS = (ImportError, MemoryError, OSError, RuntimeError)
+
+# The process that draws now; None where this process draws itself.
+_process: ContextVar[Pool | None] = ContextVar("drawing", default=None)
+
+
+@contextmanager
+def drawing_elsewhere() -> Iterator[None]:
+    """Let another process draw the pictures that are begun in the context, if it saves time.
+
+    It ends with the process that has started it, whatever happens to that one.
+    """
+    from mjfim.parallel import Pool, cores
+
+    pool = None
+    if cores() >= FEWEST_CORES:
+        with suppress(*NO_PROCESS):
+            pool = Pool(1)
+    token = _process.set(pool)
+    try:
+        if pool is not None:
+            with suppress(*NO_PROCESS):
+                pool.submit(_import_what_draws)
+        yield
+    finally:
+        _process.reset(token)
+        if pool is not None:
+            pool.end_running(wait=True)
+
+
+def begin_pictures(
+    record: ShownRecord, picture_format: PictureFormat
+) -> Callable[[], dict[str, bytes]]:
+    """Begin to draw the pictures of a record.
+
+    Args:
+        record: The record; it is copied to the other process.
+        picture_format: Format of the pictures.
+
+    Returns:
+        A function that waits for the contents of the files, by the names of the pictures. They are
+        none where this process has to draw, and then says what keeps a picture from being drawn.
+    """
+    pool, future = _process.get(), None
+    # The data of the result are written after this, whatever happens to the other process.
+    if pool is not None:
+        with suppress(*NO_PROCESS):
+            future = pool.submit(_contents, record, picture_format)
+
+    def contents() -> dict[str, bytes]:
+        """Wait for the pictures."""
+        if future is None:
+            return {}
+        fault = future.exception()
+        if fault is None:
+            return future.result()
+        _log.info("the process that draws has failed, so this one draws: %r", fault)
+        return {}
+
+    return contents
+
+
+# ---- in the other process
+
+
+def _import_what_draws() -> None:
+    """Import all modules that draw pictures, before there is anything to draw."""
+    import mjfim.output.plots.draw  # noqa: F401
+
+
+def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
+    """Draw all pictures of a record."""
+    from mjfim.output.plots.draw import content
+
+    return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}

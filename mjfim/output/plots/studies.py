@@ -10,8 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array
-from mjfim.output.campaign_parameters import CampaignParameters
-from mjfim.output.pages.accuracy import BEST_CASE
+from mjfim.output.page import (
+    DESIGNED,
+    IDENTIFIED,
+    INITIAL,
+    MEASURED,
+    NOMINAL,
+    OTHER,
+    TRAJECTORY_TERMS,
+)
 from mjfim.output.pages.studies import budget_in_words
 from mjfim.output.panels import (
     Axis,
@@ -33,7 +40,9 @@ from mjfim.output.panels import (
     words,
 )
 from mjfim.output.plots.estimate_studies import pairs
-from mjfim.output.plots.words import (
+from mjfim.output.words import (
+    BEST_CASE,
+    CampaignParameters,
     as_sentence,
     format_number,
     format_percent,
@@ -43,15 +52,6 @@ from mjfim.output.plots.words import (
     shorten,
     squared_unit,
     without_zeros,
-)
-from mjfim.output.vocabulary import (
-    DESIGNED,
-    IDENTIFIED,
-    INITIAL,
-    MEASURED,
-    NOMINAL,
-    OTHER,
-    TRAJECTORY_TERMS,
 )
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check

@@ -1,10 +1,11 @@
-"""Designs, estimates and trajectories as Rerun recordings, and the viewer that opens them."""
+"""Designs, estimates and trajectories as Rerun recordings with a summary, and their viewer."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +18,24 @@ import rerun.blueprint as rrb
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.files import replacing
-from mjfim.output import vocabulary
+from mjfim.output.archive import shown_positions
+from mjfim.output.page import (
+    DESIGNED,
+    IDENTIFIED,
+    INITIAL,
+    MEASURED,
+    NOMINAL,
+    TERMS,
+    Emphasis,
+    Listing,
+    Page,
+    Table,
+    Term,
+    Text,
+    shown_word,
+)
+from mjfim.output.pages import page_of
 from mjfim.output.panels import Panel, line
-from mjfim.output.playback import shown_positions
 from mjfim.output.plots.design import (
     convergence,
     information_panel,
@@ -41,6 +57,7 @@ from mjfim.output.rerun.plots import (
 from mjfim.output.rerun.scene import (
     BodyPoses,
     EntityParts,
+    RobotStyle,
     body_poses,
     end_point,
     entity_path,
@@ -52,15 +69,13 @@ from mjfim.output.rerun.scene import (
     pale_shapes,
     strip_of_path,
 )
-from mjfim.output.rerun.shapes import RobotStyle
-from mjfim.output.rerun.text import design_text, estimate_text
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
 from mjfim.records.trajectory import Trajectory
 
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
-FURTHER_ROLES = ("series2", "series5", vocabulary.IDENTIFIED.word, "series4")
+FURTHER_ROLES = ("series2", "series5", IDENTIFIED.word, "series4")
 
 # Largest number of samples of a motion in a file, and of recordings that have a tab each.
 MAX_SAMPLES, MAX_TABS = 20_000, 3
@@ -89,8 +104,8 @@ def log_design(
         addition: Markdown below the summary.
     """
     both = {
-        vocabulary.INITIAL.word: design.initial.trajectory,
-        vocabulary.DESIGNED.word: design.final.trajectory,
+        INITIAL.word: design.initial.trajectory,
+        DESIGNED.word: design.final.trajectory,
     }
     tabs: Tabs = motion_panels(labels, both, design.usage)
     tabs |= {
@@ -120,8 +135,8 @@ def log_design(
                 plane.log(rec, panel.marks)
         for name, each in poses.items():
             log_robot(rec, model, ("robots", name), each, style_of(name))
-        initial = poses[vocabulary.INITIAL.word]
-        root = ("robots", vocabulary.INITIAL.word)
+        initial = poses[INITIAL.word]
+        root = ("robots", INITIAL.word)
         log_end_path(rec, model, root, initial, style_of(root[1]))
         _log_iterates(rec, model, design, iterates)
 
@@ -147,10 +162,10 @@ def log_estimate(
         labels: Labels of their columns.
         addition: Markdown below the summary.
     """
-    shown = {vocabulary.IDENTIFIED.word: _thinned(identified)}
-    title = f"{vocabulary.IDENTIFIED.word} robot ({vocabulary.IDENTIFIED.colour_name})"
+    shown = {IDENTIFIED.word: _thinned(identified)}
+    title = f"{IDENTIFIED.word} robot ({IDENTIFIED.colour_name})"
     if measured is not None:
-        term = vocabulary.MEASURED
+        term = MEASURED
         shown[term.word] = _thinned(measured)
         title += f", {term.word} robot ({term.colour_name} outline)"
     kept = sum(prediction.recording is not None for prediction in estimate.predictions)
@@ -171,7 +186,7 @@ def log_estimate(
 
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in shown.items()}
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
-    root = ("robots", vocabulary.IDENTIFIED.word)
+    root = ("robots", IDENTIFIED.word)
     view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
     tabs += series_tabs(states)
     with open_recording(path, model, "estimate", view, tabs) as rec:
@@ -179,7 +194,7 @@ def log_estimate(
         log_series(rec, recordings | states)
         for name, each in poses.items():
             log_robot(rec, model, ("robots", name), each, style_of(name))
-        log_end_path(rec, model, root, poses[vocabulary.IDENTIFIED.word], style_of(root[1]))
+        log_end_path(rec, model, root, poses[IDENTIFIED.word], style_of(root[1]))
 
 
 def _pairs(panels: Sequence[Panel]) -> list[Panel]:
@@ -203,7 +218,7 @@ def log_trajectories(
         trajectories: Trajectories by name; "initial" and "final" are those of a design.
         labels: Labels of their columns.
     """
-    named = {vocabulary.shown_word(name): each for name, each in trajectories.items()}
+    named = {shown_word(name): each for name, each in trajectories.items()}
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in named.items()}
     roles = dict(zip(named, _roles(list(named)), strict=True))
     states: Tabs = {
@@ -231,14 +246,14 @@ def log_trajectories(
 
 def _roles(names: Sequence[str]) -> list[str]:
     """Return a role for every name; names that are no words take the further ones in turn."""
-    known = (vocabulary.INITIAL.word, vocabulary.DESIGNED.word)
+    known = (INITIAL.word, DESIGNED.word)
     further = iter(FURTHER_ROLES * (1 + len(names) // len(FURTHER_ROLES)))
     return [name if name in known else next(further) for name in names]
 
 
 def style_of(role: str) -> RobotStyle:
     """Return the style of the robot of a role; a measured one is an outline."""
-    return RobotStyle(accent=rgb(role), outline=role == vocabulary.MEASURED.word)
+    return RobotStyle(accent=rgb(role), outline=role == MEASURED.word)
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
@@ -290,9 +305,9 @@ def _log_iterates(
     """Log on the timeline `iteration` the curves, and the robot in the middle of its motion."""
     for plane, start, _ in plots:
         plane.log(rec)
-        still = plane.curve(*start, vocabulary.INITIAL.word, 0.6)
+        still = plane.curve(*start, INITIAL.word, 0.6)
         rec.log(entity_path((*plane.parts, "initial")), still, static=True, strict=True)
-    root, style = ("robots", vocabulary.DESIGNED.word), style_of(vocabulary.DESIGNED.word)
+    root, style = ("robots", DESIGNED.word), style_of(DESIGNED.word)
     middle = design.initial.trajectory.qpos[len(design.initial.trajectory.t) // 2]
     still_poses = body_poses(model, np.zeros(1), middle[None])
     designed = body_poses(model, design.trajectory.t, design.trajectory.qpos)
@@ -310,12 +325,12 @@ def _log_iterates(
         qpos = np.asarray(motions.qpos[i], dtype=np.float64)
         poses = body_poses(model, motions.t[i], qpos)
         log_pose(rec, model, root, poses, len(qpos) // 2)
-        log_pose(rec, model, ("robots", vocabulary.INITIAL.word), still_poses, 0)
+        log_pose(rec, model, ("robots", INITIAL.word), still_poses, 0)
         if end is not None:
             path = strip_of_path(end.path(poses), style)
             rec.log(entity_path((*root, "path")), path, strict=True)
         for plane, _, curves in plots:
-            curve = plane.curve(*curves[i], vocabulary.DESIGNED.word)
+            curve = plane.curve(*curves[i], DESIGNED.word)
             rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
     rec.reset_time()
 
@@ -428,7 +443,7 @@ def _robots(
     """Return the views of several robots: separate, and in another tab overlaid."""
     motions, names = list(poses.values()), list(poses)
     camera = place_camera(model, motions, views=len(motions), aspect=aspect)
-    words = {term.word: f"{term.word} ({term.colour_name})" for term in vocabulary.TERMS}
+    words = {term.word: f"{term.word} ({term.colour_name})" for term in TERMS}
     titles = {words.get(name, name): ("robots", name) for name in names}
     arranged = rrb.Vertical if camera.stacked else rrb.Horizontal
     separate = arranged(*robot_views(model, camera, titles), name="separate")
@@ -478,3 +493,89 @@ def show(path: Path) -> None:
             f"the Rerun viewer ended with code {code}; it needs a display; the complete recording "
             f"is in {str(path)!r}"
         )
+
+
+# Characters that Markdown would take for its own marks; an underscore only at the edge of a word.
+MARKS = re.compile(r"[\\|*`<>\[\]~]|(?<!\w)_|_(?!\w)")
+
+
+def as_markdown(page: Page, *further: str) -> str:
+    """Write a page: verdict, first part, warnings, then all other parts, and further sentences."""
+    parts = [_rendered(part) for part in page.parts]
+    if page.warnings:
+        parts[1:1] = ["**Warnings**", _list(page.warnings)]
+    texts = (f"### {escape(page.kind)}", f"**{escape(page.verdict.text)}**", *parts, *further)
+    return "\n\n".join(text for text in texts if text)
+
+
+def escape(text: str) -> str:
+    """Return a text on one line, without a character that Markdown takes for a mark."""
+    return MARKS.sub(lambda mark: f"\\{mark[0]}", " ".join(text.split()))
+
+
+def _list(sentences: Iterable[str]) -> str:
+    return "\n".join(f"- {escape(sentence)}" for sentence in sentences)
+
+
+def _rendered(part: Table | Text | Listing) -> str:
+    """One part of a page."""
+    if isinstance(part, Text):
+        text = escape(part.text)
+        return f"**{text}**" if part.emphasis is Emphasis.STRONG else text
+    title = f"**{escape(part.title)}**" if part.title else ""
+    if isinstance(part, Table):
+        rules = [":--" if part.is_left(k) else "--:" for k in range(len(part.columns))]
+        rows = [part.columns, *(row.cells for row in part.rows)]
+        lines = [f"| {' | '.join(escape(cell) for cell in cells)} |" for cells in rows]
+        lines.insert(1, f"| {' | '.join(rules)} |")
+        blocks = ["\n".join(lines), escape(part.note)]
+    elif part.code:
+        blocks = [f"```toml\n{item}\n```" for item in part.items]
+    else:
+        blocks = [_list(part.items)]
+    return "\n\n".join(block for block in (title, *blocks) if block)
+
+
+def _colours(*meanings: tuple[Term, str]) -> str:
+    """Return a sentence for each colour."""
+    return " ".join(f"{term.colour_name.capitalize()}: {meaning}." for term, meaning in meanings)
+
+
+# Sentences that explain the colours of the recordings.
+DESIGN_COLOURS = (
+    _colours(
+        (INITIAL, "the initial trajectory"),
+        (DESIGNED, "the designed trajectory"),
+    )
+    + " Grey lines: limits. Space bar: play or pause. The timeline `iteration` shows the search: "
+    "its iterates in place of the designed trajectory. The plots of ψ show sensitivities: how much "
+    "a position (→) and its velocity (↑) change per unit of a parameter."
+)
+ESTIMATE_COLOURS = (
+    _colours(
+        (IDENTIFIED, "the identified model"),
+        (MEASURED, "the measurements"),
+        (NOMINAL, "the nominal model, for data that were not fitted"),
+    )
+    + " Grey lines: twice the standard deviation of the noise."
+)
+
+
+def design_text(design: Design, addition: str = "") -> str:
+    """Render a design as Markdown.
+
+    Args:
+        design: The design.
+        addition: A paragraph below it; may be empty.
+    """
+    return as_markdown(page_of(design), DESIGN_COLOURS, addition)
+
+
+def estimate_text(estimate: Estimate, addition: str = "") -> str:
+    """Render an estimate as Markdown.
+
+    Args:
+        estimate: The estimate.
+        addition: A paragraph below it; may be empty.
+    """
+    return as_markdown(page_of(estimate), ESTIMATE_COLOURS, addition)

@@ -14,9 +14,9 @@ import rerun.blueprint as rrb
 
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.experiment.system import labels_of_model
-from mjfim.output import vocabulary
+from mjfim.output.archive import shown_positions
+from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, NOMINAL, OTHER
 from mjfim.output.panels import line
-from mjfim.output.playback import shown_positions
 from mjfim.output.progress_text import design_stage, design_text, progress_line
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.documents import (
@@ -50,10 +50,10 @@ FLUSH_SECONDS = 3.0
 TIMELINE, ROBOT = "event", ("robot",)
 
 # Style of the robot, and roles of curves that share a plot.
-STYLE = style_of(vocabulary.DESIGNED.word)
+STYLE = style_of(DESIGNED.word)
 ROLES_IN_TURN = (
-    *(term.word for term in (vocabulary.DESIGNED, vocabulary.INITIAL, vocabulary.MEASURED)),
-    *(term.word for term in (vocabulary.NOMINAL, vocabulary.IDENTIFIED, vocabulary.OTHER)),
+    *(term.word for term in (DESIGNED, INITIAL, MEASURED)),
+    *(term.word for term in (NOMINAL, IDENTIFIED, OTHER)),
 )
 
 # Name, colour and width of the curves of other starts than the one of the best iterate.
@@ -270,7 +270,7 @@ class LiveShow:
             seen.append(line([t[0], t[0]], plane.y, "text"))
         grown = Plane.around(plane.parts, plane.title, seen, log=False)
         grown.log(self._rec, static=False)
-        curve = grown.curve(t, y, vocabulary.DESIGNED.word)
+        curve = grown.curve(t, y, DESIGNED.word)
         self._rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
         return grown
 

@@ -1,10 +1,11 @@
-"""Robots that move in Rerun.
+"""Robots that move in Rerun: the shapes of their geoms, their colours, and their poses.
 
 All bodies are directly under one entity with their world poses; geoms are their static children.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -14,7 +15,384 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.output.rerun.shapes import GeomType, RobotStyle, drawn_shapes, translucent
+
+GeomType = mujoco.mjtGeom
+
+# Surfaces are drawn filled, those of an outlined robot as wire frames.
+SOLID, OUTLINE = rr.components.FillMode.Solid, rr.components.FillMode.MajorWireframe
+
+# Opacity of the meshes of an outlined robot, which have no wire frame.
+OUTLINE_OPACITY = 0.3
+
+# Opacity of a robot beside which another one is drawn in the same view.
+PALE_OPACITY = 0.4
+
+# Share of white in the colour of an outlined robot.
+OUTLINE_WHITE = 0.4
+
+# Colour (0..1) of a geom that sets none; MuJoCo then takes the colour of its material.
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
+
+# Weights of red, green and blue in the brightness of a colour.
+BRIGHTNESS_WEIGHTS = (0.30, 0.59, 0.11)
+
+# Largest group of geoms that MuJoCo's viewer shows by default.
+LAST_SHOWN_GROUP = 2
+
+# Radius of the sticks of a stick figure, as a share of the model's extent.
+STICK_RADIUS = 0.02
+
+# Side of the squares of a ground plane, and smallest distance from its middle to its edges, both as
+# multiples of the extent of the model.
+SQUARE_SIZE, INFINITE_REACH = 0.25, 20.0
+
+# Largest number of squares along each side of a ground plane.
+MAX_SQUARES = 64
+
+# Brightness of every second square of a ground plane.
+DARK_SQUARE = 0.8
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotStyle:
+    """Style in which one robot and its curves are drawn.
+
+    Attributes:
+        accent: Accent colour (0..255).
+        tint: Share of the accent colour in the moving geoms; the rest is the model's own colour.
+        outline: True to draw the moving geoms as a pale outline in the accent colour.
+    """
+
+    accent: tuple[int, int, int]
+    tint: float = 0.35
+    outline: bool = False
+
+    def geom_colour(self, rgba: Iterable[float], moving: bool) -> list[int]:
+        """Return the colour (0..255, with opacity) in which a geom is drawn.
+
+        Args:
+            rgba: Colour of the geom in the model (0..1).
+            moving: False for a geom that no joint moves; it is grey.
+        """
+        model_rgba = np.fromiter(rgba, dtype=np.float64)
+        alpha = 255.0 * model_rgba[3]
+        accent = np.array(self.accent, dtype=np.float64)
+
+        if not moving:
+            colour = np.full(3, 255.0 * float(model_rgba[:3] @ BRIGHTNESS_WEIGHTS))
+        elif self.outline:
+            colour = (1.0 - OUTLINE_WHITE) * accent + OUTLINE_WHITE * 255.0
+            alpha *= OUTLINE_OPACITY
+        else:
+            colour = self.tint * accent + (1.0 - self.tint) * 255.0 * model_rgba[:3]
+        return [round(float(channel)) for channel in (*colour, alpha)]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnShape:
+    """A shape that is drawn in the frame of a body.
+
+    Attributes:
+        name: Name of its entity.
+        position: (3,) origin of the shape in the frame of the body [m].
+        quaternion: (4,) its orientation, wxyz.
+        archetype: The shape in its own frame.
+        rgba: Its colour (0..255, with opacity).
+    """
+
+    name: str
+    position: Array
+    quaternion: Array
+    archetype: rr.AsComponents
+    rgba: list[int]
+
+
+def translucent(shape: DrawnShape) -> rrb.Visualizer:
+    """Return the translucent look of a shape, which replaces its own one in some views.
+
+    Args:
+        shape: The shape.
+    """
+    rgba = [*shape.rgba[:3], round(PALE_OPACITY * shape.rgba[3])]
+    if isinstance(shape.archetype, rr.Mesh3D):
+        return rr.Mesh3D.from_fields(albedo_factor=rgba).visualizer()
+    kinds = (rr.Boxes3D, rr.Capsules3D, rr.Cylinders3D, rr.Ellipsoids3D)
+    kind = next(kind for kind in kinds if isinstance(shape.archetype, kind))
+    return kind.from_fields(colors=[rgba]).visualizer()
+
+
+# ---- geoms of a body
+
+
+def drawn_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the geoms that MuJoCo's viewer shows.
+
+    If a body has geoms of hidden groups only, these are returned.
+
+    Args:
+        model: The model.
+        body: Number of the body.
+    """
+    first = int(model.body_geomadr[body])
+    geoms = range(first, first + int(model.body_geomnum[body]))
+    visible = [geom for geom in geoms if geom_rgba(model, geom)[3] > 0.0]
+    shown = [geom for geom in visible if model.geom_group[geom] <= LAST_SHOWN_GROUP]
+    return shown or visible
+
+
+def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
+    """Return the colour (0..1) of a geom, as MuJoCo's renderer chooses it.
+
+    The colour of the material counts unless the geom sets one.
+
+    Args:
+        model: The model.
+        geom: Number of the geom.
+    """
+    rgba = tuple(float(channel) for channel in model.geom_rgba[geom])
+    material = int(model.geom_matid[geom])
+    if material >= 0 and np.allclose(rgba, DEFAULT_RGBA):
+        return tuple(float(channel) for channel in model.mat_rgba[material])
+    return rgba
+
+
+def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterator[DrawnShape]:
+    """Find the shapes that show a body; a moving body without geoms is a stick figure.
+
+    Args:
+        model: The model.
+        body: Number of the body.
+        style: Style in which it is drawn.
+
+    Yields:
+        The shapes.
+    """
+    moving = int(model.body_weldid[body]) != 0
+    fill = OUTLINE if style.outline and moving else SOLID
+    geoms = drawn_geoms(model, body)
+    for geom in geoms:
+        rgba = style.geom_colour(geom_rgba(model, geom), moving)
+        archetype = geom_shape(model, geom, rgba, fill)
+        if archetype is None:
+            continue
+        yield DrawnShape(
+            name=model.geom(geom).name or f"geom{geom}",
+            position=geom_origin(model, geom),
+            quaternion=model.geom_quat[geom],
+            archetype=archetype,
+            rgba=rgba,
+        )
+
+    if moving and not geoms:
+        yield from stick_figure(model, body, style.geom_colour(DEFAULT_RGBA, moving), fill)
+
+
+def geom_origin(model: mujoco.MjModel, geom: int) -> Array:
+    """Return the origin of the shape of a geom in the frame of its body, (3,) [m].
+
+    A capsule of Rerun begins at the origin of its frame; that of MuJoCo is centred on it.
+
+    Args:
+        model: The model.
+        geom: Number of the geom.
+    """
+    position = np.array(model.geom_pos[geom])
+    if int(model.geom_type[geom]) != int(GeomType.mjGEOM_CAPSULE):
+        return position
+
+    to_end = np.empty(3)
+    half_length = float(model.geom_size[geom, 1])
+    mujoco.mju_rotVecQuat(to_end, np.array([0.0, 0.0, -half_length]), model.geom_quat[geom])
+    return np.asarray(position + to_end)
+
+
+def geom_shape(
+    model: mujoco.MjModel, geom: int, rgba: list[int], fill: rr.components.FillMode = SOLID
+) -> rr.AsComponents | None:
+    """Return the archetype of a geom in its own frame, whose origin is `geom_origin`.
+
+    Args:
+        model: The model.
+        geom: Number of the geom.
+        rgba: Colour (0..255).
+        fill: How its surface is drawn; meshes are always filled.
+
+    Returns:
+        The archetype; None for types without a surface.
+    """
+    kind = GeomType(int(model.geom_type[geom]))
+    # Half sizes [m]; a radius and a half length for round types.
+    a, b, c = (float(size) for size in model.geom_size[geom])
+    solid_rgba = rgba if fill is SOLID else [*rgba[:3], 255]
+    match kind:
+        case GeomType.mjGEOM_SPHERE:
+            return rr.Ellipsoids3D(half_sizes=[[a, a, a]], colors=[solid_rgba], fill_mode=fill)
+        case GeomType.mjGEOM_ELLIPSOID:
+            return rr.Ellipsoids3D(half_sizes=[[a, b, c]], colors=[solid_rgba], fill_mode=fill)
+        case GeomType.mjGEOM_BOX:
+            return rr.Boxes3D(half_sizes=[[a, b, c]], colors=[solid_rgba], fill_mode=fill)
+        case GeomType.mjGEOM_CYLINDER:
+            return rr.Cylinders3D(lengths=[2 * b], radii=[a], colors=[solid_rgba], fill_mode=fill)
+        case GeomType.mjGEOM_CAPSULE:
+            return rr.Capsules3D(lengths=[2 * b], radii=[a], colors=[solid_rgba], fill_mode=fill)
+        case GeomType.mjGEOM_PLANE:
+            return _ground_plane(model, a, b, rgba)
+        case GeomType.mjGEOM_HFIELD:
+            return _height_field(model, int(model.geom_dataid[geom]), rgba)
+        case GeomType.mjGEOM_MESH | GeomType.mjGEOM_SDF:
+            return _mesh(model, int(model.geom_dataid[geom]), rgba)
+    return None
+
+
+def stick_figure(
+    model: mujoco.MjModel, body: int, rgba: list[int], fill: rr.components.FillMode = SOLID
+) -> Iterator[DrawnShape]:
+    """Return shapes for a body without geoms: a ball, and sticks to its children.
+
+    Args:
+        model: The model.
+        body: Number of the body.
+        rgba: Colour (0..255).
+        fill: How the surfaces are drawn.
+
+    Yields:
+        The shapes.
+    """
+    radius = STICK_RADIUS * float(model.stat.extent)
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=fill)
+    yield DrawnShape(
+        name="ball", position=np.zeros(3), quaternion=upright, archetype=ball, rgba=rgba
+    )
+
+    for child in np.flatnonzero(model.body_parentid == body):
+        end = np.array(model.body_pos[child])
+        length = float(np.linalg.norm(end))
+        if not length:
+            continue
+
+        # Capsules run along z: each is turned towards its end.
+        turned = np.empty(4)
+        mujoco.mju_quatZ2Vec(turned, end / length)
+        stick = rr.Capsules3D(lengths=[length], radii=[radius], colors=[rgba], fill_mode=fill)
+        name = f"stick {child}"
+        yield DrawnShape(
+            name=name,
+            position=np.zeros(3),
+            quaternion=turned,
+            archetype=stick,
+            rgba=rgba,
+        )
+
+
+# ---- single types
+
+
+def _ground_plane(
+    model: mujoco.MjModel, half_x: float, half_y: float, rgba: list[int]
+) -> rr.Mesh3D:
+    """Return a plane, which is infinite for MuJoCo, as a large board.
+
+    Half sizes [m] larger than that are kept.
+    """
+    extent = float(model.stat.extent)
+    reach = INFINITE_REACH * extent
+    half_sizes = np.maximum((half_x, half_y), reach)
+
+    # The squares of a huge plane are larger.
+    side = max(SQUARE_SIZE * extent, 2.0 * float(half_sizes.max()) / MAX_SQUARES)
+    counts = np.maximum(np.rint(2.0 * half_sizes / side), 1.0).astype(np.intp)
+    return _checkerboard(half_sizes, counts, rgba)
+
+
+def _checkerboard(half_sizes: Array, counts: NDArray[np.intp], rgba: list[int]) -> rr.Mesh3D:
+    """Return the plane z = 0 as a board of squares in two tones, which shows depth.
+
+    `half_sizes` [m] and `counts` of squares are along x and y.
+    """
+    # (squares, 2) column and row of every square.
+    squares = np.indices(tuple(counts)).reshape(2, -1).T
+
+    # (squares, 4, 2) corners of every square, counter-clockwise.
+    shifts = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    corners = squares[:, None, :] + shifts
+    xy = (2.0 * corners / counts - 1.0) * half_sizes
+
+    vertices = np.zeros((4 * len(squares), 3))
+    vertices[:, :2] = xy.reshape(-1, 2)
+
+    is_bright = squares.sum(axis=1) % 2 == 1
+    brightness = np.where(is_bright, 1.0, DARK_SQUARE)
+    colours = brightness[:, None] * np.array(rgba[:3])
+    first_corners = 4 * np.arange(len(squares))[:, None]
+    return rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=_two_triangles(first_corners, (0, 1, 2), (0, 2, 3)),
+        vertex_normals=np.broadcast_to((0.0, 0.0, 1.0), vertices.shape),
+        vertex_colors=np.repeat(colours, 4, axis=0).astype(np.uint8),
+    )
+
+
+def _two_triangles(
+    first_corners: NDArray[np.intp], first: tuple[int, ...], second: tuple[int, ...]
+) -> NDArray[np.intp]:
+    """Return (2n, 3) triangles, two for each of n squares.
+
+    The corners of a triangle are the first corners (n, 1) plus the shifts `first` or `second`.
+    """
+    triangles = [first_corners + np.array(shifts) for shifts in (first, second)]
+    return np.concatenate(triangles)
+
+
+def _height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh3D:
+    """Return the top surface of a height field; its rows run along y, its columns along x."""
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    first = int(model.hfield_adr[field])
+    half_x, half_y, top, _ = model.hfield_size[field]
+
+    heights = model.hfield_data[first : first + rows * columns].reshape(rows, columns)
+    z = top * heights
+    x = np.linspace(-half_x, half_x, columns)
+    y = np.linspace(-half_y, half_y, rows)
+    vertices = np.stack([*np.meshgrid(x, y), z], axis=2)
+
+    # A normal of the surface z(x, y) is (-dz/dx, -dz/dy, 1).
+    slope_y, slope_x = np.gradient(z, y, x)
+    normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=2).reshape(-1, 3)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    # The first corner of every rectangle between two rows and two columns.
+    row_starts = np.arange(rows - 1)[:, None] * columns
+    first_corners = (row_starts + np.arange(columns - 1)).reshape(-1, 1)
+    return rr.Mesh3D(
+        vertex_positions=vertices.reshape(-1, 3),
+        triangle_indices=_two_triangles(
+            first_corners, (0, 1, columns + 1), (0, columns + 1, columns)
+        ),
+        vertex_normals=normals,
+        albedo_factor=rgba,
+    )
+
+
+def _mesh(model: mujoco.MjModel, index: int, rgba: list[int]) -> rr.Mesh3D:
+    """Return a compiled mesh, which MuJoCo has centred.
+
+    It has a vertex for every distinct pair of vertex and normal.
+    """
+    first = int(model.mesh_faceadr[index])
+    faces = slice(first, first + int(model.mesh_facenum[index]))
+    vertex_indices = model.mesh_face[faces].ravel()
+    normal_indices = model.mesh_facenormal[faces].ravel()
+
+    pairs = np.stack([vertex_indices, normal_indices], axis=1)
+    distinct, triangles = np.unique(pairs, axis=0, return_inverse=True)
+    return rr.Mesh3D(
+        vertex_positions=model.mesh_vert[model.mesh_vertadr[index] + distinct[:, 0]],
+        triangle_indices=triangles.reshape(-1, 3),
+        vertex_normals=model.mesh_normal[model.mesh_normaladr[index] + distinct[:, 1]],
+        albedo_factor=rgba,
+    )
+
 
 # Parts of the path of an entity, not escaped.
 EntityParts = tuple[str, ...]

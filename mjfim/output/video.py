@@ -13,14 +13,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjfim.errors import MjfimError, RecordingError
+from mjfim.errors import NoVideoError, RecordingError
 from mjfim.files import replacing
 
 if TYPE_CHECKING:
     from mjfim.experiment.schema import Experiment
     from mjfim.experiment.system import System
-    from mjfim.output.video.film import Film, Filmed
-    from mjfim.output.video.painter import Painter
+    from mjfim.output.film import Film, Filmed, Painter
 
 # Format of a video: that of the ending of its file. Pages may hold a WebP, too.
 Format = Literal["mp4", "gif", "webp"]
@@ -53,10 +52,6 @@ GIF_COLOURS = 96
 
 # Frames that are drawn to measure how long one takes; before the first one, shaders are compiled.
 MEASURED_FRAMES = 2
-
-
-class NoVideoError(MjfimError):
-    """There is no video, for a reason that its message states; the work goes on without it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +100,7 @@ def save_video(experiment: Experiment, result: Filmed, path: str | Path) -> Vide
 
 def write_video(path: Path, system: System, result: Filmed) -> Video:
     """Write a video of a result of a resolved experiment. See `save_video`."""
-    from mjfim.output.video.film import film_of
+    from mjfim.output.film import film_of
 
     video = render(film_of(system, result), require_format(path))
     with replacing(path) as temporary:
@@ -123,7 +118,7 @@ def report_video(system: System, result: Filmed) -> tuple[Video | None, str]:
     Returns:
         The video or None, and the sentence that says why there is none.
     """
-    from mjfim.output.video.film import film_of
+    from mjfim.output.film import film_of
 
     # Every browser shows both; an mp4 is smaller.
     kind: Format = "mp4" if find_spec("av") else "webp"
@@ -171,8 +166,7 @@ def render(
     Raises:
         NoVideoError: Nothing can be drawn here, or not in time.
     """
-    from mjfim.output.video.film import FRAME_RATE
-    from mjfim.output.video.painter import Painter
+    from mjfim.output.film import FRAME_RATE, Painter
 
     # A slow computer draws less well, and then every second or third frame, and so on.
     for shadows, samples in QUALITIES:

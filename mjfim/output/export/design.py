@@ -15,16 +15,17 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.model.coordinates import state_names
-from mjfim.output.playback import GAIN_NOTE, design_columns
-from mjfim.output.robots import TARGETS
-from mjfim.output.robots.lerobot import DATASET_FILES, write_lerobot_dataset
-from mjfim.output.robots.plan import RobotPlan
-from mjfim.output.robots.ros2 import (
+from mjfim.output.archive import GAIN_NOTE, design_columns
+from mjfim.output.export import TARGETS
+from mjfim.output.export.plan import RobotPlan
+from mjfim.output.export.trajectories import (
+    DATASET_FILES,
     ENDINGS,
     POSITIONS,
     bag_files,
     joint_trajectory,
     write_bag,
+    write_lerobot_dataset,
     write_trajectory_yaml,
 )
 from mjfim.records.design import Design
@@ -66,7 +67,7 @@ def write_player(path: Path, plan: RobotPlan) -> None:
     # Names of a model are arbitrary texts, in which JSON escapes every quotation mark.
     head = ",\n".join(f'  "{key}": {json.dumps(value)}' for key, value in design.items())
     text = ",\n".join(json.dumps(row) for row in rows.tolist())
-    template = files("mjfim.output.robots").joinpath("player.py").read_text(encoding="utf-8")
+    template = files("mjfim.output.export").joinpath("player.py").read_text(encoding="utf-8")
     program = template.replace(PLACE, f'r"""{{\n{head},\n  "rows": [\n{text}\n]}}"""', 1)
     with replacing(path) as temporary:
         temporary.write_text(program, encoding="utf-8")

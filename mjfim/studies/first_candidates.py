@@ -1,20 +1,191 @@
-"""Parameters and noise that a first experiment may propose."""
+"""What a first experiment may propose: the wishes, parameters, noise, and motors of a URDF."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError, ModelError, unknown
 from mjfim.model.coordinates import joint_names
 from mjfim.model.elements import element_count, element_name, identifier, names_of
 from mjfim.model.inertia import body_inertia
+from mjfim.model.loading import load_spec
 from mjfim.model.units import servo_kind
-from mjfim.studies.first_experiment.wishes import GROUPS, Group
+from mjfim.studies import GROUPS, Group
+
+# Comment at the head of the MJCF.
+COMMENT = (
+    " The URDF with one motor for each joint; the range of a motor is the effort of its joint. "
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfModel:
+    """A URDF and the motors that it lacks.
+
+    Attributes:
+        name: Name of the robot.
+        motors: One motor for each revolute or prismatic joint: its name, which is also that of the
+            motor, and the lower and upper end of its force [N or N m], equal where the URDF states
+            none.
+        velocities: Velocity limits of the URDF by joint name [m/s or rad/s]. MJCF has none.
+    """
+
+    name: str
+    motors: tuple[tuple[str, tuple[float, float]], ...]
+    velocities: dict[str, float]
+
+    def mjcf(self, file: str) -> str:
+        """Text of an MJCF that attaches the URDF and adds the motors.
+
+        Args:
+            file: Path of the URDF, relative to the MJCF or absolute.
+        """
+        root = ElementTree.Element("mujoco", model=f"{self.name} with motors")
+        root.append(ElementTree.Comment(COMMENT))
+        asset = ElementTree.SubElement(root, "asset")
+        ElementTree.SubElement(asset, "model", name="robot", file=file)
+        world = ElementTree.SubElement(root, "worldbody")
+        ElementTree.SubElement(world, "attach", model="robot", prefix="")
+
+        actuators = ElementTree.SubElement(root, "actuator")
+        for joint, (low, high) in self.motors:
+            attributes = {"name": joint, "joint": joint}
+            if low < high:
+                attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
+            ElementTree.SubElement(actuators, "motor", attributes)
+
+        ElementTree.indent(root)
+        return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def read_urdf(path: Path) -> UrdfModel:
+    """Read a URDF, and give each joint a motor.
+
+    Args:
+        path: The URDF.
+
+    Raises:
+        ModelError: The URDF cannot be read, or has no joint to drive.
+    """
+    spec = load_spec(path)
+    driven = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    motors = tuple(
+        (joint.name, (float(joint.actfrcrange[0]), float(joint.actfrcrange[1])))
+        for joint in spec.joints
+        if joint.name and joint.type in driven
+    )
+    if not motors:
+        raise ModelError(f"{path}: the URDF has no revolute or prismatic joint that a motor drives")
+
+    return UrdfModel(name=spec.modelname, motors=motors, velocities=_velocities(path))
+
+
+def _velocities(path: Path) -> dict[str, float]:
+    """Velocity limits of a URDF by joint name."""
+    found: dict[str, float] = {}
+    for joint in ElementTree.parse(path).getroot().iter("joint"):
+        limit: Any = joint.find("limit")
+        text = None if limit is None else limit.get("velocity")
+        name = joint.get("name")
+        if text is None or name is None:
+            continue
+        value = float(text)
+        if value > 0.0:
+            found[name] = value
+    return found
+
+
+# Largest deviation of a sample period from a whole number of timesteps, relative to a timestep.
+STEP_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wishes:
+    """Wishes for a first experiment; what is None is proposed.
+
+    Attributes:
+        groups: Groups of parameters that are wanted.
+        payload: Body that carries an unknown payload; None without one.
+        keyframe: Keyframe in which the experiment starts.
+        rate: Rate of samples and controls [Hz].
+        horizon: Duration of the experiment [s].
+        sigmas: Standard deviations of measured joints by kind: "angle" [rad], "length" [m],
+            "angular velocity" [rad/s], "velocity" [m/s]. Sensors whose noise the MJCF states keep
+            it.
+    """
+
+    groups: Sequence[Group] = GROUPS
+    payload: str | None = None
+    keyframe: str | None = None
+    rate: float | None = None
+    horizon: float | None = None
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+
+
+def groups_of(text: str) -> list[Group]:
+    """Groups of parameters from a list with commas. Raises ExperimentError for an unknown one.
+
+    Args:
+        text: The names.
+    """
+    found: list[Group] = []
+    for name in (part.strip() for part in text.split(",")):
+        group = next((each for each in GROUPS if each == name), None)
+        if group is None:
+            raise ExperimentError(unknown("group", name, GROUPS))
+        found.append(group)
+    return found
+
+
+def resting_keyframes(model: Any) -> list[str]:
+    """Names of the keyframes in which the model does not move.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    keys = [model.key(i) for i in range(model.nkey)]
+    return [key.name for key in keys if key.name and not key.qvel.any()]
+
+
+def require_keyframe(model: Any, name: str) -> str:
+    """The name of a keyframe without motion. Raises ExperimentError for another name.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        name: The name.
+    """
+    names = resting_keyframes(model)
+    if name not in names:
+        raise ExperimentError(unknown("keyframe at rest", name, names))
+    return name
+
+
+def require_rate(model: Any, rate: float) -> float:
+    """A rate whose period is a whole number of timesteps. Raises ExperimentError for another one.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        rate: The rate [Hz].
+    """
+    timestep = float(model.opt.timestep)
+    steps = 1.0 / (rate * timestep) if rate > 0.0 else 0.0
+    near = max(round(steps), 1)
+    if abs(steps - near) <= STEP_TOLERANCE * near:
+        return rate
+
+    rates = ", ".join(f"{1.0 / (k * timestep):.6g}" for k in (near + 1, near, near - 1) if k)
+    raise ExperimentError(
+        f"a period of {rate:g} Hz is no whole number of timesteps of {timestep:g} s; rates nearby: "
+        f"{rates}"
+    )
+
 
 # Bodies at the end of the chain whose mass and centre of mass are proposed.
 LAST_BODIES = 3
@@ -233,15 +404,15 @@ def _inertia(model: Any) -> Iterator[Candidate]:
 
 def _joint_fields(model: Any, group: Group) -> Iterator[Candidate]:
     """Fields of joints that are not zero."""
-    for field, array, meaning in JOINT_FIELDS[group]:
+    for quantity, array, meaning in JOINT_FIELDS[group]:
         for joint in range(model.njnt):
             name = element_name(model, "joint", joint)
             value = float(getattr(model, array)[int(model.jnt_dofadr[joint])])
             if name and value > 0.0:
                 yield Candidate(
-                    name=f"{name}_{field}",
+                    name=f"{name}_{quantity}",
                     group=group,
-                    path=f"joint/{name}:{field}",
+                    path=f"joint/{name}:{quantity}",
                     meaning=f"{meaning} of {name}",
                     bounds=(0.0, float(f"{10.0 * value:.3g}")),
                 )
@@ -317,10 +488,10 @@ def _sensors(model: Any) -> Iterator[ProposedNoise]:
 def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
     """Positions and velocities of all joints."""
     kinds = {"qpos": ("length", "angle"), "qvel": ("velocity", "angular velocity")}
-    for field, (length_kind, angle_kind) in kinds.items():
+    for quantity, (length_kind, angle_kind) in kinds.items():
         for joint, name in enumerate(joint_names(model)):
             kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
-            key = f"{field}:{name}"
+            key = f"{quantity}:{name}"
             if kind == mujoco.mjtJoint.mjJNT_FREE:
                 yield _noise(f"{key}.pos", length_kind, sigmas)
                 yield _noise(f"{key}.rot", angle_kind, sigmas)

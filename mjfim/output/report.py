@@ -16,14 +16,22 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjfim.errors import RecordingError, first_ones, listed
 from mjfim.files import read_json, replacing
-from mjfim.output.page import Emphasis, Page, Plot, Text, as_sentence, capitalised
+from mjfim.output.page import (
+    OTHER,
+    REPORT,
+    TERMS,
+    Emphasis,
+    Page,
+    Plot,
+    Text,
+    as_sentence,
+    capitalised,
+)
 from mjfim.output.pages import page_of
 from mjfim.output.panels import ROLES, Picture
 from mjfim.output.plots.pictures import pictures_of
-from mjfim.output.report import REPORT
-from mjfim.output.report.plotly import Group, group_of
+from mjfim.output.plots.plotly import Group, group_of
 from mjfim.output.video import Video
-from mjfim.output.vocabulary import OTHER, TERMS
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check

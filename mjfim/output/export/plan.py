@@ -14,8 +14,7 @@ from mjfim.excitation.limits.limits import limits_of
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
-from mjfim.output.archive import check_fits
-from mjfim.output.playback import reference_columns, simulate_playback
+from mjfim.output.archive import check_fits, reference_columns, simulate_playback
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Playback
 

@@ -34,7 +34,7 @@ from mjfim.model.targets import (
     OutputDelayField,
     OutputScaleField,
 )
-from mjfim.output.models.model_xml import (
+from mjfim.output.export.model_xml import (
     ROUNDING,
     ModelXml,
     child,

@@ -1,6 +1,0 @@
-from .video import NoVideoError, Video
-
-__all__ = [
-    "NoVideoError",
-    "Video",
-]

@@ -1,0 +1,305 @@
+"""Labels, numbers, units, names and accuracies as results are written and drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array
+from mjfim.model.parameters import ParameterSet
+from mjfim.output.page import number
+from mjfim.records.campaign import Campaign
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
+from mjfim.records.monte_carlo import MonteCarloStudy
+
+# Digits of a power of ten, raised.
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+# ---- units
+
+
+def quotient_unit(unit: str, divisor: str) -> str:
+    """Return the unit of a quotient: `quotient_unit("m", "kg")` is "m/kg".
+
+    Compound units are put in brackets.
+
+    Args:
+        unit: Unit of the numerator; may be empty.
+        divisor: Unit of the denominator; may be empty.
+    """
+    numerator = unit or "1"
+    if not divisor:
+        return numerator
+    return f"{bracketed_unit(numerator)}/{bracketed_unit(divisor)}"
+
+
+def bracketed_unit(unit: str) -> str:
+    """Return a unit that may be divided or raised as a whole.
+
+    Args:
+        unit: The unit.
+    """
+    compound = any(character in unit for character in " /·*^²³")
+    return f"({unit})" if compound else unit
+
+
+def squared_unit(unit: str) -> str:
+    """Return the unit of a variance: "kg" becomes "kg²".
+
+    Args:
+        unit: Unit of the quantity; may be empty.
+    """
+    return f"{bracketed_unit(unit)}²" if unit else ""
+
+
+# ---- numbers
+
+
+def format_number(value: float, digits: int = 3) -> str:
+    """Write a number with raised powers of ten: 0.874, 1.65×10⁴, ∞; a dash stands for NaN.
+
+    Args:
+        value: The number.
+        digits: Significant digits.
+    """
+    if np.isnan(value):
+        return "–"
+    if np.isinf(value):
+        return "∞" if value > 0 else "−∞"
+
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    power = int(exponent)
+
+    # Numbers of moderate size are written without a power of ten.
+    if value == 0.0 or -4 < power < max(4, digits):
+        shown_power = power if value else 0
+        decimals = max(digits - 1 - shown_power, 0)
+        return f"{value:.{decimals}f}".replace("-", "−")
+
+    raised = str(power).translate(SUPERSCRIPTS)
+    return f"{mantissa}×10{raised}".replace("-", "−")
+
+
+def without_zeros(text: str) -> str:
+    """Leave out zeros at the end of a decimal number: `0.05000` becomes `0.05`.
+
+    Args:
+        text: The number, as `format_number` writes it.
+    """
+    mantissa, times, power = text.partition("×")
+    if "." in mantissa:
+        mantissa = mantissa.rstrip("0").rstrip(".")
+    return mantissa + times + power
+
+
+def format_with_uncertainty(value: float, half_width: float) -> str:
+    """Write a value with as many digits as its uncertainty leaves: `0.994 ± 0.012`.
+
+    Args:
+        value: The value.
+        half_width: Half the width of its interval, in the unit of the value.
+    """
+    usable = bool(np.isfinite(half_width)) and half_width > 0.0
+    largest = max(abs(value), half_width)
+    if not usable or not 1e-3 <= largest < 1e5:
+        return f"{format_number(value, 4)} ± {format_number(half_width, 2)}"
+
+    # The uncertainty has two significant digits.
+    decimals = int(np.clip(1 - np.floor(np.log10(half_width)), 0, 8))
+    text = f"{value:.{decimals}f} ± {half_width:.{decimals}f}"
+    return text.replace("-", "−")
+
+
+def format_percent(value: float) -> str:
+    """Write a fraction as percent with two significant digits.
+
+    Args:
+        value: The fraction, 1 for 100 %.
+    """
+    if not np.isfinite(value):
+        return format_number(value)
+    return f"{format_number(100.0 * value, 2)} %"
+
+
+def shorten(text: str, width: int = 28) -> str:
+    """Shorten a long name; both of its ends stay, with an ellipsis between them.
+
+    Args:
+        text: The name.
+        width: Largest number of characters.
+    """
+    if len(text) <= width:
+        return text
+    kept = (width - 1) // 2
+    return f"{text[:kept]}…{text[-kept:]}"
+
+
+def as_sentence(text: str) -> str:
+    """Return a text with a capital first letter and a full stop.
+
+    Args:
+        text: The text, without a full stop.
+    """
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
+    """Return the density of a normal distribution.
+
+    Args:
+        x: (n,) places [unit of the quantity].
+        mean: Mean.
+        std: Standard deviation, positive.
+
+    Returns:
+        (n,) densities [1/unit].
+    """
+    deviations = (x - mean) / std
+    return np.asarray(np.exp(-0.5 * deviations**2) / (np.sqrt(2.0 * np.pi) * std))
+
+
+def chi_squared_quantiles(shares: tuple[float, float], freedom: float) -> tuple[float, float]:
+    """Return two quantiles of a chi-squared distribution.
+
+    Args:
+        shares: Probabilities that a value lies below each (0..1).
+        freedom: Degrees of freedom, positive.
+    """
+    low, high = 2.0 * scipy.special.gammaincinv(0.5 * freedom, np.array(shares))
+    return float(low), float(high)
+
+
+def complete_labels(record: Design | Estimate | MonteCarloStudy) -> Labels:
+    """Return the labels of a record; numbers in place of names where the record has no labels.
+
+    Records of earlier versions have none.
+
+    Args:
+        record: The record.
+    """
+    if record.labels is not None:
+        return record.labels
+
+    units = ("",) * len(record.parameters)
+    if isinstance(record, Estimate):
+        units = record.units
+    if not isinstance(record, Design):
+        return Labels(
+            qpos=(),
+            positions=(),
+            velocities=(),
+            controls=(),
+            parameters=record.parameters,
+            parameter_units=units,
+        )
+
+    trajectory = record.trajectory
+    velocities = trajectory.qvel.shape[1]
+    return Labels(
+        qpos=_numbered("qpos", trajectory.qpos.shape[1]),
+        positions=_numbered("position", velocities),
+        velocities=_numbered("velocity", velocities),
+        controls=_numbered("control", trajectory.ctrl.shape[1]),
+        parameters=record.parameters,
+        parameter_units=units,
+    )
+
+
+def _numbered(quantity: str, count: int) -> tuple[str, ...]:
+    """Return labels with a number in place of a name."""
+    return tuple(f"{quantity} {i} [model unit]" for i in range(count))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CampaignParameters:
+    """Parameters of a campaign.
+
+    Attributes:
+        names: Names of the p parameters.
+        units: Their units; empty where a parameter has none.
+        guess: (p,) guess before the first round [theta-unit].
+        interest: Indices of the parameters that are not nuisance parameters.
+        true: (p,) true values [theta-unit]; None where they are not known.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    guess: Array
+    interest: tuple[int, ...]
+    true: Array | None = None
+
+    @classmethod
+    def stated(cls, parameters: ParameterSet, *, simulated: bool) -> CampaignParameters:
+        """Take the parameters of the experiment.
+
+        Args:
+            parameters: The parameters.
+            simulated: True if the recordings were simulated at the true values.
+        """
+        return cls(
+            names=parameters.names,
+            units=tuple(parameter.unit for parameter in parameters.parameters),
+            guess=parameters.guess,
+            interest=tuple(parameters.interest.tolist()),
+            true=parameters.true if simulated else None,
+        )
+
+    @classmethod
+    def recorded(cls, campaign: Campaign) -> CampaignParameters:
+        """Take the parameters from the record of a campaign, which does not know true values.
+
+        Args:
+            campaign: The campaign, with at least one round.
+        """
+        first = campaign.rounds[0]
+        nuisance = {name for design in campaign.designs for name in design.nuisance}
+        return cls(
+            names=campaign.parameters,
+            units=first.estimate.units,
+            guess=first.theta,
+            interest=tuple(j for j, name in enumerate(campaign.parameters) if name not in nuisance),
+        )
+
+
+# Remark on predicted standard deviations.
+BEST_CASE = (
+    "σ is the Cramér-Rao bound: the best case, reached if the model and the stated noise are right."
+)
+
+# Cell of a standard deviation that is infinite, because others absorb the parameter's effect.
+NOT_ALONE = "not alone"
+
+# Largest number of digits of a share in percent.
+MAX_DIGITS = 6
+
+
+def relative(std: float, size: float) -> str:
+    """Write a standard deviation in percent of a size; "-" where there is none."""
+    if not size or not np.isfinite(std):
+        return "-"
+    percent = 100.0 * std / size
+    # Shares from 99.5 % on are whole numbers, not powers of ten.
+    places = len(f"{percent:.0f}") if percent < 10.0**MAX_DIGITS else MAX_DIGITS
+    return number(percent, max(places, 2), " %")
+
+
+def size_sentence(values: Sequence[float] | Array, sizes: Sequence[float] | Array) -> str:
+    """Say of what a relative standard deviation is a share; empty where it is of the value."""
+    if np.array_equal(np.abs(values), sizes):
+        return ""
+    return (
+        "A relative σ is a share of the value; for an entry of a vector or tensor, and for a value "
+        "of zero, it is a share of the magnitude of the whole."
+    )
+
+
+def improvement(before: float, after: float) -> str:
+    """Write how a standard deviation changed: divided by a number, or times a number."""
+    if not (np.isfinite(before) and np.isfinite(after) and after > 0 and before > 0):
+        return "-"
+    return f"÷ {before / after:.1f}" if before >= after else f"× {after / before:.1f}"

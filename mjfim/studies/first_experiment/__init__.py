@@ -1,1 +1,0 @@
-"""A first experiment for a model: rates, start, excitation, noise and parameters that suit it."""
