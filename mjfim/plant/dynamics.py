@@ -358,9 +358,9 @@ class Dynamics:
         out = self.simulator.rollout(
             [self.model(theta)], trajectory.state[:1], trajectory.ctrl[None]
         )
-        if out.loop is None:
+        if out.controls is None or out.is_clipped is None:
             return trajectory, np.zeros((len(trajectory.ctrl), 0), dtype=bool)
-        return replace(trajectory, ctrl=out.loop.controls[0]), out.loop.is_clipped[0]
+        return replace(trajectory, ctrl=out.controls[0]), out.is_clipped[0]
 
     def why_diverged(self, theta: Array, ctrl: Array) -> str:
         """Explain why an open-loop simulation from the initial state diverges.

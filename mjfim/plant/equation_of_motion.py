@@ -64,22 +64,6 @@ HELD_INERTIA = 1e9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ForceSlopes:
-    """Joint forces at n states and their derivatives.
-
-    Attributes:
-        slopes: (n, nv, 2 nv + nu) derivatives by positions, speeds and controls.
-        implicit_damping: (n, nv, nv) damping D of an engine step, which solves
-            `(M + timestep D) a = forces` for the mean acceleration a of the step.
-        agree: (n,) True where the forces are those of the engine.
-    """
-
-    slopes: Array
-    implicit_damping: Array
-    agree: np.ndarray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class AffineForces:
     """Springs, dampers and actuators whose forces are affine in (q, v, u), with clamped forces.
 
@@ -120,7 +104,7 @@ class AffineForces:
         points = about + np.concatenate([np.zeros((1, len(moves))), np.diag(moves)])
         n = len(state)
         names = ("qfrc_passive", "actuator_force", *MOMENT_FIELDS)
-        fields = simulator.engine_steps(unlimited, points[:, :n], points[:, n:], names).fields
+        fields = simulator.engine_steps(unlimited, points[:, :n], points[:, n:], names)[1]
         first = {name: values[0, 0] for name, values in fields.items()}
 
         return AffineForces(
@@ -130,13 +114,20 @@ class AffineForces:
             moments=_dense_moments(first, n // 2),
         )
 
-    def at(self, states: Array, ctrl: Array, fields: dict[str, Array]) -> ForceSlopes:
+    def at(
+        self, states: Array, ctrl: Array, fields: dict[str, Array]
+    ) -> tuple[Array, Array, np.ndarray]:
         """Derivatives of the forces at n states.
 
         Args:
             states: (n, 2 nv) states.
             ctrl: (n, nu) controls.
             fields: The `FORCE_FIELDS` of the engine, each (n, nv).
+
+        Returns:
+            (n, nv, 2 nv + nu) derivatives by positions, speeds and controls; (n, nv, nv) damping D
+            of an engine step, which solves `(M + timestep D) a = forces` for the mean acceleration
+            a of the step; and (n,) True where the forces are those of the engine.
         """
         points = self._points(states, ctrl)
         clamped, acts = self._clamped(points)
@@ -151,7 +142,7 @@ class AffineForces:
         agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
 
         slopes = self._slopes(acts, self._applied(ctrl)[1])
-        return ForceSlopes(slopes=slopes, implicit_damping=self._damping(slopes), agree=agree)
+        return slopes, self._damping(slopes), agree
 
     def change(self, states: Array, ctrl: Array, acceleration: Array, by: ParameterChange) -> Array:
         """Derivatives of the right-hand side of an engine step, `forces - timestep D a`.
@@ -412,8 +403,7 @@ class EquationOfMotion:
         names = ["M", "qfrc_smooth", "qfrc_actuator", "actuator_force"]
         if model.opt.integrator in IMPLICIT:
             names.append("qDeriv")
-        found = self.simulator.engine_steps(model, points.states, points.ctrl, names).fields
-        fields = {name: values[:, 0] for name, values in found.items()}
+        fields = self._fields(model, points, names)
 
         inertial = (_mass(model, fields["M"]) @ points.acceleration[..., None])[..., 0]
         inertial += self._implicit_damping(model, fields, points)
@@ -436,8 +426,7 @@ class EquationOfMotion:
         Returns:
             (nv, nv) root mean squares of `M_ij a_j`.
         """
-        steps = self.simulator.engine_steps(model, points.states, points.ctrl, ["M"])
-        M = _mass(model, steps.fields["M"][:, 0])
+        M = _mass(model, self._fields(model, points, ["M"])["M"])
         forces = M * points.acceleration[:, None, :]
         return np.asarray(np.sqrt(np.mean(forces**2, axis=0)))
 
@@ -452,8 +441,7 @@ class EquationOfMotion:
         Returns:
             (n, k, nv) moment arms.
         """
-        found = self.simulator.engine_steps(model, points.states, points.ctrl, MOMENT_FIELDS)
-        values, counts, starts, columns = (found.fields[name][:, 0] for name in MOMENT_FIELDS)
+        values, counts, starts, columns = self._fields(model, points, MOMENT_FIELDS).values()
         moments = np.zeros((len(values), len(actuators), model.nv))
         for place, actuator in enumerate(actuators):
             for entry in range(int(counts[:, actuator].max(initial=0))):
@@ -478,9 +466,13 @@ class EquationOfMotion:
         frictionless = copy.copy(model)
         frictionless.dof_frictionloss[:] = 0.0
         frictionless.tendon_frictionloss[:] = 0.0
-        names = ["qfrc_constraint"]
-        found = self.simulator.engine_steps(frictionless, points.states, points.ctrl, names)
-        return np.asarray(found.fields["qfrc_constraint"][:, 0] != 0.0)
+        fields = self._fields(frictionless, points, ["qfrc_constraint"])
+        return np.asarray(fields["qfrc_constraint"] != 0.0)
+
+    def _fields(self, model: Any, points: MotionPoints, names: Sequence[str]) -> dict[str, Array]:
+        """MjData fields at the n points, each (n, ...)."""
+        _, found = self.simulator.engine_steps(model, points.states, points.ctrl, names)
+        return {name: values[:, 0] for name, values in found.items()}
 
     def _implicit_damping(
         self, model: Any, fields: dict[str, Array], points: MotionPoints
@@ -521,11 +513,10 @@ class EquationOfMotion:
             return np.asarray(friction)
 
         # The speeds of a tendon below which its friction is viscous are those of its joints.
-        names = ["ten_J"]
-        values = self.simulator.engine_steps(model, points.states, points.ctrl, names)
+        values = self._fields(model, points, ["ten_J"])["ten_J"]
         for tendon in np.flatnonzero(model.tendon_frictionloss).tolist():
             first, count = int(model.ten_J_rowadr[tendon]), int(model.ten_J_rownnz[tendon])
-            arms = values.fields["ten_J"][:, 0].reshape(len(speed), -1)[:, first : first + count]
+            arms = values.reshape(len(speed), -1)[:, first : first + count]
             dofs = np.reshape(model.ten_J_colind, -1)[first : first + count]
             slow = np.abs(arms) @ self.friction_speeds[dofs]
             rate = np.sum(arms * speed[:, dofs], axis=1)

@@ -456,22 +456,6 @@ class InputContext:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LoopTrace:
-    """Record of control laws along m curves of N samples.
-
-    Attributes:
-        controls: (m, N, nu) controls at the begin of every sample [u-unit].
-        is_clipped: (m, N, laws) True where the range or the largest change of a control has clipped
-            it.
-        memory: Memory at the end of the curves, grouped by the periods of the laws.
-    """
-
-    controls: Array
-    is_clipped: np.ndarray
-    memory: tuple[LawMemory, ...]
-
-
 class RunningLaws:
     """C laws with one period, which compute the controls of m curves at successive ticks.
 
@@ -479,6 +463,11 @@ class RunningLaws:
         held: (m, c) controls that the laws hold now [u-unit].
         is_clipped: (m, c) True where the range or the largest change has clipped them.
         has_limits: True where something may clip them.
+        laws: The c laws.
+        period: Engine steps from one evaluation to the next.
+        controls: (c,) addresses of their controls in ctrl.
+        positions: (c,) addresses of the positions that they read in qpos.
+        velocities: (c,) addresses of the velocities that they read in qvel.
     """
 
     def __init__(
@@ -502,6 +491,11 @@ class RunningLaws:
             begins: True where no control was held before the first tick, so that its change is not
                 limited.
         """
+        self.laws = laws
+        self.period = ticks.period
+        self.controls = np.array([law.control for law in laws])
+        self.positions = np.array([law.q for law in laws])
+        self.velocities = np.array([law.v for law in laws])
         self._numbers = numbers
         self._commands = commands
         self._drive = commands.drive(numbers)
