@@ -330,7 +330,7 @@ def _require_rotations(model: Any, qpos: Array) -> None:
             continue
 
         # The quaternion of a free joint follows its position.
-        is_free = int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)
+        is_free = int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE
         first = int(model.jnt_qposadr[j]) + (3 if is_free else 0)
         if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
             raise ExperimentError(

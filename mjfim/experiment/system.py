@@ -21,7 +21,7 @@ from mjfim.experiment.controllers import resolve_controllers
 from mjfim.experiment.initial import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.packing import for_workers, model_of
-from mjfim.experiment.parameters import Measured, resolve_parameters
+from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
@@ -135,9 +135,7 @@ class System:
         key = keyframe(model, "initial.keyframe", experiment.initial.keyframe)
         start = initial_state(experiment.initial, model, key, source.layout)
         mocap = MocapPlacement.of(model, key)
-        sigma = np.sqrt(np.diag(noise.covariance))
-        measured = Measured(names=outputs.names, sigma=sigma, period=1.0 / experiment.rate)
-        parameters = resolve_parameters(experiment, source, mocap, measured)
+        parameters = resolve_parameters(experiment, source, mocap, outputs)
 
         # The plant that the parameters act on.
         private = PlantModel(

@@ -289,7 +289,7 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
 def _force_unit(model: Any, actuator: int) -> str:
     """Unit of the force of an actuator; empty for one with several forces or on a free joint."""
     joint = int(model.actuator_trnid[actuator, 0])
-    acts_on_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    acts_on_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
     if not acts_on_joint or int(model.jnt_type[joint]) in (BALL, FREE):
         return ""
     return force_unit(model, actuator)

@@ -274,7 +274,7 @@ def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:
         joint = identifier(model, "joint", path.name)
         # One number holds for all coordinates of a ball or free joint; it gets the unit for a
         # rotation.
-        slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        slides = int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
         return joint_field_unit(path.field, LENGTH if slides else ANGLE, path.component)
 
     if path.field in SERVO_FIELDS:
@@ -431,7 +431,7 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
     rows = (actuator,)
 
     # The gain of a PID actuator is its integral gain; kp and kv are entries of its bias.
-    if int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_PID):
+    if int(model.actuator_gaintype[actuator]) == mujoco.mjtGain.mjGAIN_PID:
         column = {"kp": 1, "kv": 2}[path.field]
         return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
 

@@ -141,7 +141,7 @@ def force_unit(model: Any, actuator: int) -> str:
     Returns:
         The unit; empty where the actuator does not act on a joint.
     """
-    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+    if int(model.actuator_trntype[actuator]) != mujoco.mjtTrn.mjTRN_JOINT:
         return ""
     return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
 
@@ -198,14 +198,14 @@ def control_unit(model: Any, actuator: int) -> str:
         The unit; empty where it is not evident from the model.
     """
     gear = actuator_gear(model, actuator)
-    at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
     if not at_joint or gear != 1 or int(model.actuator_ctrlnum[actuator]) != 1:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])
     coordinate = joint_unit(model, joint)
     gain = float(model.actuator_gainprm[actuator, 0])
-    if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
+    if int(model.actuator_biastype[actuator]) == mujoco.mjtBias.mjBIAS_NONE:
         unit = FORCE_UNITS[coordinate] if gain == 1.0 else ""
     else:
         units = {"position": coordinate, "velocity": per_second(coordinate)}

@@ -246,13 +246,13 @@ class AffineForces:
     @property
     def _damps_implicitly(self) -> bool:
         """Whether it takes those of the joints' dampers, and no others, at the end of the step."""
-        is_explicit = self.model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        is_explicit = self.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
         return not (self._is_implicit or is_explicit)
 
     def _applied(self, ctrl: Array) -> tuple[Array, np.ndarray]:
         """(n, nu) controls within their limits, and (n, nu) True where they are not clamped."""
         model = self.model
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL):
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
             return ctrl, np.ones(ctrl.shape, dtype=bool)
 
         low = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 0], -np.inf)
@@ -460,7 +460,7 @@ class EquationOfMotion:
         Returns:
             (n, nv) True where such a force acts on a degree of freedom.
         """
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
             return np.zeros(points.acceleration.shape, dtype=bool)
 
         frictionless = copy.copy(model)
@@ -482,7 +482,7 @@ class EquationOfMotion:
         if "qDeriv" in fields:
             D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind)
             return -timestep * (D @ points.acceleration[..., None])[..., 0]
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
             return np.zeros_like(points.acceleration)
 
         # The slope of a damper with a force that is a polynomial of the speed.

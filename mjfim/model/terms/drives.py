@@ -242,7 +242,7 @@ class BackEmf(Term):
 
 def _require_plain(model: Any, name: str, number: int, kind: str) -> None:
     """Raise ExperimentError for an actuator with dynamics, or with a gain of another type."""
-    has_dynamics = int(model.actuator_dyntype[number]) != int(mujoco.mjtDyn.mjDYN_NONE)
+    has_dynamics = int(model.actuator_dyntype[number]) != mujoco.mjtDyn.mjDYN_NONE
     is_plain = int(model.actuator_gaintype[number]) in [int(gain) for gain in PLAIN_GAINS]
     has_bias = int(model.actuator_biastype[number]) in [int(bias) for bias in PLAIN_BIASES]
     if has_dynamics or not (is_plain and has_bias) or int(model.actuator_ctrlnum[number]) != 1:

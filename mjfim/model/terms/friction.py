@@ -208,7 +208,7 @@ class _PassiveDevice(Term):
         actuator.dyntype = mujoco.mjtDyn.mjDYN_DCMOTOR
         actuator.gaintype = mujoco.mjtGain.mjGAIN_DCMOTOR
         actuator.biastype = mujoco.mjtBias.mjBIAS_DCMOTOR
-        actuator.ctrlspec = int(mujoco.mjtCtrlInput.mjINPUT_NONE)
+        actuator.ctrlspec = mujoco.mjtCtrlInput.mjINPUT_NONE
 
         # The motor constant is zero, so that the resistance has no effect.
         numbers = {"gainprm": {0: 1.0}, **self._numbers(self.values)}
@@ -546,10 +546,10 @@ class LoadDependentFriction(Term):
 
 def _driven_hinge(model: Any, name: str, actuator: int) -> int:
     """Number of the hinge that a direct drive acts on; ExperimentError for other actuators."""
-    is_at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    is_at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
     joint = int(model.actuator_trnid[actuator, 0])
-    is_hinge = is_at_joint and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-    has_bias = int(model.actuator_biastype[actuator]) != int(mujoco.mjtBias.mjBIAS_NONE)
+    is_hinge = is_at_joint and int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_HINGE
+    has_bias = int(model.actuator_biastype[actuator]) != mujoco.mjtBias.mjBIAS_NONE
     if not is_hinge or has_bias or not element_name(model, "joint", joint):
         raise ExperimentError(
             f"actuator: {name!r} is no direct drive at a hinge with a name; the feedback of a "
@@ -560,7 +560,7 @@ def _driven_hinge(model: Any, name: str, actuator: int) -> int:
 
 def _enables_contacts(model: Any) -> bool:
     """Whether contacts are disabled; ExperimentError where geoms would then begin to collide."""
-    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT):
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         return False
     collide = np.any(model.geom_contype) and np.any(model.geom_conaffinity)
     if collide or model.npair:

@@ -494,7 +494,10 @@ def extended_spec(
         term.edit(extended)
 
     # Keyframes have the sizes of the state, which the terms may change.
-    keys = [_StatedKey.of(key) for key in extended.keys]
+    numbers = [
+        [np.array(each) for each in (key.qpos, key.qvel, key.act, key.ctrl)]
+        for key in extended.keys
+    ]
     for key in extended.keys:
         key.qpos, key.qvel, key.act = [], [], []
     model = compiled(extended)
@@ -505,48 +508,30 @@ def extended_spec(
         [int(joint.id) for joint in joints],
         [int(actuator.id) for actuator in actuators],
     )
-    for key, numbers in zip(extended.keys, keys, strict=True):
-        numbers.write(key, layout)
+    for key, stated_numbers in zip(extended.keys, numbers, strict=True):
+        _write_key(key, stated_numbers, layout)
     return extended, layout
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _StatedKey:
-    """Numbers of a keyframe of the stated model; those that are not stated are empty.
+def _write_key(key: Any, numbers: Sequence[Array], layout: StateLayout) -> None:
+    """Write the numbers of the extended state into a keyframe of an MjSpec.
 
-    Attributes:
-        qpos: (nq,) positions.
-        qvel: (nv,) velocities.
-        act: (na,) activations.
-        ctrl: (nu,) control.
+    Args:
+        key: The keyframe.
+        numbers: Positions, velocities, activations and control that the keyframe of the stated
+            model has; empty where it states none.
+        layout: The layout of the extended state.
     """
-
-    qpos: Array
-    qvel: Array
-    act: Array
-    ctrl: Array
-
-    @staticmethod
-    def of(key: Any) -> _StatedKey:
-        """Numbers of a keyframe of an MjSpec."""
-        return _StatedKey(
-            qpos=np.array(key.qpos),
-            qvel=np.array(key.qvel),
-            act=np.array(key.act),
-            ctrl=np.array(key.ctrl),
-        )
-
-    def write(self, key: Any, layout: StateLayout) -> None:
-        """Write the numbers of the extended state into a keyframe of an MjSpec."""
-        qpos = np.array(layout.model.qpos0)
-        if len(self.qpos):
-            qpos = layout.positions(self.qpos)
-            key.qpos = qpos
-        if len(self.qvel):
-            key.qvel = layout.velocities(self.qvel)
-        if len(self.act) or layout.model.na > len(layout.act):
-            stated = self.act if len(self.act) else np.zeros(len(layout.act))
-            key.act = layout.activations(stated, qpos, self.ctrl if len(self.ctrl) else None)
+    positions, velocities, activations, ctrl = numbers
+    qpos = np.array(layout.model.qpos0)
+    if len(positions):
+        qpos = layout.positions(positions)
+        key.qpos = qpos
+    if len(velocities):
+        key.qvel = layout.velocities(velocities)
+    if len(activations) or layout.model.na > len(layout.act):
+        stated = activations if len(activations) else np.zeros(len(layout.act))
+        key.act = layout.activations(stated, qpos, ctrl if len(ctrl) else None)
 
 
 def _range(addresses: Any, element: int, end: int) -> np.ndarray:
