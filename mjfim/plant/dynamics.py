@@ -501,18 +501,15 @@ class WrittenModels:
 
         for key, row in zip(keys, rows, strict=True):
             if key not in self._copies:
-                model = self._free_copy()
+                # A new copy, or the one that was not asked for the longest.
+                if len(self._copies) < self._largest_call + SPARE_COPIES:
+                    model = copy.copy(self.source.model)
+                else:
+                    model = self._copies.popitem(last=False)[1]
                 ParameterWriter(self.parameters).write(model, row)
                 self._copies[key] = self.source.refresh(model)
 
         return [self._copies[key] for key in keys]
-
-    def _free_copy(self) -> Any:
-        """A copy to write into: a new one, or the one that was not asked for the longest."""
-        if len(self._copies) < self._largest_call + SPARE_COPIES:
-            return copy.copy(self.source.model)
-
-        return self._copies.popitem(last=False)[1]
 
 
 def explain_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> str:

@@ -105,13 +105,13 @@ class AffineForces:
         n = len(state)
         names = ("qfrc_passive", "actuator_force", *MOMENT_FIELDS)
         fields = simulator.engine_steps(unlimited, points[:, :n], points[:, n:], names)[1]
-        first = {name: values[0, 0] for name, values in fields.items()}
+        values, counts, starts, columns = (fields[name][0, 0] for name in MOMENT_FIELDS)
 
         return AffineForces(
             model=model,
             springs=_affine(fields["qfrc_passive"][:, 0], about, moves),
             actuators=_affine(fields["actuator_force"][:, 0], about, moves),
-            moments=_dense_moments(first, n // 2),
+            moments=_dense(values[None], starts, counts, columns, n // 2)[0],
         )
 
     def at(
@@ -214,7 +214,9 @@ class AffineForces:
         if not self.model.actuator_forcelimited.any():
             return force, np.ones(force.shape, dtype=bool)
 
-        low, high = self._limits()
+        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
+        low = np.where(limited, limits[:, 0], -np.inf)
+        high = np.where(limited, limits[:, 1], np.inf)
         clamped = np.clip(force, low, high)
         return clamped, clamped == force
 
@@ -260,30 +262,12 @@ class AffineForces:
         applied = np.clip(ctrl, low, high)
         return applied, applied == ctrl
 
-    def _limits(self) -> tuple[Array, Array]:
-        """(actuators,) least and largest forces of the actuators."""
-        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
-        return (
-            np.where(limited, limits[:, 0], -np.inf),
-            np.where(limited, limits[:, 1], np.inf),
-        )
-
 
 def _affine(forces: Array, about: Array, moves: Array) -> Array:
     """(w, 1 + c) values at zero and slopes, from (1 + c, w) forces: unmoved, then moved each."""
     slopes = ((forces[1:] - forces[0]) / moves[:, None]).T
     offset = forces[0] - slopes @ about
     return np.concatenate([offset[:, None], slopes], axis=1)
-
-
-def _dense_moments(fields: dict[str, Array], nv: int) -> Array:
-    """(actuators, nv) moment arms from the sparse matrix of the `MOMENT_FIELDS`."""
-    counts, starts = fields["moment_rownnz"], fields["moment_rowadr"]
-    moments = np.zeros((len(counts), nv))
-    for row, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
-        entries = slice(start, start + count)
-        moments[row, fields["moment_colind"][entries]] = fields["actuator_moment"][entries]
-    return moments
 
 
 def is_inertial(parameter: Parameter) -> bool:
@@ -480,7 +464,7 @@ class EquationOfMotion:
         """(n, nv) forces `τ B a`."""
         timestep = float(model.opt.timestep)
         if "qDeriv" in fields:
-            D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind)
+            D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind, model.nv)
             return -timestep * (D @ points.acceleration[..., None])[..., 0]
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
             return np.zeros_like(points.acceleration)
@@ -556,13 +540,13 @@ def activations(
 
 def _mass(model: Any, values: Array) -> Array:
     """(n, nv, nv) mass matrices from those that MuJoCo stores, which are lower triangles."""
-    lower = _dense(values, model.M_rowadr, model.M_rownnz, model.M_colind)
+    lower = _dense(values, model.M_rowadr, model.M_rownnz, model.M_colind, model.nv)
     return lower + np.swapaxes(np.tril(lower, -1), 1, 2)
 
 
-def _dense(values: Array, starts: Any, counts: Any, columns: Any) -> Array:
-    """(n, nv, nv) matrices from values (n, entries) of sparse rows."""
-    dense = np.zeros((len(values), len(starts), len(starts)))
+def _dense(values: Array, starts: Any, counts: Any, columns: Any, width: int) -> Array:
+    """(n, rows, width) matrices from values (n, entries) of sparse rows."""
+    dense = np.zeros((len(values), len(starts), width))
     for row, (start, count) in enumerate(zip(starts, counts, strict=True)):
         entries = slice(start, start + count)
         dense[:, row, columns[entries]] = values[:, entries]

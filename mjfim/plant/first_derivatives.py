@@ -198,11 +198,11 @@ class FirstDerivatives:
             The first derivatives, and (r, N, nx+nu, nx) derivatives of `DF[psi w, w]` by (x, u);
             None where there is no closed form.
         """
-        closed = self._closed_form(trajectory)
-        origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
-        if closed is None or origin is None:
+        found = self._origin_jacobians(theta, trajectory)
+        if found is None:
             return None
 
+        closed, origin = found
         nx = self.plant.space.nx
         sizes = self.difference_sizes(trajectory)[:nx]
         mixed = np.zeros((len(directions), *origin.A.shape[:1], nx + self.plant.nu, nx))
@@ -222,28 +222,6 @@ class FirstDerivatives:
             mixed[r][~_has_same_clamps(origin, moved, trajectory.ctrl)] = 0.0
         return origin, mixed
 
-    def closed_form_observations(
-        self, theta: Array, trajectory: Trajectory, observations: SubstepObservations
-    ) -> tuple[SampleJacobians, Array] | None:
-        """First derivatives of F and of observations.
-
-        Args:
-            theta: (p,) parameters of the trajectory [theta-unit].
-            trajectory: The trajectory.
-            observations: The w observed quantities.
-
-        Returns:
-            The first derivatives, and (N, S, w, nx+nu) derivatives of the observations by (x, u);
-            None where there is no closed form.
-        """
-        closed = self._closed_form(trajectory)
-        origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
-        if origin is None:
-            return None
-
-        observed = observation_jacobian(origin, trajectory.ctrl, observations)
-        return None if observed is None else (origin, observed)
-
     def _closed_form(self, trajectory: Trajectory) -> ClosedForm | None:
         """The closed form with the sizes of a trajectory; None where there is none."""
         plant = self.plant
@@ -255,9 +233,13 @@ class FirstDerivatives:
         return ClosedForm(simulator=plant.simulator, tree=tree, sizes=sizes)
 
     def _origin_jacobians(
-        self, closed: ClosedForm, theta: Array, trajectory: Trajectory
-    ) -> SampleJacobians | None:
-        """Derivatives along a trajectory: those that were computed last, or new ones."""
+        self, theta: Array, trajectory: Trajectory
+    ) -> tuple[ClosedForm, SampleJacobians] | None:
+        """The closed form and derivatives along a trajectory: those computed last, or new ones."""
+        closed = self._closed_form(trajectory)
+        if closed is None:
+            return None
+
         latest = self.plant.closed_form_memory.latest
         if latest is not None:
             known_theta, known_trajectory, known = latest
@@ -266,13 +248,14 @@ class FirstDerivatives:
                 and known.accelerations.shape[1] == self.plant.simulator.substeps
                 and np.array_equal(known_theta, theta)
             ):
-                return known
+                return closed, known
 
         model = self.plant.model(theta)
         found = closed.jacobians(model, trajectory.state[:-1], trajectory.ctrl)
-        if found is not None:
-            self._remember(theta, trajectory, found)
-        return found
+        if found is None:
+            return None
+        self._remember(theta, trajectory, found)
+        return closed, found
 
     def _remember(self, theta: Array, trajectory: Trajectory, found: SampleJacobians) -> None:
         """Keep the first derivatives of a trajectory for its mixed ones."""
@@ -394,9 +377,12 @@ class FirstDerivatives:
         Raises:
             SimulationDivergedError: A perturbed step diverges.
         """
-        closed = self.closed_form_observations(theta, trajectory, observations)
-        if closed is not None:
-            return closed[0].A, closed[0].B, closed[1]
+        found = self._origin_jacobians(theta, trajectory)
+        if found is not None:
+            origin = found[1]
+            observed = observation_jacobian(origin, trajectory.ctrl, observations)
+            if observed is not None:
+                return origin.A, origin.B, observed
 
         plant, nx = self.plant, self.plant.space.nx
         sizes = self.difference_sizes(trajectory)

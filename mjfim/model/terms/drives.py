@@ -120,8 +120,6 @@ class ActuatorLag(Term):
     sources = (KRAUSE_2013,)
     words = "a lag of {}"
     size = "time_constant"
-    words = "a lag of {}"
-    size = "time_constant"
 
     actuator: str
     explicit: bool
@@ -258,6 +256,8 @@ class JointElasticity(Term):
 
     Attributes:
         damping_ratio: Damping ratio of the motor against the link where no damping is stated.
+        spring: Kind and name of the element that is the spring, as in a parameter path, with `{}`
+            for the name of the term.
         joint: Name of the joint that becomes motor and link.
         body: Name of its body.
         slides: Whether it slides.
@@ -298,6 +298,7 @@ class JointElasticity(Term):
     # MuJoCo keeps the stiffness, the inverse of the compliance.
     is_written_as_a_whole = True
     damping_ratio: ClassVar[float] = 0.1
+    spring: ClassVar[str] = "joint/{}"
 
     joint: str
     body: str
@@ -358,7 +359,7 @@ class JointElasticity(Term):
         frequency = STIFFEST / float(model.opt.timestep)
         stiffness = rounded(reduced * frequency**2)
         damping = rounded(2.0 * reduced * frequency)
-        spring = cls._spring(table.name)
+        spring = cls.spring.format(table.name)
         return {
             "compliance": TermQuantity(
                 value=1.0 / stiffness,
@@ -375,11 +376,6 @@ class JointElasticity(Term):
                 numbers=((f"{spring}:damping", 1.0),),
             ),
         }
-
-    @classmethod
-    def _spring(cls, name: str) -> str:
-        """Kind and name of the element that is the spring, as in a parameter path."""
-        return f"joint/{name}"
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Write the spring and the damper."""
@@ -448,6 +444,7 @@ class Backlash(JointElasticity):
     size = "gap"
     estimated: ClassVar[tuple[str, ...]] = ()
     damping_ratio = 0.05
+    spring = "tendon/{}_gap"
 
     @classmethod
     def _defaults(
@@ -455,7 +452,7 @@ class Backlash(JointElasticity):
     ) -> dict[str, TermQuantity]:
         """Fields where the table states nothing."""
         require_free_name(model, "tendon", f"{table.name}_gap")
-        spring = cls._spring(table.name)
+        spring = cls.spring.format(table.name)
         gap = TermQuantity(
             value=0.0,
             unit=at.unit,
@@ -464,11 +461,6 @@ class Backlash(JointElasticity):
             numbers=((f"{spring}:springlength[0]", -0.5), (f"{spring}:springlength[1]", 0.5)),
         )
         return {"gap": gap, **super()._defaults(at, table, model, reduced)}
-
-    @classmethod
-    def _spring(cls, name: str) -> str:
-        """Kind and name of the tendon with the gap."""
-        return f"tendon/{name}_gap"
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Write the gap, its flanks and the damper."""

@@ -129,6 +129,9 @@ GARCIA_2002 = (
     "friction arising with gears, International Journal of Robotics Research 21, 2002"
 )
 
+# Numbers of the actuator that no field sets, each by its array and place.
+Fixed = tuple[tuple[str, float], ...]
+
 
 @dataclass(frozen=True, kw_only=True)
 class _PassiveDevice(Term):
@@ -144,7 +147,7 @@ class _PassiveDevice(Term):
     places: ClassVar[Places]
 
     joint: str
-    fixed: tuple[tuple[str, float], ...]
+    fixed: Fixed
     replaces_friction: bool
 
     @classmethod
@@ -152,18 +155,19 @@ class _PassiveDevice(Term):
         """Resolve the term."""
         at = JointSizes.of(table, model, period, cls.kind)
         require_free_name(model, "actuator", table.name)
+        found, fixed = cls._defaults(at, model)
         defaults = {
             field: replace(
                 quantity,
                 numbers=tuple((f"actuator/{table.name}:{n}", 1.0) for n in cls.places[field]),
             )
-            for field, quantity in cls._defaults(at, model).items()
+            for field, quantity in found.items()
         }
         return cls(
             name=table.name,
             joint=at.joint,
             quantities=stated_quantities(cls.kind, table, defaults),
-            fixed=cls._fixed(at, model),
+            fixed=fixed,
             replaces_friction="coulomb" in defaults and float(model.dof_frictionloss[at.dof]) > 0.0,
         )
 
@@ -176,13 +180,8 @@ class _PassiveDevice(Term):
 
     @classmethod
     @abstractmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
-        """Fields where the table states nothing, without their numbers."""
-
-    @classmethod
-    @abstractmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """Further numbers of the actuator."""
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
+        """Fields where the table states nothing, without their numbers; and `fixed`."""
 
     def _numbers(self, values: Mapping[str, float]) -> dict[str, dict[int, float]]:
         """Numbers of the actuator at values of the fields, by array and place."""
@@ -252,20 +251,16 @@ class Stribeck(_PassiveDevice):
     beside = "frictionloss"
 
     @classmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
         """Refuse RK4, whose stages would make the bristle unstable."""
         if is_rk4(model):
             raise ExperimentError(
                 "kind: with the integrator RK4, the bristle of 'stribeck' is unstable; use the "
                 "kind 'lugre', or the integrator implicitfast in the MJCF"
             )
-        return {"excess": _friction(at, 0.0), "speed": _stribeck_speed(at)}
-
-    @classmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """The stiffness of the bristle."""
         stiffness = BRISTLE_STIFFNESS * at.inertia / float(model.opt.timestep) ** 2
-        return (("dynprm[5]", rounded(stiffness)),)
+        fields = {"excess": _friction(at, 0.0), "speed": _stribeck_speed(at)}
+        return fields, (("dynprm[5]", rounded(stiffness)),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,7 +301,7 @@ class LuGre(_PassiveDevice):
     }
 
     @classmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
         """Fields where the table states nothing."""
         stiffness, damping = BRISTLE_STIFFNESS, BRISTLE_DAMPING
         if is_rk4(model):
@@ -314,7 +309,7 @@ class LuGre(_PassiveDevice):
         timestep = float(model.opt.timestep)
         stiffness = rounded(stiffness * at.inertia / timestep**2)
         damping = rounded(damping * at.inertia / timestep)
-        return {
+        fields = {
             "coulomb": _friction(at, float(model.dof_frictionloss[at.dof])),
             "excess": _friction(at, 0.0),
             "speed": _stribeck_speed(at),
@@ -332,11 +327,7 @@ class LuGre(_PassiveDevice):
                 bounds=(0.0, np.inf),
             ),
         }
-
-    @classmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """No further numbers."""
-        return ()
+        return fields, ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,14 +356,10 @@ class AsymmetricFriction(_PassiveDevice):
     beside = "frictionloss"
 
     @classmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
-        """Fields where the table states nothing."""
-        return {"offset": replace(_friction(at, 0.0), bounds=(-np.inf, np.inf))}
-
-    @classmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """The phase of the cogging torque."""
-        return (("biasprm[2]", CONSTANT_PHASE),)
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
+        """The field, and the phase of the cogging torque."""
+        offset = replace(_friction(at, 0.0), bounds=(-np.inf, np.inf))
+        return {"offset": offset}, (("biasprm[2]", CONSTANT_PHASE),)
 
 
 def _friction(at: JointSizes, value: float) -> TermQuantity:
