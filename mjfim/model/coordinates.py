@@ -257,7 +257,7 @@ def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
     Returns:
         The parts; none for slide and hinge joints.
     """
-    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+    kind = int(model.jnt_type[joint])
     if kind == mujoco.mjtJoint.mjJNT_FREE:
         return (*TRANSLATION, *ROTATION_VECTOR)
     if kind == mujoco.mjtJoint.mjJNT_BALL:

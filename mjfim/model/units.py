@@ -106,9 +106,8 @@ def joint_unit(model: Any, joint: int) -> str:
     Returns:
         Metres for slide and free joints, radians for hinge and ball joints.
     """
-    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
-    translates = kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
-    return LENGTH if translates else ANGLE
+    translating = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
+    return LENGTH if int(model.jnt_type[joint]) in translating else ANGLE
 
 
 def sensor_unit(model: Any, sensor: int) -> str:
@@ -161,7 +160,7 @@ def gain_unit(model: Any, actuator: int, field: str) -> str:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])
-    if mujoco.mjtJoint(int(model.jnt_type[joint])) not in SCALAR_JOINTS:
+    if int(model.jnt_type[joint]) not in SCALAR_JOINTS:
         return ""
     return JOINT_FIELD_UNITS[FIELD_OF_GAIN[field]][joint_unit(model, joint)]
 
@@ -233,7 +232,7 @@ def servo_kind(model: Any, actuator: int) -> Servo | None:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    if mujoco.mjtBias(int(model.actuator_biastype[actuator])) not in AFFINE:
+    if int(model.actuator_biastype[actuator]) not in AFFINE:
         return None
 
     gain = float(model.actuator_gainprm[actuator, 0])
@@ -262,7 +261,7 @@ def acts_at_joint(model: Any, actuator: int) -> bool:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    return mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
+    return int(model.actuator_trntype[actuator]) in AT_JOINT
 
 
 def commanded_joint(model: Any, actuator: int) -> int | None:
@@ -281,7 +280,7 @@ def commanded_joint(model: Any, actuator: int) -> int | None:
         return None
 
     joint = int(model.actuator_trnid[actuator, 0])
-    is_scalar = mujoco.mjtJoint(int(model.jnt_type[joint])) in SCALAR_JOINTS
+    is_scalar = int(model.jnt_type[joint]) in SCALAR_JOINTS
     has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
     return joint if is_scalar and has_gain and actuator_gear(model, actuator) != 0.0 else None
 

@@ -232,7 +232,8 @@ class ClosedLoopSimulator(BatchSimulator):
         if observations is not None:
             self._refuse()
         if context is None:
-            context = InputContext.none(ctrl)
+            begin = np.zeros(len(ctrl), dtype=np.intp)
+            context = InputContext.of_interval(ctrl, begin, slice(0, ctrl.shape[1]), 0, None)
 
         batch = self._batch_of(len(ctrl))
         batch.set_models(models[0] if len(models) == 1 else list(models))

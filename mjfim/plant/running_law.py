@@ -407,17 +407,6 @@ class InputContext:
     memory: tuple[LawMemory, ...] | None = None
 
     @classmethod
-    def none(cls, inputs: Array) -> InputContext:
-        """The context of curves at the begin of recordings.
-
-        Args:
-            inputs: (m, N, w) inputs of the curves.
-        """
-        nothing = inputs[:, :0]
-        begin = np.zeros(len(inputs), dtype=np.intp)
-        return cls(before=nothing, after=nothing, samples=begin)
-
-    @classmethod
     def of_interval(
         cls,
         inputs: Array,
