@@ -372,11 +372,6 @@ class System:
         return tuple(parameter.unit for parameter in self.parameters.parameters)
 
     @property
-    def measurable(self) -> tuple[str, ...]:
-        """Columns that a recording may hold: state components and sensors."""
-        return self.source.coordinates.measurable
-
-    @property
     def channels(self) -> Channels:
         """Signals that a log of this experiment may hold, and how to read them."""
         return Channels(

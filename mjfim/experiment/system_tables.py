@@ -450,8 +450,9 @@ class ParameterSpec(Section):
                 "per_recording needs nuisance = true: other parameters have one value in all "
                 "recordings"
             )
-        if self.bounds is not None:
-            self._require_inside(*self.bounds)
+        if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
+            low, high = self.bounds
+            raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
 
         return self
 
@@ -492,11 +493,6 @@ class ParameterSpec(Section):
             raise ValueError(
                 f"inertial defines ten parameters; {', '.join(single)} would fit only one"
             )
-
-    def _require_inside(self, low: float, high: float) -> None:
-        """Raise ValueError if the bounds are inverted, or exclude the guess or the true value."""
-        if not low < high:
-            raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
 
     @property
     def all_targets(self) -> tuple[TargetSpec, ...]:

@@ -414,28 +414,6 @@ class EigenvalueModel:
         """
         return self._changed(d).gradient
 
-    def hessian(self, d: Array) -> Array:
-        """Second derivative of the model.
-
-        Args:
-            d: (m,) coordinates of B.
-
-        Returns:
-            (m, m) derivative of the gradient by the coordinates.
-        """
-        return self._changed(d).hessian
-
-    def value(self, d: Array) -> float:
-        """Change of the model from the point about which it was made.
-
-        Args:
-            d: (m,) coordinates of B.
-
-        Returns:
-            h(d) - h(0).
-        """
-        return self._changed(d).value - self._changed(np.zeros_like(d)).value
-
     @cached_property
     def _logs(self) -> Array:
         """(r, r) diagonal matrix of the logarithms of the eigenvalues over the smallest one."""

@@ -201,14 +201,9 @@ class ClosedForm:
                 return None
             parts.append(part)
 
-        return SampleJacobians(
-            A=np.concatenate([part.A for part in parts]),
-            B=np.concatenate([part.B for part in parts]),
-            E=np.concatenate([part.E for part in parts]),
-            states=np.concatenate([part.states for part in parts]),
-            accelerations=np.concatenate([part.accelerations for part in parts]),
-            forces=forces,
-        )
+        names = ("A", "B", "E", "states", "accelerations")
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return SampleJacobians(**joined, forces=forces)
 
     def _part(
         self,

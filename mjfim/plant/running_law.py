@@ -213,21 +213,6 @@ class LawCommands:
             lag_time=numbers.latency + kept_back,
         )
 
-    def drive(self, numbers: LawNumbers) -> Array:
-        """(K, m, c) part of the controls that does not depend on the state [u-unit].
-
-        Args:
-            numbers: Numbers of the laws.
-        """
-        drive = numbers.kp * self.reference
-        if self.reference_velocity is not None:
-            drive += numbers.kd * self.reference_velocity
-        if self.gain is not None:
-            drive *= self.gain
-        if self.feedforward is not None:
-            drive += self.feedforward
-        return np.asarray(drive)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Columns:
@@ -487,7 +472,16 @@ class RunningLaws:
         self.velocities = np.array([law.v for law in laws])
         self._numbers = numbers
         self._commands = commands
-        self._drive = commands.drive(numbers)
+
+        # (K, m, c) part of the controls that does not depend on the state.
+        drive = numbers.kp * commands.reference
+        if commands.reference_velocity is not None:
+            drive += numbers.kd * commands.reference_velocity
+        if commands.gain is not None:
+            drive *= commands.gain
+        if commands.feedforward is not None:
+            drive += commands.feedforward
+        self._drive = drive
         self._next = ticks.before
 
         seconds = ticks.seconds

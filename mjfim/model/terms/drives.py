@@ -27,6 +27,7 @@ from mjfim.model.elements import (
 )
 from mjfim.model.terms.term import (
     NEGLIGIBLE,
+    NON_NEGATIVE,
     FieldDescription,
     JointSizes,
     Shape,
@@ -217,7 +218,7 @@ class BackEmf(Term):
             value=0.0,
             unit="",
             size=size,
-            bounds=(0.0, np.inf),
+            bounds=NON_NEGATIVE,
             numbers=((f"actuator/{name}:biasprm[2]", 1.0),),
         )
         quantities = stated_quantities(cls.kind, table, {"constant": quantity})
@@ -372,7 +373,7 @@ class JointElasticity(Term):
                 value=rounded(cls.damping_ratio * damping),
                 unit=JOINT_FIELD_UNITS["damping"][at.unit],
                 size=damping,
-                bounds=(0.0, np.inf),
+                bounds=NON_NEGATIVE,
                 numbers=((f"{spring}:damping", 1.0),),
             ),
         }
@@ -457,7 +458,7 @@ class Backlash(JointElasticity):
             value=0.0,
             unit=at.unit,
             size=LEAST_MOVE_PER_SAMPLE * float(position_sizes(model)[at.dof]),
-            bounds=(0.0, np.inf),
+            bounds=NON_NEGATIVE,
             numbers=((f"{spring}:springlength[0]", -0.5), (f"{spring}:springlength[1]", 0.5)),
         )
         return {"gap": gap, **super()._defaults(at, table, model, reduced)}

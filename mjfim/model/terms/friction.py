@@ -29,6 +29,7 @@ import scipy
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name, is_rk4, model_length
 from mjfim.model.terms.term import (
+    NON_NEGATIVE,
     FieldDescription,
     JointSizes,
     Shape,
@@ -324,7 +325,7 @@ class LuGre(_PassiveDevice):
                 value=damping,
                 unit=JOINT_FIELD_UNITS["damping"][at.unit],
                 size=damping,
-                bounds=(0.0, np.inf),
+                bounds=NON_NEGATIVE,
             ),
         }
         return fields, ()
@@ -364,7 +365,7 @@ class AsymmetricFriction(_PassiveDevice):
 
 def _friction(at: JointSizes, value: float) -> TermQuantity:
     """A force of dry friction as a field."""
-    return TermQuantity(value=value, unit=FORCE_UNITS[at.unit], size=at.force, bounds=(0.0, np.inf))
+    return TermQuantity(value=value, unit=FORCE_UNITS[at.unit], size=at.force, bounds=NON_NEGATIVE)
 
 
 def _stribeck_speed(at: JointSizes) -> TermQuantity:
@@ -413,11 +414,6 @@ class LoadDependentFriction(Term):
         ),
     )
     sources = (DUCLAUSAUD_2025, GARCIA_2002)
-    words = "friction that grows with the torque of {}"
-    size = "coefficient"
-    beside = "frictionloss"
-    # Its contacts would slow down all simulations of the others.
-    alone = True
     words = "friction that grows with the torque of {}"
     size = "coefficient"
     beside = "frictionloss"

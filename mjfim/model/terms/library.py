@@ -17,6 +17,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.model.elements import model_length
 from mjfim.model.terms import drives, friction
 from mjfim.model.terms.term import (
+    NON_NEGATIVE,
     FieldDescription,
     Shape,
     Term,
@@ -172,14 +173,14 @@ class Payload(Term):
             value=0.0,
             unit="kg",
             size=tree_mass,
-            bounds=(0.0, np.inf),
+            bounds=NON_NEGATIVE,
             numbers=((f"{load}:mass", 1.0),),
         )
         inertia = TermQuantity(
             value=0.0,
             unit="kg m²",
             size=tree_mass * length**2,
-            bounds=(0.0, np.inf),
+            bounds=NON_NEGATIVE,
             numbers=tuple((f"{load}:inertia[{i}]", 1.0) for i in range(3)),
         )
         place = TermQuantity(value=0.0, unit="m", size=length)

@@ -37,6 +37,9 @@ ELEMENT_KEYS = ("joint", "actuator", "body")
 # Values of some fields of a term, and the names of those that a fit estimates.
 Shape = tuple[dict[str, float], tuple[str, ...]]
 
+# Range of a number that physics keeps from being negative.
+NON_NEGATIVE = (0.0, np.inf)
+
 # Types of dynamics whose activation follows the control, so that it equals the control at rest.
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
