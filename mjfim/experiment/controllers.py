@@ -73,7 +73,7 @@ def resolve_controllers(
                 q=joint.q,
                 v=joint.v,
                 first=first_number(source.model, actuator),
-                tick=_tick(experiment, actuator, spec, float(source.model.opt.timestep)),
+                tick=_tick(experiment, actuator, spec, source.model.opt.timestep),
                 columns=columns,
                 interpolated=spec.interpolation == "linear",
                 differences=spec.velocity == "difference",

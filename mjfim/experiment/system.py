@@ -123,7 +123,7 @@ class System:
 
         # What the experiment states, checked against the model. The time grid comes first, because
         # it gives the period of the measurements.
-        grid = TimeGrid.stated(experiment, float(model.opt.timestep))
+        grid = TimeGrid.stated(experiment, model.opt.timestep)
         strides = noise_strides(experiment)
         outputs, noise = resolve_outputs(
             experiment,
@@ -262,7 +262,7 @@ class System:
         """
         grid = replace(
             self.stated_grid,
-            dt=substeps * float(self.model.opt.timestep),
+            dt=substeps * self.model.opt.timestep,
             substeps=substeps,
             stride=max(self.stated_grid.stride * self.stated_grid.substeps // substeps, 1),
             playback_steps=substeps,
@@ -455,7 +455,7 @@ def _require_supported(source: ModelSource) -> None:
     It has a state that mjfim cannot read, or a timestep that is not positive.
     """
     model = source.model
-    timestep = float(model.opt.timestep)
+    timestep = model.opt.timestep
 
     # MuJoCo compiles a model with any timestep. The comparison is false for NaN.
     if not 0.0 < timestep < np.inf:

@@ -168,7 +168,7 @@ def model_length(model: Any) -> float:
             longest = max(longest, from_root[body] + centre + gyration)
 
     # MuJoCo's extent is the size of the geoms and sites, where nothing that moves has a mass.
-    return longest or float(model.stat.extent)
+    return longest or model.stat.extent
 
 
 def translations(model: Any) -> np.ndarray:
@@ -285,7 +285,7 @@ def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     for actuator in bristle_actuators(model):
         stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
         under_force = _actuator_force_size(model, actuator, time) / stiffness
-        way = _transmission_size(model, actuator) / time * float(model.opt.timestep)
+        way = _transmission_size(model, actuator) / time * model.opt.timestep
         found[int(model.actuator_actadr[actuator])] = max(under_force, way)
     return found
 
@@ -327,7 +327,7 @@ def _acceleration(model: Any, actuator: int, output: int) -> float:
 
     # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
     gear = float(np.abs(model.actuator_gear[output]).max())
-    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
     return gear * float(model.dof_invweight0[dof])
 
 
@@ -343,5 +343,5 @@ def _transmission_size(model: Any, actuator: int) -> float:
 
     output = int(model.actuator_outadr[actuator])
     gear = float(np.abs(model.actuator_gear[output]).max()) or 1.0
-    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
     return gear * float(position_sizes(model)[dof])

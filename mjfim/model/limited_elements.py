@@ -378,7 +378,7 @@ def tilt_weights(model: Any, joint: int) -> Array:
     mujoco.mj_kinematics(model, data)
 
     # The upward direction in the frame of the body, and two directions perpendicular to it.
-    rotation = data.xmat[int(model.jnt_bodyid[joint])].reshape(3, 3)
+    rotation = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
     up = rotation.T @ upward(model)
     _, _, directions = np.linalg.svd(up[None])
     return directions[1:] @ turn_weights(model, joint)
@@ -400,5 +400,5 @@ def quaternion_address(model: Any, joint: int) -> int:
         model: The compiled model (`mujoco.MjModel`).
         joint: Number of the joint.
     """
-    place = QUATERNION_PLACE[int(model.jnt_type[joint])]
+    place = QUATERNION_PLACE[model.jnt_type[joint]]
     return int(model.jnt_qposadr[joint]) + place

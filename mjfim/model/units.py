@@ -292,4 +292,4 @@ def actuator_gear(model: Any, actuator: int) -> float:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    return float(model.actuator_gear[int(model.actuator_outadr[actuator]), 0])
+    return float(model.actuator_gear[model.actuator_outadr[actuator], 0])

@@ -364,7 +364,7 @@ def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
         model: The model (`mujoco.MjModel`).
         fastest: (nv,) fastest speeds of the degrees of freedom [m/s or rad/s].
     """
-    step = float(model.opt.timestep)
+    step = model.opt.timestep
     sticking = []
     for loss, weight, solimp, reference in _friction_arrays(model):
         # Below such a speed, friction brakes with less than its full force: the constraint asks for

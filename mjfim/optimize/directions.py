@@ -118,11 +118,7 @@ class MetricDescent:
         Its psi-part is left out, because the projection computes psi anew.
         """
         shown = expansion.extended if self.weighs_psi else expansion
-        if shown is None:
-            raise ValueError(
-                "the problem must provide extended expansions for a metric with weight on psi"
-            )
-
+        assert shown is not None
         zeta = descent(
             shown.A,
             shown.B,

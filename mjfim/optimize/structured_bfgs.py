@@ -252,9 +252,7 @@ class _LocalModel:
     @cached_property
     def _matrices(self) -> tuple[Array, Array]:
         """(M nu, M nu) matrices of the weights and of the uniform weights on the coefficients."""
-        if self.basis is None:
-            raise ValueError("without a basis there are no coefficients")
-
+        assert self.basis is not None
         response = basis_response(self.expansion, self.basis)
         uniform = _barrier(self.expansion).uniform_weights
         return (

@@ -217,7 +217,7 @@ class ClosedForm:
         N, substeps, nv = len(states), self.simulator.substeps, self.tree.count
         stepped, recorded = self.simulator.engine_steps(model, states, ctrl, RECORDED_FIELDS)
         fields = {name: _flat(values) for name, values in recorded.items()}
-        timestep = float(model.opt.timestep)
+        timestep = model.opt.timestep
 
         speed = stepped[..., nv:]
         accelerations = _flat(np.diff(speed, axis=1)) / timestep

@@ -203,7 +203,7 @@ class ClosedLoopSimulator(BatchSimulator):
         Args:
             models: Models with the numbers of the laws.
         """
-        timestep = float(self.model.opt.timestep)
+        timestep = self.model.opt.timestep
         numbers = LawNumbers.of(models, self.laws.laws, len(models))
         longest = max(law.tick for law in self.laws.laws) * timestep
         return int(np.ceil(lead_time(numbers, longest) / (self.substeps * timestep))) + 1
@@ -319,7 +319,7 @@ class ClosedLoopSimulator(BatchSimulator):
             before=lead * self.substeps // period,
             count=-(-total // period),
             substeps=self.substeps,
-            timestep=float(self.model.opt.timestep),
+            timestep=self.model.opt.timestep,
         )
 
         numbers = LawNumbers.of(models, laws, count)

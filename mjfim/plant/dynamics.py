@@ -120,8 +120,8 @@ class Dynamics:
         self.nominal_initial_state = np.array(nominal_initial_state, dtype=np.float64)
         self.initial_state_derivative = parameters.initial_state_derivative(self.space.nx)
         self.calibration = Calibration.of(parameters, len(outputs))
-        self.nu = int(source.model.nu) if laws is None else len(laws.inputs)
-        self.dt = substeps * float(source.model.opt.timestep)
+        self.nu = source.model.nu if laws is None else len(laws.inputs)
+        self.dt = substeps * source.model.opt.timestep
         self.sizes = StateSizes.of(source.model, self.space, self.dt)
         if laws is not None:
             self.sizes = replace(self.sizes, control=input_sizes(laws, self.sizes))
@@ -174,7 +174,7 @@ class Dynamics:
         """
         other = copy.copy(self)
         other.simulator = self.simulator.with_substeps(substeps)
-        other.dt = substeps * float(self.source.model.opt.timestep)
+        other.dt = substeps * self.source.model.opt.timestep
         if self._smooth is not None:
             other._smooth = self._smooth.with_substeps(substeps)
         return other
@@ -538,7 +538,7 @@ def explain_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> 
         return NO_WARNING
 
     stable = _stable_timestep(model, start, ctrl, substeps)
-    timestep = float(model.opt.timestep)
+    timestep = model.opt.timestep
     if stable is None:
         return f"{found}; {NO_WARNING}"
     return (
@@ -562,7 +562,7 @@ def find_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> str
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:] = state_space(model).split(start)
 
-    duration = substeps * float(model.opt.timestep)
+    duration = substeps * model.opt.timestep
     for k, u in enumerate(ctrl):
         data.ctrl[:] = u
         with silence_mujoco_log():

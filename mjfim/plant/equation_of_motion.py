@@ -164,7 +164,7 @@ class AffineForces:
         if self._is_implicit:
             speeds = slice(1 + nv, 1 + 2 * nv)
             points = np.array(points)
-            points[:, speeds] += float(model.opt.timestep) * acceleration
+            points[:, speeds] += model.opt.timestep * acceleration
 
         total = np.zeros((len(points), nv, by.count))
         for joint, k in np.argwhere(by.springs.any(axis=1)).tolist():
@@ -174,7 +174,7 @@ class AffineForces:
             total[:, :, k] += force[:, None] * self.moments[actuator]
 
         if self._damps_implicitly:
-            total -= float(model.opt.timestep) * acceleration[..., None] * by.damping
+            total -= model.opt.timestep * acceleration[..., None] * by.damping
         return total
 
     def actuator_slopes(self, states: Array, ctrl: Array) -> Array:

@@ -389,8 +389,7 @@ class FirstDerivatives:
         moved = self._move_samples(trajectory.state[:-1], trajectory.ctrl, step * sizes, False)
         model = plant.model(theta)
         after, _, seen = plant.simulator.step([model], moved.states, moved.ctrl, observations)
-        if seen is None:
-            raise ValueError("the simulator returned no observations")
+        assert seen is not None
 
         # The last of the moves is the zero one.
         states = moved.unflatten(after)[0]

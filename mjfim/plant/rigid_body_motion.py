@@ -425,7 +425,7 @@ class JointTree:
             return None
 
         # Parents have lower numbers than their children.
-        nv = int(model.nv)
+        nv = model.nv
         supports = np.eye(nv)
         for i, parent in enumerate(model.dof_parentid.tolist()):
             if parent >= 0:

@@ -242,7 +242,7 @@ class StateSizes:
                 int(model.actuator_actnum[actuator]),
             )
             if first >= 0 and int(model.actuator_ctrlnum[actuator]):
-                activation[first : first + count] = control[int(model.actuator_ctrladr[actuator])]
+                activation[first : first + count] = control[model.actuator_ctrladr[actuator]]
 
         position = position_sizes(model)
         return StateSizes(

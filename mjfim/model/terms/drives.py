@@ -133,7 +133,7 @@ class ActuatorLag(Term):
 
         # With `actearly` the actuator acts within the same step, so that a vanishing lag would be
         # the actuator without it. RK4 takes the activation through its stages.
-        timestep = float(model.opt.timestep)
+        timestep = model.opt.timestep
         explicit = is_rk4(model)
         least = (LEAST_LAG_RK4 if explicit else LEAST_LAG) * timestep
         lag = TermQuantity(
@@ -210,7 +210,7 @@ class BackEmf(Term):
             )
 
         time = period / LEAST_MOVE_PER_SAMPLE
-        control = float(control_sizes(model, time)[int(model.actuator_ctrladr[number])])
+        control = float(control_sizes(model, time)[model.actuator_ctrladr[number]])
         slides = force_unit(model, number) == FORCE_UNITS[LENGTH]
         length = model_length(model) if slides else 1.0
         size = control * time / (length * (abs(actuator_gear(model, number)) or 1.0))
@@ -314,7 +314,7 @@ class JointElasticity(Term):
     @classmethod
     def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
         """A joint that a motor drives may be elastic."""
-        return [({}, cls.estimated)] if motors_at(model, int(model.joint(element).id)) else []
+        return [({}, cls.estimated)] if motors_at(model, model.joint(element).id) else []
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> Self:
@@ -357,7 +357,7 @@ class JointElasticity(Term):
     ) -> dict[str, TermQuantity]:
         """Fields where the table states nothing. reduced: inertia of motor against link."""
         # Largest stiffness that the timestep resolves, and the damping at damping ratio 1.
-        frequency = STIFFEST / float(model.opt.timestep)
+        frequency = STIFFEST / model.opt.timestep
         stiffness = rounded(reduced * frequency**2)
         damping = rounded(2.0 * reduced * frequency)
         spring = cls.spring.format(table.name)
@@ -382,7 +382,7 @@ class JointElasticity(Term):
         """Write the spring and the damper."""
         joint = model.joint(self.name).id
         model.jnt_stiffness[joint] = 1.0 / values["compliance"]
-        model.dof_damping[int(model.jnt_dofadr[joint])] = values["damping"]
+        model.dof_damping[model.jnt_dofadr[joint]] = values["damping"]
 
     def edit(self, spec: Any) -> None:
         """Add the deflection and, for an encoder on the link, the rotor."""

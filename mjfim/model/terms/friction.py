@@ -73,7 +73,7 @@ CONSTANT_PHASE = float(np.pi / 2.0)
 # Force range of a passive device, so small that MuJoCo's implicit integrators do not take the
 # damping of the bristle for damping of the joint, which would act like an inertia [N or N m]. It
 # bounds the electrical force, which is zero.
-NO_ELECTRICAL_FORCE = float(mujoco.mjMINVAL)
+NO_ELECTRICAL_FORCE = mujoco.mjMINVAL
 
 DE_WIT_1995 = (
     "C. Canudas de Wit, H. Olsson, K. J. Åström and P. Lischinsky, A new model for control of "
@@ -259,7 +259,7 @@ class Stribeck(_PassiveDevice):
                 "kind: with the integrator RK4, the bristle of 'stribeck' is unstable; use the "
                 "kind 'lugre', or the integrator implicitfast in the MJCF"
             )
-        stiffness = BRISTLE_STIFFNESS * at.inertia / float(model.opt.timestep) ** 2
+        stiffness = BRISTLE_STIFFNESS * at.inertia / model.opt.timestep**2
         fields = {"excess": _friction(at, 0.0), "speed": _stribeck_speed(at)}
         return fields, (("dynprm[5]", rounded(stiffness)),)
 
@@ -307,7 +307,7 @@ class LuGre(_PassiveDevice):
         stiffness, damping = BRISTLE_STIFFNESS, BRISTLE_DAMPING
         if is_rk4(model):
             stiffness, damping = BRISTLE_STIFFNESS_RK4, BRISTLE_DAMPING_RK4
-        timestep = float(model.opt.timestep)
+        timestep = model.opt.timestep
         stiffness = rounded(stiffness * at.inertia / timestep**2)
         damping = rounded(damping * at.inertia / timestep)
         fields = {
@@ -463,7 +463,7 @@ class LoadDependentFriction(Term):
         direction = turn.apply(axis)
 
         # MuJoCo replaces coefficients below its minimum, so that no fit could begin there.
-        least = LEAST_TORSIONAL * float(mujoco.mjMINMU) / radius
+        least = LEAST_TORSIONAL * mujoco.mjMINMU / radius
         default = max(SMALL_COEFFICIENT, 2.0 * least)
         pairs = [f"pair/{table.name}_{side}:friction[{TORSIONAL}]" for side in SIDES]
         quantity = TermQuantity(
@@ -488,7 +488,7 @@ class LoadDependentFriction(Term):
             radius=radius,
             armature=rounded(ARMATURE_SHARE * inertia / radius**2),
             carrier=light_body(model, body, inertia),
-            contact_time=CONTACT_TIME * float(model.opt.timestep),
+            contact_time=CONTACT_TIME * model.opt.timestep,
             enables_contacts=_enables_contacts(model),
             quantities=stated_quantities(cls.kind, table, {"coefficient": quantity}),
         )

@@ -196,7 +196,7 @@ class Payload(Term):
     @classmethod
     def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
         """Places on a line through the centre of mass of a body that carries no moving one."""
-        body = int(model.body(element).id)
+        body = model.body(element).id
         is_last = not any(
             int(model.body_weldid[model.body_parentid[other]]) == body
             for other in np.flatnonzero(model.body_jntnum)

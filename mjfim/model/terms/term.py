@@ -314,7 +314,7 @@ def rounded(number: float) -> float:
 
 def joint_inertia(model: Any, joint: int) -> float:
     """Inertia that the force of a joint feels in the reference position [kg or kg m²]."""
-    weight = float(model.dof_invweight0[int(model.jnt_dofadr[joint])])
+    weight = float(model.dof_invweight0[model.jnt_dofadr[joint]])
     return 1.0 / weight if weight > 0.0 else 1.0
 
 
@@ -431,8 +431,8 @@ class StateLayout:
     @property
     def added(self) -> frozenset[int]:
         """Addresses in (qpos, qvel) of the extended model that the stated one does not have."""
-        size = int(self.model.nq) + int(self.model.nv)
-        stated = {*self.qpos.tolist(), *(int(self.model.nq) + self.qvel).tolist()}
+        size = self.model.nq + self.model.nv
+        stated = {*self.qpos.tolist(), *(self.model.nq + self.qvel).tolist()}
         return frozenset(range(size)) - stated
 
     def positions(self, stated: Any) -> Array:
@@ -469,11 +469,11 @@ class StateLayout:
     def _resting_control(self, actuator: int, qpos: Array, ctrl: Array | None) -> float:
         """Control of an actuator with one control at rest."""
         if ctrl is not None:
-            return float(ctrl[int(self.model.actuator_ctrladr[actuator])])
+            return float(ctrl[self.model.actuator_ctrladr[actuator]])
         joint = commanded_joint(self.model, actuator)
         if joint is None:
             return 0.0
-        position = float(qpos[int(self.model.jnt_qposadr[joint])])
+        position = float(qpos[self.model.jnt_qposadr[joint]])
         return position * actuator_gear(self.model, actuator)
 
 
