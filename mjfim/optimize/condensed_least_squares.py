@@ -331,12 +331,12 @@ class Condensed:
         """
         n = self.private_count
         weight = np.sqrt(damping) * scale
-        private: Array = np.zeros((self.segment_count, 0))
+        private = np.zeros((self.segment_count, 0))
         if n:
             # The steps of the private unknowns follow from that of the common ones.
             R = self._damped_triangles(weight[:n], scale[:n])
             rhs = R[:, :n, -1] + R[:, :n, n:-1] @ common
-            private = -np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0]
+            private = np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
         return self._evaluated(common, private)
 
     def _damped_triangles(self, weight: Array, scale: Array) -> Array:
