@@ -119,7 +119,10 @@ class Dynamics:
         self.space = self.simulator.space
         self.nominal_initial_state = np.array(nominal_initial_state, dtype=np.float64)
         self.initial_state_derivative = parameters.initial_state_derivative(self.space.nx)
-        self.calibration = Calibration.of(parameters, len(outputs))
+        self.calibration = Calibration(
+            scale=parameters.scale_derivative(len(outputs)),
+            bias=parameters.bias_derivative(len(outputs)),
+        )
         self.nu = source.model.nu if laws is None else len(laws.inputs)
         self.dt = substeps * source.model.opt.timestep
         self.sizes = StateSizes.of(source.model, self.space, self.dt)

@@ -17,7 +17,6 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.model.parameters import ParameterSet
 from mjfim.plant.state_space import StateSpace, quaternion_product
 
 # Number of samples through which the cubic polynomial of the interpolation passes.
@@ -241,18 +240,6 @@ class Calibration:
 
     scale: Array
     bias: Array
-
-    @staticmethod
-    def of(parameters: ParameterSet, ny: int) -> Calibration:
-        """Errors that some parameters stand for.
-
-        Args:
-            parameters: The parameters.
-            ny: Number of outputs.
-        """
-        return Calibration(
-            scale=parameters.scale_derivative(ny), bias=parameters.bias_derivative(ny)
-        )
 
     @property
     def scales(self) -> bool:
