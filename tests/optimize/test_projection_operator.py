@@ -537,7 +537,7 @@ def test_lbfgs_on_a_finer_grid_keeps_its_curvature_and_direction() -> None:
     np.testing.assert_allclose(
         fine(dense, np.zeros((4 * N, 1, 1))).v, np.repeat(coarse, 4, axis=0), rtol=1e-9
     )
-    assert direction._pairs[0].s.shape == (N, 1)  # the coarse memory is left alone
+    assert direction._pairs[0][0].shape == (N, 1)  # the coarse memory is left alone
 
 
 def test_feedback_only_above_the_threshold_of_amplification() -> None:
