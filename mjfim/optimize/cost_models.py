@@ -61,12 +61,13 @@ EQUAL_EIGENVALUES = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BarrierDerivatives:
-    """Value and derivatives of the barrier of numbers: (..., w).
+    """Value and derivatives of the barrier of numbers, or of norms of vectors: (..., w).
 
     Attributes:
-        value: Sum of the barrier over all numbers.
+        value: Sum of the barrier over all numbers or vectors.
         slope: (..., w) first derivative by each number.
-        curvature: (..., w) second derivative by each number.
+        curvature: (..., w) second derivative by each number; of a norm, (..., w, w) by the
+            components of its vector.
     """
 
     value: float
