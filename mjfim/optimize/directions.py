@@ -105,7 +105,11 @@ class MetricDescent:
         Its psi-part is left out, because the projection computes psi anew.
         """
         shown = expansion.extended if self.weighs_psi else expansion
-        assert shown is not None
+        if shown is None:
+            raise ValueError(
+                "the problem must provide extended expansions for a metric with weight on psi"
+            )
+
         zeta = descent(
             shown.A,
             shown.B,
