@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -18,11 +19,132 @@ from typer.main import get_command
 
 from mjfim.cli.main import app
 from mjfim.experiment.schema import json_schema
-from mjfim.model.terms.library import NUMBERS, TERMS, CatalogueEntry
+from mjfim.model.terms import drives, friction
+from mjfim.model.terms.library import KINDS, SWEVERS_2007
+from mjfim.model.terms.term import Term
 
 SCHEMA_FILE = "reference/experiment.schema.json"  # Place of the JSON schema on the site.
 
 Schema = Mapping[str, Any]
+
+TEDALDI_2014 = (
+    "D. Tedaldi, A. Pretto and E. Menegatti, A robust and easy to implement method for IMU "
+    "calibration without external equipments, IEEE International Conference on Robotics and "
+    "Automation, 2014"
+)
+
+LJUNG_1999 = (
+    "L. Ljung, System Identification: Theory for the User, 2nd edition, Prentice Hall, 1999"
+)
+
+BATCHELOR_1967 = "G. K. Batchelor, An Introduction to Fluid Dynamics, Cambridge University Press"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MjcfNumber:
+    """A number of the MJCF that describes a physical term, so that it needs no table.
+
+    Attributes:
+        name: Name of the number in words.
+        description: One sentence about the physics.
+        equation: The force, torque or reading.
+        paths: Parameter paths of the number.
+        sources: Publications that describe it.
+    """
+
+    name: str
+    description: str
+    equation: str
+    paths: tuple[str, ...]
+    sources: tuple[str, ...]
+
+
+NUMBERS = (
+    MjcfNumber(
+        name="dry friction",
+        description="Coulomb friction of a joint or a tendon, which sticks at rest.",
+        equation="F = -f sgn(v)",
+        paths=("joint/<name>:frictionloss", "tendon/<name>:frictionloss"),
+        sources=(friction.OLSSON_1998,),
+    ),
+    MjcfNumber(
+        name="viscous friction",
+        description="Friction of a lubricant, and the back-EMF of a motor with short circuit.",
+        equation="F = -b0 v",
+        paths=("joint/<name>:damping", "tendon/<name>:damping"),
+        sources=(friction.ARMSTRONG_1994,),
+    ),
+    MjcfNumber(
+        name="drag",
+        description="Quadratic drag in air or oil, and a viscosity that changes with the speed.",
+        equation="F = -(b0 v + b1 v |v| + b2 v³)",
+        paths=("joint/<name>:damping[1]", "joint/<name>:damping[2]"),
+        sources=(BATCHELOR_1967, friction.ARMSTRONG_1994),
+    ),
+    MjcfNumber(
+        name="rotor inertia",
+        description="Inertia of a rotor behind a gear, reflected to the joint.",
+        equation="F = -J q̈",
+        paths=("joint/<name>:armature", "tendon/<name>:armature"),
+        sources=(drives.SPONG_1987,),
+    ),
+    MjcfNumber(
+        name="spring",
+        description="A spring of a joint, such as that of a cable or a balance.",
+        equation="F = -(k0 x + k1 x |x| + k2 x³), x = q - springref",
+        paths=("joint/<name>:stiffness", "joint/<name>:springref", "joint/<name>:stiffness[1]"),
+        sources=(LJUNG_1999,),
+    ),
+    MjcfNumber(
+        name="torque constant",
+        description="Torque of a direct drive per unit of its control.",
+        equation="τ = gain · control",
+        paths=("actuator/<name>:gainprm[0]",),
+        sources=(drives.KRAUSE_2013,),
+    ),
+    MjcfNumber(
+        name="gravity",
+        description="Direction and size of gravity; `tilt` turns it and keeps its size.",
+        equation="F = m g",
+        paths=("option:gravity[i]",),
+        sources=(SWEVERS_2007,),
+    ),
+    MjcfNumber(
+        name="air or water",
+        description="Forces of a fluid on all bodies, by their inertia boxes.",
+        equation="MuJoCo's fluid forces, linear in viscosity, quadratic with density",
+        paths=("option:density", "option:viscosity", "option:wind[i]"),
+        sources=(BATCHELOR_1967,),
+    ),
+    MjcfNumber(
+        name="misalignment of a sensor",
+        description="A sensor whose axes are turned against the site that the MJCF states.",
+        equation="y = R(rot) y of the site",
+        paths=("site/<name>:rot[i]",),
+        sources=(TEDALDI_2014,),
+    ),
+    MjcfNumber(
+        name="scale of a sensor",
+        description="A reading that is too large by a constant share s.",
+        equation="y = (1 + s) h + b",
+        paths=("output/<name>:scale",),
+        sources=(TEDALDI_2014,),
+    ),
+    MjcfNumber(
+        name="bias of a sensor",
+        description="A reading with a constant offset b.",
+        equation="y = (1 + s) h + b",
+        paths=("output/<name>:bias",),
+        sources=(TEDALDI_2014,),
+    ),
+    MjcfNumber(
+        name="delay",
+        description="Readings that are late against the controls.",
+        equation="y(t) = h(t - d)",
+        paths=("output:delay",),
+        sources=(LJUNG_1999,),
+    ),
+)
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
@@ -73,13 +195,17 @@ def terms_reference() -> str:
             for entry in NUMBERS
         ],
     )
-    sections = ["## Terms of the library", "", *(line for e in TERMS for line in _term(e))]
+    sections = [
+        "## Terms of the library",
+        "",
+        *(line for each in KINDS.values() for line in _term(each)),
+    ]
     return "\n".join([*sections, *numbers])
 
 
-def _term(entry: CatalogueEntry) -> Iterator[str]:
+def _term(entry: type[Term]) -> Iterator[str]:
     """Section of one term of the library."""
-    yield f"### `{entry.name}`"
+    yield f"### `{entry.kind}`"
     yield ""
     yield entry.description
     yield ""

@@ -10,7 +10,7 @@ import numpy as np
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import ControllerSpec
-from mjfim.experiment.time_grid import possible_rates, whole_timesteps
+from mjfim.experiment.time_grid import parts_of, whole_number
 from mjfim.model.control_laws import (
     KINDS,
     ControlLaw,
@@ -73,7 +73,7 @@ def resolve_controllers(
                 q=joint.q,
                 v=joint.v,
                 first=first_number(source.model, actuator),
-                tick=_tick(experiment, actuator, spec, float(source.model.opt.timestep)),
+                tick=_tick(experiment, actuator, spec, source.model.opt.timestep),
                 columns=columns,
                 interpolated=spec.interpolation == "linear",
                 differences=spec.velocity == "difference",
@@ -174,12 +174,12 @@ def _tick(experiment: Experiment, actuator: str, spec: ControllerSpec, timestep:
     Raises ExperimentError if this is not a whole number.
     """
     rate = spec.rate or experiment.rate
-    ticks = whole_timesteps(rate, timestep)
+    ticks = whole_number(1.0 / (rate * timestep))
     if ticks is None:
         raise ExperimentError(
             f"controllers.{actuator}.rate: {rate:g} Hz does not divide the rate of the engine "
             f"({1.0 / timestep:g} Hz, timestep {timestep:g} s of the MJCF); valid for example: "
-            f"{possible_rates(timestep)} Hz"
+            f"{parts_of(1.0 / timestep)} Hz"
         )
     return ticks
 

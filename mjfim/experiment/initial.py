@@ -5,6 +5,7 @@ Controls are combinations of basis functions: splines of a bandwidth, Fourier se
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -142,9 +143,7 @@ def _power_derivatives(t: Array, horizon: float, powers: np.ndarray, order: int)
         powers: (K,) exponents k.
         order: Order of the derivative.
     """
-    factors = [
-        np.prod(np.arange(k - order + 1, k + 1)) if k >= order else 0.0 for k in powers.tolist()
-    ]
+    factors = [math.perm(k, order) for k in powers.tolist()]
     remaining = np.maximum(powers - order, 0)
     return np.asarray(np.array(factors) * (t[:, None] / horizon) ** remaining / horizon**order)
 
@@ -295,13 +294,15 @@ def initial_state(stated: Initial, model: Any, key: Any, layout: StateLayout | N
             qpos = _completed("qpos", stated.qpos, model.nq, len(own.qpos), own.positions)
         zeros = np.zeros(model.nv)
         qvel = _completed("qvel", stated.qvel or zeros, model.nv, len(own.qvel), own.velocities)
-
-        def activations(numbers: Array) -> Array:
-            """Activations of the model at the initial positions."""
-            return own.activations(numbers, qpos, None)
-
+        # Activations that terms add are those at the initial positions.
         zeros = np.zeros(len(own.act))
-        act = _completed("act", stated.act or zeros, model.na, len(own.act), activations)
+        act = _completed(
+            "act",
+            stated.act or zeros,
+            model.na,
+            len(own.act),
+            lambda numbers: own.activations(numbers, qpos, None),
+        )
 
     _require_rotations(model, qpos)
     mujoco.mj_normalizeQuat(model, qpos)
@@ -330,7 +331,7 @@ def _require_rotations(model: Any, qpos: Array) -> None:
             continue
 
         # The quaternion of a free joint follows its position.
-        is_free = int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)
+        is_free = int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE
         first = int(model.jnt_qposadr[j]) + (3 if is_free else 0)
         if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
             raise ExperimentError(

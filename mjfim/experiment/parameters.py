@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from mjfim.model.parameters import Parameter, ParameterSet, Target, physical_bou
 from mjfim.model.paths import ParameterPath, resolve, term_quantity, unit_of
 from mjfim.model.targets import InertiaField, OutputBiasField, OutputDelayField
 from mjfim.model.variants import MocapPlacement
+from mjfim.plant.outputs import Outputs
 
 # Prefix of the names of parameters that are nuisance deviations of the initial state.
 INITIAL_STATE_PREFIX = "initial "
@@ -39,34 +39,8 @@ BARYCENTRIC_FIELDS = (
 LOGCHOLESKY_FIELDS = tuple(f"logcholesky[{i}]" for i in range(10))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Measured:
-    """The measured outputs, as far as parameters depend on them.
-
-    Attributes:
-        names: ny names of the outputs.
-        sigma: (ny,) sizes of biases: the standard deviations of the outputs' noise [y-unit].
-        period: Size of a delay: the sample period of the experiment [s].
-    """
-
-    names: Sequence[str]
-    sigma: Array
-    period: float
-
-    def magnitude(self, target: Target, model: Any) -> float:
-        """Size with which a change of a target is compared [unit of the target]."""
-        field = target.field
-        if target.term is not None:
-            return target.term.size
-        if isinstance(field, OutputBiasField):
-            return float(self.sigma[field.row])
-        if isinstance(field, OutputDelayField):
-            return self.period
-        return field.magnitude(model)
-
-
 def resolve_parameters(
-    experiment: Experiment, source: ModelSource, mocap: MocapPlacement | None, measured: Measured
+    experiment: Experiment, source: ModelSource, mocap: MocapPlacement | None, outputs: Outputs
 ) -> ParameterSet:
     """Resolve all parameters in the order of theta.
 
@@ -76,7 +50,7 @@ def resolve_parameters(
         experiment: The experiment.
         source: Its model.
         mocap: Where mocap bodies start; None where they start as compiled.
-        measured: The measured outputs.
+        outputs: The measured outputs.
 
     Returns:
         The p parameters.
@@ -84,11 +58,12 @@ def resolve_parameters(
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
-    nuisance = dict(_nuisance(experiment.nuisance, source, measured.names))
+    nuisance = dict(_nuisance(experiment.nuisance, source, outputs.names))
     resolved: list[Parameter] = []
     for name, spec in (*experiment.parameters.items(), *nuisance.items()):
         if spec.inertial is None:
-            resolved.append(_single_parameter(name, spec, source, measured))
+            period = 1.0 / experiment.rate
+            resolved.append(_single_parameter(name, spec, source, outputs, period))
         else:
             resolved += _inertia_parameters(name, spec, source.model)
 
@@ -104,16 +79,16 @@ def resolve_parameters(
 
 
 def _single_parameter(
-    name: str, spec: ParameterSpec, source: ModelSource, measured: Measured
+    name: str, spec: ParameterSpec, source: ModelSource, outputs: Outputs, period: float
 ) -> Parameter:
-    """A parameter with targets or a function."""
+    """A parameter with targets or a function. period: sample period of the experiment [s]."""
     guess, unit, magnitude = spec.guess, spec.unit, 0.0
     try:
-        targets = tuple(_target(stated, source, measured.names) for stated in spec.all_targets)
+        targets = tuple(_target(stated, source, outputs.names) for stated in spec.all_targets)
         for target in targets[:1]:
             if guess is None:
                 guess = (target.field.read(source.model) - target.offset) / target.scale
-            magnitude = measured.magnitude(target, source.model) / abs(target.scale)
+            magnitude = _magnitude(target, source.model, outputs, period) / abs(target.scale)
             # A parameter whose factor is not 1 may have another unit than its target.
             if not unit and target.scale == 1.0:
                 unit = unit_of(source.model, target.path, source.terms)
@@ -149,6 +124,19 @@ def _single_parameter(
         wanted=spec.wanted,
         per_recording=spec.per_recording,
     )
+
+
+def _magnitude(target: Target, model: Any, outputs: Outputs, period: float) -> float:
+    """Size with which a change of a target is compared [unit of the target].
+
+    The size of a bias is the standard deviation of the noise, that of a delay the sample period.
+    """
+    field = target.field
+    if target.term is not None:
+        return target.term.size
+    if isinstance(field, OutputBiasField):
+        return outputs.outputs[field.row].sigma
+    return period if isinstance(field, OutputDelayField) else field.magnitude(model)
 
 
 def _require_inside(

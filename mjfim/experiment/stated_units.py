@@ -118,8 +118,12 @@ class _Units:
         A unit is empty where it does not follow from the model.
         """
         for length in (2, 3):
-            if keys[:length] in self.tables:
-                return _named(self.tables[keys[:length]], keys[length:])
+            if (units := self.tables.get(keys[:length])) is not None:
+                # Of the element that a table names, or of all; a wrong name is refused later.
+                names = keys[length:]
+                if not names:
+                    return tuple(units.values())
+                return (units[names[0]],) if names[0] in units else None
 
         found: tuple[str, ...] | None = None
         match keys:
@@ -215,13 +219,6 @@ class _Units:
         for number in coordinates.sensors:
             units[number.name] = sensor_unit(model, identifier(model, "sensor", number.sensor))
         return units
-
-
-def _named(units: Mapping[str, str], names: Sequence[Any]) -> tuple[str, ...] | None:
-    """Unit of the element that a table names, or of all of them; a wrong name is refused later."""
-    if not names:
-        return tuple(units.values())
-    return (units[names[0]],) if names[0] in units else None
 
 
 def _parameter_unit(spec: ParameterSpec, source: ModelSource) -> str:

@@ -21,7 +21,7 @@ from mjfim.experiment.controllers import resolve_controllers
 from mjfim.experiment.initial import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.packing import for_workers, model_of
-from mjfim.experiment.parameters import Measured, resolve_parameters
+from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
@@ -123,7 +123,7 @@ class System:
 
         # What the experiment states, checked against the model. The time grid comes first, because
         # it gives the period of the measurements.
-        grid = TimeGrid.stated(experiment, float(model.opt.timestep))
+        grid = TimeGrid.stated(experiment, model.opt.timestep)
         strides = noise_strides(experiment)
         outputs, noise = resolve_outputs(
             experiment,
@@ -135,9 +135,7 @@ class System:
         key = keyframe(model, "initial.keyframe", experiment.initial.keyframe)
         start = initial_state(experiment.initial, model, key, source.layout)
         mocap = MocapPlacement.of(model, key)
-        sigma = np.sqrt(np.diag(noise.covariance))
-        measured = Measured(names=outputs.names, sigma=sigma, period=1.0 / experiment.rate)
-        parameters = resolve_parameters(experiment, source, mocap, measured)
+        parameters = resolve_parameters(experiment, source, mocap, outputs)
 
         # The plant that the parameters act on.
         private = PlantModel(
@@ -264,7 +262,7 @@ class System:
         """
         grid = replace(
             self.stated_grid,
-            dt=substeps * float(self.model.opt.timestep),
+            dt=substeps * self.model.opt.timestep,
             substeps=substeps,
             stride=max(self.stated_grid.stride * self.stated_grid.substeps // substeps, 1),
             playback_steps=substeps,
@@ -374,11 +372,6 @@ class System:
         return tuple(parameter.unit for parameter in self.parameters.parameters)
 
     @property
-    def measurable(self) -> tuple[str, ...]:
-        """Columns that a recording may hold: state components and sensors."""
-        return self.source.coordinates.measurable
-
-    @property
     def channels(self) -> Channels:
         """Signals that a log of this experiment may hold, and how to read them."""
         return Channels(
@@ -462,7 +455,7 @@ def _require_supported(source: ModelSource) -> None:
     It has a state that mjfim cannot read, or a timestep that is not positive.
     """
     model = source.model
-    timestep = float(model.opt.timestep)
+    timestep = model.opt.timestep
 
     # MuJoCo compiles a model with any timestep. The comparison is false for NaN.
     if not 0.0 < timestep < np.inf:

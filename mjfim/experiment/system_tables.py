@@ -442,7 +442,18 @@ class ParameterSpec(Section):
     @model_validator(mode="after")
     def _consistent(self) -> ParameterSpec:
         """Refuse keys that contradict each other."""
-        self._require_one_source()
+        sources = (
+            self.target is not None,
+            bool(self.targets),
+            self.function is not None,
+            self.inertial is not None,
+        )
+        if sum(sources) != 1:
+            raise ValueError(
+                "give exactly one of target, targets and inertial (in Python also function)"
+            )
+        if self.function is not None and (not callable(self.function) or self.guess is None):
+            raise ValueError("function must be callable, f(spec, value), and needs a guess")
         self._require_keys_of_inertial()
 
         if self.per_recording and not self.nuisance:
@@ -450,26 +461,11 @@ class ParameterSpec(Section):
                 "per_recording needs nuisance = true: other parameters have one value in all "
                 "recordings"
             )
-        if self.bounds is not None:
-            self._require_inside(*self.bounds)
+        if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
+            low, high = self.bounds
+            raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
 
         return self
-
-    def _require_one_source(self) -> None:
-        """Raise ValueError unless exactly one key states what the parameter changes."""
-        sources = (
-            self.target is not None,
-            bool(self.targets),
-            self.function is not None,
-            self.inertial is not None,
-        )
-
-        if sum(sources) != 1:
-            raise ValueError(
-                "give exactly one of target, targets and inertial (in Python also function)"
-            )
-        if self.function is not None and (not callable(self.function) or self.guess is None):
-            raise ValueError("function must be callable, f(spec, value), and needs a guess")
 
     def _require_keys_of_inertial(self) -> None:
         """Raise ValueError for keys that contradict `inertial`, or that need it."""
@@ -492,11 +488,6 @@ class ParameterSpec(Section):
             raise ValueError(
                 f"inertial defines ten parameters; {', '.join(single)} would fit only one"
             )
-
-    def _require_inside(self, low: float, high: float) -> None:
-        """Raise ValueError if the bounds are inverted, or exclude the guess or the true value."""
-        if not low < high:
-            raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
 
     @property
     def all_targets(self) -> tuple[TargetSpec, ...]:

@@ -42,11 +42,11 @@ class TimeGrid:
                 timesteps.
         """
         rate, playback_rate = experiment.rate, experiment.playback_rate
-        substeps = whole_timesteps(rate, timestep)
+        substeps = whole_number(1.0 / (rate * timestep))
         if substeps is None:
             raise ExperimentError(
                 f"rate: at {rate:g} Hz, a sample is not a whole number of timesteps ({timestep:g} "
-                f"s); valid for example: {possible_rates(timestep)} Hz"
+                f"s); valid for example: {parts_of(1.0 / timestep)} Hz"
             )
         if substeps > MAX_SUBSTEPS:
             raise ExperimentError(
@@ -55,7 +55,7 @@ class TimeGrid:
                 "Hz or more"
             )
 
-        rows = 1 if playback_rate is None else _whole(playback_rate / rate)
+        rows = 1 if playback_rate is None else whole_number(playback_rate / rate)
         if rows is None or substeps % rows:
             valid = [k for k in range(1, substeps + 1) if substeps % k == 0]
             raise ExperimentError(
@@ -110,32 +110,22 @@ def noise_strides(experiment: Experiment) -> dict[str, int]:
     return strides
 
 
-def whole_timesteps(rate: float, timestep: float) -> int | None:
-    """Number of timesteps in a period; None if it is not a whole number."""
-    return _whole(1.0 / (rate * timestep))
-
-
-def possible_rates(timestep: float) -> str:
-    """Some rates whose periods are whole numbers of timesteps [Hz], for a message."""
-    return _parts(1.0 / timestep)
-
-
-def _whole(ratio: float) -> int | None:
-    """A ratio that is a whole number within the tolerance, or None."""
+def whole_number(ratio: float) -> int | None:
+    """A ratio of rates that is a whole number within the tolerance, or None."""
     n = round(ratio)
     return n if n >= 1 and abs(ratio - n) <= RATE_TOLERANCE * n else None
 
 
-def _parts(rate: float) -> str:
-    """Some rates that divide another one [Hz]."""
+def parts_of(rate: float) -> str:
+    """Some rates that divide another one [Hz], for a message."""
     return ", ".join(f"{rate / k:g}" for k in (1, 2, 4, 5, 10))
 
 
 def _stride(key: str, rate: float, measure_rate: float) -> int:
     """Samples from one measurement to the next."""
-    stride = _whole(rate / measure_rate)
+    stride = whole_number(rate / measure_rate)
     if stride is None:
         raise ExperimentError(
-            f"{key}: {measure_rate:g} Hz does not divide rate {rate:g} Hz; valid: {_parts(rate)}"
+            f"{key}: {measure_rate:g} Hz does not divide rate {rate:g} Hz; valid: {parts_of(rate)}"
         )
     return stride

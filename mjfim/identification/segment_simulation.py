@@ -167,8 +167,8 @@ class SegmentSimulation:
             simulated = self._simulated(at, i, samples)
             if not simulated.finite[0]:
                 return None
-            if simulated.loop is not None:
-                ctrl[segment.begin : segment.begin + samples] = simulated.loop.controls[0]
+            if simulated.controls is not None:
+                ctrl[segment.begin : segment.begin + samples] = simulated.controls[0]
 
             # Segments overlap where outputs are delayed; there, the earlier segment counts.
             part = states[segment.begin : segment.begin + samples + 1]
@@ -198,9 +198,9 @@ class SegmentSimulation:
 
         counts = np.zeros(len(laws.laws))
         for i, segment in enumerate(self.segments):
-            loop = self._simulated(at, i, segment.samples).loop
-            if loop is not None:
-                counts += loop.is_clipped[0].sum(axis=0)
+            is_clipped = self._simulated(at, i, segment.samples).is_clipped
+            if is_clipped is not None:
+                counts += is_clipped[0].sum(axis=0)
         shares = (counts / max(self.sample_count, 1)).tolist()
         return {law.actuator: share for law, share in zip(laws.laws, shares, strict=True)}
 

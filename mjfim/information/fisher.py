@@ -107,9 +107,7 @@ def _delay_term(bilinear: Bilinear, v: Array) -> Array:
 
     v: (N+1, ny) weights of the measured outputs.
     """
-    if bilinear.output_delay is None:
-        raise ValueError("the outputs have no delay")
-
+    assert bilinear.output_delay is not None
     e = bilinear.output_delay.derivative_transposed(v)
     by_state = np.einsum("kyx,ky->kx", bilinear.C, e)
     by_control = np.einsum("kyu,ky->ku", bilinear.D, e)

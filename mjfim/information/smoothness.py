@@ -85,7 +85,9 @@ def roughness(
         The worst disagreement and its causes; None if it is below `DISAGREEMENT_TOLERANCE`.
     """
     names, derivatives = plant.parameters.names, plant.derivatives
-    factors = _longer_step_factors(plant)
+    # Ratio of the second to the first difference step of each parameter.
+    factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / derivatives.parameter_scale
+    factors = np.maximum(factors, LEAST_STEP_FACTOR)
     coarse = derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
     if fine is None:
         fine = derivatives.sensitivity(theta, trajectory)
@@ -142,12 +144,6 @@ def only_curved(medium: Array, longer: Array, tolerated: float) -> bool:
     """
     allowed = np.maximum(longer / SMOOTH_DECREASE, tolerated)
     return bool((medium <= allowed).all())
-
-
-def _longer_step_factors(plant: Plant) -> Array:
-    """(p,) ratio of the second to the first difference step of each parameter."""
-    factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / plant.derivatives.parameter_scale
-    return np.maximum(factors, LEAST_STEP_FACTOR)
 
 
 def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:

@@ -408,19 +408,11 @@ class _Selection:
         return bool(forward or backward)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SignedDistances:
-    """Signed distances at n configurations, in m columns.
-
-    Attributes:
-        d: (n, m) distances [m], negative in penetration, at most the reach; NaN at configurations
-            that are not finite.
-        slope: (n, m, nv) d(d)/dq, q in the tangent space of qpos as in `mj_integratePos`; zero
-            where d is the reach. None where slopes were not asked for.
-    """
-
-    d: Array
-    slope: Array | None
+# Signed distances at n configurations, in m columns: (n, m) distances [m], negative in penetration,
+# at most the reach, NaN at configurations that are not finite; and their (n, m, nv) slopes d(d)/dq,
+# q in the tangent space of qpos as in `mj_integratePos`, zero where d is the reach, or None where
+# slopes were not asked for.
+SignedDistances = tuple[Array, Array | None]
 
 
 class GeomDistances:
@@ -508,9 +500,9 @@ class GeomDistances:
         starts = range(0, max(len(qpos), 1), rows)
         blocks = [self._block(qpos[k : k + rows], slopes) for k in starts]
 
-        d = np.concatenate([block.d for block in blocks])
-        found = [block.slope for block in blocks if block.slope is not None]
-        return SignedDistances(d=d, slope=np.concatenate(found) if slopes else None)
+        d = np.concatenate([block for block, _ in blocks])
+        found = [slope for _, slope in blocks if slope is not None]
+        return d, np.concatenate(found) if slopes else None
 
     def nearest(self, qpos: Array) -> tuple[float, int, GeomPair]:
         """The smallest distance at any configuration, however large it is.
@@ -565,7 +557,7 @@ class GeomDistances:
         every[~finite] = np.nan
         d = np.minimum.reduceat(every, self._first_of_column, axis=1)
         if screws is None:
-            return SignedDistances(d=d, slope=None)
+            return d, None
 
         plane_rows, plane_pairs = np.nonzero(near & distances.exact)
         slope = self._slopes(
@@ -575,7 +567,7 @@ class GeomDistances:
             exact=(plane_rows, plane_pairs, points),
             poses=(positions, frames, screws),
         )
-        return SignedDistances(d=d, slope=slope)
+        return d, slope
 
     def _slopes(
         self,

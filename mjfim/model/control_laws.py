@@ -267,7 +267,7 @@ def law_field(model: Any, actuator: str, field: str, component: int) -> LawField
     # integral with the range of the control.
     size = 0.0
     if field in TIMES:
-        size = float(model.opt.timestep)
+        size = model.opt.timestep
     elif field == "integral":
         first = place - NUMBERS.index("integral") + NUMBERS.index("saturation_low")
         ends = np.abs(model.numeric_data[first : first + 2])
@@ -291,7 +291,7 @@ def law_unit(model: Any, actuator: str, field: str) -> str:
     first = first_number(model, actuator) - len(DESCRIPTION)
     joint, kind = (int(model.numeric_data[first + i]) for i in range(len(DESCRIPTION)))
     coordinate = joint_unit(model, joint)
-    unit = unit_of_control(model, int(model.actuator(actuator).id), coordinate, KINDS[kind])
+    unit = unit_of_control(model, model.actuator(actuator).id, coordinate, KINDS[kind])
     if not unit:
         return ""
     gains = {"kp": f"{unit}/{coordinate}", "kd": f"{unit} s/{coordinate}"}

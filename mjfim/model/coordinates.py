@@ -257,7 +257,7 @@ def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
     Returns:
         The parts; none for slide and hinge joints.
     """
-    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+    kind = int(model.jnt_type[joint])
     if kind == mujoco.mjtJoint.mjJNT_FREE:
         return (*TRANSLATION, *ROTATION_VECTOR)
     if kind == mujoco.mjtJoint.mjJNT_BALL:
@@ -353,15 +353,10 @@ def dof_names(model: Any) -> tuple[str, ...]:
     return tuple(component.name.removeprefix("qpos:") for component in components)
 
 
-def activation_names(model: Any) -> tuple[str, ...]:
-    """Columns of the na activations: `act:<actuator>`, with `[i]` where an actuator has several."""
-    return tuple(component.name for component in _activation_components(model))
-
-
 def state_names(model: Any) -> tuple[str, ...]:
     """Columns of the state (qpos, qvel, act): nq + nv + na names."""
     joints = [component.name for component in state_components(model)]
-    return (*joints, *activation_names(model))
+    return (*joints, *(component.name for component in _activation_components(model)))
 
 
 def tangent_names(model: Any) -> tuple[str, ...]:

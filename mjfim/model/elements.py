@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.model.units import acts_at_joint
 
 # MuJoCo's object type of every kind of element that a parameter path can name.
 OBJECT_TYPES = {
@@ -167,7 +168,7 @@ def model_length(model: Any) -> float:
             longest = max(longest, from_root[body] + centre + gyration)
 
     # MuJoCo's extent is the size of the geoms and sites, where nothing that moves has a mass.
-    return longest or float(model.stat.extent)
+    return longest or model.stat.extent
 
 
 def translations(model: Any) -> np.ndarray:
@@ -179,7 +180,7 @@ def translations(model: Any) -> np.ndarray:
     found = np.zeros(model.nv, dtype=bool)
     for joint in range(model.njnt):
         first = int(model.jnt_dofadr[joint])
-        kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+        kind = int(model.jnt_type[joint])
         if kind == mujoco.mjtJoint.mjJNT_SLIDE:
             found[first] = True
         elif kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -284,7 +285,7 @@ def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     for actuator in bristle_actuators(model):
         stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
         under_force = _actuator_force_size(model, actuator, time) / stiffness
-        way = _transmission_size(model, actuator) / time * float(model.opt.timestep)
+        way = _transmission_size(model, actuator) / time * model.opt.timestep
         found[int(model.actuator_actadr[actuator])] = max(under_force, way)
     return found
 
@@ -321,19 +322,13 @@ def _actuator_force_size(model: Any, actuator: int, time: float) -> float:
 
 def _acceleration(model: Any, actuator: int, output: int) -> float:
     """Acceleration that a unit force of an actuator causes, 0 without any [1/s² per unit force]."""
-    if not _acts_on_joint(model, actuator):
+    if not acts_at_joint(model, actuator):
         return float(model.actuator_acc0[output])
 
     # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
     gear = float(np.abs(model.actuator_gear[output]).max())
-    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
     return gear * float(model.dof_invweight0[dof])
-
-
-def _acts_on_joint(model: Any, actuator: int) -> bool:
-    """True for an actuator on a joint."""
-    joint_like = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    return int(model.actuator_trntype[actuator]) in [int(kind) for kind in joint_like]
 
 
 def _largest_finite(bounds: Array) -> float:
@@ -343,10 +338,10 @@ def _largest_finite(bounds: Array) -> float:
 
 def _transmission_size(model: Any, actuator: int) -> float:
     """Natural size of the length that an actuator acts on [m or rad, times the gear]."""
-    if not _acts_on_joint(model, actuator):
+    if not acts_at_joint(model, actuator):
         return model_length(model)
 
     output = int(model.actuator_outadr[actuator])
     gear = float(np.abs(model.actuator_gear[output]).max()) or 1.0
-    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
     return gear * float(position_sizes(model)[dof])

@@ -289,7 +289,7 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
 def _force_unit(model: Any, actuator: int) -> str:
     """Unit of the force of an actuator; empty for one with several forces or on a free joint."""
     joint = int(model.actuator_trnid[actuator, 0])
-    acts_on_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    acts_on_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
     if not acts_on_joint or int(model.jnt_type[joint]) in (BALL, FREE):
         return ""
     return force_unit(model, actuator)
@@ -378,7 +378,7 @@ def tilt_weights(model: Any, joint: int) -> Array:
     mujoco.mj_kinematics(model, data)
 
     # The upward direction in the frame of the body, and two directions perpendicular to it.
-    rotation = data.xmat[int(model.jnt_bodyid[joint])].reshape(3, 3)
+    rotation = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
     up = rotation.T @ upward(model)
     _, _, directions = np.linalg.svd(up[None])
     return directions[1:] @ turn_weights(model, joint)
@@ -400,5 +400,5 @@ def quaternion_address(model: Any, joint: int) -> int:
         model: The compiled model (`mujoco.MjModel`).
         joint: Number of the joint.
     """
-    place = QUATERNION_PLACE[int(model.jnt_type[joint])]
+    place = QUATERNION_PLACE[model.jnt_type[joint]]
     return int(model.jnt_qposadr[joint]) + place

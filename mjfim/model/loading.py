@@ -150,23 +150,19 @@ class ModelSource:
         with stated._lock:
             found = stated._derived.get(key)
             if found is None:
-                found = stated._with_terms(key)
+                path, files = stated.path, stated._files
+                spec, layout = extended_spec(
+                    stated.spec,
+                    stated.model,
+                    key,
+                    lambda edited: compile_spec(edited, path, files=files),
+                )
+                found = ModelSource(path, spec, files)
+                found.terms = {term.name: term for term in key}
+                found.layout = layout
+                found._stated = stated
                 stated._derived[key] = found
             return found
-
-    def _with_terms(self, terms: tuple[Term, ...]) -> ModelSource:
-        """This model with physical terms."""
-        spec, layout = extended_spec(
-            self.spec,
-            self.model,
-            terms,
-            lambda edited: compile_spec(edited, self.path, files=self._files),
-        )
-        source = ModelSource(self.path, spec, self._files)
-        source.terms = {term.name: term for term in terms}
-        source.layout = layout
-        source._stated = self
-        return source
 
     def with_numbers(self, numbers: tuple[tuple[str, tuple[float, ...]], ...]) -> ModelSource:
         """This model with custom numbers, compiled once as long as it is in use.

@@ -217,27 +217,28 @@ def resolve(
             names, fields or indices.
     """
     path = ParameterPath.parse(text)
-    if path.kind not in KINDS:
-        raise path.error(unknown("kind", path.kind, KINDS))
-    if path.kind == "term":
+    kind = path.kind
+    if kind not in KINDS:
+        raise path.error(unknown("kind", kind, KINDS))
+    if kind == "term":
         return _term_field(model, path, terms)
-    if path.field not in fields_of(path.kind):
-        raise path.error(unknown(f"{path.kind} field", path.field, fields_of(path.kind)))
-    if path.part and path.kind != "initial":
+    if path.field not in fields_of(kind):
+        raise path.error(unknown(f"{kind} field", path.field, fields_of(kind)))
+    if path.part and kind != "initial":
         raise path.error(
             "only the initial state of a ball or free joint has parts such as '.rx', not "
-            f"{path.kind} {path.field}; write {path.field}[index]"
+            f"{kind} {path.field}; write {path.field}[index]"
         )
 
-    if path.kind == "option":
+    if kind == "option":
         array = MODEL_ARRAYS["option"][path.field]
         width = int(np.size(getattr(model.opt, array)))
         return ModelField(array=array, rows=(path.component_of(width),), in_options=True)
-    if path.kind == "output":
+    if kind == "output":
         return _output_field(path, outputs)
-    if path.kind == "controller":
+    if kind == "controller":
         return _law_field(model, path)
-    if path.kind == "initial":
+    if kind == "initial":
         return _initial_state_field(model, path)
     return _element_field(model, path, decoration)
 
@@ -255,11 +256,12 @@ def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:
         (entries of gains, tendons).
     """
     path = ParameterPath.parse(text)
+    field = path.field
     if path.kind == "term":
         return term_quantity(path, terms).unit
 
-    if path.field in INERTIAL_FIELDS:
-        parametrisation, first, _ = INERTIAL_FIELDS[path.field]
+    if field in INERTIAL_FIELDS:
+        parametrisation, first, _ = INERTIAL_FIELDS[field]
         return INERTIA_PARAMETRISATIONS[parametrisation].units[first + path.component]
 
     if path.kind == "initial":
@@ -268,18 +270,18 @@ def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:
         return next((c.unit for c in tangent_components(model) if c.path == plain), "")
 
     if path.kind == "controller":
-        return law_unit(model, path.name, path.field)
+        return law_unit(model, path.name, field)
 
     if path.kind == "joint":
         joint = identifier(model, "joint", path.name)
         # One number holds for all coordinates of a ball or free joint; it gets the unit for a
         # rotation.
-        slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-        return joint_field_unit(path.field, LENGTH if slides else ANGLE, path.component)
+        slides = int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
+        return joint_field_unit(field, LENGTH if slides else ANGLE, path.component)
 
-    if path.field in SERVO_FIELDS:
-        return gain_unit(model, identifier(model, "actuator", path.name), path.field)
-    return FIELD_UNITS.get(path.field, "")
+    if field in SERVO_FIELDS:
+        return gain_unit(model, identifier(model, "actuator", path.name), field)
+    return FIELD_UNITS.get(field, "")
 
 
 def term_quantity(path: ParameterPath, terms: Mapping[str, Term]) -> TermQuantity:
@@ -392,6 +394,7 @@ def _initial_activation_field(model: Any, path: ParameterPath) -> InitialStateFi
 
 def _element_field(model: Any, path: ParameterPath, decoration: Collection[str]) -> TargetField:
     """A number of an element of the model."""
+    field = path.field
     number = identifier(model, path.kind, path.name)
     if number < 0:
         fault = unknown(path.kind, path.name, names_of(model, path.kind))
@@ -399,25 +402,25 @@ def _element_field(model: Any, path: ParameterPath, decoration: Collection[str])
         hint = f"; {unnamed} more have no name: give them one in the MJCF" if unnamed else ""
         raise path.error(f"{fault}{hint}")
 
-    if path.field in INERTIAL_FIELDS:
-        parametrisation, first, width = INERTIAL_FIELDS[path.field]
+    if field in INERTIAL_FIELDS:
+        parametrisation, first, width = INERTIAL_FIELDS[field]
         if not float(model.body_mass[number]) > 0.0:
             raise path.error(f"body {path.name!r} has no mass")
         return InertiaField(number, parametrisation, first + path.component_of(width))
 
-    if path.field == "rot":
+    if field == "rot":
         return RotationField(f"{path.kind}_quat", number, path.component_of(3))
 
-    if path.field in COMPILED_FIELDS.get(path.kind, ()):
+    if field in COMPILED_FIELDS.get(path.kind, ()):
         # Place, size, mass or density of a geom need a compile unless the geom is decoration.
-        index = path.component_of(3 if path.field in ("size", "pos") else 1)
-        if path.field == "size" and int(model.geom_dataid[number]) >= 0:
+        index = path.component_of(3 if field in ("size", "pos") else 1)
+        if field == "size" and int(model.geom_dataid[number]) >= 0:
             raise path.error("the size of a mesh or height field is not a number of the geom")
-        if path.field in ("size", "pos") and path.name in decoration:
-            return ModelField(array=f"geom_{path.field}", rows=(number,), column=index)
-        return SpecField(path.kind, path.name, path.field, index)
+        if field in ("size", "pos") and path.name in decoration:
+            return ModelField(array=f"geom_{field}", rows=(number,), column=index)
+        return SpecField(path.kind, path.name, field, index)
 
-    if path.kind == "actuator" and path.field in SERVO_FIELDS:
+    if path.kind == "actuator" and field in SERVO_FIELDS:
         return _servo_field(model, path, number)
 
     return _array_field(model, path, number)
@@ -431,7 +434,7 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
     rows = (actuator,)
 
     # The gain of a PID actuator is its integral gain; kp and kv are entries of its bias.
-    if int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_PID):
+    if int(model.actuator_gaintype[actuator]) == mujoco.mjtGain.mjGAIN_PID:
         column = {"kp": 1, "kv": 2}[path.field]
         return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
 

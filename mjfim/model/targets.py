@@ -255,7 +255,7 @@ class InitialStateField(OutsideField):
         The time is that of many engine steps. Activations have the magnitude 1.
         """
         sizes = position_sizes(model)
-        speeds = LEAST_MOVE_PER_SAMPLE * sizes / float(model.opt.timestep)
+        speeds = LEAST_MOVE_PER_SAMPLE * sizes / model.opt.timestep
         both = np.concatenate([sizes, speeds])
         return float(both[self.row]) if self.row < len(both) else 1.0
 

@@ -106,9 +106,8 @@ def joint_unit(model: Any, joint: int) -> str:
     Returns:
         Metres for slide and free joints, radians for hinge and ball joints.
     """
-    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
-    translates = kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
-    return LENGTH if translates else ANGLE
+    translating = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
+    return LENGTH if int(model.jnt_type[joint]) in translating else ANGLE
 
 
 def sensor_unit(model: Any, sensor: int) -> str:
@@ -141,7 +140,7 @@ def force_unit(model: Any, actuator: int) -> str:
     Returns:
         The unit; empty where the actuator does not act on a joint.
     """
-    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+    if int(model.actuator_trntype[actuator]) != mujoco.mjtTrn.mjTRN_JOINT:
         return ""
     return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
 
@@ -161,7 +160,7 @@ def gain_unit(model: Any, actuator: int, field: str) -> str:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])
-    if mujoco.mjtJoint(int(model.jnt_type[joint])) not in SCALAR_JOINTS:
+    if int(model.jnt_type[joint]) not in SCALAR_JOINTS:
         return ""
     return JOINT_FIELD_UNITS[FIELD_OF_GAIN[field]][joint_unit(model, joint)]
 
@@ -198,14 +197,14 @@ def control_unit(model: Any, actuator: int) -> str:
         The unit; empty where it is not evident from the model.
     """
     gear = actuator_gear(model, actuator)
-    at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
     if not at_joint or gear != 1 or int(model.actuator_ctrlnum[actuator]) != 1:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])
     coordinate = joint_unit(model, joint)
     gain = float(model.actuator_gainprm[actuator, 0])
-    if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
+    if int(model.actuator_biastype[actuator]) == mujoco.mjtBias.mjBIAS_NONE:
         unit = FORCE_UNITS[coordinate] if gain == 1.0 else ""
     else:
         units = {"position": coordinate, "velocity": per_second(coordinate)}
@@ -233,7 +232,7 @@ def servo_kind(model: Any, actuator: int) -> Servo | None:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    if mujoco.mjtBias(int(model.actuator_biastype[actuator])) not in AFFINE:
+    if int(model.actuator_biastype[actuator]) not in AFFINE:
         return None
 
     gain = float(model.actuator_gainprm[actuator, 0])
@@ -262,7 +261,7 @@ def acts_at_joint(model: Any, actuator: int) -> bool:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    return mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
+    return int(model.actuator_trntype[actuator]) in AT_JOINT
 
 
 def commanded_joint(model: Any, actuator: int) -> int | None:
@@ -281,7 +280,7 @@ def commanded_joint(model: Any, actuator: int) -> int | None:
         return None
 
     joint = int(model.actuator_trnid[actuator, 0])
-    is_scalar = mujoco.mjtJoint(int(model.jnt_type[joint])) in SCALAR_JOINTS
+    is_scalar = int(model.jnt_type[joint]) in SCALAR_JOINTS
     has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
     return joint if is_scalar and has_gain and actuator_gear(model, actuator) != 0.0 else None
 
@@ -293,4 +292,4 @@ def actuator_gear(model: Any, actuator: int) -> float:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    return float(model.actuator_gear[int(model.actuator_outadr[actuator]), 0])
+    return float(model.actuator_gear[model.actuator_outadr[actuator], 0])

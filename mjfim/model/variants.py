@@ -166,13 +166,13 @@ class Relaxation:
         if self.controls:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         if self.constraints:
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             if is_rk4(model):
-                model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
-                model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+                model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+                model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
 
 
 class PlantModel:
@@ -278,23 +278,23 @@ class PlantModel:
 
         # Work that cannot matter is switched off.
         if not self._sensors:
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         if not self._friction and unconstrained(model):
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         if forms_one_island(model):
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
 
         # A single row is solved exactly by one pass of projected Gauss-Seidel, with which a step of
         # such a model takes a third less time than with Newton's method.
         if has_at_most_one_row(model):
-            model.opt.solver = int(mujoco.mjtSolver.mjSOL_PGS)
+            model.opt.solver = mujoco.mjtSolver.mjSOL_PGS
 
         model.opt.timestep *= self._timestep_factor
 
         # Differences between steps must depend neither on the initial guess of the solver nor on
         # its remaining error.
         model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
 
         if self._mocap is not None:
             self._mocap.put(model, self._mocap.start)
@@ -308,7 +308,7 @@ def unconstrained(model: Any) -> bool:
 
 def allows_dry_friction_only(model: Any) -> bool:
     """Whether dry friction of joints and tendons is the only constraint that can be active."""
-    no_contact = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)) or (
+    no_contact = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT) or (
         model.npair == 0 and not (np.any(model.geom_contype) and np.any(model.geom_conaffinity))
     )
     limited = model.jnt_limited.any() or model.tendon_limited.any()
@@ -322,7 +322,7 @@ def has_at_most_one_row(model: Any) -> bool:
     with which MuJoCo does not solve for this row by projected Gauss-Seidel are excluded.
     """
     solves = model.opt.iterations > 0
-    solves &= not model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_IPC)
+    solves &= not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_IPC
     return bool(solves and allows_dry_friction_only(model) and model.nv + model.ntendon == 1)
 
 
@@ -331,7 +331,7 @@ def forms_one_island(model: Any) -> bool:
 
     Where bodies may sleep, MuJoCo needs the islands for other purposes.
     """
-    sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
     return bool(model.ntree == 1 and not sleeps)
 
 
@@ -364,7 +364,7 @@ def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
         model: The model (`mujoco.MjModel`).
         fastest: (nv,) fastest speeds of the degrees of freedom [m/s or rad/s].
     """
-    step = float(model.opt.timestep)
+    step = model.opt.timestep
     sticking = []
     for loss, weight, solimp, reference in _friction_arrays(model):
         # Below such a speed, friction brakes with less than its full force: the constraint asks for

@@ -331,8 +331,13 @@ class Condensed:
         """
         n = self.private_count
         weight = np.sqrt(damping) * scale
-        R = self._damped_triangles(weight[:n], scale[:n])
-        return self._evaluated(common, self._substituted(R, common))
+        private = np.zeros((self.segment_count, 0))
+        if n:
+            # The steps of the private unknowns follow from that of the common ones.
+            R = self._damped_triangles(weight[:n], scale[:n])
+            rhs = R[:, :n, -1] + R[:, :n, n:-1] @ common
+            private = np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
+        return self._evaluated(common, private)
 
     def _damped_triangles(self, weight: Array, scale: Array) -> Array:
         """(P, m, m) triangles of all rows of each segment and of the damping of private unknowns.
@@ -350,19 +355,6 @@ class Condensed:
         damping_rows = np.zeros((self.segment_count, n, R.shape[2]))
         damping_rows[:, np.arange(n), np.arange(n)] = np.maximum(weight, least)
         return triangle(np.concatenate([R, damping_rows], axis=1))
-
-    def _substituted(self, R: Array, common: Array) -> Array:
-        """(P, n) steps of the private unknowns that follow from a step of the common ones.
-
-        Args:
-            R: (P, m, m) damped triangles of the segments.
-            common: (c,) step of the common unknowns.
-        """
-        n = self.private_count
-        if not n:
-            return np.zeros((self.segment_count, 0))
-        rhs = R[:, :n, -1] + R[:, :n, n:-1] @ common
-        return np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
 
     def _evaluated(self, common: Array, private: Array) -> Step:
         """A step with its lengths and the decrease that the linearisation predicts.

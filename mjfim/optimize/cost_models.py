@@ -61,12 +61,13 @@ EQUAL_EIGENVALUES = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BarrierDerivatives:
-    """Value and derivatives of the barrier of numbers: (..., w).
+    """Value and derivatives of the barrier of numbers, or of norms of vectors: (..., w).
 
     Attributes:
-        value: Sum of the barrier over all numbers.
+        value: Sum of the barrier over all numbers or vectors.
         slope: (..., w) first derivative by each number.
-        curvature: (..., w) second derivative by each number.
+        curvature: (..., w) second derivative by each number; of a norm, (..., w, w) by the
+            components of its vector.
     """
 
     value: float
@@ -413,28 +414,6 @@ class EigenvalueModel:
             (m,) derivative by the coordinates.
         """
         return self._changed(d).gradient
-
-    def hessian(self, d: Array) -> Array:
-        """Second derivative of the model.
-
-        Args:
-            d: (m,) coordinates of B.
-
-        Returns:
-            (m, m) derivative of the gradient by the coordinates.
-        """
-        return self._changed(d).hessian
-
-    def value(self, d: Array) -> float:
-        """Change of the model from the point about which it was made.
-
-        Args:
-            d: (m,) coordinates of B.
-
-        Returns:
-            h(d) - h(0).
-        """
-        return self._changed(d).value - self._changed(np.zeros_like(d)).value
 
     @cached_property
     def _logs(self) -> Array:

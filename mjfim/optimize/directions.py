@@ -20,19 +20,8 @@ from mjfim.optimize.projection_operator import Expansion
 MIN_RELATIVE_CURVATURE = 1e-10
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CurvaturePair:
-    """A step and the change of the gradient along it.
-
-    Attributes:
-        s: (...) step.
-        y: (...) change of the gradient along the step.
-        curvature: Product s'y, which is positive.
-    """
-
-    s: Array
-    y: Array
-    curvature: float
+# A step s, the change y of the gradient along it, and their product, which is positive.
+CurvaturePair = tuple[Array, Array, float]
 
 
 def convex_pairs(s: Array, y: Array, tolerance: float) -> list[CurvaturePair]:
@@ -51,10 +40,7 @@ def convex_pairs(s: Array, y: Array, tolerance: float) -> list[CurvaturePair]:
     curvatures = np.einsum("pi,pi->p", steps, changes)
     norms = np.linalg.norm(steps, axis=1) * np.linalg.norm(changes, axis=1)
     is_convex = curvatures > tolerance * norms
-    return [
-        CurvaturePair(s=s[i], y=y[i], curvature=float(curvatures[i]))
-        for i in np.flatnonzero(is_convex)
-    ]
+    return [(s[i], y[i], float(curvatures[i])) for i in np.flatnonzero(is_convex)]
 
 
 def inverse_hessian_product(
@@ -74,20 +60,21 @@ def inverse_hessian_product(
         return initial(g)
 
     # A product of the rows with a vector has the shape (m,), or is a number for a single row.
-    size = pairs[0].s.size
-    rows = g.reshape(*g.shape[: g.ndim - pairs[0].s.ndim], size)
+    step = pairs[0][0]
+    size = step.size
+    rows = g.reshape(*g.shape[: g.ndim - step.ndim], size)
 
     alphas = []
-    for pair in reversed(pairs):
-        alpha = (rows @ pair.s.reshape(size) / pair.curvature)[..., None]
-        rows = rows - alpha * pair.y.reshape(size)
+    for s, y, curvature in reversed(pairs):
+        alpha = (rows @ s.reshape(size) / curvature)[..., None]
+        rows = rows - alpha * y.reshape(size)
         alphas.append(alpha)
 
     rows = initial(rows.reshape(g.shape)).reshape(rows.shape)
 
-    for pair, alpha in zip(pairs, reversed(alphas), strict=True):
-        beta = (rows @ pair.y.reshape(size) / pair.curvature)[..., None]
-        rows = rows + (alpha - beta) * pair.s.reshape(size)
+    for (s, y, curvature), alpha in zip(pairs, reversed(alphas), strict=True):
+        beta = (rows @ y.reshape(size) / curvature)[..., None]
+        rows = rows + (alpha - beta) * s.reshape(size)
 
     return rows.reshape(g.shape)
 
@@ -178,8 +165,8 @@ class LBFGS:
         """
         scaled = self._inverse_metric(g)
         if self._pairs:
-            newest = self._pairs[-1]
-            scaled *= newest.curvature / np.vdot(newest.y, self._inverse_metric(newest.y))
+            _, y, curvature = self._pairs[-1]
+            scaled *= curvature / np.vdot(y, self._inverse_metric(y))
 
         return scaled
 
@@ -226,10 +213,10 @@ class LBFGS:
             The direction on the finer grid.
         """
         pairs = []
-        for pair in self._pairs:
-            s = np.repeat(pair.s, factor, axis=0)
-            y = np.repeat(pair.y, factor, axis=0) / factor
-            pairs.append(CurvaturePair(s=s, y=y, curvature=float(np.vdot(s, y))))
+        for coarse_s, coarse_y, _ in self._pairs:
+            s = np.repeat(coarse_s, factor, axis=0)
+            y = np.repeat(coarse_y, factor, axis=0) / factor
+            pairs.append((s, y, float(np.vdot(s, y))))
 
         return LBFGS(R, self.memory, tuple(pairs))
 

@@ -510,7 +510,11 @@ class _Search:
             self.callback(self.iteration, self.cost, trial.fraction * trial.step.common_length)
 
         if converged:
-            return self._finished(trial.step)
+            # The last step is linearised at its end where the settings ask for it.
+            relinearises = self.settings.relinearise_at_end
+            anew = self.problem.condense(self.unknowns) if relinearises else None
+            self.condensed = self.condensed.after(trial.step) if anew is None else anew
+            return self._solution("converged: the step vanished", success=True)
         if near or (slow and trial.fraction == 1.0):
             self.condensed = self.condensed.after(trial.step)
             solution = self._solution("near the minimum", success=True)
@@ -674,16 +678,12 @@ class _Search:
         ):
             return True
 
-        return not self.settings.relinearise_at_end and self._next_step_is_small(
-            trial.step, predicted
-        )
+        if self.settings.relinearise_at_end:
+            return False
 
-    def _next_step_is_small(self, step: Step, predicted: Step) -> bool:
-        """Whether the next step is expected to be below the tolerance.
-
-        Gauss-Newton steps shrink quadratically near the minimum.
-        """
-        length = step.common_length
+        # Or where the next step is expected to be below the tolerance: Gauss-Newton steps shrink
+        # quadratically near the minimum.
+        length = trial.step.common_length
         next_length = np.inf
         if self.previous_length > 0.0:
             next_length = length * (length / self.previous_length) ** 2
@@ -753,12 +753,6 @@ class _Search:
 
         self.condensed = condensed
         return None
-
-    def _finished(self, step: Step) -> Solution:
-        """Solution after the last step, linearised there where the settings ask for it."""
-        anew = self.problem.condense(self.unknowns) if self.settings.relinearise_at_end else None
-        self.condensed = self.condensed.after(step) if anew is None else anew
-        return self._solution("converged: the step vanished", success=True)
 
     def _without_progress(self, predicted: Step) -> Solution:
         """Solution where no step lowers the cost: converged if the predicted step is short."""

@@ -316,22 +316,18 @@ class Regulator:
         Returns:
             K: (N, nu, nx).
         """
-        if self._needs_feedback(expansion):
+        # The two extreme thresholds need no amplification, whose computation takes time.
+        threshold = self.feedback_threshold
+        if threshold == 0.0 or np.isinf(threshold):
+            needs_feedback = threshold == 0.0
+        else:
+            growth = amplification_in_best_units(expansion.A, self.state_sizes)
+            needs_feedback = growth > threshold
+        if needs_feedback:
             return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
 
         N, nx, nu = expansion.B.shape
         return np.zeros((N, nu, nx))
-
-    def _needs_feedback(self, expansion: Expansion) -> bool:
-        """Check whether deviations along the trajectory of an expansion grow above the threshold.
-
-        The two extreme thresholds need no amplification, whose computation takes time.
-        """
-        if self.feedback_threshold == 0.0 or np.isinf(self.feedback_threshold):
-            return self.feedback_threshold == 0.0
-
-        growth = amplification_in_best_units(expansion.A, self.state_sizes)
-        return growth > self.feedback_threshold
 
 
 def optimize(

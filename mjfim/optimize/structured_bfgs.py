@@ -6,7 +6,6 @@ by BFGS.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -253,9 +252,7 @@ class _LocalModel:
     @cached_property
     def _matrices(self) -> tuple[Array, Array]:
         """(M nu, M nu) matrices of the weights and of the uniform weights on the coefficients."""
-        if self.basis is None:
-            raise ValueError("without a basis there are no coefficients")
-
+        assert self.basis is not None
         response = basis_response(self.expansion, self.basis)
         uniform = _barrier(self.expansion).uniform_weights
         return (
@@ -395,7 +392,14 @@ class StructuredBFGS:
 
     def _step(self, here: _LocalModel) -> Array:
         """Minimum of the model, in its coordinates, with the present damping."""
-        inverse = self._inverse_hessian(here.metric(self.damping))
+        # Product of the inverse Hessian of metric and stored pairs with a vector.
+        metric = here.metric(self.damping)
+        pairs: list[CurvaturePair] = []
+        if self._pairs:
+            s, y = (np.stack(each) for each in zip(*self._pairs, strict=True))
+            pairs = convex_pairs(s, y + metric.apply(s), MIN_RELATIVE_CURVATURE)
+        inverse = partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
+
         model = here.expansion.eigenvalue_model
         if model is None:
             return -inverse(here.gradient)
@@ -415,15 +419,6 @@ class StructuredBFGS:
         spread = flat @ responses.reshape(m, -1).T
         w = model.minimising_gradient(d, 0.5 * (spread + spread.T))
         return np.asarray(step - np.tensordot(w, responses, axes=1))
-
-    def _inverse_hessian(self, metric: CurveMetric | BasisMetric) -> Callable[[Array], Array]:
-        """Product of the inverse Hessian of metric and stored pairs with a vector."""
-        pairs: list[CurvaturePair] = []
-        if self._pairs:
-            s, y = (np.stack(each) for each in zip(*self._pairs, strict=True))
-            pairs = convex_pairs(s, y + metric.apply(s), MIN_RELATIVE_CURVATURE)
-
-        return partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
         """Adapt damping and curvature to an accepted step, and store a curvature pair.

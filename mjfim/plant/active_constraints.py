@@ -51,8 +51,8 @@ def clamped_actuators(model: Any, data: Any) -> list[int]:
         Ids of the actuators.
     """
     # Passive devices have a force range that does not bound their friction.
-    driven = np.asarray(model.actuator_ctrlnum) > 0
-    limited = np.flatnonzero(driven & (np.asarray(model.actuator_forcelimited) > 0)).tolist()
+    driven = model.actuator_ctrlnum > 0
+    limited = np.flatnonzero(driven & (model.actuator_forcelimited > 0)).tolist()
     return [actuator for actuator in limited if _is_clamped(model, data, actuator)]
 
 

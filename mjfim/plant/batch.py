@@ -18,7 +18,7 @@ from mujoco.batch import Batch
 from mjfim.arrays import Array
 from mjfim.model.loading import silence_mujoco_log
 from mjfim.parallel import cores
-from mjfim.plant.running_law import InputContext, LoopTrace
+from mjfim.plant.running_law import InputContext, LawMemory
 from mjfim.plant.state_space import StateSpace
 
 # Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,
@@ -218,44 +218,27 @@ class Rollouts:
         finite: (m,) False where a simulation diverged.
         observed: (m, N, rows, w) observations at every engine step of a sample, and then the
             further rows of `SubstepObservations.force_rows`; None if not requested.
-        loop: What control laws have done; None without laws.
+        controls: (m, N, nu) controls at the begin of every sample that control laws have applied
+            [u-unit]; None without laws.
+        is_clipped: (m, N, laws) True where the range or the largest change of a control has clipped
+            it; None without laws.
+        memory: Memory of the laws at the end of the curves, grouped by their periods; None without
+            laws.
     """
 
     states: Array
     sensors: Array | None
     finite: np.ndarray
     observed: Array | None = None
-    loop: LoopTrace | None = None
+    controls: Array | None = None
+    is_clipped: np.ndarray | None = None
+    memory: tuple[LawMemory, ...] | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EngineSteps:
-    """All engine steps of n samples of s engine steps each.
-
-    Attributes:
-        states: (n, s+1, ns) states before the steps, and after the last one.
-        fields: MjData fields that belong to the states before the steps, each (n, s, ...).
-    """
-
-    states: Array
-    fields: dict[str, Array]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SampleSteps:
-    """One sample of many simulations.
-
-    Attributes:
-        states: (n, ns) states after the sample, NaN where a simulation diverged.
-        sensors: (n, nsensordata) sensor data that belong to the states before the sample, or None
-            if not requested.
-        observed: (n, S, w) observations at the S rows of `SubstepObservations.derivative_rows`, or
-            None if not requested.
-    """
-
-    states: Array
-    sensors: Array | None
-    observed: Array | None
+# One sample of n simulations: the (n, ns) states after it, NaN where a simulation diverged; (n,
+# nsensordata) sensor data that belong to the states before it, or None if not requested; and (n, S,
+# w) observations at the S rows of `SubstepObservations.derivative_rows`, or None.
+SampleSteps = tuple[Array, Array | None, Array | None]
 
 
 class BatchSimulator:
@@ -355,7 +338,7 @@ class BatchSimulator:
         if observations is not None and found.observed is not None:
             observed = found.observed[:, 0, list(observations.derivative_rows)]
         sensors = None if found.sensors is None else found.sensors[:, 0]
-        return SampleSteps(states=after, sensors=sensors, observed=observed)
+        return after, sensors, observed
 
     def rollout(
         self,
@@ -381,7 +364,7 @@ class BatchSimulator:
 
     def engine_steps(
         self, model: Any, states: Array, ctrl: Array, fields: Sequence[str]
-    ) -> EngineSteps:
+    ) -> tuple[Array, dict[str, Array]]:
         """Advance every simulation by one sample and record its engine steps.
 
         Args:
@@ -391,15 +374,15 @@ class BatchSimulator:
             fields: MjData fields that an engine step computes before it moves the state.
 
         Returns:
-            The engine steps; without a meaning where a simulation diverges.
+            (n, s+1, ns) states before the s engine steps, and after the last one; the fields that
+            belong to the states before the steps, each (n, s, ...). They have no meaning where a
+            simulation diverges.
         """
         held = np.repeat(ctrl[:, None], self.substeps, axis=1)
         out = self._recorded([model], states, held, (RECORDED_STATE, *fields))
         after = out[RECORDED_STATE][:, :, 1:]
-        return EngineSteps(
-            states=np.concatenate([states[:, None], after], axis=1),
-            fields={name: out[name] for name in fields},
-        )
+        states = np.concatenate([states[:, None], after], axis=1)
+        return states, {name: out[name] for name in fields}
 
     def _open_loop(
         self,

@@ -201,14 +201,9 @@ class ClosedForm:
                 return None
             parts.append(part)
 
-        return SampleJacobians(
-            A=np.concatenate([part.A for part in parts]),
-            B=np.concatenate([part.B for part in parts]),
-            E=np.concatenate([part.E for part in parts]),
-            states=np.concatenate([part.states for part in parts]),
-            accelerations=np.concatenate([part.accelerations for part in parts]),
-            forces=forces,
-        )
+        names = ("A", "B", "E", "states", "accelerations")
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return SampleJacobians(**joined, forces=forces)
 
     def _part(
         self,
@@ -219,33 +214,32 @@ class ClosedForm:
         change: ParameterChange | None,
     ) -> SampleJacobians | None:
         """First derivatives of some samples, see `jacobians`."""
-        steps = self.simulator.engine_steps(model, states, ctrl, RECORDED_FIELDS)
         N, substeps, nv = len(states), self.simulator.substeps, self.tree.count
-        fields = {name: _flat(values) for name, values in steps.fields.items()}
-        timestep = float(model.opt.timestep)
+        stepped, recorded = self.simulator.engine_steps(model, states, ctrl, RECORDED_FIELDS)
+        fields = {name: _flat(values) for name, values in recorded.items()}
+        timestep = model.opt.timestep
 
-        speed = steps.states[..., nv:]
+        speed = stepped[..., nv:]
         accelerations = _flat(np.diff(speed, axis=1)) / timestep
         motion = RigidBodyMotion.of(self.tree, model, fields, _flat(speed[:, :-1]), accelerations)
-        points = _flat(steps.states[:, :-1]), np.repeat(ctrl, substeps, axis=0)
-        slopes = forces.at(*points, fields)
+        points = _flat(stepped[:, :-1]), np.repeat(ctrl, substeps, axis=0)
+        by_point, implicit_damping, agree = forces.at(*points, fields)
 
         # Whether the motion of the engine solves the equation of motion.
-        damping = slopes.implicit_damping @ motion.acceleration[..., None]
+        damping = implicit_damping @ motion.acceleration[..., None]
         force = sum(fields[name] for name in FORCE_FIELDS)
         error = np.abs(motion.force + timestep * damping[..., 0] - force)
         solves = (error <= LARGEST_ERROR * motion.largest_force).all()
-        if not (slopes.agree.all() and solves):
+        if not (agree.all() and solves):
             return None
 
         by_position, by_speed = motion.force_derivatives()
-        by_point = slopes.slopes
         by_point[..., :nv] -= by_position
         by_point[..., nv : 2 * nv] -= by_speed
 
         # One small inverse for all right-hand sides takes a third of the time of solving for them,
         # and A and B do not depend on whether parameters are asked for.
-        inverse = np.linalg.inv(motion.mass_matrix + timestep * slopes.implicit_damping)
+        inverse = np.linalg.inv(motion.mass_matrix + timestep * implicit_damping)
         by_point = (inverse @ by_point).reshape(N, substeps, nv, -1)
 
         count = 0 if change is None else change.count
@@ -268,9 +262,7 @@ class ClosedForm:
             by_state = np.ascontiguousarray(by_point[:, i, :, :nx])
             advance(E, by_state @ E + by_theta[:, i], timestep)
         A, B = (np.ascontiguousarray(each) for each in np.split(AB, [nx], axis=2))
-        return SampleJacobians(
-            A=A, B=B, E=E, states=steps.states, accelerations=by_point, forces=forces
-        )
+        return SampleJacobians(A=A, B=B, E=E, states=stepped, accelerations=by_point, forces=forces)
 
     def change_between(
         self,
@@ -413,23 +405,6 @@ def observation_jacobian(
     return np.stack(rows, axis=1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class KnownJacobians:
-    """Derivatives of the samples of a trajectory.
-
-    Attributes:
-        theta: (p,) parameters [theta-unit].
-        trajectory: The trajectory.
-        substeps: Engine steps of a sample.
-        jacobians: The derivatives, without those by parameters.
-    """
-
-    theta: Array
-    trajectory: Trajectory
-    substeps: int
-    jacobians: SampleJacobians
-
-
 class ClosedFormMemory:
     """Joints and latest derivatives, shared by the closed forms of a plant and of its variants.
 
@@ -437,8 +412,9 @@ class ClosedFormMemory:
         tree: Joints of the model; None where there is no closed form.
         covered: (p,) True for parameters by which derivatives have a closed form: those that change
             nothing but inertias, or nothing but springs, dampers, gains and armatures.
-        latest: Derivatives that were computed last. The gradient of a design needs those of the
-            trajectory whose sensitivities were computed before.
+        latest: Derivatives that were computed last, without those by parameters, after their theta:
+            (p,) and their trajectory. The gradient of a design needs those of the trajectory whose
+            sensitivities were computed before.
         changes: Change of the model by the covered parameters, by the bytes of theta.
     """
 
@@ -449,5 +425,5 @@ class ClosedFormMemory:
         self.covered = np.array(
             [is_inertial(p) or acts_on_joints(p) for p in parameters.parameters], dtype=bool
         )
-        self.latest: KnownJacobians | None = None
+        self.latest: tuple[Array, Trajectory, SampleJacobians] | None = None
         self.changes: dict[bytes, ParameterChange] = {}

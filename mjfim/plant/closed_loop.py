@@ -7,7 +7,6 @@ MuJoCo steps them up to the next tick.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -27,7 +26,6 @@ from mjfim.plant.running_law import (
     LawCommands,
     LawMemory,
     LawNumbers,
-    LoopTrace,
     RunningLaws,
     Ticks,
     lead_time,
@@ -39,27 +37,6 @@ from mjfim.plant.state_space import StateSizes
 KEPT_BATCHES = 6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LawGroup:
-    """C laws with one period in the loop.
-
-    Attributes:
-        running: The laws in the loop.
-        ticks: Engine steps at which they are evaluated.
-        controls: (c,) addresses of their controls in ctrl.
-        positions: (c,) addresses of the positions that they read in qpos.
-        velocities: (c,) addresses of the velocities that they read in qvel.
-        places: (c,) places of the laws among all laws.
-    """
-
-    running: RunningLaws
-    ticks: Ticks
-    controls: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray
-    places: np.ndarray
-
-
 class LawLoop:
     """Simulation of m curves from one tick to the next.
 
@@ -67,7 +44,7 @@ class LawLoop:
         laws: All laws, and the inputs.
         batch: The m simulations, with the initial states.
         ctrl: (m, N, w) inputs.
-        groups: The laws, grouped by their periods.
+        groups: The laws in the loop, grouped by their periods.
         substeps: Engine steps of a sample.
         sensors: True if sensor data are wanted. A step after the last sample gives its data.
 
@@ -78,6 +55,10 @@ class LawLoop:
         sensor_data: (m, N+1, nsensordata) sensor data that belong to the states, or None.
         time: (m,) time of each simulation at the end of the samples [s].
         largest: (m,) largest magnitudes of the controls so far [u-unit].
+        controls: (m, N, nu) controls at the begin of every sample [u-unit].
+        is_clipped: (m, N, laws) True where the range or the largest change of a control has clipped
+            it.
+        memory: Memory of the laws at the end of the curves, by groups.
     """
 
     def __init__(
@@ -86,7 +67,7 @@ class LawLoop:
         laws: ControlLaws,
         batch: Batch,
         ctrl: Array,
-        groups: Sequence[LawGroup],
+        groups: Sequence[RunningLaws],
         substeps: int,
         sensors: bool,
     ) -> None:
@@ -94,6 +75,7 @@ class LawLoop:
         self._batch = batch
         self._ctrl = ctrl
         self._groups = groups
+        self._places = [[laws.laws.index(law) for law in group.laws] for group in groups]
         self._substeps = substeps
 
         count, samples = ctrl.shape[:2]
@@ -113,22 +95,22 @@ class LawLoop:
         self.time = np.zeros(count)
         self.largest = np.zeros(count)
 
-        self._controls = np.zeros((count, samples, model.nu))
-        self._is_clipped = np.zeros((count, samples, len(laws.laws)), dtype=bool)
-        self._memory: tuple[LawMemory, ...] = ()
+        self.controls = np.zeros((count, samples, model.nu))
+        self.is_clipped = np.zeros((count, samples, len(laws.laws)), dtype=bool)
+        self.memory: tuple[LawMemory, ...] = ()
 
-    def run(self) -> LoopTrace:
-        """Simulate the curves, and return what the laws have done."""
+    def run(self) -> None:
+        """Simulate the curves, and note what the laws do."""
         qpos, qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         for group in self._groups:
-            self._applied[:, group.controls] = group.running.held
+            self._applied[:, group.controls] = group.held
 
         for length, sample, due in self._plan():
             if sample is not None:
                 self._begin(sample)
             for group in due:
                 positions, velocities = qpos[:, group.positions], qvel[:, group.velocities]
-                control = group.running.evaluate(positions, velocities)
+                control = group.evaluate(positions, velocities)
                 self.largest = np.maximum(self.largest, np.abs(control).max(axis=1))
                 self._applied[:, group.controls] = control
             if sample is not None:
@@ -138,9 +120,7 @@ class LawLoop:
             if sample is not None and self.sensor_data is not None:
                 self.sensor_data[:, sample] = self._sensed
 
-        return LoopTrace(controls=self._controls, is_clipped=self._is_clipped, memory=self._memory)
-
-    def _plan(self) -> Iterator[tuple[int, int | None, list[LawGroup]]]:
+    def _plan(self) -> Iterator[tuple[int, int | None, list[RunningLaws]]]:
         """Everything that happens between engine steps.
 
         Yields:
@@ -149,7 +129,7 @@ class LawLoop:
         """
         begins = np.arange(0, self.end + 1, self._substeps)
         stops = [begins, np.array([self.total])]
-        stops += [np.arange(0, self.total, g.ticks.period) for g in self._groups]
+        stops += [np.arange(0, self.total, g.period) for g in self._groups]
 
         # The first step of a sample computes the sensor data that belong to its begin.
         if self._sensed is not None:
@@ -157,7 +137,7 @@ class LawLoop:
         steps = np.unique(np.concatenate(stops))
         for step, length in zip(steps.tolist(), [*np.diff(steps).tolist(), 0], strict=True):
             sample, inside = divmod(step, self._substeps)
-            due = [g for g in self._groups if step % g.ticks.period == 0]
+            due = [g for g in self._groups if step % g.period == 0]
             is_over = step >= self.total
             is_begin = inside == 0 and step <= self.end
             yield length, sample if is_begin else None, [] if is_over else due
@@ -168,7 +148,7 @@ class LawLoop:
         last = self._ctrl.shape[1] - 1
         if sample > last:
             self.time[:] = self._batch.bind("time")
-            self._memory = tuple(group.running.memory for group in self._groups)
+            self.memory = tuple(group.memory for group in self._groups)
 
         inputs, direct = self._laws.direct
         if len(direct):
@@ -178,10 +158,10 @@ class LawLoop:
         """Note the controls of a sample, once they are known."""
         if sample == self._ctrl.shape[1]:
             return
-        self._controls[:, sample] = self._applied
-        for group in self._groups:
-            if group.running.has_limits:
-                self._is_clipped[:, sample, group.places] = group.running.is_clipped
+        self.controls[:, sample] = self._applied
+        for group, places in zip(self._groups, self._places, strict=True):
+            if group.has_limits:
+                self.is_clipped[:, sample, places] = group.is_clipped
 
 
 class ClosedLoopSimulator(BatchSimulator):
@@ -223,7 +203,7 @@ class ClosedLoopSimulator(BatchSimulator):
         Args:
             models: Models with the numbers of the laws.
         """
-        timestep = float(self.model.opt.timestep)
+        timestep = self.model.opt.timestep
         numbers = LawNumbers.of(models, self.laws.laws, len(models))
         longest = max(law.tick for law in self.laws.laws) * timestep
         return int(np.ceil(lead_time(numbers, longest) / (self.substeps * timestep))) + 1
@@ -252,7 +232,8 @@ class ClosedLoopSimulator(BatchSimulator):
         if observations is not None:
             self._refuse()
         if context is None:
-            context = InputContext.none(ctrl)
+            begin = np.zeros(len(ctrl), dtype=np.intp)
+            context = InputContext.of_interval(ctrl, begin, slice(0, ctrl.shape[1]), 0, None)
 
         batch = self._batch_of(len(ctrl))
         batch.set_models(models[0] if len(models) == 1 else list(models))
@@ -268,13 +249,20 @@ class ClosedLoopSimulator(BatchSimulator):
             sensors=self.sensors,
         )
         with silence_mujoco_log(), np.errstate(over="ignore", invalid="ignore"):
-            trace = loop.run()
+            loop.run()
         self._count.steps += len(ctrl) * loop.total
 
         finite = self._on_time(loop.time, loop.end)
         finite &= np.isfinite(loop.states).all(axis=(1, 2)) & is_accepted(loop.largest)
         sensors = None if loop.sensor_data is None else self._sensor_data(loop.sensor_data)
-        return Rollouts(states=loop.states, sensors=sensors, finite=finite, loop=trace)
+        return Rollouts(
+            states=loop.states,
+            sensors=sensors,
+            finite=finite,
+            controls=loop.controls,
+            is_clipped=loop.is_clipped,
+            memory=loop.memory,
+        )
 
     def _recorded(
         self, models: Sequence[Any], start: Array, held: Array, record: Sequence[Any]
@@ -312,7 +300,7 @@ class ClosedLoopSimulator(BatchSimulator):
         start: Array,
         ctrl: Array,
         context: InputContext,
-    ) -> LawGroup:
+    ) -> RunningLaws:
         """Laws with one period, ready for curves that begin at a tick.
 
         Args:
@@ -331,30 +319,22 @@ class ClosedLoopSimulator(BatchSimulator):
             before=lead * self.substeps // period,
             count=-(-total // period),
             substeps=self.substeps,
-            timestep=float(self.model.opt.timestep),
+            timestep=self.model.opt.timestep,
         )
 
         numbers = LawNumbers.of(models, laws, count)
         window = np.concatenate([context.before, ctrl, context.after], axis=1)
         commands = LawCommands.of(laws, numbers, window, lead, ticks)
 
-        q, v = [law.q for law in laws], [law.v + self.space.nq for law in laws]
         known = None if context.memory is None else context.memory[index]
         if known is None:
             sums = self._measured_sums(laws, ctrl, context)
-            state = (start[:, q], start[:, v])
+            velocities = [law.v + self.space.nq for law in laws]
+            state = (start[:, [law.q for law in laws]], start[:, velocities])
             known = memory_at_begin(numbers, commands, ticks, state, sums)
 
         begins = context.memory is None
-        running = RunningLaws(laws, numbers, commands, ticks, known, begins=begins)
-        return LawGroup(
-            running=running,
-            ticks=ticks,
-            controls=np.array([law.control for law in laws]),
-            positions=np.array(q),
-            velocities=np.array(v) - self.space.nq,
-            places=np.array([self.laws.laws.index(law) for law in laws]),
-        )
+        return RunningLaws(laws, numbers, commands, ticks, known, begins=begins)
 
     def _measured_sums(
         self, laws: Sequence[ControlLaw], ctrl: Array, context: InputContext

@@ -119,9 +119,12 @@ class Dynamics:
         self.space = self.simulator.space
         self.nominal_initial_state = np.array(nominal_initial_state, dtype=np.float64)
         self.initial_state_derivative = parameters.initial_state_derivative(self.space.nx)
-        self.calibration = Calibration.of(parameters, len(outputs))
-        self.nu = int(source.model.nu) if laws is None else len(laws.inputs)
-        self.dt = substeps * float(source.model.opt.timestep)
+        self.calibration = Calibration(
+            scale=parameters.scale_derivative(len(outputs)),
+            bias=parameters.bias_derivative(len(outputs)),
+        )
+        self.nu = source.model.nu if laws is None else len(laws.inputs)
+        self.dt = substeps * source.model.opt.timestep
         self.sizes = StateSizes.of(source.model, self.space, self.dt)
         if laws is not None:
             self.sizes = replace(self.sizes, control=input_sizes(laws, self.sizes))
@@ -174,7 +177,7 @@ class Dynamics:
         """
         other = copy.copy(self)
         other.simulator = self.simulator.with_substeps(substeps)
-        other.dt = substeps * float(self.source.model.opt.timestep)
+        other.dt = substeps * self.source.model.opt.timestep
         if self._smooth is not None:
             other._smooth = self._smooth.with_substeps(substeps)
         return other
@@ -358,9 +361,9 @@ class Dynamics:
         out = self.simulator.rollout(
             [self.model(theta)], trajectory.state[:1], trajectory.ctrl[None]
         )
-        if out.loop is None:
+        if out.controls is None or out.is_clipped is None:
             return trajectory, np.zeros((len(trajectory.ctrl), 0), dtype=bool)
-        return replace(trajectory, ctrl=out.loop.controls[0]), out.loop.is_clipped[0]
+        return replace(trajectory, ctrl=out.controls[0]), out.is_clipped[0]
 
     def why_diverged(self, theta: Array, ctrl: Array) -> str:
         """Explain why an open-loop simulation from the initial state diverges.
@@ -501,18 +504,15 @@ class WrittenModels:
 
         for key, row in zip(keys, rows, strict=True):
             if key not in self._copies:
-                model = self._free_copy()
+                # A new copy, or the one that was not asked for the longest.
+                if len(self._copies) < self._largest_call + SPARE_COPIES:
+                    model = copy.copy(self.source.model)
+                else:
+                    model = self._copies.popitem(last=False)[1]
                 ParameterWriter(self.parameters).write(model, row)
                 self._copies[key] = self.source.refresh(model)
 
         return [self._copies[key] for key in keys]
-
-    def _free_copy(self) -> Any:
-        """A copy to write into: a new one, or the one that was not asked for the longest."""
-        if len(self._copies) < self._largest_call + SPARE_COPIES:
-            return copy.copy(self.source.model)
-
-        return self._copies.popitem(last=False)[1]
 
 
 def explain_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> str:
@@ -541,7 +541,7 @@ def explain_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> 
         return NO_WARNING
 
     stable = _stable_timestep(model, start, ctrl, substeps)
-    timestep = float(model.opt.timestep)
+    timestep = model.opt.timestep
     if stable is None:
         return f"{found}; {NO_WARNING}"
     return (
@@ -565,7 +565,7 @@ def find_divergence(model: Any, start: Array, ctrl: Array, substeps: int) -> str
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:] = state_space(model).split(start)
 
-    duration = substeps * float(model.opt.timestep)
+    duration = substeps * model.opt.timestep
     for k, u in enumerate(ctrl):
         data.ctrl[:] = u
         with silence_mujoco_log():

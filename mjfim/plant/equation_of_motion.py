@@ -64,22 +64,6 @@ HELD_INERTIA = 1e9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ForceSlopes:
-    """Joint forces at n states and their derivatives.
-
-    Attributes:
-        slopes: (n, nv, 2 nv + nu) derivatives by positions, speeds and controls.
-        implicit_damping: (n, nv, nv) damping D of an engine step, which solves
-            `(M + timestep D) a = forces` for the mean acceleration a of the step.
-        agree: (n,) True where the forces are those of the engine.
-    """
-
-    slopes: Array
-    implicit_damping: Array
-    agree: np.ndarray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class AffineForces:
     """Springs, dampers and actuators whose forces are affine in (q, v, u), with clamped forces.
 
@@ -120,23 +104,30 @@ class AffineForces:
         points = about + np.concatenate([np.zeros((1, len(moves))), np.diag(moves)])
         n = len(state)
         names = ("qfrc_passive", "actuator_force", *MOMENT_FIELDS)
-        fields = simulator.engine_steps(unlimited, points[:, :n], points[:, n:], names).fields
-        first = {name: values[0, 0] for name, values in fields.items()}
+        fields = simulator.engine_steps(unlimited, points[:, :n], points[:, n:], names)[1]
+        values, counts, starts, columns = (fields[name][0, 0] for name in MOMENT_FIELDS)
 
         return AffineForces(
             model=model,
             springs=_affine(fields["qfrc_passive"][:, 0], about, moves),
             actuators=_affine(fields["actuator_force"][:, 0], about, moves),
-            moments=_dense_moments(first, n // 2),
+            moments=_dense(values[None], starts, counts, columns, n // 2)[0],
         )
 
-    def at(self, states: Array, ctrl: Array, fields: dict[str, Array]) -> ForceSlopes:
+    def at(
+        self, states: Array, ctrl: Array, fields: dict[str, Array]
+    ) -> tuple[Array, Array, np.ndarray]:
         """Derivatives of the forces at n states.
 
         Args:
             states: (n, 2 nv) states.
             ctrl: (n, nu) controls.
             fields: The `FORCE_FIELDS` of the engine, each (n, nv).
+
+        Returns:
+            (n, nv, 2 nv + nu) derivatives by positions, speeds and controls; (n, nv, nv) damping D
+            of an engine step, which solves `(M + timestep D) a = forces` for the mean acceleration
+            a of the step; and (n,) True where the forces are those of the engine.
         """
         points = self._points(states, ctrl)
         clamped, acts = self._clamped(points)
@@ -151,7 +142,7 @@ class AffineForces:
         agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
 
         slopes = self._slopes(acts, self._applied(ctrl)[1])
-        return ForceSlopes(slopes=slopes, implicit_damping=self._damping(slopes), agree=agree)
+        return slopes, self._damping(slopes), agree
 
     def change(self, states: Array, ctrl: Array, acceleration: Array, by: ParameterChange) -> Array:
         """Derivatives of the right-hand side of an engine step, `forces - timestep D a`.
@@ -173,7 +164,7 @@ class AffineForces:
         if self._is_implicit:
             speeds = slice(1 + nv, 1 + 2 * nv)
             points = np.array(points)
-            points[:, speeds] += float(model.opt.timestep) * acceleration
+            points[:, speeds] += model.opt.timestep * acceleration
 
         total = np.zeros((len(points), nv, by.count))
         for joint, k in np.argwhere(by.springs.any(axis=1)).tolist():
@@ -183,7 +174,7 @@ class AffineForces:
             total[:, :, k] += force[:, None] * self.moments[actuator]
 
         if self._damps_implicitly:
-            total -= float(model.opt.timestep) * acceleration[..., None] * by.damping
+            total -= model.opt.timestep * acceleration[..., None] * by.damping
         return total
 
     def actuator_slopes(self, states: Array, ctrl: Array) -> Array:
@@ -223,7 +214,9 @@ class AffineForces:
         if not self.model.actuator_forcelimited.any():
             return force, np.ones(force.shape, dtype=bool)
 
-        low, high = self._limits()
+        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
+        low = np.where(limited, limits[:, 0], -np.inf)
+        high = np.where(limited, limits[:, 1], np.inf)
         clamped = np.clip(force, low, high)
         return clamped, clamped == force
 
@@ -255,13 +248,13 @@ class AffineForces:
     @property
     def _damps_implicitly(self) -> bool:
         """Whether it takes those of the joints' dampers, and no others, at the end of the step."""
-        is_explicit = self.model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        is_explicit = self.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
         return not (self._is_implicit or is_explicit)
 
     def _applied(self, ctrl: Array) -> tuple[Array, np.ndarray]:
         """(n, nu) controls within their limits, and (n, nu) True where they are not clamped."""
         model = self.model
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL):
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
             return ctrl, np.ones(ctrl.shape, dtype=bool)
 
         low = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 0], -np.inf)
@@ -269,30 +262,12 @@ class AffineForces:
         applied = np.clip(ctrl, low, high)
         return applied, applied == ctrl
 
-    def _limits(self) -> tuple[Array, Array]:
-        """(actuators,) least and largest forces of the actuators."""
-        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
-        return (
-            np.where(limited, limits[:, 0], -np.inf),
-            np.where(limited, limits[:, 1], np.inf),
-        )
-
 
 def _affine(forces: Array, about: Array, moves: Array) -> Array:
     """(w, 1 + c) values at zero and slopes, from (1 + c, w) forces: unmoved, then moved each."""
     slopes = ((forces[1:] - forces[0]) / moves[:, None]).T
     offset = forces[0] - slopes @ about
     return np.concatenate([offset[:, None], slopes], axis=1)
-
-
-def _dense_moments(fields: dict[str, Array], nv: int) -> Array:
-    """(actuators, nv) moment arms from the sparse matrix of the `MOMENT_FIELDS`."""
-    counts, starts = fields["moment_rownnz"], fields["moment_rowadr"]
-    moments = np.zeros((len(counts), nv))
-    for row, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
-        entries = slice(start, start + count)
-        moments[row, fields["moment_colind"][entries]] = fields["actuator_moment"][entries]
-    return moments
 
 
 def is_inertial(parameter: Parameter) -> bool:
@@ -412,8 +387,7 @@ class EquationOfMotion:
         names = ["M", "qfrc_smooth", "qfrc_actuator", "actuator_force"]
         if model.opt.integrator in IMPLICIT:
             names.append("qDeriv")
-        found = self.simulator.engine_steps(model, points.states, points.ctrl, names).fields
-        fields = {name: values[:, 0] for name, values in found.items()}
+        fields = self._fields(model, points, names)
 
         inertial = (_mass(model, fields["M"]) @ points.acceleration[..., None])[..., 0]
         inertial += self._implicit_damping(model, fields, points)
@@ -436,8 +410,7 @@ class EquationOfMotion:
         Returns:
             (nv, nv) root mean squares of `M_ij a_j`.
         """
-        steps = self.simulator.engine_steps(model, points.states, points.ctrl, ["M"])
-        M = _mass(model, steps.fields["M"][:, 0])
+        M = _mass(model, self._fields(model, points, ["M"])["M"])
         forces = M * points.acceleration[:, None, :]
         return np.asarray(np.sqrt(np.mean(forces**2, axis=0)))
 
@@ -452,8 +425,7 @@ class EquationOfMotion:
         Returns:
             (n, k, nv) moment arms.
         """
-        found = self.simulator.engine_steps(model, points.states, points.ctrl, MOMENT_FIELDS)
-        values, counts, starts, columns = (found.fields[name][:, 0] for name in MOMENT_FIELDS)
+        values, counts, starts, columns = self._fields(model, points, MOMENT_FIELDS).values()
         moments = np.zeros((len(values), len(actuators), model.nv))
         for place, actuator in enumerate(actuators):
             for entry in range(int(counts[:, actuator].max(initial=0))):
@@ -472,15 +444,19 @@ class EquationOfMotion:
         Returns:
             (n, nv) True where such a force acts on a degree of freedom.
         """
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
             return np.zeros(points.acceleration.shape, dtype=bool)
 
         frictionless = copy.copy(model)
         frictionless.dof_frictionloss[:] = 0.0
         frictionless.tendon_frictionloss[:] = 0.0
-        names = ["qfrc_constraint"]
-        found = self.simulator.engine_steps(frictionless, points.states, points.ctrl, names)
-        return np.asarray(found.fields["qfrc_constraint"][:, 0] != 0.0)
+        fields = self._fields(frictionless, points, ["qfrc_constraint"])
+        return np.asarray(fields["qfrc_constraint"] != 0.0)
+
+    def _fields(self, model: Any, points: MotionPoints, names: Sequence[str]) -> dict[str, Array]:
+        """MjData fields at the n points, each (n, ...)."""
+        _, found = self.simulator.engine_steps(model, points.states, points.ctrl, names)
+        return {name: values[:, 0] for name, values in found.items()}
 
     def _implicit_damping(
         self, model: Any, fields: dict[str, Array], points: MotionPoints
@@ -488,9 +464,9 @@ class EquationOfMotion:
         """(n, nv) forces `τ B a`."""
         timestep = float(model.opt.timestep)
         if "qDeriv" in fields:
-            D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind)
+            D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind, model.nv)
             return -timestep * (D @ points.acceleration[..., None])[..., 0]
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
             return np.zeros_like(points.acceleration)
 
         # The slope of a damper with a force that is a polynomial of the speed.
@@ -521,11 +497,10 @@ class EquationOfMotion:
             return np.asarray(friction)
 
         # The speeds of a tendon below which its friction is viscous are those of its joints.
-        names = ["ten_J"]
-        values = self.simulator.engine_steps(model, points.states, points.ctrl, names)
+        values = self._fields(model, points, ["ten_J"])["ten_J"]
         for tendon in np.flatnonzero(model.tendon_frictionloss).tolist():
             first, count = int(model.ten_J_rowadr[tendon]), int(model.ten_J_rownnz[tendon])
-            arms = values.fields["ten_J"][:, 0].reshape(len(speed), -1)[:, first : first + count]
+            arms = values.reshape(len(speed), -1)[:, first : first + count]
             dofs = np.reshape(model.ten_J_colind, -1)[first : first + count]
             slow = np.abs(arms) @ self.friction_speeds[dofs]
             rate = np.sum(arms * speed[:, dofs], axis=1)
@@ -565,13 +540,13 @@ def activations(
 
 def _mass(model: Any, values: Array) -> Array:
     """(n, nv, nv) mass matrices from those that MuJoCo stores, which are lower triangles."""
-    lower = _dense(values, model.M_rowadr, model.M_rownnz, model.M_colind)
+    lower = _dense(values, model.M_rowadr, model.M_rownnz, model.M_colind, model.nv)
     return lower + np.swapaxes(np.tril(lower, -1), 1, 2)
 
 
-def _dense(values: Array, starts: Any, counts: Any, columns: Any) -> Array:
-    """(n, nv, nv) matrices from values (n, entries) of sparse rows."""
-    dense = np.zeros((len(values), len(starts), len(starts)))
+def _dense(values: Array, starts: Any, counts: Any, columns: Any, width: int) -> Array:
+    """(n, rows, width) matrices from values (n, entries) of sparse rows."""
+    dense = np.zeros((len(values), len(starts), width))
     for row, (start, count) in enumerate(zip(starts, counts, strict=True)):
         entries = slice(start, start + count)
         dense[:, row, columns[entries]] = values[:, entries]

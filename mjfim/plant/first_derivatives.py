@@ -17,7 +17,6 @@ from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.closed_form import (
     MODEL_STEP,
     ClosedForm,
-    KnownJacobians,
     SampleJacobians,
     observation_jacobian,
 )
@@ -39,8 +38,60 @@ TINY = 1e-300
 FIRST_DERIVATIVE_STEP = 1e-6
 
 
-class ClosedFormDerivatives:
-    """Derivatives in closed form; None wherever the plant has no closed form.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MovedSamples:
+    """Samples of a trajectory that are moved along each coordinate of (x, u).
+
+    There are n samples, c = nx+nu coordinates and m moves: c forward moves, then c backward moves
+    or a single zero move.
+
+    Attributes:
+        trajectory_states: (n, ns) states that are not moved.
+        states: (m*n, ns) moved states.
+        ctrl: (m*n, nu) moved controls.
+        batch_shape: (m, n).
+        widths: (c, 1, 1) distance between the forward move and the backward or zero one [x-unit,
+            u-unit].
+    """
+
+    trajectory_states: Array
+    states: Array
+    ctrl: Array
+    batch_shape: tuple[int, int]
+    widths: Array
+
+    def unflatten(self, values: Array) -> Array:
+        """(b, m, n, ...) values of b batches of the moved samples from (b * m * n, ...)."""
+        moves, samples = self.batch_shape
+
+        # `reshape` cannot find this number itself where there are no values per sample.
+        batches = len(values) // (moves * samples)
+        return values.reshape(batches, moves, samples, *values.shape[1:])
+
+    def quotient(self, values: Array) -> Array:
+        """(c, n, k) derivative by (x, u) from (m, n, k) values of the moved samples."""
+        count = len(self.widths)
+        difference = values[:count] - values[count:]
+        return difference / self.widths
+
+    def observation_jacobian(self, change: Array) -> Array:
+        """Derivative of observations by (x, u).
+
+        Args:
+            change: (c, n, S, w) differences of the observations at S rows between the
+                forward moves and the backward or zero ones.
+
+        Returns:
+            (n, S, w, c) derivative.
+        """
+        quotient = change / self.widths[..., None]
+        return np.moveaxis(quotient, 0, 3)
+
+
+class FirstDerivatives:
+    """First derivatives of F and h by state, control and parameters.
+
+    Those in closed form are None wherever the plant has no closed form.
 
     Attributes:
         plant: The plant.
@@ -147,11 +198,11 @@ class ClosedFormDerivatives:
             The first derivatives, and (r, N, nx+nu, nx) derivatives of `DF[psi w, w]` by (x, u);
             None where there is no closed form.
         """
-        closed = self._closed_form(trajectory)
-        origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
-        if closed is None or origin is None:
+        found = self._origin_jacobians(theta, trajectory)
+        if found is None:
             return None
 
+        closed, origin = found
         nx = self.plant.space.nx
         sizes = self.difference_sizes(trajectory)[:nx]
         mixed = np.zeros((len(directions), *origin.A.shape[:1], nx + self.plant.nu, nx))
@@ -171,28 +222,6 @@ class ClosedFormDerivatives:
             mixed[r][~_has_same_clamps(origin, moved, trajectory.ctrl)] = 0.0
         return origin, mixed
 
-    def closed_form_observations(
-        self, theta: Array, trajectory: Trajectory, observations: SubstepObservations
-    ) -> tuple[SampleJacobians, Array] | None:
-        """First derivatives of F and of observations.
-
-        Args:
-            theta: (p,) parameters of the trajectory [theta-unit].
-            trajectory: The trajectory.
-            observations: The w observed quantities.
-
-        Returns:
-            The first derivatives, and (N, S, w, nx+nu) derivatives of the observations by (x, u);
-            None where there is no closed form.
-        """
-        closed = self._closed_form(trajectory)
-        origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
-        if origin is None:
-            return None
-
-        observed = observation_jacobian(origin, trajectory.ctrl, observations)
-        return None if observed is None else (origin, observed)
-
     def _closed_form(self, trajectory: Trajectory) -> ClosedForm | None:
         """The closed form with the sizes of a trajectory; None where there is none."""
         plant = self.plant
@@ -204,32 +233,34 @@ class ClosedFormDerivatives:
         return ClosedForm(simulator=plant.simulator, tree=tree, sizes=sizes)
 
     def _origin_jacobians(
-        self, closed: ClosedForm, theta: Array, trajectory: Trajectory
-    ) -> SampleJacobians | None:
-        """Derivatives along a trajectory: those that were computed last, or new ones."""
-        known = self.plant.closed_form_memory.latest
-        if (
-            known is not None
-            and known.trajectory is trajectory
-            and known.substeps == self.plant.simulator.substeps
-            and np.array_equal(known.theta, theta)
-        ):
-            return known.jacobians
+        self, theta: Array, trajectory: Trajectory
+    ) -> tuple[ClosedForm, SampleJacobians] | None:
+        """The closed form and derivatives along a trajectory: those computed last, or new ones."""
+        closed = self._closed_form(trajectory)
+        if closed is None:
+            return None
+
+        latest = self.plant.closed_form_memory.latest
+        if latest is not None:
+            known_theta, known_trajectory, known = latest
+            if (
+                known_trajectory is trajectory
+                and known.accelerations.shape[1] == self.plant.simulator.substeps
+                and np.array_equal(known_theta, theta)
+            ):
+                return closed, known
 
         model = self.plant.model(theta)
         found = closed.jacobians(model, trajectory.state[:-1], trajectory.ctrl)
-        if found is not None:
-            self._remember(theta, trajectory, found)
-        return found
+        if found is None:
+            return None
+        self._remember(theta, trajectory, found)
+        return closed, found
 
     def _remember(self, theta: Array, trajectory: Trajectory, found: SampleJacobians) -> None:
         """Keep the first derivatives of a trajectory for its mixed ones."""
-        self.plant.closed_form_memory.latest = KnownJacobians(
-            theta=np.array(theta),
-            trajectory=trajectory,
-            substeps=self.plant.simulator.substeps,
-            jacobians=replace(found, E=np.zeros((*found.E.shape[:2], 0))),
-        )
+        without_theta = replace(found, E=np.zeros((*found.E.shape[:2], 0)))
+        self.plant.closed_form_memory.latest = np.array(theta), trajectory, without_theta
 
     def _change(
         self, closed: ClosedForm, theta: Array, trajectory: Trajectory
@@ -261,76 +292,6 @@ class ClosedFormDerivatives:
         memory.changes[key] = ParameterChange.joined(changes)
         return memory.changes[key]
 
-
-def _has_same_clamps(origin: SampleJacobians, moved: SampleJacobians, ctrl: Array) -> np.ndarray:
-    """(N,) True for samples in which the same actuators' forces are clamped in both motions.
-
-    Args:
-        origin: Derivatives along a motion.
-        moved: Derivatives along the motion beside it.
-        ctrl: (N, nu) controls of both.
-    """
-    N, points, nx = origin.states.shape
-    held = np.repeat(ctrl, points - 1, axis=0)
-    own, other = (
-        each.forces.clamped(each.states[:, :-1].reshape(-1, nx), held) for each in (origin, moved)
-    )
-    return np.asarray((own == other).reshape(N, -1).all(axis=1))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MovedSamples:
-    """Samples of a trajectory that are moved along each coordinate of (x, u).
-
-    There are n samples, c = nx+nu coordinates and m moves: c forward moves, then c backward moves
-    or a single zero move.
-
-    Attributes:
-        trajectory_states: (n, ns) states that are not moved.
-        states: (m*n, ns) moved states.
-        ctrl: (m*n, nu) moved controls.
-        batch_shape: (m, n).
-        widths: (c, 1, 1) distance between the forward move and the backward or zero one [x-unit,
-            u-unit].
-    """
-
-    trajectory_states: Array
-    states: Array
-    ctrl: Array
-    batch_shape: tuple[int, int]
-    widths: Array
-
-    def unflatten(self, values: Array) -> Array:
-        """(b, m, n, ...) values of b batches of the moved samples from (b * m * n, ...)."""
-        moves, samples = self.batch_shape
-
-        # `reshape` cannot find this number itself where there are no values per sample.
-        batches = len(values) // (moves * samples)
-        return values.reshape(batches, moves, samples, *values.shape[1:])
-
-    def quotient(self, values: Array) -> Array:
-        """(c, n, k) derivative by (x, u) from (m, n, k) values of the moved samples."""
-        count = len(self.widths)
-        difference = values[:count] - values[count:]
-        return difference / self.widths
-
-    def observation_jacobian(self, change: Array) -> Array:
-        """Derivative of observations by (x, u).
-
-        Args:
-            change: (c, n, S, w) differences of the observations at S rows between the
-                forward moves and the backward or zero ones.
-
-        Returns:
-            (n, S, w, c) derivative.
-        """
-        quotient = change / self.widths[..., None]
-        return np.moveaxis(quotient, 0, 3)
-
-
-class StepDerivatives(ClosedFormDerivatives):
-    """First derivatives of F and h by state, control and parameters."""
-
     def linearize(
         self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
     ) -> Linearization:
@@ -359,7 +320,7 @@ class StepDerivatives(ClosedFormDerivatives):
         calibration, sensors = self.plant.calibration, None
         if calibration.scales and outputs.needs_sensors:
             model = self.plant.model(theta)
-            sensors = self.plant.simulator.step([model], states, ctrl).sensors
+            _, sensors, _ = self.plant.simulator.step([model], states, ctrl)
         H = calibration.by_theta(outputs(states, sensors), H, theta)
         return Linearization(A=A, B=B, E=E, C=C, D=D, H=H)
 
@@ -416,23 +377,26 @@ class StepDerivatives(ClosedFormDerivatives):
         Raises:
             SimulationDivergedError: A perturbed step diverges.
         """
-        closed = self.closed_form_observations(theta, trajectory, observations)
-        if closed is not None:
-            return closed[0].A, closed[0].B, closed[1]
+        found = self._origin_jacobians(theta, trajectory)
+        if found is not None:
+            origin = found[1]
+            observed = observation_jacobian(origin, trajectory.ctrl, observations)
+            if observed is not None:
+                return origin.A, origin.B, observed
 
         plant, nx = self.plant, self.plant.space.nx
         sizes = self.difference_sizes(trajectory)
         moved = self._move_samples(trajectory.state[:-1], trajectory.ctrl, step * sizes, False)
-        stepped = plant.simulator.step([plant.model(theta)], moved.states, moved.ctrl, observations)
-        if stepped.observed is None:
-            raise ValueError("the simulator returned no observations")
+        model = plant.model(theta)
+        after, _, seen = plant.simulator.step([model], moved.states, moved.ctrl, observations)
+        assert seen is not None
 
         # The last of the moves is the zero one.
-        states = moved.unflatten(stepped.states)[0]
+        states = moved.unflatten(after)[0]
         by_z = plant.space.minus(states[:-1], states[-1:]) / moved.widths
         AB = np.moveaxis(_require_finite(by_z), 0, 2)
 
-        observed = moved.unflatten(stepped.observed)[0]
+        observed = moved.unflatten(seen)[0]
         jacobian = moved.observation_jacobian(observed[:-1] - observed[-1:])
         return AB[..., :nx], AB[..., nx:], jacobian
 
@@ -508,14 +472,14 @@ class StepDerivatives(ClosedFormDerivatives):
             (count, n, nx) quotients of the next state, and (count, n, nsensordata) of the sensors,
             or None without sensors.
         """
-        stepped = self.plant.simulator.step(models, states, ctrl)
-        pair = stepped.states.reshape(2, len(widths), -1, states.shape[1])
+        after, sensors, _ = self.plant.simulator.step(models, states, ctrl)
+        pair = after.reshape(2, len(widths), -1, states.shape[1])
         dx = self.plant.space.minus(pair[0], pair[1]) / widths
-        if stepped.sensors is None:
+        if sensors is None:
             return dx, None
 
-        sensors = stepped.sensors.reshape(2, len(widths), -1, stepped.sensors.shape[1])
-        return dx, (sensors[0] - sensors[1]) / widths
+        forward, backward = sensors.reshape(2, len(widths), -1, sensors.shape[1])
+        return dx, (forward - backward) / widths
 
     def _move_samples(
         self, states: Array, ctrl: Array, steps: Array, central: bool
@@ -547,6 +511,22 @@ class StepDerivatives(ClosedFormDerivatives):
         moves = np.zeros((nx + self.plant.nu, samples, nx))
         moves[:nx] = np.eye(nx)[:, None, :]
         return moves
+
+
+def _has_same_clamps(origin: SampleJacobians, moved: SampleJacobians, ctrl: Array) -> np.ndarray:
+    """(N,) True for samples in which the same actuators' forces are clamped in both motions.
+
+    Args:
+        origin: Derivatives along a motion.
+        moved: Derivatives along the motion beside it.
+        ctrl: (N, nu) controls of both.
+    """
+    N, points, nx = origin.states.shape
+    held = np.repeat(ctrl, points - 1, axis=0)
+    own, other = (
+        each.forces.clamped(each.states[:, :-1].reshape(-1, nx), held) for each in (origin, moved)
+    )
+    return np.asarray((own == other).reshape(N, -1).all(axis=1))
 
 
 def all_samples(trajectory: Trajectory) -> tuple[Array, Array]:

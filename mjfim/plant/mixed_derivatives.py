@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.plant.batch import SampleSteps, SubstepObservations
 from mjfim.plant.dynamics import Dynamics
-from mjfim.plant.first_derivatives import MovedSamples, StepDerivatives, all_samples, tiled
+from mjfim.plant.first_derivatives import FirstDerivatives, MovedSamples, all_samples, tiled
 from mjfim.plant.outputs import OutputDelay
 from mjfim.records.trajectory import Trajectory
 
@@ -83,7 +83,7 @@ class Bilinear:
     observation_jacobian: Array | None = None
 
 
-class MixedDerivatives(StepDerivatives):
+class MixedDerivatives(FirstDerivatives):
     """First and mixed second derivatives of F and h."""
 
     @property
@@ -163,22 +163,23 @@ class MixedDerivatives(StepDerivatives):
                 if smooth is plant and origin is None
                 else _stepped(smooth, moved, at, shifts)
             )
-            reached = moved.unflatten(on_smooth.states)
-            other = reached[1] if origin is None else moved.unflatten(origin.states)[0]
+            after, smooth_sensors, _ = on_smooth
+            reached = moved.unflatten(after)
+            other = reached[1] if origin is None else moved.unflatten(origin[0])[0]
             width = 2.0 * epsilon if origin is None else epsilon
             F_mixed.append(moved.quotient(space.minus(reached[0], other) / width))
-            if on_smooth.sensors is not None:
-                pair = moved.unflatten(on_smooth.sensors)
+            if smooth_sensors is not None:
+                pair = moved.unflatten(smooth_sensors)
                 of_sensors.append(moved.quotient((pair[0] - pair[1]) / width))
 
         # The state after the last sample is no state of the trajectory.
         jacobian = None
-        if near[0].observed is not None:
-            jacobian = moved.observation_jacobian(_mean_change(moved, near[0].observed))[:-1]
+        if (observed := near[0][2]) is not None:
+            jacobian = moved.observation_jacobian(_mean_change(moved, observed))[:-1]
         count = len(moved.widths)
-        states = [moved.unflatten(each.states) for each in near]
+        states = [moved.unflatten(each) for each, _, _ in near]
         by_z = [np.mean(space.minus(x[:, :count], x[:, count:]), axis=0) for x in states]
-        sensors = [_mean_change(moved, each.sensors) for each in near if each.sensors is not None]
+        sensors = [_mean_change(moved, each) for _, each, _ in near if each is not None]
         return self._bilinear_from(
             theta,
             moved.trajectory_states,

@@ -17,7 +17,6 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.model.parameters import ParameterSet
 from mjfim.plant.state_space import StateSpace, quaternion_product
 
 # Number of samples through which the cubic polynomial of the interpolation passes.
@@ -79,20 +78,14 @@ class Outputs:
     @cached_property
     def _states(self) -> np.ndarray:
         """(2, n) output and address in the state vector of every measured state component."""
-        rows = []
-        for i, output in enumerate(self.outputs):
-            if output.state is not None:
-                rows.append((i, output.state))
-        return _columns(rows, 2)
+        stated = [(i, o.state) for i, o in enumerate(self.outputs) if o.state is not None]
+        return _columns(stated, 2)
 
     @cached_property
     def _sensors(self) -> np.ndarray:
         """(2, n) output and address in sensordata of every measured sensor."""
-        rows = []
-        for i, output in enumerate(self.outputs):
-            if output.sensor is not None:
-                rows.append((i, output.sensor))
-        return _columns(rows, 2)
+        sensed = [(i, o.sensor) for i, o in enumerate(self.outputs) if o.sensor is not None]
+        return _columns(sensed, 2)
 
     @cached_property
     def _scalars(self) -> np.ndarray:
@@ -115,11 +108,12 @@ class Outputs:
             (4, n) for each of them the output, the component, and the addresses of the quaternion
             in qpos and of its angular velocity in qvel.
         """
-        rows = []
-        for i, address in self._states.T.tolist():
-            for q, v in self.space.quaternions:
-                if q <= address < q + 4:
-                    rows.append((i, address - q, q, v))
+        rows = [
+            (i, address - q, q, v)
+            for i, address in self._states.T.tolist()
+            for q, v in self.space.quaternions
+            if q <= address < q + 4
+        ]
         return _columns(rows, 4)
 
     def __call__(self, states: Array, sensors: Array | None) -> Array:
@@ -247,18 +241,6 @@ class Calibration:
     scale: Array
     bias: Array
 
-    @staticmethod
-    def of(parameters: ParameterSet, ny: int) -> Calibration:
-        """Errors that some parameters stand for.
-
-        Args:
-            parameters: The parameters.
-            ny: Number of outputs.
-        """
-        return Calibration(
-            scale=parameters.scale_derivative(ny), bias=parameters.bias_derivative(ny)
-        )
-
     @property
     def scales(self) -> bool:
         """Whether a parameter is the scale error of an output."""
@@ -328,20 +310,6 @@ class Noise:
 
     covariance: Array
     strides: np.ndarray
-
-    @staticmethod
-    def independent(sigma: Sequence[float] | Array, stride: int = 1) -> Noise:
-        """Noise of uncorrelated outputs that are measured at the same samples.
-
-        Args:
-            sigma: (ny,) standard deviations [y-unit].
-            stride: Stride of all outputs.
-
-        Returns:
-            The noise.
-        """
-        covariance = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
-        return Noise(covariance=covariance, strides=np.full(len(sigma), stride))
 
     @cached_property
     def sigma(self) -> Array:

@@ -423,7 +423,7 @@ class Derivatives(MixedDerivatives):
             out = plant.simulator.rollout(
                 models, current.reshape(J * S, -1), every, context=context
             )
-            memory = None if out.loop is None else out.loop.memory
+            memory = out.memory
             if not (out.finite.all() and compiled.all()):
                 yield None
                 return

@@ -211,9 +211,23 @@ class RigidBodyMotion:
     @cached_property
     def _coriolis_behind(self) -> Array:
         """(n, nv, 6, 6) twice the matrix B of the source, of all bodies that each joint moves."""
-        turned = self.inertia @ _motion_matrix(self._body_speed)
-        own = _momentum_matrix(self._momentum) - turned - np.swapaxes(turned, 2, 3)
-        return self._summed_behind(own)
+        # Matrix of `_moved_motion` for the motion of the bodies.
+        speed, force = self._body_speed, self._momentum
+        of_motion = np.zeros((*speed.shape, 6))
+        turn = _cross_matrix(speed[..., :3])
+        of_motion[..., :3, :3] = turn
+        of_motion[..., 3:, 3:] = turn
+        of_motion[..., 3:, :3] = _cross_matrix(speed[..., 3:])
+
+        # Matrix of `_moved_force` as a function of the motion, for the momentum.
+        of_force = np.zeros((*force.shape, 6))
+        linear = -_cross_matrix(force[..., 3:])
+        of_force[..., :3, :3] = -_cross_matrix(force[..., :3])
+        of_force[..., :3, 3:] = linear
+        of_force[..., 3:, :3] = linear
+
+        turned = self.inertia @ of_motion
+        return self._summed_behind(of_force - turned - np.swapaxes(turned, 2, 3))
 
     def regressor(self, origins: Array, axes: Array, change: Array) -> Array:
         """Derivatives of the forces by parameters of the bodies' inertias.
@@ -366,26 +380,6 @@ def _moved_force(v: Array, force: Array) -> Array:
     )
 
 
-def _motion_matrix(v: Array) -> Array:
-    """(..., 6, 6) matrix of `_moved_motion` for v: (..., 6)."""
-    matrix = np.zeros((*v.shape, 6))
-    turn = _cross_matrix(v[..., :3])
-    matrix[..., :3, :3] = turn
-    matrix[..., 3:, 3:] = turn
-    matrix[..., 3:, :3] = _cross_matrix(v[..., 3:])
-    return matrix
-
-
-def _momentum_matrix(force: Array) -> Array:
-    """(..., 6, 6) matrix of `_moved_force` as a function of the motion, for a force (..., 6)."""
-    matrix = np.zeros((*force.shape, 6))
-    linear = -_cross_matrix(force[..., 3:])
-    matrix[..., :3, :3] = -_cross_matrix(force[..., :3])
-    matrix[..., :3, 3:] = linear
-    matrix[..., 3:, :3] = linear
-    return matrix
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointTree:
     """Hinges and slides of a model, and the bodies that each of them moves.
@@ -425,7 +419,7 @@ class JointTree:
             return None
 
         # Parents have lower numbers than their children.
-        nv = int(model.nv)
+        nv = model.nv
         supports = np.eye(nv)
         for i, parent in enumerate(model.dof_parentid.tolist()):
             if parent >= 0:

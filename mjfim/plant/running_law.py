@@ -213,21 +213,6 @@ class LawCommands:
             lag_time=numbers.latency + kept_back,
         )
 
-    def drive(self, numbers: LawNumbers) -> Array:
-        """(K, m, c) part of the controls that does not depend on the state [u-unit].
-
-        Args:
-            numbers: Numbers of the laws.
-        """
-        drive = numbers.kp * self.reference
-        if self.reference_velocity is not None:
-            drive += numbers.kd * self.reference_velocity
-        if self.gain is not None:
-            drive *= self.gain
-        if self.feedforward is not None:
-            drive += self.feedforward
-        return np.asarray(drive)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Columns:
@@ -407,17 +392,6 @@ class InputContext:
     memory: tuple[LawMemory, ...] | None = None
 
     @classmethod
-    def none(cls, inputs: Array) -> InputContext:
-        """The context of curves at the begin of recordings.
-
-        Args:
-            inputs: (m, N, w) inputs of the curves.
-        """
-        nothing = inputs[:, :0]
-        begin = np.zeros(len(inputs), dtype=np.intp)
-        return cls(before=nothing, after=nothing, samples=begin)
-
-    @classmethod
     def of_interval(
         cls,
         inputs: Array,
@@ -456,22 +430,6 @@ class InputContext:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LoopTrace:
-    """Record of control laws along m curves of N samples.
-
-    Attributes:
-        controls: (m, N, nu) controls at the begin of every sample [u-unit].
-        is_clipped: (m, N, laws) True where the range or the largest change of a control has clipped
-            it.
-        memory: Memory at the end of the curves, grouped by the periods of the laws.
-    """
-
-    controls: Array
-    is_clipped: np.ndarray
-    memory: tuple[LawMemory, ...]
-
-
 class RunningLaws:
     """C laws with one period, which compute the controls of m curves at successive ticks.
 
@@ -479,6 +437,11 @@ class RunningLaws:
         held: (m, c) controls that the laws hold now [u-unit].
         is_clipped: (m, c) True where the range or the largest change has clipped them.
         has_limits: True where something may clip them.
+        laws: The c laws.
+        period: Engine steps from one evaluation to the next.
+        controls: (c,) addresses of their controls in ctrl.
+        positions: (c,) addresses of the positions that they read in qpos.
+        velocities: (c,) addresses of the velocities that they read in qvel.
     """
 
     def __init__(
@@ -502,9 +465,23 @@ class RunningLaws:
             begins: True where no control was held before the first tick, so that its change is not
                 limited.
         """
+        self.laws = laws
+        self.period = ticks.period
+        self.controls = np.array([law.control for law in laws])
+        self.positions = np.array([law.q for law in laws])
+        self.velocities = np.array([law.v for law in laws])
         self._numbers = numbers
         self._commands = commands
-        self._drive = commands.drive(numbers)
+
+        # (K, m, c) part of the controls that does not depend on the state.
+        drive = numbers.kp * commands.reference
+        if commands.reference_velocity is not None:
+            drive += numbers.kd * commands.reference_velocity
+        if commands.gain is not None:
+            drive *= commands.gain
+        if commands.feedforward is not None:
+            drive += commands.feedforward
+        self._drive = drive
         self._next = ticks.before
 
         seconds = ticks.seconds

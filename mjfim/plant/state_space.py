@@ -242,7 +242,7 @@ class StateSizes:
                 int(model.actuator_actnum[actuator]),
             )
             if first >= 0 and int(model.actuator_ctrlnum[actuator]):
-                activation[first : first + count] = control[int(model.actuator_ctrladr[actuator])]
+                activation[first : first + count] = control[model.actuator_ctrladr[actuator]]
 
         position = position_sizes(model)
         return StateSizes(
@@ -274,25 +274,22 @@ class StateSizes:
         if least_speed is None:
             least_speed = self.velocity
         velocity = np.maximum(least_speed, np.abs(trajectory.qvel).max(axis=0, initial=0.0))
+
+        # The distance travelled by a coordinate that is no rotation counts where it is larger.
+        scalar_q, scalar_v = self.space.scalar_q, self.space.scalar_v
+        path = trajectory.qpos[:, scalar_q]
+        travelled = np.abs(path - path[0]).max(axis=0, initial=0.0)
+        position = np.array(self.position)
+        farther = self.translates[scalar_v] & (travelled > position[scalar_v])
+        position[scalar_v[farther]] = travelled[farther]
         return np.concatenate(
             [
-                self._travelled(trajectory),
+                position,
                 velocity,
                 _shown(trajectory.act, self.activation),
                 _shown(trajectory.ctrl, self.control),
             ]
         )
-
-    def _travelled(self, trajectory: Trajectory) -> Array:
-        """(nv,) natural sizes, or the distance travelled by a coordinate that is no rotation."""
-        scalar_q, scalar_v = self.space.scalar_q, self.space.scalar_v
-        path = trajectory.qpos[:, scalar_q]
-        travelled = np.abs(path - path[0]).max(axis=0, initial=0.0)
-
-        sizes = np.array(self.position)
-        farther = self.translates[scalar_v] & (travelled > sizes[scalar_v])
-        sizes[scalar_v[farther]] = travelled[farther]
-        return sizes
 
 
 def _shown(values: Array, natural: Array) -> Array:

@@ -13,9 +13,15 @@ from mjfim.optimize.directions import MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, Bilinear
-from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
-from tests.support.numerics import Array, Loop, body_task, cart_task, relative_error
+from tests.support.numerics import (
+    Array,
+    Loop,
+    body_task,
+    cart_task,
+    independent_noise,
+    relative_error,
+)
 
 TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "control": 1e-2}
 SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}
@@ -96,7 +102,7 @@ def test_the_slope_with_psi_eliminated_is_that_of_the_extended_system(criterion:
         h_mixed=rng.normal(size=(p, N + 1, nx + nu, ny)),
     )
     S = Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, ny, p)))
-    noise = Noise.independent([0.3, 2.0])
+    noise = independent_noise([0.3, 2.0])
     made = FisherInformation(
         noise=noise,
         measure_rate=20.0,

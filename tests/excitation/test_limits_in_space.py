@@ -17,10 +17,15 @@ from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import limits_of
 from mjfim.excitation.limits.magnitudes import Magnitude, VectorBarrier
 from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
+from mjfim.excitation.limits.magnitudes import Magnitude
+from mjfim.excitation.limits.verification import require_feasible_start, verify
+from mjfim.excitation.limits.violations import violations_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
+from mjfim.optimize.cost_models import BarrierDerivatives
+from mjfim.output.labels import complete_labels
 from mjfim.output.pages.files import experiment_page
 from mjfim.output.plots.design import limits as limits_picture
 from mjfim.output.words import complete_labels
@@ -284,10 +289,10 @@ def test_a_wrong_slope_of_a_magnitude_would_be_noticed(
 ) -> None:
     right = Magnitude.barrier
 
-    def wrong(*args: Any, **kwargs: Any) -> VectorBarrier:
+    def wrong(*args: Any, **kwargs: Any) -> BarrierDerivatives:
         found = right(*args, **kwargs)
         slope = 1.05 * found.slope
-        return VectorBarrier(value=found.value, slope=slope, curvature=found.curvature)
+        return BarrierDerivatives(value=found.value, slope=slope, curvature=found.curvature)
 
     monkeypatch.setattr(Magnitude, "barrier", wrong)
     task = ship_task(tmp_path, limits=KINDS[name], horizon=0.1).relaxed()
@@ -303,7 +308,7 @@ def test_derivatives_of_the_barrier_of_a_norm_are_those_of_differences(is_angle:
     for norm in (0.0, 1e-6, 0.3, 0.995, 1.2):
         here = np.concatenate([[9.0], norm * share * way])
 
-        def at(y: Array) -> VectorBarrier:
+        def at(y: Array) -> BarrierDerivatives:
             return magnitude.barrier(y, 0.7, 0.8, delta=0.01, weight=0.5)
 
         moves = step * share * np.eye(4)[1:]

@@ -18,7 +18,13 @@ from mjfim.information.criteria import CRITERIA, standard_deviations
 from mjfim.information.fisher import FisherInformation
 from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
-from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error, richardson
+from tests.support.numerics import (
+    CART_PARAMETERS,
+    cart_task,
+    independent_noise,
+    relative_error,
+    richardson,
+)
 
 SIGMA = np.array([0.1, 0.5, 2.0])
 
@@ -31,7 +37,7 @@ def random_sensitivity(seed: int, N: int = 12, p: int = 4, nx: int = 5) -> Sensi
 
 def information(stride: int = 1, criterion: str = "E", **changes) -> FisherInformation:
     """Three outputs, four parameters of different scale, no prior."""
-    noise = Noise.independent(SIGMA, stride)
+    noise = independent_noise(SIGMA, stride)
     base = FisherInformation(
         noise=noise,
         measure_rate=50.0,

@@ -123,12 +123,12 @@ def slope_errors(
     """Largest error of slopes of the first column against differences along every dof, of each
     configuration: (n,).
     """
-    slope = measured(qpos).slope
+    _, slope = measured(qpos)
     assert slope is not None
     worst = []
     for now, claimed in zip(qpos, slope[:, 0], strict=True):
         curves = [
-            lambda t, now=now, e=e: float(measured(moved(model, now, t * e)[None]).d[0, 0])
+            lambda t, now=now, e=e: float(measured(moved(model, now, t * e)[None])[0][0, 0])
             for e in np.eye(model.nv)
         ]
         worst.append(directional_check(claimed, curves, h))
@@ -235,7 +235,7 @@ def test_all_distances_within_reach_are_found(reach: float) -> None:
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, reach), scattered(model, 200, 0.4)
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
-    d, expected = chosen(qpos, False).d, asked(model, chosen, qpos, reach)
+    d, expected = chosen(qpos, False)[0], asked(model, chosen, qpos, reach)
     shapes = [{int(model.geom_type[g]) for g in (p.first, p.second)} for p in chosen.pairs]
     trusted = (d > -0.05) | np.array([s != {CAPSULE, BOX} for s in shapes])  # see below
     assert trusted.mean() > 0.99
@@ -277,7 +277,7 @@ def test_distances_by_hand(
         )
         qpos = model.qpos0.copy()
         qpos[7:10] += shift
-        assert between(model, 2.0)(qpos[None], False).d[0, 0] == pytest.approx(expected, abs=1e-8)
+        assert between(model, 2.0)(qpos[None], False)[0][0, 0] == pytest.approx(expected, abs=1e-8)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -287,7 +287,7 @@ def test_planes_agree_with_contacts(kind: str) -> None:
     """
     model = on_floor(KINDS[kind])
     chosen, qpos, data = between(model, 9.0), scattered(model, 200, 1.0), mujoco.MjData(model)
-    d, deepest = chosen(qpos, False).d[:, 0], []
+    d, deepest = chosen(qpos, False)[0][:, 0], []
     for now in qpos:
         data.qpos[:] = now
         mujoco.mj_fwdPosition(model, data)
@@ -310,7 +310,7 @@ def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
         """
     )
     chosen, qpos = between(model, 1.0), scattered(model, 500, 0.06)
-    d = chosen(qpos, False).d
+    d = chosen(qpos, False)[0]
     assert (d[:, 0] < -0.06).mean() > 0.5
     np.testing.assert_allclose(d[:, 0], d[:, 1], rtol=0, atol=2e-8)
     worst = asked(model, chosen, qpos, 1.0)[:, 0] - d[:, 0]
@@ -335,7 +335,7 @@ def test_slopes_agree_with_differences(first: str, second: str) -> None:
     """Geoms are near or far and are moved by hinge, ball and free joints."""
     model = two(KINDS[first], KINDS[second])
     chosen, qpos = between(model, 2.0), scattered(model, 16, 0.4)
-    qpos = qpos[chosen(qpos, False).d[:, 0] > 0.02]
+    qpos = qpos[chosen(qpos, False)[0][:, 0] > 0.02]
     assert len(qpos) > 5
     errors = slope_errors(model, lambda q: chosen(q, True), qpos)
     assert np.quantile(errors, 0.75) < 1e-6
@@ -347,7 +347,7 @@ def test_slopes_to_the_floor_agree_with_differences(kind: str) -> None:
     """The geom is above or below a tilted plane."""
     model = on_floor(KINDS[kind])
     chosen, qpos = between(model, 9.0), scattered(model, 8, 1.0)
-    d = chosen(qpos, False).d
+    d = chosen(qpos, False)[0]
     assert d.min() < -0.1 and d.max() > 0.1
     assert slope_errors(model, lambda q: chosen(q, True), qpos).max() < 1e-6
 
@@ -365,7 +365,7 @@ def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -
     """
     model = two(KINDS[first], KINDS[second])
     chosen, qpos = between(model, 2.0), scattered(model, 60, 0.1, seed=3)
-    d = chosen(qpos, False).d[:, 0]
+    d = chosen(qpos, False)[0][:, 0]
     qpos = qpos[(d < -0.01) & (d > -0.04)][:6]
     assert len(qpos) > 2
     assert slope_errors(model, lambda q: chosen(q, True), qpos).max() < 1e-4
@@ -381,11 +381,11 @@ def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
     chosen, qpos = between(model, 2.0), scattered(model, 1, 0.4)[0]
     start = model.joint(2).qposadr[0]
     for _ in range(40):
-        found = chosen(qpos[None], True)
-        out = found.slope[0, 0, -6:-3]
+        d, slope = chosen(qpos[None], True)
+        out = slope[0, 0, -6:-3]
         assert np.linalg.norm(out) == pytest.approx(1.0, abs=1e-9)
-        qpos[start : start + 3] -= (found.d[0, 0] - offset) * out
-    assert chosen(qpos[None], False).d[0, 0] == pytest.approx(offset, abs=2e-11)
+        qpos[start : start + 3] -= (d[0, 0] - offset) * out
+    assert chosen(qpos[None], False)[0][0, 0] == pytest.approx(offset, abs=2e-11)
     assert slope_errors(model, lambda q: chosen(q, True), qpos[None]).max() < 2e-4
 
 
@@ -394,7 +394,7 @@ def test_columns_are_pairs_of_bodies() -> None:
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, single = between(model, 0.5, grouped=True), between(model, 0.5)
     qpos = scattered(model, 50, 0.4)
-    bodies, geoms = chosen(qpos, True), single(qpos, True)
+    (bodies, by_bodies), (geoms, by_geoms) = chosen(qpos, True), single(qpos, True)
     names = [
         " - ".join(model.body(model.geom_bodyid[g]).name for g in (p.first, p.second))
         for p in single.pairs
@@ -405,10 +405,10 @@ def test_columns_are_pairs_of_bodies() -> None:
     assert single.columns == tuple(p.name for p in single.pairs)
     for i, column in enumerate(chosen.columns):
         own = [j for j, name in enumerate(names) if name == column]
-        least = geoms.d[:, own].argmin(axis=1)
-        np.testing.assert_array_equal(bodies.d[:, i], geoms.d[:, own].min(axis=1))
+        least = geoms[:, own].argmin(axis=1)
+        np.testing.assert_array_equal(bodies[:, i], geoms[:, own].min(axis=1))
         np.testing.assert_array_equal(
-            bodies.slope[:, i], geoms.slope[np.arange(50), np.array(own)[least]]
+            by_bodies[:, i], by_geoms[np.arange(50), np.array(own)[least]]
         )
 
 
@@ -419,7 +419,7 @@ def test_nearest_is_the_smallest_of_all(spread: float) -> None:
     stone = [p for p in find_geom_pairs(model, ()) if "stone" in p.name and "floor" not in p.name]
     chosen, qpos = GeomDistances(model, stone, 0.01), scattered(model, 40, spread)
     if spread > 1.0:
-        qpos = qpos[(chosen(qpos, False).d == 0.01).all(axis=1)]
+        qpos = qpos[(chosen(qpos, False)[0] == 0.01).all(axis=1)]
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
     every = asked(model, chosen, qpos, 100.0)
     row, column = np.unravel_index(every.argmin(), every.shape)
@@ -435,7 +435,7 @@ def test_diverged_configurations_have_no_distance(value: float) -> None:
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, 0.5, grouped=True), scattered(model, 5, 0.4)
     qpos[3, 1] = value
-    found = chosen(qpos, True)
-    assert np.isnan(found.d[3]).all() and np.isfinite(np.delete(found.d, 3, axis=0)).all()
+    d, _ = chosen(qpos, True)
+    assert np.isnan(d[3]).all() and np.isfinite(np.delete(d, 3, axis=0)).all()
     with pytest.raises(SimulationDivergedError, match="configuration 3 is not finite"):
         chosen.nearest(qpos)

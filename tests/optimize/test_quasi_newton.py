@@ -29,8 +29,8 @@ def test_the_product_is_that_with_the_dense_bfgs_matrix(count: int) -> None:
     assert len(pairs) == count
 
     H = start
-    for pair in pairs:
-        H = updated(H, pair.s.reshape(-1), pair.y.reshape(-1))
+    for step, change, _ in pairs:
+        H = updated(H, step.reshape(-1), change.reshape(-1))
 
     def initial(g: np.ndarray) -> np.ndarray:
         return np.asarray((g.reshape(-1, 6) @ start).reshape(g.shape))
@@ -46,8 +46,8 @@ def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:
     s = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
     y = np.array([[3.0, 1.0], [-1.0, 5.0], [1.0, 1.0], [1.0, 1e-9]])
     kept = convex_pairs(s, y, 1e-8)
-    assert [pair.curvature for pair in kept] == [3.0]
-    np.testing.assert_array_equal(kept[0].y, y[0])
+    assert [curvature for _, _, curvature in kept] == [3.0]
+    np.testing.assert_array_equal(kept[0][1], y[0])
 
     for step, change in zip(s, y, strict=True):
         alone = convex_pairs(step[None], change[None], 1e-8)

@@ -309,9 +309,9 @@ def test_stored_pairs_do_not_contain_the_barrier() -> None:
     def gradient(u: Array) -> Array:
         return Toy(0.0).expand(Toy(0.0).point(u)).gradient(np.zeros((N, NU, NX)))
 
-    last = pairs[-1]
-    wanted = gradient(point.u) - gradient(point.u - last.s)
-    np.testing.assert_allclose(last.y, wanted, rtol=0, atol=1e-9 * max(np.abs(wanted).max(), 1.0))
+    step, change = pairs[-1]
+    wanted = gradient(point.u) - gradient(point.u - step)
+    np.testing.assert_allclose(change, wanted, rtol=0, atol=1e-9 * max(np.abs(wanted).max(), 1.0))
     assert direction.reset() is True
     assert direction.reset() is False
 

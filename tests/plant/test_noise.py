@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from mjfim.plant.outputs import Noise
+from tests.support.numerics import independent_noise
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def test_whitened_residuals_are_the_normal_density() -> None:
         assert density.logpdf(np.zeros(4)) - density.logpdf(row) == pytest.approx(
             half_square(white), rel=1e-10
         )
-    wrong = Noise.independent(np.sqrt(np.diag(FULL))).whiten(values)
+    wrong = independent_noise(np.sqrt(np.diag(FULL))).whiten(values)
     assert half_square(wrong[0]) != pytest.approx(
         half_square(correlated().whiten(values)[0]), rel=1e-2
     )

@@ -417,9 +417,9 @@ def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None
     np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
     states, ctrl = task.initial.state, np.repeat(task.control, 1, axis=0)
     for count in (5, 50, 1, 12):
-        out = task.plant.simulator.step(
+        out, _, _ = task.plant.simulator.step(
             [task.plant.model(task.theta)], states[:count], ctrl[:count]
-        ).states
+        )
         np.testing.assert_array_equal(out, states[1 : count + 1])
 
 
@@ -828,8 +828,8 @@ def test_mocap_bodies_stand_where_the_keyframe_puts_them(function: bool, tmp_pat
     model, K = task.plant.model(task.theta), np.zeros((task.samples, 1, 4))
     closed, _, _ = task.plant.simulator.closed_loop(model, task.initial.state, task.control, K)
     np.testing.assert_allclose(closed, wanted, **tolerance)
-    stepped = task.plant.simulator.step([model], wanted[:-1], task.control)
-    np.testing.assert_allclose(stepped.states, wanted[1:], **tolerance)
+    stepped, _, _ = task.plant.simulator.step([model], wanted[:-1], task.control)
+    np.testing.assert_allclose(stepped, wanted[1:], **tolerance)
     whole = task.system.model_at(task.theta)
     np.testing.assert_allclose(whole.eq_data, task.system.model.eq_data, atol=1e-12)
     np.testing.assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
@@ -866,7 +866,7 @@ def test_clock_sensors_begin_at_zero(tmp_path) -> None:
     t = np.arange(task.samples + 1) * task.dt
     np.testing.assert_allclose(y[0, :, task.system.outputs.names.index("clock")], t, atol=1e-12)
     model = task.plant.model(task.theta)
-    sensed = task.plant.simulator.step([model], task.initial.state[:1], task.control[:1]).sensors
+    _, sensed, _ = task.plant.simulator.step([model], task.initial.state[:1], task.control[:1])
     assert sensed is not None
     assert sensed[0, task.system.model.sensor("clock").adr[0]] == 0.0
 

@@ -152,7 +152,7 @@ def engine_loop(task: DesignTask, model: Any, start: Array, reference: Array, K:
     states = [start]
     for k in range(len(K)):
         u = task.initial.ctrl[k] + K[k] @ task.space.minus(reference[k], states[-1])
-        states.append(task.plant.simulator.step([model], states[-1][None], u[None]).states[0])
+        states.append(task.plant.simulator.step([model], states[-1][None], u[None])[0][0])
     return np.array(states)
 
 

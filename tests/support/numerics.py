@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.plant.outputs import Noise
 from tests.support.paths import SHARED_MODELS
 
 Array = NDArray[np.float64]
@@ -259,3 +260,11 @@ def relative_error(value: Array, reference: Array) -> float:
     """Largest deviation, relative to the largest reference entry."""
     assert value.shape == reference.shape
     return float(np.abs(value - reference).max() / np.abs(reference).max())
+
+
+def independent_noise(sigma: Sequence[float] | Array, stride: int = 1) -> Noise:
+    """Noise of uncorrelated outputs that are measured at the same samples."""
+    return Noise(
+        covariance=np.diag(np.asarray(sigma, dtype=np.float64) ** 2),
+        strides=np.full(len(sigma), stride),
+    )

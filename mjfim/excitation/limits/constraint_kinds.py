@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.excitation.limits.magnitudes import Magnitude, VectorBarrier
+from mjfim.excitation.limits.magnitudes import Magnitude
 from mjfim.model.clearance import GeomDistances
 from mjfim.optimize.cost_models import BarrierDerivatives, Bounds
 from mjfim.optimize.lq import TangentCurve, Weights
@@ -327,7 +327,7 @@ class SubstepConstraint:
 
     def _vector_barrier(
         self, i: int, magnitude: Magnitude, observed: Array, delta: float, weight: float
-    ) -> VectorBarrier:
+    ) -> BarrierDerivatives:
         """Barrier of quantity i, a magnitude, with derivatives by its observed numbers."""
         upper, scale = float(self.bounds.upper[i]), float(self.bounds.scale[i])
         return magnitude.barrier(observed, upper, scale, delta=delta, weight=weight)

@@ -273,12 +273,12 @@ class ConstraintSet:
         if self.clearance is None:
             return ConstraintValues(trajectory=trajectory, observed=observed)
 
-        measured = self.clearance.distances(trajectory.qpos[1:], slopes)
+        distances, by_state = self.clearance.distances(trajectory.qpos[1:], slopes)
         return ConstraintValues(
             trajectory=trajectory,
             observed=observed,
-            distances=measured.d,
-            distance_slopes=measured.slope,
+            distances=distances,
+            distance_slopes=by_state,
         )
 
     def is_feasible(self, values: ConstraintValues, *, strictly: bool = False) -> bool:

@@ -16,26 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.optimize.cost_models import Bounds
+from mjfim.optimize.cost_models import BarrierDerivatives, Bounds
 
 # Norm over its bound below which the limits of the derivatives at zero hold; the error is the
 # square of it.
 NEARLY_ZERO = 1e-8
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class VectorBarrier:
-    """Value and derivatives of the barrier of the norm of vectors y: (..., c).
-
-    Attributes:
-        value: Sum of the barrier over all vectors.
-        slope: (..., c) derivative by the components.
-        curvature: (..., c, c) second derivative by the components.
-    """
-
-    value: float
-    slope: Array
-    curvature: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +59,7 @@ class Magnitude:
 
     def barrier(
         self, observed: Array, upper: float, scale: float, *, delta: float, weight: float
-    ) -> VectorBarrier:
+    ) -> BarrierDerivatives:
         """Barrier of the norm with its derivatives by the observed numbers.
 
         Args:
@@ -100,7 +85,7 @@ class Magnitude:
         outer = direction[..., :, None] * direction[..., None, :]
         identity = np.eye(len(self.columns))
         bend = (found.curvature - across)[..., None]
-        return VectorBarrier(
+        return BarrierDerivatives(
             value=found.value,
             slope=across * vectors,
             curvature=across[..., None] * identity + bend * outer,

@@ -314,7 +314,7 @@ def _clearance_usage(
         clearance: The clearance.
         positions: (n, nq) positions after each engine step.
     """
-    nearest = clearance.distances(positions, slopes=False).d.min(axis=1)
+    nearest = clearance.distances(positions, slopes=False)[0].min(axis=1)
 
     # Where geoms come within reach, the engine step at which they are nearest is known by now.
     row = int(nearest.argmin())

@@ -27,6 +27,7 @@ from mjfim.model.elements import (
 )
 from mjfim.model.terms.term import (
     NEGLIGIBLE,
+    NON_NEGATIVE,
     FieldDescription,
     JointSizes,
     Shape,
@@ -120,8 +121,6 @@ class ActuatorLag(Term):
     sources = (KRAUSE_2013,)
     words = "a lag of {}"
     size = "time_constant"
-    words = "a lag of {}"
-    size = "time_constant"
 
     actuator: str
     explicit: bool
@@ -134,7 +133,7 @@ class ActuatorLag(Term):
 
         # With `actearly` the actuator acts within the same step, so that a vanishing lag would be
         # the actuator without it. RK4 takes the activation through its stages.
-        timestep = float(model.opt.timestep)
+        timestep = model.opt.timestep
         explicit = is_rk4(model)
         least = (LEAST_LAG_RK4 if explicit else LEAST_LAG) * timestep
         lag = TermQuantity(
@@ -211,7 +210,7 @@ class BackEmf(Term):
             )
 
         time = period / LEAST_MOVE_PER_SAMPLE
-        control = float(control_sizes(model, time)[int(model.actuator_ctrladr[number])])
+        control = float(control_sizes(model, time)[model.actuator_ctrladr[number]])
         slides = force_unit(model, number) == FORCE_UNITS[LENGTH]
         length = model_length(model) if slides else 1.0
         size = control * time / (length * (abs(actuator_gear(model, number)) or 1.0))
@@ -219,7 +218,7 @@ class BackEmf(Term):
             value=0.0,
             unit="",
             size=size,
-            bounds=(0.0, np.inf),
+            bounds=NON_NEGATIVE,
             numbers=((f"actuator/{name}:biasprm[2]", 1.0),),
         )
         quantities = stated_quantities(cls.kind, table, {"constant": quantity})
@@ -242,7 +241,7 @@ class BackEmf(Term):
 
 def _require_plain(model: Any, name: str, number: int, kind: str) -> None:
     """Raise ExperimentError for an actuator with dynamics, or with a gain of another type."""
-    has_dynamics = int(model.actuator_dyntype[number]) != int(mujoco.mjtDyn.mjDYN_NONE)
+    has_dynamics = int(model.actuator_dyntype[number]) != mujoco.mjtDyn.mjDYN_NONE
     is_plain = int(model.actuator_gaintype[number]) in [int(gain) for gain in PLAIN_GAINS]
     has_bias = int(model.actuator_biastype[number]) in [int(bias) for bias in PLAIN_BIASES]
     if has_dynamics or not (is_plain and has_bias) or int(model.actuator_ctrlnum[number]) != 1:
@@ -258,6 +257,8 @@ class JointElasticity(Term):
 
     Attributes:
         damping_ratio: Damping ratio of the motor against the link where no damping is stated.
+        spring: Kind and name of the element that is the spring, as in a parameter path, with `{}`
+            for the name of the term.
         joint: Name of the joint that becomes motor and link.
         body: Name of its body.
         slides: Whether it slides.
@@ -298,6 +299,7 @@ class JointElasticity(Term):
     # MuJoCo keeps the stiffness, the inverse of the compliance.
     is_written_as_a_whole = True
     damping_ratio: ClassVar[float] = 0.1
+    spring: ClassVar[str] = "joint/{}"
 
     joint: str
     body: str
@@ -312,7 +314,7 @@ class JointElasticity(Term):
     @classmethod
     def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
         """A joint that a motor drives may be elastic."""
-        return [({}, cls.estimated)] if motors_at(model, int(model.joint(element).id)) else []
+        return [({}, cls.estimated)] if motors_at(model, model.joint(element).id) else []
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> Self:
@@ -355,10 +357,10 @@ class JointElasticity(Term):
     ) -> dict[str, TermQuantity]:
         """Fields where the table states nothing. reduced: inertia of motor against link."""
         # Largest stiffness that the timestep resolves, and the damping at damping ratio 1.
-        frequency = STIFFEST / float(model.opt.timestep)
+        frequency = STIFFEST / model.opt.timestep
         stiffness = rounded(reduced * frequency**2)
         damping = rounded(2.0 * reduced * frequency)
-        spring = cls._spring(table.name)
+        spring = cls.spring.format(table.name)
         return {
             "compliance": TermQuantity(
                 value=1.0 / stiffness,
@@ -371,21 +373,16 @@ class JointElasticity(Term):
                 value=rounded(cls.damping_ratio * damping),
                 unit=JOINT_FIELD_UNITS["damping"][at.unit],
                 size=damping,
-                bounds=(0.0, np.inf),
+                bounds=NON_NEGATIVE,
                 numbers=((f"{spring}:damping", 1.0),),
             ),
         }
-
-    @classmethod
-    def _spring(cls, name: str) -> str:
-        """Kind and name of the element that is the spring, as in a parameter path."""
-        return f"joint/{name}"
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Write the spring and the damper."""
         joint = model.joint(self.name).id
         model.jnt_stiffness[joint] = 1.0 / values["compliance"]
-        model.dof_damping[int(model.jnt_dofadr[joint])] = values["damping"]
+        model.dof_damping[model.jnt_dofadr[joint]] = values["damping"]
 
     def edit(self, spec: Any) -> None:
         """Add the deflection and, for an encoder on the link, the rotor."""
@@ -448,6 +445,7 @@ class Backlash(JointElasticity):
     size = "gap"
     estimated: ClassVar[tuple[str, ...]] = ()
     damping_ratio = 0.05
+    spring = "tendon/{}_gap"
 
     @classmethod
     def _defaults(
@@ -455,20 +453,15 @@ class Backlash(JointElasticity):
     ) -> dict[str, TermQuantity]:
         """Fields where the table states nothing."""
         require_free_name(model, "tendon", f"{table.name}_gap")
-        spring = cls._spring(table.name)
+        spring = cls.spring.format(table.name)
         gap = TermQuantity(
             value=0.0,
             unit=at.unit,
             size=LEAST_MOVE_PER_SAMPLE * float(position_sizes(model)[at.dof]),
-            bounds=(0.0, np.inf),
+            bounds=NON_NEGATIVE,
             numbers=((f"{spring}:springlength[0]", -0.5), (f"{spring}:springlength[1]", 0.5)),
         )
         return {"gap": gap, **super()._defaults(at, table, model, reduced)}
-
-    @classmethod
-    def _spring(cls, name: str) -> str:
-        """Kind and name of the tendon with the gap."""
-        return f"tendon/{name}_gap"
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Write the gap, its flanks and the damper."""

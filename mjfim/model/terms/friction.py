@@ -29,6 +29,7 @@ import scipy
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name, is_rk4, model_length
 from mjfim.model.terms.term import (
+    NON_NEGATIVE,
     FieldDescription,
     JointSizes,
     Shape,
@@ -72,7 +73,7 @@ CONSTANT_PHASE = float(np.pi / 2.0)
 # Force range of a passive device, so small that MuJoCo's implicit integrators do not take the
 # damping of the bristle for damping of the joint, which would act like an inertia [N or N m]. It
 # bounds the electrical force, which is zero.
-NO_ELECTRICAL_FORCE = float(mujoco.mjMINVAL)
+NO_ELECTRICAL_FORCE = mujoco.mjMINVAL
 
 DE_WIT_1995 = (
     "C. Canudas de Wit, H. Olsson, K. J. Åström and P. Lischinsky, A new model for control of "
@@ -129,6 +130,9 @@ GARCIA_2002 = (
     "friction arising with gears, International Journal of Robotics Research 21, 2002"
 )
 
+# Numbers of the actuator that no field sets, each by its array and place.
+Fixed = tuple[tuple[str, float], ...]
+
 
 @dataclass(frozen=True, kw_only=True)
 class _PassiveDevice(Term):
@@ -144,7 +148,7 @@ class _PassiveDevice(Term):
     places: ClassVar[Places]
 
     joint: str
-    fixed: tuple[tuple[str, float], ...]
+    fixed: Fixed
     replaces_friction: bool
 
     @classmethod
@@ -152,18 +156,19 @@ class _PassiveDevice(Term):
         """Resolve the term."""
         at = JointSizes.of(table, model, period, cls.kind)
         require_free_name(model, "actuator", table.name)
+        found, fixed = cls._defaults(at, model)
         defaults = {
             field: replace(
                 quantity,
                 numbers=tuple((f"actuator/{table.name}:{n}", 1.0) for n in cls.places[field]),
             )
-            for field, quantity in cls._defaults(at, model).items()
+            for field, quantity in found.items()
         }
         return cls(
             name=table.name,
             joint=at.joint,
             quantities=stated_quantities(cls.kind, table, defaults),
-            fixed=cls._fixed(at, model),
+            fixed=fixed,
             replaces_friction="coulomb" in defaults and float(model.dof_frictionloss[at.dof]) > 0.0,
         )
 
@@ -176,13 +181,8 @@ class _PassiveDevice(Term):
 
     @classmethod
     @abstractmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
-        """Fields where the table states nothing, without their numbers."""
-
-    @classmethod
-    @abstractmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """Further numbers of the actuator."""
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
+        """Fields where the table states nothing, without their numbers; and `fixed`."""
 
     def _numbers(self, values: Mapping[str, float]) -> dict[str, dict[int, float]]:
         """Numbers of the actuator at values of the fields, by array and place."""
@@ -208,7 +208,7 @@ class _PassiveDevice(Term):
         actuator.dyntype = mujoco.mjtDyn.mjDYN_DCMOTOR
         actuator.gaintype = mujoco.mjtGain.mjGAIN_DCMOTOR
         actuator.biastype = mujoco.mjtBias.mjBIAS_DCMOTOR
-        actuator.ctrlspec = int(mujoco.mjtCtrlInput.mjINPUT_NONE)
+        actuator.ctrlspec = mujoco.mjtCtrlInput.mjINPUT_NONE
 
         # The motor constant is zero, so that the resistance has no effect.
         numbers = {"gainprm": {0: 1.0}, **self._numbers(self.values)}
@@ -252,20 +252,16 @@ class Stribeck(_PassiveDevice):
     beside = "frictionloss"
 
     @classmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
         """Refuse RK4, whose stages would make the bristle unstable."""
         if is_rk4(model):
             raise ExperimentError(
                 "kind: with the integrator RK4, the bristle of 'stribeck' is unstable; use the "
                 "kind 'lugre', or the integrator implicitfast in the MJCF"
             )
-        return {"excess": _friction(at, 0.0), "speed": _stribeck_speed(at)}
-
-    @classmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """The stiffness of the bristle."""
-        stiffness = BRISTLE_STIFFNESS * at.inertia / float(model.opt.timestep) ** 2
-        return (("dynprm[5]", rounded(stiffness)),)
+        stiffness = BRISTLE_STIFFNESS * at.inertia / model.opt.timestep**2
+        fields = {"excess": _friction(at, 0.0), "speed": _stribeck_speed(at)}
+        return fields, (("dynprm[5]", rounded(stiffness)),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,15 +302,15 @@ class LuGre(_PassiveDevice):
     }
 
     @classmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
         """Fields where the table states nothing."""
         stiffness, damping = BRISTLE_STIFFNESS, BRISTLE_DAMPING
         if is_rk4(model):
             stiffness, damping = BRISTLE_STIFFNESS_RK4, BRISTLE_DAMPING_RK4
-        timestep = float(model.opt.timestep)
+        timestep = model.opt.timestep
         stiffness = rounded(stiffness * at.inertia / timestep**2)
         damping = rounded(damping * at.inertia / timestep)
-        return {
+        fields = {
             "coulomb": _friction(at, float(model.dof_frictionloss[at.dof])),
             "excess": _friction(at, 0.0),
             "speed": _stribeck_speed(at),
@@ -329,14 +325,10 @@ class LuGre(_PassiveDevice):
                 value=damping,
                 unit=JOINT_FIELD_UNITS["damping"][at.unit],
                 size=damping,
-                bounds=(0.0, np.inf),
+                bounds=NON_NEGATIVE,
             ),
         }
-
-    @classmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """No further numbers."""
-        return ()
+        return fields, ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,19 +357,15 @@ class AsymmetricFriction(_PassiveDevice):
     beside = "frictionloss"
 
     @classmethod
-    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
-        """Fields where the table states nothing."""
-        return {"offset": replace(_friction(at, 0.0), bounds=(-np.inf, np.inf))}
-
-    @classmethod
-    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
-        """The phase of the cogging torque."""
-        return (("biasprm[2]", CONSTANT_PHASE),)
+    def _defaults(cls, at: JointSizes, model: Any) -> tuple[dict[str, TermQuantity], Fixed]:
+        """The field, and the phase of the cogging torque."""
+        offset = replace(_friction(at, 0.0), bounds=(-np.inf, np.inf))
+        return {"offset": offset}, (("biasprm[2]", CONSTANT_PHASE),)
 
 
 def _friction(at: JointSizes, value: float) -> TermQuantity:
     """A force of dry friction as a field."""
-    return TermQuantity(value=value, unit=FORCE_UNITS[at.unit], size=at.force, bounds=(0.0, np.inf))
+    return TermQuantity(value=value, unit=FORCE_UNITS[at.unit], size=at.force, bounds=NON_NEGATIVE)
 
 
 def _stribeck_speed(at: JointSizes) -> TermQuantity:
@@ -431,11 +419,6 @@ class LoadDependentFriction(Term):
     beside = "frictionloss"
     # Its contacts would slow down all simulations of the others.
     alone = True
-    words = "friction that grows with the torque of {}"
-    size = "coefficient"
-    beside = "frictionloss"
-    # Its contacts would slow down all simulations of the others.
-    alone = True
 
     motors: tuple[str, ...]
     joint: str
@@ -480,7 +463,7 @@ class LoadDependentFriction(Term):
         direction = turn.apply(axis)
 
         # MuJoCo replaces coefficients below its minimum, so that no fit could begin there.
-        least = LEAST_TORSIONAL * float(mujoco.mjMINMU) / radius
+        least = LEAST_TORSIONAL * mujoco.mjMINMU / radius
         default = max(SMALL_COEFFICIENT, 2.0 * least)
         pairs = [f"pair/{table.name}_{side}:friction[{TORSIONAL}]" for side in SIDES]
         quantity = TermQuantity(
@@ -505,7 +488,7 @@ class LoadDependentFriction(Term):
             radius=radius,
             armature=rounded(ARMATURE_SHARE * inertia / radius**2),
             carrier=light_body(model, body, inertia),
-            contact_time=CONTACT_TIME * float(model.opt.timestep),
+            contact_time=CONTACT_TIME * model.opt.timestep,
             enables_contacts=_enables_contacts(model),
             quantities=stated_quantities(cls.kind, table, {"coefficient": quantity}),
         )
@@ -546,10 +529,10 @@ class LoadDependentFriction(Term):
 
 def _driven_hinge(model: Any, name: str, actuator: int) -> int:
     """Number of the hinge that a direct drive acts on; ExperimentError for other actuators."""
-    is_at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    is_at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
     joint = int(model.actuator_trnid[actuator, 0])
-    is_hinge = is_at_joint and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-    has_bias = int(model.actuator_biastype[actuator]) != int(mujoco.mjtBias.mjBIAS_NONE)
+    is_hinge = is_at_joint and int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_HINGE
+    has_bias = int(model.actuator_biastype[actuator]) != mujoco.mjtBias.mjBIAS_NONE
     if not is_hinge or has_bias or not element_name(model, "joint", joint):
         raise ExperimentError(
             f"actuator: {name!r} is no direct drive at a hinge with a name; the feedback of a "
@@ -560,7 +543,7 @@ def _driven_hinge(model: Any, name: str, actuator: int) -> int:
 
 def _enables_contacts(model: Any) -> bool:
     """Whether contacts are disabled; ExperimentError where geoms would then begin to collide."""
-    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT):
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         return False
     collide = np.any(model.geom_contype) and np.any(model.geom_conaffinity)
     if collide or model.npair:

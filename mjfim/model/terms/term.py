@@ -37,6 +37,9 @@ ELEMENT_KEYS = ("joint", "actuator", "body")
 # Values of some fields of a term, and the names of those that a fit estimates.
 Shape = tuple[dict[str, float], tuple[str, ...]]
 
+# Range of a number that physics keeps from being negative.
+NON_NEGATIVE = (0.0, np.inf)
+
 # Types of dynamics whose activation follows the control, so that it equals the control at rest.
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
@@ -311,7 +314,7 @@ def rounded(number: float) -> float:
 
 def joint_inertia(model: Any, joint: int) -> float:
     """Inertia that the force of a joint feels in the reference position [kg or kg m²]."""
-    weight = float(model.dof_invweight0[int(model.jnt_dofadr[joint])])
+    weight = float(model.dof_invweight0[model.jnt_dofadr[joint]])
     return 1.0 / weight if weight > 0.0 else 1.0
 
 
@@ -428,8 +431,8 @@ class StateLayout:
     @property
     def added(self) -> frozenset[int]:
         """Addresses in (qpos, qvel) of the extended model that the stated one does not have."""
-        size = int(self.model.nq) + int(self.model.nv)
-        stated = {*self.qpos.tolist(), *(int(self.model.nq) + self.qvel).tolist()}
+        size = self.model.nq + self.model.nv
+        stated = {*self.qpos.tolist(), *(self.model.nq + self.qvel).tolist()}
         return frozenset(range(size)) - stated
 
     def positions(self, stated: Any) -> Array:
@@ -466,11 +469,11 @@ class StateLayout:
     def _resting_control(self, actuator: int, qpos: Array, ctrl: Array | None) -> float:
         """Control of an actuator with one control at rest."""
         if ctrl is not None:
-            return float(ctrl[int(self.model.actuator_ctrladr[actuator])])
+            return float(ctrl[self.model.actuator_ctrladr[actuator]])
         joint = commanded_joint(self.model, actuator)
         if joint is None:
             return 0.0
-        position = float(qpos[int(self.model.jnt_qposadr[joint])])
+        position = float(qpos[self.model.jnt_qposadr[joint]])
         return position * actuator_gear(self.model, actuator)
 
 
@@ -494,7 +497,10 @@ def extended_spec(
         term.edit(extended)
 
     # Keyframes have the sizes of the state, which the terms may change.
-    keys = [_StatedKey.of(key) for key in extended.keys]
+    numbers = [
+        [np.array(each) for each in (key.qpos, key.qvel, key.act, key.ctrl)]
+        for key in extended.keys
+    ]
     for key in extended.keys:
         key.qpos, key.qvel, key.act = [], [], []
     model = compiled(extended)
@@ -505,48 +511,30 @@ def extended_spec(
         [int(joint.id) for joint in joints],
         [int(actuator.id) for actuator in actuators],
     )
-    for key, numbers in zip(extended.keys, keys, strict=True):
-        numbers.write(key, layout)
+    for key, stated_numbers in zip(extended.keys, numbers, strict=True):
+        _write_key(key, stated_numbers, layout)
     return extended, layout
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _StatedKey:
-    """Numbers of a keyframe of the stated model; those that are not stated are empty.
+def _write_key(key: Any, numbers: Sequence[Array], layout: StateLayout) -> None:
+    """Write the numbers of the extended state into a keyframe of an MjSpec.
 
-    Attributes:
-        qpos: (nq,) positions.
-        qvel: (nv,) velocities.
-        act: (na,) activations.
-        ctrl: (nu,) control.
+    Args:
+        key: The keyframe.
+        numbers: Positions, velocities, activations and control that the keyframe of the stated
+            model has; empty where it states none.
+        layout: The layout of the extended state.
     """
-
-    qpos: Array
-    qvel: Array
-    act: Array
-    ctrl: Array
-
-    @staticmethod
-    def of(key: Any) -> _StatedKey:
-        """Numbers of a keyframe of an MjSpec."""
-        return _StatedKey(
-            qpos=np.array(key.qpos),
-            qvel=np.array(key.qvel),
-            act=np.array(key.act),
-            ctrl=np.array(key.ctrl),
-        )
-
-    def write(self, key: Any, layout: StateLayout) -> None:
-        """Write the numbers of the extended state into a keyframe of an MjSpec."""
-        qpos = np.array(layout.model.qpos0)
-        if len(self.qpos):
-            qpos = layout.positions(self.qpos)
-            key.qpos = qpos
-        if len(self.qvel):
-            key.qvel = layout.velocities(self.qvel)
-        if len(self.act) or layout.model.na > len(layout.act):
-            stated = self.act if len(self.act) else np.zeros(len(layout.act))
-            key.act = layout.activations(stated, qpos, self.ctrl if len(self.ctrl) else None)
+    positions, velocities, activations, ctrl = numbers
+    qpos = np.array(layout.model.qpos0)
+    if len(positions):
+        qpos = layout.positions(positions)
+        key.qpos = qpos
+    if len(velocities):
+        key.qvel = layout.velocities(velocities)
+    if len(activations) or layout.model.na > len(layout.act):
+        stated = activations if len(activations) else np.zeros(len(layout.act))
+        key.act = layout.activations(stated, qpos, ctrl if len(ctrl) else None)
 
 
 def _range(addresses: Any, element: int, end: int) -> np.ndarray:
