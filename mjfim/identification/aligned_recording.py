@@ -172,7 +172,7 @@ class AlignedRecording:
             has_before = middle >= count or first == 0
             has_after = len(rows) - middle >= count or last == len(column)
             if has_before and has_after:
-                return np.asarray(rows[max(middle - count, 0) : middle + count])
+                return rows[max(middle - count, 0) : middle + count]
             reach *= 4
 
 
@@ -383,7 +383,7 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     first = np.clip(first, 0, len(ctrl) - 1)
     last = np.clip(last, 0, len(ctrl) - 1)
     constant = first == last
-    return np.asarray(np.where(constant[:, None], ctrl[first], mean))
+    return np.where(constant[:, None], ctrl[first], mean)
 
 
 def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array:

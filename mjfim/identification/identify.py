@@ -22,7 +22,6 @@ from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
-from mjfim.identification.horizons import choose_length
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import (
     FitSearch,
@@ -33,7 +32,7 @@ from mjfim.identification.search import (
     quick_subset,
     with_length,
 )
-from mjfim.identification.starts import SPREAD_STARTS, begin_fit, start_from_segments
+from mjfim.identification.starts import SPREAD_STARTS, begin_fit, choose_length, start_from_segments
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,

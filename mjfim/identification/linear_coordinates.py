@@ -119,7 +119,7 @@ class UnknownBody:
         line of log-Cholesky coordinates.
         """
         if not self.is_logcholesky or not step.any():
-            return np.asarray(values + step)
+            return values + step
         return self.values(self.linear(values) + step @ self.linear_slopes(values))
 
     def is_physical(self, linear: Array) -> bool:
@@ -361,4 +361,4 @@ class CadPrior:
     def information(self, theta: Array) -> Array:
         """(p, p) information of the priors about the parameters at theta: (p,)."""
         J = self.rows(theta)[:, :-1]
-        return np.asarray(J.T @ J)
+        return J.T @ J

@@ -50,26 +50,14 @@ class SegmentRows:
         segment: Index of the segment.
         rows: (k,) rows of its recording.
         y: (k, ny) predicted outputs [y-unit].
-        common: (k, ny, p) derivatives by theta [y-unit / theta-unit], or None if not requested.
-        private: (k, ny, n) derivatives by the private unknowns, or None if not requested.
+        jacobians: (k, ny, p) derivatives by theta [y-unit / theta-unit], and (k, ny, n) derivatives
+            by the private unknowns; none if not requested.
     """
 
     segment: int
     rows: np.ndarray
     y: Array
-    common: Array | None
-    private: Array | None
-
-    @property
-    def jacobians(self) -> tuple[Array, Array]:
-        """Derivatives by theta and by the private unknowns.
-
-        Raises:
-            ValueError: These rows were simulated without derivatives.
-        """
-        if self.common is None or self.private is None:
-            raise ValueError("these rows were simulated without derivatives")
-        return self.common, self.private
+    jacobians: tuple[Array, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -408,18 +396,13 @@ class SegmentSimulation:
         if not inside.any():
             return None
 
-        y, common, private = self._at_times(response, place, recording, times[inside])
-        return SegmentRows(
-            segment=index,
-            rows=np.flatnonzero(inside) + segment.rows.start,
-            y=y,
-            common=common,
-            private=private,
-        )
+        y, *jacobians = self._at_times(response, place, recording, times[inside])
+        rows = np.flatnonzero(inside) + segment.rows.start
+        return SegmentRows(segment=index, rows=rows, y=y, jacobians=tuple(jacobians))
 
     def _at_times(
         self, response: Response, place: int, recording: AlignedRecording, times: Array
-    ) -> tuple[Array, Array | None, Array | None]:
+    ) -> list[Array]:
         """(k, ny) outputs of a segment at some times, and their derivatives if there are any.
 
         Args:
@@ -428,28 +411,26 @@ class SegmentSimulation:
             recording: Recording of the segment.
             times: (k,) times of the rows [samples since the begin of the segment].
         """
-        y = response.y[place]
-        common = None if response.common is None else response.common[place]
-        private = None if response.private is None else response.private[place]
-
+        found = [
+            each[place]
+            for each in (response.y, response.common, response.private)
+            if each is not None
+        ]
         delay_derivative = self.system.parameters.delay_derivative
         is_delayed = bool(delay_derivative.any())
 
         # Rows on the grid are samples of the simulation.
         if recording.on_grid and not is_delayed:
             sample = np.rint(times).astype(int) - response.first
-            common = None if common is None else common[sample]
-            private = None if private is None else private[sample]
-            return y[sample], common, private
+            return [each[sample] for each in found]
 
         # Other rows are interpolated between the samples; the derivative by the delay is added.
-        interpolation = OutputDelay.at(times - response.first, len(y), recording.dt)
-        private = None if private is None else interpolation.apply(private)
-        if common is not None:
-            common = interpolation.apply(common)
-            if is_delayed:
-                common = common + interpolation.derivative(y)[..., None] * delay_derivative
-        return interpolation.apply(y), common, private
+        interpolation = OutputDelay.at(times - response.first, len(found[0]), recording.dt)
+        at_times = [interpolation.apply(each) for each in found]
+        if is_delayed and len(found) > 1:
+            change = interpolation.derivative(found[0])
+            at_times[1] = at_times[1] + change[..., None] * delay_derivative
+        return at_times
 
     # ---- blocks of rows; every segment is divided evenly into its blocks
 

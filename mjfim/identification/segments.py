@@ -55,7 +55,7 @@ class Bristle:
             model: The compiled model (`mujoco.MjModel`).
             qvel: (n, nv) velocities [m/s or rad/s].
         """
-        return np.asarray(actuator_gear(model, self.actuator) * qvel[:, self.dof])
+        return actuator_gear(model, self.actuator) * qvel[:, self.dof]
 
     def friction(self, model: Any) -> tuple[float, ...]:
         """Stiffness, Coulomb friction, static friction and Stribeck speed in a model."""
@@ -527,7 +527,7 @@ def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: flo
     row_after = int(np.searchsorted(recording.t, t0))
     candidates = recording.measured_rows_near(columns[0], row_after, 1)
     nearest = min(candidates, key=lambda row: abs(recording.t[row] - t0))
-    return np.asarray(recording.y[nearest, list(columns)])
+    return recording.y[nearest, list(columns)]
 
 
 def _nominal_states(

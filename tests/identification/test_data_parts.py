@@ -13,7 +13,6 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.assessment import term_tests
 from mjfim.identification.assessment.term_tests import (
-    DataPart,
     TermTests,
     find_missing_terms,
     part_of_data,
@@ -139,10 +138,8 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
     assert solution is not None
     at = solution.unknowns
 
-    first = DataPart(problem=problem, segments=np.zeros(1, dtype=int), share=0.25)
-    assert not find_missing_terms(
-        problem.of_segments(first.segments), logs, first.unknowns(at)
-    ).terms
+    first = np.zeros(1, dtype=int)
+    assert not find_missing_terms(problem.of_segments(first), logs, of_subset(at, first)).terms
 
     monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
     found = find_missing_terms(problem, logs, at)

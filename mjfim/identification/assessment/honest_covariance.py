@@ -250,7 +250,7 @@ def agreeing_covariance(covariance: Array, std: Array) -> Array:
 
     # Parameters about which the covariance says nothing are uncorrelated.
     alone = np.where(is_wanted & ~is_moving, std, 0.0)
-    return np.asarray(root @ root.T + np.diag(alone**2))
+    return root @ root.T + np.diag(alone**2)
 
 
 def _stretch(root: Array, j: int, factor: float) -> None:

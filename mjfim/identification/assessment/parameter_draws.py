@@ -254,7 +254,7 @@ def draw_parameters_system(
         root = covariance_root(covariance)
         _, _, axes = np.linalg.svd(combinations @ root)
         kept = root @ axes[len(combinations) :].T
-        covariance = np.asarray(kept @ kept.T)
+        covariance = kept @ kept.T
     values, replaced = _physical_draws(
         system, estimate, drawn, centre, covariance, count=count, rng=rng
     )

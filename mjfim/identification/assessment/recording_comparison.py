@@ -108,7 +108,7 @@ def random_effects(values: Array, variances: Array, freedom: float) -> RandomEff
         mean=mean,
         variance=variance,
         tau2=tau2,
-        share=np.asarray(np.where(count > 1, share, 0.0)),
+        share=(np.where(count > 1, share, 0.0)),
         p=p,
         prediction=np.column_stack([mean - reach, mean + reach]),
     )
@@ -223,7 +223,7 @@ def satterthwaite(share: Array, within: float, between: int | np.ndarray) -> Arr
         between: Degrees of freedom of the part between recordings, one number or (s,).
     """
     share = np.clip(share, 0.0, 1.0)
-    return np.asarray(1.0 / ((1.0 - share) ** 2 / within + share**2 / np.maximum(between, 1)))
+    return 1.0 / ((1.0 - share) ** 2 / within + share**2 / np.maximum(between, 1))
 
 
 def t_quantile(freedom: np.ndarray) -> Array:
@@ -282,7 +282,7 @@ class RecordingViews:
             tau2: (s,) variances of theta between recordings.
         """
         inverse = np.linalg.pinv(self.directions)
-        return np.asarray(inverse * tau2 @ inverse.T)
+        return inverse * tau2 @ inverse.T
 
     def mean(self, chosen: Sequence[int], tau2: Array) -> tuple[Array, Array]:
         """(s,) mean of theta over recordings that scatter, and (s,) its standard deviations.

@@ -336,7 +336,7 @@ def _in_unknowns(covariance: Array, root: Array) -> Array:
             not be small in combinations that are known well.
         root: (c, k) the root.
     """
-    return np.asarray(root @ (0.5 * (covariance + covariance.T)) @ root.T)
+    return root @ (0.5 * (covariance + covariance.T)) @ root.T
 
 
 def covering_covariance(first: Array, second: Array) -> Array:

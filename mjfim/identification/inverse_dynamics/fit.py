@@ -121,7 +121,7 @@ class FoundEquations:
 
     def residual(self, x: Array) -> Array:
         """(R,) residuals that the linearisation predicts for linear coordinates: (p,)."""
-        return np.asarray(_residual(self.rows) + self.slopes @ (x - self.x))
+        return _residual(self.rows) + self.slopes @ (x - self.x)
 
 
 def _residual(rows: Array) -> Array:
