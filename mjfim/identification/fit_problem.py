@@ -29,9 +29,8 @@ from mjfim.identification.segments import (
     recorded_release,
     stated_segments,
 )
-from mjfim.identification.unknowns import UnknownLayout
-from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
-from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
+from mjfim.information.null_space import COARSER_STEP_FACTOR
+from mjfim.optimize.condensed_least_squares import Condensed, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel.budget import Budget
@@ -132,25 +131,25 @@ class FitProblem(SegmentSimulation):
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = has_free_starts(system)
+        is_held = np.isin(parameters.names, list(settings.hold))
         segments, directions = stated_segments(system, aligned)
 
         masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
         if not any(mask.any() for mask in masks):
             raise RecordingError("the recordings contain no measured value after t = 0")
 
-        layout = UnknownLayout.of(
-            parameters,
-            len(aligned),
-            free_starts=free_starts,
-            data_only=data_only,
-            held=settings.hold,
-        )
         return cls(
             system=system,
             recordings=aligned,
             segments=segments,
-            layout=layout,
             start_directions=directions,
+            parameters=parameters,
+            shared=np.flatnonzero(~parameters.recording_specific & ~is_held),
+            free_starts=free_starts,
+            bounded=not data_only,
+            with_priors=not data_only,
+            pins=np.zeros((0, len(parameters))),
+            pinned_at=parameters.guess,
             masks=masks,
             noise=system.noise,
             loss=RobustLoss(kind=settings.loss, scale=settings.loss_scale),
@@ -165,14 +164,6 @@ class FitProblem(SegmentSimulation):
             workers: The workers.
         """
         return replace(self, workers=workers)
-
-    def unbounded(self) -> FitProblem:
-        """This problem without bounds."""
-        return replace(self, layout=self.layout.unbounded())
-
-    def with_shared_held(self) -> FitProblem:
-        """This problem with all shared parameters held."""
-        return replace(self, layout=self.layout.without_shared())
 
     def with_noise(self, noise: Noise) -> FitProblem:
         """This problem with other noise.
@@ -236,20 +227,22 @@ class FitProblem(SegmentSimulation):
         Returns:
             The problem without pins; None where the segments would be too short.
         """
-        parameters = self.system.parameters
-        moving = parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
-        held = [*self.system.experiment.fit.hold, *np.array(parameters.names)[moving].tolist()]
+        parameters = self.parameters
+        is_held = parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
+        is_held |= np.isin(parameters.names, list(self.system.experiment.fit.hold))
         try:
             segments, directions = free_segments(self.system, self.recordings, length)
         except RecordingError:
             return None
-        count = len(self.recordings)
         return replace(
             self,
             segments=segments,
-            layout=UnknownLayout.of(parameters, count, free_starts=True, held=held),
+            shared=np.flatnonzero(~parameters.recording_specific & ~is_held),
+            free_starts=True,
+            bounded=True,
             start_directions=directions,
             masks=tuple(np.array(recording.measured) for recording in self.recordings),
+            pins=self.pins[:0],
         )
 
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
@@ -264,18 +257,6 @@ class FitProblem(SegmentSimulation):
         both = tuple(mask & counted for mask, counted in zip(masks, self.masks, strict=True))
         return replace(self, masks=both)
 
-    def pinned(self, theta: Array, null_space: NullSpace) -> FitProblem:
-        """This problem with the combinations of parameters held that no recording determines.
-
-        Args:
-            theta: (p,) parameters at which the combinations are held.
-            null_space: Directions of theta about which there is no information.
-
-        Returns:
-            The problem.
-        """
-        return replace(self, layout=self.layout.pinned(theta, null_space))
-
     # ---- sizes
 
     @property
@@ -286,7 +267,7 @@ class FitProblem(SegmentSimulation):
     @property
     def unknown_count(self) -> int:
         """Number of all unknowns."""
-        return self.layout.column_count + len(self.segments) * self.private_count
+        return self.column_count + len(self.segments) * self.private_count
 
     @property
     def segments_with_values(self) -> np.ndarray:
@@ -298,73 +279,10 @@ class FitProblem(SegmentSimulation):
 
         return np.array(indices, dtype=np.intp)
 
-    def private_prior_rows(self, at: UnknownValues) -> Array:
-        """(P, k, m) rows `[J_private, J_common, r]` on the private unknowns of every segment."""
-        sizes = np.abs(self.start_directions).T @ self.system.plant.sizes.state
-        return self.layout.private_rows(at, sizes)
-
     @property
     def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:
         """Rows of priors and pins along a step, where inertias of whole bodies are unknown."""
-        return self.layout.common_rows_after if self.layout.shared_bodies else None
-
-    # ---- unknowns
-
-    @property
-    def lower(self) -> Array:
-        """(c,) lower bounds of the common unknowns."""
-        return self.layout.lower
-
-    @property
-    def upper(self) -> Array:
-        """(c,) upper bounds of the common unknowns."""
-        return self.layout.upper
-
-    def begin(self, theta: Array) -> UnknownValues:
-        """Unknowns at given parameters, with every initial state as stated or measured.
-
-        Args:
-            theta: (p,) parameters.
-
-        Returns:
-            The unknowns.
-        """
-        return self.layout.begin(theta, len(self.segments), self.private_count)
-
-    def common_values(self, at: UnknownValues) -> Array:
-        """Values of the common unknowns.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (c,) values.
-        """
-        return self.layout.common_values(at)
-
-    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step, clipped to the bounds.
-
-        Args:
-            at: The unknowns.
-            step: Step of all unknowns.
-            fraction: Fraction of the step.
-
-        Returns:
-            The moved unknowns.
-        """
-        return self.layout.moved(at, step, fraction)
-
-    def theta(self, at: UnknownValues) -> Array:
-        """Parameters, with the values of the first recording.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (p,) parameters [theta-unit].
-        """
-        return self.layout.theta(at)
+        return self.common_rows_after if self.shared_bodies else None
 
     # ---- residuals
 
@@ -434,8 +352,8 @@ class FitProblem(SegmentSimulation):
                 total += loss
 
         # Priors and pins.
-        common = self.layout.common_rows(at)[:, -1]
-        private = self.private_prior_rows(at)[:, :, -1]
+        common = self.common_rows(at)[:, -1]
+        private = self.private_rows(at)[:, :, -1]
         return 0.5 * total + 0.5 * (float(common @ common) + float(np.sum(private**2)))
 
     def condense(self, at: UnknownValues) -> Condensed | None:
@@ -447,7 +365,7 @@ class FitProblem(SegmentSimulation):
         Returns:
             The linearisation; None where a perturbed simulation diverges.
         """
-        m = self.private_count + self.layout.column_count + 1
+        m = self.private_count + self.column_count + 1
         blocks = np.zeros((self.block_count, m, m))
 
         batches = self.batches(derivatives=True)
@@ -460,8 +378,8 @@ class FitProblem(SegmentSimulation):
         return Condensed(
             blocks=blocks,
             segment_of_block=self.segment_of_block,
-            private_rows=self.private_prior_rows(at),
-            common_rows=self.layout.common_rows(at),
+            private_rows=self.private_rows(at),
+            common_rows=self.common_rows(at),
         )
 
     def outputs_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[SegmentRows] | None:
@@ -500,7 +418,7 @@ class FitProblem(SegmentSimulation):
         Returns:
             (m, m) triangle of each block by its index; None where a perturbed simulation diverges.
         """
-        m = self.private_count + self.layout.column_count + 1
+        m = self.private_count + self.column_count + 1
         empty = np.zeros((m, m))
         blocks: dict[int, Array] = {}
         for rows in self.rows_of_batch(at, batch):
@@ -541,7 +459,7 @@ class FitProblem(SegmentSimulation):
         """
         mask = self.mask_of(rows)
         common, private = rows.jacobians
-        columns = self.layout.to_columns(common, self.segments[rows.segment].recording)
+        columns = self.to_columns(common, self.segments[rows.segment].recording)
         J = self.noise.whiten_present(np.concatenate([private, columns], axis=2), mask)
         return np.nonzero(mask)[0], self.residual(rows), J
 
@@ -671,7 +589,7 @@ def sensitivity_rows(
                 f"{' or '.join(names)}: the simulation diverges under the recorded control"
             )
         condensed.update(of_batch)
-    n = problem.private_count if problem.layout.free_starts else 0
+    n = problem.private_count if problem.free_starts else 0
 
     found = []
     for segment in sorted(condensed):
@@ -704,7 +622,7 @@ def _of_batch(
     def sensitivity(rows: SegmentRows) -> Array:
         """(k, n+p) derivatives by the initial state where that is free, then by theta."""
         common, private = rows.jacobians
-        both = [private, common] if problem.layout.free_starts else [common]
+        both = [private, common] if problem.free_starts else [common]
         G = np.concatenate(both, axis=2)
         return problem.noise.whiten_present(G, problem.mask_of(rows))
 

@@ -372,16 +372,16 @@ def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> U
         begin: Its unknowns at the parameters where the search begins.
         near: The similar fit to the same recordings.
     """
-    found, layout = near.solution.unknowns, near.problem.layout
+    found = near.solution.unknowns
 
     if have_same_initial_states(problem, near.problem):
         begin = replace(begin, private=found.private)
 
     # A parameter with a value for each recording keeps these values.
     names, known = problem.system.parameters.names, near.problem.system.parameters.names
-    columns = {known[j]: column for column, j in enumerate(layout.per_recording.tolist())}
+    columns = {known[j]: column for column, j in enumerate(near.problem.per_recording.tolist())}
     per_recording = np.array(begin.per_recording)
-    for place, j in enumerate(problem.layout.per_recording.tolist()):
+    for place, j in enumerate(problem.per_recording.tolist()):
         if names[j] in columns:
             per_recording[:, place] = found.per_recording[:, columns[names[j]]]
     return replace(begin, per_recording=per_recording)

@@ -170,13 +170,13 @@ def with_initial_states(
     """
     problem = problem.of_segments(problem.masked(masks).segments_with_values)
     at = problem.begin(theta)
-    if problem.unknown_count <= len(problem.layout.shared):
+    if problem.unknown_count <= len(problem.shared):
         return problem, at
 
     # Deviations of the initial state that were fitted belong to other recordings.
     private = np.zeros_like(at.private)
-    if not problem.layout.free_starts:
-        guess = problem.system.parameters.guess[problem.layout.private]
+    if not problem.free_starts:
+        guess = problem.system.parameters.guess[problem.private]
         private = np.tile(guess, (len(problem.segments), 1))
 
     known = problem.masked(_masks_for_initial_states(problem, masks))

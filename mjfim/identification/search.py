@@ -488,7 +488,7 @@ class FitSearch:
         iterations: int = INITIAL_STATES.max_iterations,
     ) -> UnknownValues:
         """Unknowns with measured initial states improved for the given theta."""
-        if not problem.layout.free_starts or self.interrupted:
+        if not problem.free_starts or self.interrupted:
             return begin
         settings = replace(INITIAL_STATES, max_iterations=iterations)
         found = self.minimise(problem.with_shared_held(), begin, settings, "initial states")

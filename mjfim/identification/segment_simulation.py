@@ -10,10 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.segments import Segment, batches
-from mjfim.identification.unknowns import UnknownLayout
+from mjfim.identification.unknowns import FitUnknowns
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.delay import OutputDelay
@@ -82,25 +81,14 @@ class SegmentBatch:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SegmentSimulation:
+class SegmentSimulation(FitUnknowns):
     """Predicted outputs of all segments as functions of the unknowns.
 
     Attributes:
-        system: The system, with difference steps calibrated along a recording.
-        recordings: The K recordings on the sample grid.
-        segments: The P segments.
-        layout: Which parameters are common, and which are private.
-        start_directions: (nx, n) directions of the initial state along which the private unknowns
-            move it.
         difference_step: Relative step of the two-sided differences of a linearisation.
         central: True for two-sided differences; None for two-sided ones unless there is much data.
     """
 
-    system: System
-    recordings: tuple[AlignedRecording, ...]
-    segments: tuple[Segment, ...]
-    layout: UnknownLayout
-    start_directions: Array
     difference_step: float = SENSITIVITY_STEP
     central: bool | None = None
 
@@ -108,11 +96,6 @@ class SegmentSimulation:
     def sample_count(self) -> int:
         """Number of samples of all segments together."""
         return sum(segment.samples for segment in self.segments)
-
-    @property
-    def private_count(self) -> int:
-        """Number of private unknowns of a segment n."""
-        return int(self.start_directions.shape[1])
 
     def segments_of(self, recording: int) -> list[int]:
         """Segments of one recording.
@@ -195,7 +178,7 @@ class SegmentSimulation:
     def _simulated(self, at: UnknownValues, index: int, samples: int) -> Rollouts:
         """One segment over some samples."""
         plant, segment = self.system.plant, self.segments[index]
-        theta = self.layout.theta_of_recording(at, segment.recording)
+        theta = self.theta_of_recording(at, segment.recording)
         start = self._initial_state(at, index)[None]
         if plant.laws is None:
             return plant.simulator.rollout(
@@ -233,7 +216,7 @@ class SegmentSimulation:
             The batches.
         """
         if wanted is None:
-            wanted = self.layout.estimated
+            wanted = self.estimated
 
         # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
@@ -280,7 +263,7 @@ class SegmentSimulation:
             Predictions of some rows of one segment. Where a simulation diverges, None is the last
             item.
         """
-        theta = self.layout.theta_of_recording(at, batch.recording)
+        theta = self.theta_of_recording(at, batch.recording)
         longest = max(self.segments[i].samples for i in batch.segments)
         lead = self.system.plant.lead(theta)
         begins = np.array([self.segments[i].begin for i in batch.segments])
@@ -325,7 +308,7 @@ class SegmentSimulation:
             Index of a recording whose parameters the segments have, and indices of the segments.
         """
         # Without parameters of single recordings, a batch may contain segments of all recordings.
-        if not len(self.layout.per_recording):
+        if not len(self.per_recording):
             for batch in batches(self.segments, max_samples):
                 yield 0, batch
             return
@@ -341,11 +324,11 @@ class SegmentSimulation:
         space = self.system.space
         parameters = self.system.parameters
         start = self.segments[index].start
-        if self.layout.free_starts:
+        if self.free_starts:
             return space.plus(start, self.start_directions @ at.private[index])
 
         theta = np.array(at.theta)
-        theta[self.layout.private] = at.private[index]
+        theta[self.private] = at.private[index]
         return space.plus(start, parameters.initial_state_derivative(space.nx) @ theta)
 
     def _control(self, index: int, samples: int, lead: int) -> Array:

@@ -367,7 +367,7 @@ def _iterations(problem: FitProblem, part: FitProblem, count: int) -> int:
     """Largest number of iterations of one of several fits over segments."""
     # Both are linearised by two simulations for each direction and one without a change.
     whole, parts = (
-        1 + 2 * (int(each.layout.estimated.sum()) + each.private_count) for each in (problem, part)
+        1 + 2 * (int(each.estimated.sum()) + each.private_count) for each in (problem, part)
     )
     allowed = int(ITERATIONS_OF_ALL_SEGMENTS / count * whole / parts)
     return min(max(allowed, FEWEST_SEGMENT_ITERATIONS), SEGMENT_SEARCH.max_iterations)

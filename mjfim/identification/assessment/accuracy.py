@@ -177,10 +177,10 @@ def accuracy_of(
     Returns:
         The accuracy.
     """
-    system, layout = problem.system, problem.layout
+    system = problem.system
     parameters, theta = system.parameters, problem.theta(solution.unknowns)
-    columns = layout.first_columns
-    index = layout.parameter_of_column[columns]
+    columns = problem.first_columns
+    index = problem.parameter_of_column[columns]
 
     # The formal covariance; unknowns of each recording have the values of the first one.
     H = solution.condensed.information()
@@ -193,8 +193,8 @@ def accuracy_of(
     formal = _of_parameters(problem, solution, common)
     std = np.zeros(len(formal))
     std[index] = common_std[columns]
-    if not layout.free_starts:
-        std[layout.private] = np.sqrt(np.diag(formal)[layout.private])
+    if not problem.free_starts:
+        std[problem.private] = np.sqrt(np.diag(formal)[problem.private])
 
     # Members of a group are not identifiable separately, though pins make their information
     # regular.
@@ -220,7 +220,7 @@ def accuracy_of(
             min_rows=independent_rows(problem, correlation_rows),
             draws=settings.bootstrap,
             rng=np.random.default_rng(settings.seed),
-            own=layout.own_columns,
+            own=problem.own_columns,
             inflation=inflation,
         )
         covariance = _of_parameters(
@@ -244,11 +244,11 @@ def accuracy_of(
 
     # Information of the recordings alone about the parameters that they share. Only the priors on
     # the other unknowns, which are marginalised, count.
-    J = layout.prior_rows(solution.unknowns)[:, :-1]
+    J = problem.prior_rows(solution.unknowns)[:, :-1]
     of_data = solution.condensed.information(with_common_rows=False)
     data = np.zeros_like(formal)
-    shared = np.arange(len(layout.shared))
-    data[np.ix_(layout.shared, layout.shared)] = marginal(of_data, J.T @ J, shared)
+    shared = np.arange(len(problem.shared))
+    data[np.ix_(problem.shared, problem.shared)] = marginal(of_data, J.T @ J, shared)
     return Accuracy(
         std=std,
         covariance=formal,
@@ -272,15 +272,14 @@ def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Ar
     Unknowns of each recording have the values of the first recording. Deviations of the first
     initial state, which are private unknowns, follow the common ones.
     """
-    layout = problem.layout
     p = len(problem.system.parameters)
-    columns = layout.first_columns
-    index = layout.parameter_of_column[columns]
+    columns = problem.first_columns
+    index = problem.parameter_of_column[columns]
     covariance = np.zeros((p, p))
     covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
 
-    private = layout.private
-    if not len(private) or layout.free_starts:
+    private = problem.private
+    if not len(private) or problem.free_starts:
         return covariance
 
     # The private unknowns follow the common ones linearly; both are infinite where an unknown is

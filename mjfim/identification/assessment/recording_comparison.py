@@ -502,32 +502,31 @@ def compare_recordings(
         The comparison; None for a single recording, and where the recordings have no parameter of
         the robot in common.
     """
-    layout = problem.layout
     parameters = problem.system.parameters
     recordings = tuple(PurePath(recording.name).name for recording in problem.recordings)
-    if len(recordings) < 2 or not len(layout.shared):
+    if len(recordings) < 2 or not len(problem.shared):
         return None
 
     condensed = solution.condensed
     recording_of_block = problem.recording_of_block
     min_rows = independent_rows(problem, correlation_rows)
     blocks = independent_blocks(condensed, recording_of_block, problem.mean_block_rows, min_rows)
-    evidence = recording_evidence(condensed, blocks, recording_of_block, layout.own_columns)
+    evidence = recording_evidence(condensed, blocks, recording_of_block, problem.own_columns)
     # Parameters of the robot that are stated to differ have their values already.
-    stated = [i for i, j in enumerate(layout.per_recording) if parameters.changes_model[j]]
+    stated = [i for i, j in enumerate(problem.per_recording) if parameters.changes_model[j]]
     std = standard_deviations(condensed.information())
     if robust is not None:
         std = np.maximum(std, robust.sandwich)
-    index = [*layout.shared.tolist(), *layout.per_recording[stated].tolist()]
+    index = [*problem.shared.tolist(), *problem.per_recording[stated].tolist()]
     theta = solution.unknowns.theta
     found = compare_evidence(
-        theta[layout.shared],
+        theta[problem.shared],
         evidence,
         recordings=recordings,
         parameters=tuple(parameters.names[j] for j in index),
         units=tuple(problem.system.units[j] for j in index),
-        is_single=(parameters.sizes(theta) == np.abs(theta))[layout.shared],
-        stated=(solution.unknowns.per_recording[:, stated], std[layout.own_columns[:, stated]]),
+        is_single=(parameters.sizes(theta) == np.abs(theta))[problem.shared],
+        stated=(solution.unknowns.per_recording[:, stated], std[problem.own_columns[:, stated]]),
     )
 
     # Intervals end at the bounds of the parameters.

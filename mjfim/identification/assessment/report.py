@@ -200,7 +200,7 @@ def estimate_from(
     )
     undetermined = accuracy.singular or accuracy.single_unidentifiable
     per_recording = zip(
-        problem.layout.per_recording, solution.unknowns.per_recording.T.tolist(), strict=True
+        problem.per_recording, solution.unknowns.per_recording.T.tolist(), strict=True
     )
     quick, at = result.quick
     interval = accuracy.interval
@@ -303,7 +303,7 @@ def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:
     if problem.row_count > MAX_NOMINAL_ROWS:
         return ()
     guess = problem.begin(result.task.start)
-    if problem.layout.free_starts:
+    if problem.free_starts:
         guess = replace(guess, private=at.private)
     return tuple(problem.predict(guess) or ())
 
@@ -459,7 +459,7 @@ def _warnings_of_recordings(
         return
 
     names = result.task.system.parameters.names
-    index = result.problem.layout.parameter_of_column
+    index = result.problem.parameter_of_column
     apart = [names[index[column]] for column in robust.apart]
     yield (
         f"recordings disagree on {listed(apart)} by more than the scatter within each recording: "
