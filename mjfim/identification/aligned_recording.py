@@ -6,7 +6,7 @@ because that would colour their noise. Predictions are interpolated instead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -308,20 +308,23 @@ def _outputs(system: System, recording: Recording) -> Array:
     Raises RecordingError where the recording has none of them.
     """
     names = system.outputs.names
-    recorded = [name for name in names if name in recording.outputs]
-    if not recorded:
+    if not set(names) & set(recording.outputs):
         raise RecordingError(
             f"{recording.name}: no measured column; "
             f"{unknown('column', listed(recording.outputs), names)}"
         )
 
     # An array in the order of the outputs is shared.
-    if recording.outputs == tuple(names):
-        return recording.y
+    return recording.y if recording.outputs == tuple(names) else _in_order(system, recording)
 
+
+def _in_order(system: System, recording: Recording) -> Array:
+    """(M, ny) measured values in the order of the outputs, NaN for those without a column."""
+    names = system.outputs.names
     y = np.full((len(recording.t), len(names)), np.nan)
-    for name in recorded:
-        y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
+    for name in recording.outputs:
+        if name in names:
+            y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
     return y
 
 
@@ -458,14 +461,11 @@ def measured_trajectory(
     recording = recording.first_rows(max(rows, 2))
 
     # Joints that physical terms have added show a robot that is not deflected.
+    y = _in_order(system, recording)
     qpos = np.tile(model.qpos0, (len(recording.t), 1))
     layout = system.source.layout
     for q in range(model.nq) if layout is None else layout.qpos.tolist():
-        name = system.outputs.names[measured[q]] if q in measured else ""
-        if name not in recording.outputs:
-            return None
-
-        column = recording.y[:, recording.outputs.index(name)]
+        column = y[:, measured[q]] if q in measured else np.full(len(y), np.nan)
         finite = np.isfinite(column)
         if not finite.any():
             return None
@@ -476,31 +476,16 @@ def measured_trajectory(
         norms = np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True)
         qpos[:, q : q + 4] /= np.maximum(norms, SMALLEST_NORM)
 
-    n = len(qpos)
+    known = [dof for dof in range(model.nv) if model.nq + dof in measured]
+    qvel = np.full((len(y), model.nv), np.nan)
+    qvel[:, known] = y[:, [measured[model.nq + dof] for dof in known]]
     ctrl = recording.ctrl
     if system.laws is not None:
-        ctrl = np.full((n - 1, model.nu), np.nan)
+        ctrl = np.full((len(y) - 1, model.nu), np.nan)
     return Trajectory(
         t=recording.t,
         qpos=qpos,
-        qvel=_measured_velocities(system, recording, measured),
-        act=np.zeros((n, model.na)),
+        qvel=qvel,
+        act=np.zeros((len(y), model.na)),
         ctrl=ctrl,
     )
-
-
-def _measured_velocities(
-    system: System, recording: Recording, measured: Mapping[int, int]
-) -> Array:
-    """(M, nv) measured velocities [m/s or rad/s]; NaN where there is none.
-
-    The index of the output that measures a component of the state is `measured[address]`.
-    """
-    model = system.model
-    qvel = np.full((len(recording.t), model.nv), np.nan)
-    for dof in range(model.nv):
-        output = measured.get(model.nq + dof)
-        name = "" if output is None else system.outputs.names[output]
-        if name in recording.outputs:
-            qvel[:, dof] = recording.y[:, recording.outputs.index(name)]
-    return qvel

@@ -78,10 +78,7 @@ class UnknownBody:
 
     def derivative(self, linear: Array) -> Array:
         """(10, 10) derivatives of the parameters by the barycentric coordinates."""
-        if not self.is_logcholesky:
-            return np.eye(COUNT)
-        by_parameters = barycentric_of(logcholesky_derivatives(self.values(linear))).T
-        return np.asarray(np.linalg.inv(by_parameters))
+        return np.asarray(np.linalg.inv(self.linear_slopes(self.values(linear)).T))
 
     def physical_share(self, values: Array, step: Array) -> float:
         """Largest share, at most 1, of a step (10,) of the parameters that `moved` may take.
@@ -118,8 +115,8 @@ class UnknownBody:
         Forces are linear along it, so that Gauss-Newton steps err far less than along a straight
         line of log-Cholesky coordinates.
         """
-        if not self.is_logcholesky or not step.any():
-            return values + step
+        if not step.any():
+            return values
         return self.values(self.linear(values) + step @ self.linear_slopes(values))
 
     def is_physical(self, linear: Array) -> bool:

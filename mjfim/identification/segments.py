@@ -470,7 +470,7 @@ def measured_initial_states(
     space = system.space
     known = KnownActivations.of(system)
     states = _nominal_states(system, recording, begins, known)
-    output_of = _measured_states(system, recording)
+    output_of = measured_states(system, recording)
 
     quaternion_components = {a for q, _ in space.quaternions for a in range(q, q + 4)}
     velocity_addresses = (space.nq + space.scalar_v).tolist()
@@ -543,7 +543,7 @@ def _nominal_states(
     # No simulation is needed where the whole state is measured, or where all segments begin at the
     # first sample.
     first = system.space.nq + system.space.nv
-    measured = {*_measured_states(system, recording), *(first + a for a in known.addresses)}
+    measured = {*measured_states(system, recording), *(first + a for a in known.addresses)}
     if measured.issuperset(range(len(start))) or not begins.any():
         return states
 
@@ -553,10 +553,14 @@ def _nominal_states(
     return np.array(simulated.states[0][begins]) if simulated.finite[0] else states
 
 
-def _measured_states(system: System, recording: AlignedRecording) -> dict[int, int]:
+def measured_states(system: System, recording: AlignedRecording) -> dict[int, int]:
     """Output that measures each component of the state, by the address of the component.
 
     Outputs without any value in the recording are left out.
+
+    Args:
+        system: System that was recorded.
+        recording: The recording.
     """
     outputs = outputs_by_state(system.model, system.outputs)
     has_values = np.asarray(recording.measured.any(axis=0))

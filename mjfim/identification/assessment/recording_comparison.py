@@ -25,17 +25,14 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array, scaled_to_unit_diagonal
-from mjfim.identification.assessment.accuracy import independent_rows
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.robust_covariance import (
     Blocks,
     independent_blocks,
     recording_evidence,
     weighted,
 )
-from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.marginal import standard_deviations
-from mjfim.optimize.levenberg_marquardt import Solution
-from mjfim.records.estimate import Uncertainty
 from mjfim.records.robots import OddParameter, OddRecording, RecordingComparison
 
 # Newton steps for tau², of which the weighted squares are a decreasing function.
@@ -484,24 +481,17 @@ def _left_out(
     return p, each, effects
 
 
-def compare_recordings(
-    problem: FitProblem,
-    solution: Solution,
-    correlation_rows: Sequence[float],
-    robust: Uncertainty | None,
-) -> RecordingComparison | None:
+def compare_recordings(fit: FitResult) -> RecordingComparison | None:
     """Compare the recordings of a fit with each other.
 
     Args:
-        problem: The least-squares problem.
-        solution: Its solution.
-        correlation_rows: Autocorrelation time of the residuals of every output [rows].
-        robust: Robust uncertainty of the common unknowns, or None.
+        fit: The fit.
 
     Returns:
         The comparison; None for a single recording, and where the recordings have no parameter of
         the robot in common.
     """
+    problem, solution, robust = fit.problem, fit.solution, fit.accuracy.robust
     parameters = problem.system.parameters
     recordings = tuple(PurePath(recording.name).name for recording in problem.recordings)
     if len(recordings) < 2 or not len(problem.shared):
@@ -509,8 +499,9 @@ def compare_recordings(
 
     condensed = solution.condensed
     recording_of_block = problem.recording_of_block
-    min_rows = independent_rows(problem, correlation_rows)
-    blocks = independent_blocks(condensed, recording_of_block, problem.mean_block_rows, min_rows)
+    blocks = independent_blocks(
+        condensed, recording_of_block, problem.mean_block_rows, fit.independent_rows
+    )
     evidence = recording_evidence(condensed, blocks, recording_of_block, problem.own_columns)
     # Parameters of the robot that are stated to differ have their values already.
     stated = [i for i, j in enumerate(problem.per_recording) if parameters.changes_model[j]]

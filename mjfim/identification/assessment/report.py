@@ -174,9 +174,8 @@ def estimate_from(
 
     begin_stage("computing the intervals")
     accuracy = result.accuracy
-    rows = quality.correlation_rows(problem.row_count)
     at_bound, outside = _at_bounds(parameters, result.theta, task.settings.hold)
-    comparison = compare_recordings(problem, solution, rows, accuracy.robust)
+    comparison = compare_recordings(result)
 
     # A good fit needs no advice.
     unpredictable = ""

@@ -410,17 +410,6 @@ class FitQuality:
         longest = max((test.time for test in self.whiteness), default=1.0)
         return max(self.chi2 / self.dof, 1.0) * max(longest, 1.0)
 
-    def correlation_rows(self, rows: int) -> list[float]:
-        """Autocorrelation times of the residuals.
-
-        Args:
-            rows: Number of rows of all recordings.
-
-        Returns:
-            One time for every output, in rows of the recordings.
-        """
-        return [test.time * rows / max(test.count, 1) for test in self.whiteness]
-
 
 def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
     """Assess the residuals of a solution.
