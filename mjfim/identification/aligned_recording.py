@@ -200,7 +200,8 @@ def on_grid_of(system: System, recordings: Sequence[Recording]) -> System:
     if all(_lie_on_grid(t, timestep) for t in times):
         steps = np.concatenate([np.rint(t / timestep).astype(np.int64) for t in times])
         common = int(np.gcd.reduce(steps))
-        return system.with_substeps(_largest_divisor(common, stated))
+        divisors = (k for k in range(min(common, stated), 0, -1) if common % k == 0)
+        return system.with_substeps(next(divisors, 1))
     return system.with_substeps(1)
 
 
@@ -210,12 +211,6 @@ def _lie_on_grid(t: Array, dt: float) -> bool:
     False for times that are missing, which `align` refuses.
     """
     return bool(np.abs(t - np.rint(t / dt) * dt).max() <= GRID_TOLERANCE * dt)
-
-
-def _largest_divisor(number: int, limit: int) -> int:
-    """Largest divisor of a number that does not exceed a limit; 1 for the number 0."""
-    divisors = (k for k in range(min(number, limit), 0, -1) if number % k == 0)
-    return next(divisors, 1)
 
 
 def align(system: System, recording: Recording) -> AlignedRecording:

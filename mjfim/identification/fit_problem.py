@@ -27,6 +27,7 @@ from mjfim.identification.segments import (
     free_segments,
     has_free_starts,
     recorded_release,
+    spread_over_data,
     stated_segments,
 )
 from mjfim.information.null_space import COARSER_STEP_FACTOR
@@ -134,7 +135,10 @@ class FitProblem(SegmentSimulation):
         is_held = np.isin(parameters.names, list(settings.hold))
         segments, directions = stated_segments(system, aligned)
 
-        masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
+        # Values at a stated initial state do not count, because they contain no information.
+        masks = tuple(np.array(recording.measured) for recording in aligned)
+        for mask in () if free_starts else masks:
+            mask[0] = False
         if not any(mask.any() for mask in masks):
             raise RecordingError("the recordings contain no measured value after t = 0")
 
@@ -198,6 +202,17 @@ class FitProblem(SegmentSimulation):
         for segment in segments:
             masks[segment.recording][segment.rows] = self.masks[segment.recording][segment.rows]
         return replace(self, segments=segments, masks=masks)
+
+    def spread(self, samples: int, least: int) -> np.ndarray:
+        """Indices of some segments that are spread over the data.
+
+        Args:
+            samples: About the number of their samples.
+            least: Least number of segments, if there are as many.
+        """
+        count = len(self.segments)
+        wanted = max(samples * count // self.sample_count, least)
+        return spread_over_data(count, min(wanted, count))
 
     def of_first_parts(self, share: float) -> FitProblem:
         """The problem of the first part of every segment only.
@@ -536,17 +551,6 @@ def _calibrated_along(
     )
     calibrated = begun.calibrated(guess, control, wanted)
     return replace(calibrated, plant=calibrated.plant.with_initial_state(nominal))
-
-
-def _counted_values(recording: AlignedRecording, free_starts: bool) -> np.ndarray:
-    """(M, ny) True for the measured values that count.
-
-    Those at a stated initial state do not count, because they contain no information.
-    """
-    mask = np.array(recording.measured)
-    if not free_starts:
-        mask[0] = False
-    return mask
 
 
 def sensitivity_rows(

@@ -389,11 +389,10 @@ def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> U
 
 def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, FitProblem | None]:
     """The least-squares problems of the fitted and of the held-out recordings."""
-    problem = task.problem()
-    held_out = task.held_out_problem()
-    if workers is None:
-        return problem, held_out
-    return problem.on_workers(workers), None if held_out is None else held_out.on_workers(workers)
+    problem = replace(task.problem(), workers=workers)
+    if not task.held_out:
+        return problem, None
+    return problem, replace(FitProblem.of(task.system, task.held_out), workers=workers)
 
 
 def least_squares(

@@ -129,14 +129,6 @@ class FitTask:
         problem = FitProblem.of(self.system, self.recordings)
         return problem.unbounded() if self.method == "newton" else problem
 
-    def held_out_problem(self) -> FitProblem | None:
-        """The least-squares problem of the held-out recordings; None without any.
-
-        Raises:
-            RecordingError: A recording cannot be used.
-        """
-        return FitProblem.of(self.system, self.held_out) if self.held_out else None
-
 
 def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTask:
     """The task of fitting segments of a length.
@@ -273,11 +265,6 @@ FIRST_SHARE = 0.25
 MIN_FIRST_SAMPLES = 2_000
 MIN_FIRST_SEGMENTS = 3
 
-# Number of samples, and least number of segments, that lead near enough to a minimum for a search
-# over all data to begin there.
-RESTART_SAMPLES = 3_000
-MIN_RESTART_SEGMENTS = 12
-
 Callback = Callable[[FitEvent], None]
 
 
@@ -287,7 +274,7 @@ Callback = Callable[[FitEvent], None]
 def quick_subset(problem: FitProblem) -> np.ndarray:
     """Indices of segments that are quick to simulate, evenly spread over the data."""
     count = len(problem.segments)
-    wanted = max(min(QUICK_SAMPLES * count // problem.sample_count, count), 1)
+    wanted = max(QUICK_SAMPLES * count // problem.sample_count, 1)
     return evenly_spread_indices(count, wanted)
 
 
@@ -300,13 +287,6 @@ def first_subset(problem: FitProblem) -> np.ndarray:
     if not enough or 2 * wanted > count:
         return quick
     return spread_over_data(count, min(wanted, len(quick)))
-
-
-def restart_subset(problem: FitProblem) -> np.ndarray:
-    """Indices of the segments of a fit that only leads to a start for another one."""
-    count = len(problem.segments)
-    wanted = max(RESTART_SAMPLES * count // problem.sample_count, MIN_RESTART_SEGMENTS)
-    return spread_over_data(count, min(wanted, count))
 
 
 def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:

@@ -247,7 +247,9 @@ def has_free_starts(system: System) -> bool:
     """Whether the initial states of segments are free, and begin at measured values."""
     settings = system.experiment.fit
     is_measured = settings.start != "stated" or settings.segment_length is not None
-    return is_measured or free_release(system)
+    # Recordings may begin at releases that only they show, where nothing else moves the start.
+    moves = system.parameters.initial_state_derivative(system.space.nx).any()
+    return is_measured or (bool(system.experiment.initial.free) and not moves)
 
 
 def stated_segments(
@@ -325,16 +327,6 @@ def whole_recordings(system: System, recordings: Sequence[AlignedRecording]) -> 
         )
         for i, recording in enumerate(recordings)
     )
-
-
-def free_release(system: System) -> bool:
-    """Whether recordings begin at releases that only they show, and nothing else moves the start.
-
-    The whole initial state of a recording is then unknown.
-    """
-    if not system.experiment.initial.free:
-        return False
-    return not system.parameters.initial_state_derivative(system.space.nx).any()
 
 
 def recorded_release(system: System, recording: AlignedRecording) -> Array:

@@ -37,8 +37,7 @@ from mjfim.identification.left_out import (
     losses_of,
     stretches_of,
 )
-from mjfim.identification.search import FitSearch, FitTask, of_subset, quick_subset, restart_subset
-from mjfim.identification.segments import spread_over_data
+from mjfim.identification.search import FitSearch, FitTask, of_subset, quick_subset
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameter_ranges import make_physical
 from mjfim.model.parameters import ParameterSet
@@ -65,6 +64,11 @@ SHORT_SEARCH = SearchSettings(max_iterations=4, relinearise_at_end=False)
 # rows of a segment. Fewer rows tell little besides the free initial state.
 MAX_SEGMENTS = 64
 MIN_ROWS = 12
+
+# Number of samples, and least number of segments, that lead near enough to a minimum for a search
+# over all data to begin there.
+RESTART_SAMPLES = 3_000
+MIN_RESTART_SEGMENTS = 12
 
 # Ratio of the lengths of the segments of one fit and of the fit before it. Segments that are longer
 # than the share of a recording are hardly better than the whole one.
@@ -141,7 +145,7 @@ def _other_starts(
 
     # The length of the segments is that of the user where it is stated.
     if task.settings.segment_length is not None:
-        part = problem.of_segments(restart_subset(problem))
+        part = problem.of_segments(problem.spread(RESTART_SAMPLES, MIN_RESTART_SEGMENTS))
         theta = _best_spread_start(search, part, task.start)
         if theta is not None:
             yield theta, None, AT_SPREAD_START
@@ -314,7 +318,7 @@ def start_from_segments(
             continue
         if null_space is not None:
             part = part.pinned(theta, null_space)
-        part = part.of_segments(restart_subset(part))
+        part = part.of_segments(part.spread(RESTART_SAMPLES, MIN_RESTART_SEGMENTS))
         if not used:
             first, dynamics = _first_start(search, part, spread=spread)
             if first is None:
@@ -479,7 +483,9 @@ def _problems(
             found.append((length, part.pinned(search.task.start, whole.null_space)))
     if problem.sample_count <= MAX_WHOLE_SAMPLES:
         found.append((None, problem))
-    return [(length, _affordable(part)) for length, part in found]
+    return [
+        (length, part.of_segments(part.spread(MAX_SAMPLES, MAX_FOLDS))) for length, part in found
+    ]
 
 
 def _fitted(
@@ -519,15 +525,6 @@ def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
         bounds = np.linspace(0.0, float(recording.t[-1]), -(-MAX_FOLDS // count) + 1)
         parts += stretches_of(recording.name, i, bounds[:-1].tolist())
     return tuple(parts)
-
-
-def _affordable(problem: FitProblem) -> FitProblem:
-    """Segments of a problem, spread over the data, that can be simulated often."""
-    count = len(problem.segments)
-    wanted = max(int(MAX_SAMPLES * count / problem.sample_count), MAX_FOLDS)
-    if wanted >= count:
-        return problem
-    return problem.of_segments(spread_over_data(count, wanted))
 
 
 def _over_all_horizons(losses: Sequence[Sequence[HeldOutLosses]], index: int) -> HeldOutLosses:

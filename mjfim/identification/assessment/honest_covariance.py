@@ -133,8 +133,10 @@ def with_honest_covariance(
     inner = found[place]
     if covariance is not None and estimate.horizons is not None:
         inner = _covering(inner, _differences(inner, estimate.horizons, known))
-    if without_parts is not None:
-        inner = _covering(inner, _between_parts(without_parts)[:, known])
+    if without_parts is not None and len(without_parts) > 1:
+        # Deviations between the parts of the data, by Student's factor, like the intervals.
+        factor = student_quantile(len(without_parts), LEVEL) / NORMAL_95
+        inner = _covering(inner, factor * jackknife_deviations(without_parts)[:, known])
     found[place] = agreeing_covariance(inner, std[known])
     return replace(estimate, honest_covariance=found)
 
@@ -294,13 +296,3 @@ def _differences(covariance: Array, study: HorizonStudy, known: np.ndarray) -> A
             along = np.linalg.pinv(root[is_apart]) @ difference[is_apart]
             found.append((root @ along)[None])
     return np.concatenate(found)
-
-
-def _between_parts(without_parts: Array) -> Array:
-    """(K, p) deviations between the parts of the data, by Student's factor, like the intervals.
-
-    Args:
-        without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
-    """
-    deviations, K = jackknife_deviations(without_parts), len(without_parts)
-    return student_quantile(K, LEVEL) / NORMAL_95 * deviations if K > 1 else deviations

@@ -383,19 +383,16 @@ def _warnings_of_rate(result: FitResult) -> Iterator[str]:
         if share < MIN_SHARE_WITHIN_SAMPLES:
             continue
 
+        # The longest timestep of which the period of the log is a whole number.
         period = float(np.median(np.diff(recording.t)))
+        timestep = period / math.ceil(period / dt * (1.0 - ROUNDING))
         yield (
             f"{100 * share:.0f} % of the changes of the control in {Path(recording.name).name} lie "
             f"inside the engine steps of the model ({dt:g} s), which hold its mean: this alone can "
             f"cause a misfit. State a timestep in the MJCF that divides the period of the log, for "
-            f'example timestep="{_dividing_timestep(period, dt):.4g}", and rate = '
+            f'example timestep="{timestep:.4g}", and rate = '
             f"{1.0 / period:.4g} in the experiment file"
         )
-
-
-def _dividing_timestep(period: float, timestep: float) -> float:
-    """Longest timestep [s] of at most `timestep` [s] of which a period [s] is a whole number."""
-    return period / math.ceil(period / timestep * (1.0 - ROUNDING))
 
 
 def _warnings_of_search(

@@ -296,6 +296,11 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     terms = rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))
     statistic = count * (count + 2) * float(np.sum(terms))
 
+    # The integrated autocorrelation time ends where the autocorrelation first vanishes (initial
+    # positive sequence).
+    vanishing = np.flatnonzero(rho < NO_AUTOCORRELATION)
+    end = int(vanishing[0]) if len(vanishing) else len(rho)
+
     # Means over runs show slow drifts that short lags miss. The smallest probability is multiplied
     # by the number of tests (Bonferroni).
     variance = squares / count
@@ -309,7 +314,7 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
         correlation=float(rho[1]),
         p=min(min(probabilities) * len(probabilities), 1.0),
         inflation=max(inflation, 1.0),
-        time=_autocorrelation_time(rho),
+        time=float(1.0 + 2.0 * rho[1:end].sum()),
     )
 
 
@@ -333,19 +338,6 @@ def _autocorrelation(series: Sequence[Array], least_lag: int, longest_lag: int) 
         if lag >= longest_lag or (rho[least_lag:] < NO_AUTOCORRELATION).any():
             return np.asarray(rho)
         lag = min(LAG_GROWTH * lag, longest_lag)
-
-
-def _autocorrelation_time(rho: Array) -> float:
-    """Integrated autocorrelation time `1 + 2 sum rho` [rows].
-
-    The sum ends where rho: (lags,) first vanishes (initial positive sequence).
-    """
-    end = len(rho)
-    vanishing = np.flatnonzero(rho < NO_AUTOCORRELATION)
-    if len(vanishing):
-        end = int(vanishing[0])
-
-    return float(1.0 + 2.0 * rho[1:end].sum())
 
 
 def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float, float]]:

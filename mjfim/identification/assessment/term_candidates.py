@@ -110,7 +110,12 @@ def candidates_of(system: System, speeds: Array) -> tuple[list[Candidate], list[
     Returns:
         The candidates, and terms in words, each with the reason, that the model cannot have.
     """
-    targets = _targeted_paths(system)
+    # Paths of the numbers that parameters set, those of first entries without their index.
+    targets = {
+        _without_index(target.path)
+        for parameter in system.parameters.parameters
+        for target in parameter.targets
+    }
     library, impossible = _library_terms(system, speeds, targets)
     numbers = (*_joint_terms(system), *_latencies(system), *_gains(system), *_tilts(system))
     further = (*_misalignments(system), *_output_errors(system))
@@ -120,15 +125,6 @@ def candidates_of(system: System, speeds: Array) -> tuple[list[Candidate], list[
         if not targets & {_without_index(each.path) for each in candidate.tested}
     ]
     return found, impossible
-
-
-def _targeted_paths(system: System) -> set[str]:
-    """Paths of the numbers that parameters set, those of first entries without their index."""
-    return {
-        _without_index(target.path)
-        for parameter in system.parameters.parameters
-        for target in parameter.targets
-    }
 
 
 def _without_index(path: str) -> str:
