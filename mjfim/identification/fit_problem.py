@@ -6,7 +6,7 @@ linearised rows are condensed block by block.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, zip_longest
@@ -17,7 +17,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
+from mjfim.identification.aligned_recording import align, on_grid_of
 from mjfim.identification.segment_simulation import (
     SegmentBatch,
     SegmentRows,
@@ -94,7 +94,6 @@ class FitProblem(SegmentSimulation):
         recordings: Sequence[Recording],
         *,
         data_only: bool = False,
-        calibrated: Collection[str] | None = None,
     ) -> FitProblem:
         """The problem that the `[fit]` table of a system's experiment states.
 
@@ -102,9 +101,6 @@ class FitProblem(SegmentSimulation):
             system: The system.
             recordings: Recordings in SI units.
             data_only: Whether to leave priors and bounds out.
-            calibrated: Names of the parameters whose difference steps are calibrated; None for all.
-                There are none for a problem that is never linearised, or that gets the steps of
-                another one.
 
         Returns:
             The problem.
@@ -123,12 +119,14 @@ class FitProblem(SegmentSimulation):
         system = on_grid_of(system, recordings)
         aligned = tuple(align(system, recording) for recording in recordings)
 
-        # Difference steps depend on how strongly each parameter changes the recorded motion.
-        if calibrated is None or len(calibrated):
-            longest = max(aligned, key=lambda recording: len(recording.ctrl))
-            samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
-            wanted = None if calibrated is None else np.isin(parameters.names, list(calibrated))
-            system = _calibrated_along(system, longest, samples, wanted)
+        # Difference steps suit the first samples of the longest recording: they depend on how
+        # strongly each parameter changes the recorded motion.
+        longest = max(aligned, key=lambda recording: len(recording.ctrl))
+        samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
+        nominal = system.plant.nominal_initial_state
+        begun = system.plant.with_initial_state(recorded_release(system, longest))
+        system = replace(system, plant=begun).calibrated(parameters.guess, longest.ctrl[:samples])
+        system = replace(system, plant=system.plant.with_initial_state(nominal))
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = has_free_starts(system)
@@ -535,22 +533,6 @@ def have_same_initial_states(problem: FitProblem, other: FitProblem) -> bool:
     begins, others = ([segment.begin for segment in each.segments] for each in (problem, other))
     width = problem.private_count
     return begins == others and width == other.private_count
-
-
-def _calibrated_along(
-    system: System, recording: AlignedRecording, samples: int, wanted: np.ndarray | None
-) -> System:
-    """The system with difference steps that suit the first samples of a recording.
-
-    wanted: (p,) True for the parameters whose steps are calibrated; None for all.
-    """
-    guess, control = system.parameters.guess, recording.ctrl[:samples]
-    nominal = system.plant.nominal_initial_state
-    begun = replace(
-        system, plant=system.plant.with_initial_state(recorded_release(system, recording))
-    )
-    calibrated = begun.calibrated(guess, control, wanted)
-    return replace(calibrated, plant=calibrated.plant.with_initial_state(nominal))
 
 
 def sensitivity_rows(

@@ -294,7 +294,7 @@ def start_from_segments(
     problem: FitProblem,
     null_space: NullSpace | None = None,
     *,
-    spread: bool = False,
+    spread: bool,
 ) -> tuple[UnknownValues | None, tuple[float, ...], InverseDynamicsFit | None]:
     """Fit longer and longer segments, and take the result that costs least over whole recordings.
 

@@ -108,7 +108,7 @@ def test_the_prior_of_barycentric_coordinates_is_that_metric_to_second_order(
 def test_inertias_move_along_straight_lines_of_barycentric_coordinates(
     tmp_path: Path, log: Recording
 ) -> None:
-    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log], calibrated=())
+    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log])
     begin = problem.begin(problem.system.parameters.guess)
     sizes = problem.system.parameters.magnitude
     common = 0.02 * sizes * np.random.default_rng(6).standard_normal(20)
@@ -157,7 +157,7 @@ def test_a_step_to_a_rod_ends_before_it(tmp_path: Path) -> None:
 def test_rows_along_a_step_have_the_derivatives_of_differences(
     tmp_path: Path, log: Recording
 ) -> None:
-    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log], calibrated=())
+    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log])
     parameters = problem.system.parameters
     begin = problem.begin(moved(parameters.guess, 0.01))
     common = 0.02 * parameters.magnitude * np.random.default_rng(7).standard_normal(20)

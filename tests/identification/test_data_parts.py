@@ -37,7 +37,7 @@ def problem_of(folder: Path, count: int, segments: float | str = "whole") -> Fit
     fit = {"bootstrap": 0, "segments": segments}
     system = System.resolve(experiment_of(folder, "tilt", fit=fit))
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in range(count)]
-    return FitProblem.of(system, logs, calibrated=())
+    return FitProblem.of(system, logs)
 
 
 def test_a_part_has_the_begin_of_each_recording(tmp_path: Path) -> None:
