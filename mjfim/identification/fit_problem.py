@@ -561,7 +561,7 @@ def sensitivity_rows(
         SimulationDivergedError: A perturbed simulation diverges.
     """
     if wanted is None:
-        wanted = np.ones(len(problem.system.parameters), dtype=bool)
+        wanted = np.ones(len(problem.parameters), dtype=bool)
     work: BatchWork[dict[int, Array]] = partial(_of_batch, with_error=with_error)
     batches = list(
         problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)

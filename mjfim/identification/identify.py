@@ -378,7 +378,7 @@ def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> U
         begin = replace(begin, private=found.private)
 
     # A parameter with a value for each recording keeps these values.
-    names, known = problem.system.parameters.names, near.problem.system.parameters.names
+    names, known = problem.parameters.names, near.problem.parameters.names
     columns = {known[j]: column for column, j in enumerate(near.problem.per_recording.tolist())}
     per_recording = np.array(begin.per_recording)
     for place, j in enumerate(problem.per_recording.tolist()):

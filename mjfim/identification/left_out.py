@@ -176,7 +176,7 @@ def with_initial_states(
     # Deviations of the initial state that were fitted belong to other recordings.
     private = np.zeros_like(at.private)
     if not problem.free_starts:
-        guess = problem.system.parameters.guess[problem.private]
+        guess = problem.parameters.guess[problem.private]
         private = np.tile(guess, (len(problem.segments), 1))
 
     known = problem.masked(_masks_for_initial_states(problem, masks))
@@ -248,7 +248,7 @@ def fit_without(
         starts.append((cost_at_end, own(moved)))
 
     # The data that are left out may have led the estimate to a minimum that the others lack.
-    guess = others.begin(problem.system.parameters.guess)
+    guess = others.begin(problem.parameters.guess)
     starts.append((others.cost(guess), guess))
     found = minimise(others, min(starts, key=lambda start: start[0])[1], SEARCH, budget)
     return None if found is None or budget.exhausted is not None else found.unknowns
@@ -606,7 +606,7 @@ def _prediction_by_others(
     others = fit_without(problem, budget, solution=solution, part=part)
     if others is None:
         return None
-    guess, masks = problem.system.parameters.guess, part.masks(problem)
+    guess, masks = problem.parameters.guess, part.masks(problem)
     return Prediction(
         name=part.name,
         identified=_predicted(problem, others.theta, masks, part.name, budget)[0],

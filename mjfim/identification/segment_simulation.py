@@ -322,7 +322,7 @@ class SegmentSimulation(FitUnknowns):
     def _initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""
         space = self.system.space
-        parameters = self.system.parameters
+        parameters = self.parameters
         start = self.segments[index].start
         if self.free_starts:
             return space.plus(start, self.start_directions @ at.private[index])
@@ -352,7 +352,7 @@ class SegmentSimulation(FitUnknowns):
         earlier time than that of their row. theta: (p,) parameters of the recording.
         """
         recording = self.recordings[segment.recording]
-        delay_samples = float(self.system.parameters.delay_derivative @ theta) / recording.dt
+        delay_samples = float(self.parameters.delay_derivative @ theta) / recording.dt
         return recording.t[segment.rows] / recording.dt - segment.begin - delay_samples
 
     def _rows_of_segment(
@@ -399,7 +399,7 @@ class SegmentSimulation(FitUnknowns):
             for each in (response.y, response.common, response.private)
             if each is not None
         ]
-        delay_derivative = self.system.parameters.delay_derivative
+        delay_derivative = self.parameters.delay_derivative
         is_delayed = bool(delay_derivative.any())
 
         # Rows on the grid are samples of the simulation.

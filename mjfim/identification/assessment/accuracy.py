@@ -255,7 +255,7 @@ def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Ar
     Unknowns of each recording have the values of the first recording. Deviations of the first
     initial state, which are private unknowns, follow the common ones.
     """
-    p = len(problem.system.parameters)
+    p = len(problem.parameters)
     columns = problem.first_columns
     index = problem.parameter_of_column[columns]
     covariance = np.zeros((p, p))

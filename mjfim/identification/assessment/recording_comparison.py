@@ -492,7 +492,7 @@ def compare_recordings(fit: FitResult) -> RecordingComparison | None:
         the robot in common.
     """
     problem, solution, robust = fit.problem, fit.solution, fit.accuracy.robust
-    parameters = problem.system.parameters
+    parameters = problem.parameters
     recordings = tuple(PurePath(recording.name).name for recording in problem.recordings)
     if len(recordings) < 2 or not len(problem.shared):
         return None

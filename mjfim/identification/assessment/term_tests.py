@@ -158,7 +158,7 @@ def _extended_private(problem: FitProblem, wider: FitProblem, at: UnknownValues)
 def _private_names(problem: FitProblem) -> list[str]:
     """Names of the private unknowns of a segment."""
     if not problem.free_starts:
-        return [problem.system.parameters.names[i] for i in problem.private]
+        return [problem.parameters.names[i] for i in problem.private]
     names = np.array(tangent_names(problem.system.model))
     directions = problem.start_directions
     return [str(names[np.flatnonzero(column)[0]]) for column in directions.T]
@@ -508,7 +508,7 @@ class _TermSearch:
         if condensed is None:
             return None
 
-        names = wider.system.parameters.names
+        names = wider.parameters.names
         column_of = {names[j]: i for i, j in enumerate(wider.parameter_of_column.tolist())}
         tested = np.array(
             [
@@ -603,7 +603,7 @@ class _TermSearch:
         if extended is None:
             return None
         wider, begin = extended
-        place = wider.system.parameters.names.index("?")
+        place = wider.parameters.names.index("?")
         best, least = 0.0, self.squares
         for k in range(MAX_VALUES):
             theta = np.array(begin.theta)
