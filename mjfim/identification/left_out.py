@@ -583,11 +583,15 @@ def _cross_validate(
     """Prediction of every part of the data by a fit to the others."""
     whole = problem
     problem, solution = affordable_part(problem, solution)
-    parts = [
-        replace(part, name=part.name + _note_of_subset(part.recordings, problem, whole))
-        for part in left_out_parts(problem)
-        if any(segment.recording in part.recordings for segment in problem.segments)
-    ]
+    parts = []
+    for part in left_out_parts(problem):
+        tested, count = (
+            sum(segment.recording in part.recordings for segment in each.segments)
+            for each in (problem, whole)
+        )
+        note = "" if tested == count else f" ({tested} of {count} segments)"
+        if tested:
+            parts.append(replace(part, name=part.name + note))
     works = [partial(_prediction_by_others, solution=solution, part=part) for part in parts]
     for prediction in of_parts(problem, works, budget):
         if budget.exhausted is not None:
@@ -613,15 +617,6 @@ def _prediction_by_others(
         nominal=_predicted(problem, guess, masks, part.name, budget)[0],
         held_out=False,
     )
-
-
-def _note_of_subset(recordings: Sequence[int], subset: FitProblem, whole: FitProblem) -> str:
-    """How many segments of some recordings are in a subset; empty where all of them are."""
-    tested, count = (
-        sum(segment.recording in recordings for segment in problem.segments)
-        for problem in (subset, whole)
-    )
-    return "" if tested == count else f" ({tested} of {count} segments)"
 
 
 def _predicted(

@@ -265,10 +265,6 @@ class LinearCoordinates:
             blocks[np.ix_(body.columns, body.columns)] = body.derivative(x[body.columns])
         return blocks
 
-    def are_physical(self, x: Array) -> bool:
-        """Whether all bodies are physical at x: (p,)."""
-        return all(body.is_physical(x[body.columns]) for body in self.bodies)
-
     def slopes(self, differences: Array, moves: Array) -> Array:
         """Slopes of rows by the linear coordinates from differences along moves.
 

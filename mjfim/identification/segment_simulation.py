@@ -11,7 +11,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.segments import Segment, batches
+from mjfim.identification.segments import batches
 from mjfim.identification.unknowns import FitUnknowns
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.batch import Rollouts
@@ -222,7 +222,7 @@ class SegmentSimulation(FitUnknowns):
         directions = int(wanted.sum()) + self.private_count
         central = self.central if central is None else central
         if central is None:
-            central = self.affords_two_sided(directions)
+            central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
         step = self.difference_step if step is None else step
         if not central:
             step = ONE_SIDED_STEP_FACTOR * step
@@ -231,7 +231,11 @@ class SegmentSimulation(FitUnknowns):
         if derivatives:
             simulations += directions * (2 if central else 1)
 
-        for recording, segments in self._batches(self._max_samples(simulations)):
+        # The states of a batch have to fit into memory.
+        numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
+        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
+        max_samples = max(most // (simulations * self.system.grid.substeps), 1)
+        for recording, segments in self._batches(max_samples):
             yield SegmentBatch(
                 recording=recording,
                 segments=tuple(segments),
@@ -240,17 +244,6 @@ class SegmentSimulation(FitUnknowns):
                 step=step,
                 wanted=wanted,
             )
-
-    def affords_two_sided(self, directions: int) -> bool:
-        """Whether two-sided differences along some directions take little time.
-
-        Args:
-            directions: Number of the directions.
-
-        Returns:
-            True where they simulate few samples.
-        """
-        return self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
 
     def rows_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> Iterator[SegmentRows | None]:
         """Simulate a batch over one interval of time after the other.
@@ -286,17 +279,6 @@ class SegmentSimulation(FitUnknowns):
                 found = self._rows_of_segment(theta, i, place, response)
                 if found is not None:
                     yield found
-
-    def _max_samples(self, simulations: int) -> int:
-        """Largest number of samples of a batch, whose states have to fit into memory.
-
-        Args:
-            simulations: Number of simulations of every segment.
-        """
-        steps_per_sample = simulations * self.system.grid.substeps
-        numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
-        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
-        return max(most // steps_per_sample, 1)
 
     def _batches(self, max_samples: int) -> Iterator[tuple[int, list[int]]]:
         """Segments that are simulated together.
@@ -345,16 +327,6 @@ class SegmentSimulation(FitUnknowns):
         after = np.repeat(ctrl[-1:], lead + samples - len(before) - len(ctrl), axis=0)
         return np.concatenate([before, ctrl, after])
 
-    def _row_times(self, theta: Array, segment: Segment) -> Array:
-        """(M,) times in the simulation of a segment that its rows measure.
-
-        They are counted in samples since the begin of the segment. Delayed outputs measure an
-        earlier time than that of their row. theta: (p,) parameters of the recording.
-        """
-        recording = self.recordings[segment.recording]
-        delay_samples = float(self.parameters.delay_derivative @ theta) / recording.dt
-        return recording.t[segment.rows] / recording.dt - segment.begin - delay_samples
-
     def _rows_of_segment(
         self, theta: Array, index: int, place: int, response: Response
     ) -> SegmentRows | None:
@@ -368,7 +340,11 @@ class SegmentSimulation(FitUnknowns):
         """
         segment = self.segments[index]
         recording = self.recordings[segment.recording]
-        times = self._row_times(theta, segment)
+
+        # Times that the rows measure, in samples since the begin of the segment. Delayed outputs
+        # measure an earlier time than that of their row.
+        delay = float(self.parameters.delay_derivative @ theta)
+        times = recording.t[segment.rows] / recording.dt - segment.begin - delay / recording.dt
 
         # Rows in this interval; the last interval includes its end.
         samples = response.y.shape[1] - 1

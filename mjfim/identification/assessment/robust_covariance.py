@@ -356,18 +356,19 @@ def covering_covariance(first: Array, second: Array) -> Array:
     return np.asarray((spread * np.maximum(ratios, 1.0)) @ spread.T)
 
 
-def covariance_root(covariance: Array, tolerance: float = 0.0) -> Array:
+def covariance_root(covariance: Array, tolerance: float = -1.0) -> Array:
     """(p, k) factor A of a covariance `A A'`: (p, p), which may be singular.
 
     Args:
         covariance: (p, p) the covariance.
-        tolerance: Eigenvalues of the correlations below this share of the largest one are left out.
+        tolerance: Eigenvalues of the correlations up to this share of the largest one are left out;
+            default: none of them.
     """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(std > 0.0, std, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values >= tolerance * values.max(initial=0.0)
-    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+    kept = values > tolerance * values.max(initial=0.0)
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)))
 
 
 def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:

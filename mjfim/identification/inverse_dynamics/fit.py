@@ -378,7 +378,7 @@ class EquationSearch:
             residual = R @ np.append(x - at.x, 1.0)
             return np.concatenate([residual, priors]), np.concatenate([R[:, :-1], J])
 
-        x = begin
+        x, bodies = begin, self.coordinates.bodies
         values, J = all_rows(x)
         cost = first = float(values @ values)
         for _ in range(MAX_STEPS):
@@ -389,7 +389,7 @@ class EquationSearch:
                 break
             for _ in range(MAX_HALVINGS):
                 moved = x + step
-                if self.coordinates.are_physical(moved):
+                if all(body.is_physical(moved[body.columns]) for body in bodies):
                     values, J = all_rows(moved)
                     if float(values @ values) < cost - MIN_DECREASE_RATIO * predicted:
                         break
@@ -587,7 +587,18 @@ def fit_equations(
     start = np.clip(start, parameters.lower, parameters.upper)
     equations = MotionEquations.of(system, recordings, start, forces=forces, laws=laws)
     search = EquationSearch.of(system, equations, start)
-    _require_rows(search, recordings)
+    rows, count = len(search.of_row), len(search.active)
+    if not count:
+        raise RecordingError(
+            f"{recordings[0].name}: the equation of motion contains none of the parameters; "
+            'remove fit.start = "inverse_dynamics"'
+        )
+    if rows < ROWS_PER_PARAMETER * count:
+        raise RecordingError(
+            f"{recordings[0].name}: the equation of motion has only {rows} rows for {count} "
+            "parameters; rows near gaps, stops and contacts do not count: use longer recordings, "
+            'or fit.start = "measured"'
+        )
 
     found = search.run()
     taken = equations.system.plant.engine_steps + system.plant.engine_steps - steps
@@ -615,22 +626,6 @@ def try_fit_equations(
         return None
     has_forces = any(each.measured.any() for each in found.degrees_of_freedom)
     return found if has_forces else None
-
-
-def _require_rows(search: EquationSearch, recordings: Sequence[AlignedRecording]) -> None:
-    """Raise RecordingError where the equations have too few rows."""
-    rows, count = len(search.of_row), len(search.active)
-    if not count:
-        raise RecordingError(
-            f"{recordings[0].name}: the equation of motion contains none of the parameters; "
-            'remove fit.start = "inverse_dynamics"'
-        )
-    if rows < ROWS_PER_PARAMETER * count:
-        raise RecordingError(
-            f"{recordings[0].name}: the equation of motion has only {rows} rows for {count} "
-            "parameters; rows near gaps, stops and contacts do not count: use longer recordings, "
-            'or fit.start = "measured"'
-        )
 
 
 # ---- record

@@ -337,7 +337,9 @@ def measured_motion(
     Raises:
         RecordingError: A degree of freedom was not measured, or too seldom.
     """
-    space, lag = system.space, engine_lag(system.model)
+    # A velocity of the engine's state is older than the position.
+    space = system.space
+    lag = 0.0 if is_rk4(system.model) else 0.5 * float(system.model.opt.timestep)
     curves = _curves(system, recording)
     y = recording.y - system.parameters.bias_derivative(recording.y.shape[1]) @ theta
     splines: dict[int, RegressionSpline] = {}
@@ -389,11 +391,6 @@ def measured_motion(
         spacing=spacing,
         speed_sigma=speed_sigma,
     )
-
-
-def engine_lag(model: mujoco.MjModel) -> float:
-    """Time by which a velocity of the engine's state is older than the position [s]."""
-    return 0.0 if is_rk4(model) else 0.5 * float(model.opt.timestep)
 
 
 # ---- curves
