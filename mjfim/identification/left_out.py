@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices, freeze
+from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import jackknife_std
@@ -288,10 +288,6 @@ class HeldOutLosses:
     counts: Array
     parts: np.ndarray
     estimates: Array
-
-    def __post_init__(self) -> None:
-        freeze(self, "losses", "counts", "estimates")
-        self.parts.setflags(write=False)
 
     @property
     def error(self) -> float:

@@ -213,14 +213,10 @@ class LinearCoordinates:
 
     Attributes:
         bodies: Bodies with barycentric coordinates in x.
-        lower: (p,) lower bounds of x.
-        upper: (p,) upper bounds of x.
         sizes: (p,) sizes of x.
     """
 
     bodies: tuple[UnknownBody, ...]
-    lower: Array
-    upper: Array
     sizes: Array
 
     @staticmethod
@@ -240,9 +236,7 @@ class LinearCoordinates:
         )
         for body in bodies:
             sizes[body.columns] = body.linear_sizes
-        return LinearCoordinates(
-            bodies=bodies, lower=parameters.lower, upper=parameters.upper, sizes=sizes
-        )
+        return LinearCoordinates(bodies=bodies, sizes=sizes)
 
     def linear(self, theta: Array) -> Array:
         """(p,) linear coordinates of parameters theta: (p,)."""

@@ -57,11 +57,6 @@ class Bristle:
         """
         return actuator_gear(model, self.actuator) * qvel[:, self.dof]
 
-    def friction(self, model: Any) -> tuple[float, ...]:
-        """Stiffness, Coulomb friction, static friction and Stribeck speed in a model."""
-        stiffness = model.actuator_dynprm[self.actuator, BRISTLE_STIFFNESS_COLUMN]
-        return (float(stiffness), *model.actuator_biasprm[self.actuator, FRICTION_COLUMNS].tolist())
-
     def deflection(self, model: Any, speed: Array, direction: Array) -> Array:
         """(n,) deflections in steady sliding.
 
@@ -70,7 +65,8 @@ class Bristle:
             speed: (n,) speeds of the device.
             direction: (n,) the signs of the speeds, or numbers between -1 and 1 near rest.
         """
-        stiffness, coulomb, static, stribeck = self.friction(model)
+        stiffness = model.actuator_dynprm[self.actuator, BRISTLE_STIFFNESS_COLUMN]
+        coulomb, static, stribeck = model.actuator_biasprm[self.actuator, FRICTION_COLUMNS]
         ratio = speed / max(stribeck, mujoco.mjMINVAL)
         force = coulomb + (static - coulomb) * np.exp(-(ratio**2))
         return np.asarray(direction * force / stiffness)

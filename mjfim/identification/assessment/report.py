@@ -244,7 +244,10 @@ def estimate_from(
         labels=labels_of_system(system),
         trace=np.array([task.start, *(problem.theta(each) for each in solution.iterates)]),
         nominal=_nominal_outputs(result),
-        segments=_beginnings(problem),
+        segments=tuple(
+            np.array([each.t[s.rows.start] for s in problem.segments if s.recording == k])
+            for k, each in enumerate(problem.recordings)
+        ),
         sizes=parameters.sizes(result.theta),
         restart=result.restart,
         controllers=laws_in_loop(system, result.theta, quick.clipped_shares(at)),
@@ -305,15 +308,6 @@ def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:
     if problem.free_starts:
         guess = replace(guess, private=at.private)
     return tuple(problem.predict(guess) or ())
-
-
-def _beginnings(problem: FitProblem) -> tuple[Array, ...]:
-    """Times at which the segments of each recording begin [s]."""
-    begins: list[list[float]] = [[] for _ in problem.recordings]
-    for segment in problem.segments:
-        t = problem.recordings[segment.recording].t[segment.rows]
-        begins[segment.recording] += t[:1].tolist()
-    return tuple(np.array(times) for times in begins)
 
 
 def _as_aligned(problem: FitProblem, recordings: Sequence[Recording]) -> tuple[Recording, ...]:

@@ -212,7 +212,7 @@ class EquationSearch:
         for shape in self.shapes:
             moved = np.array(self.start)
             moved[list(shape)] = list(shape.values())
-            yield np.clip(moved, self.coordinates.lower, self.coordinates.upper), True
+            yield np.clip(moved, self.parameters.lower, self.parameters.upper), True
 
         # Other values of the parameters that are no inertias of whole bodies.
         plain = np.isin(np.arange(len(self.start)), self.active)
@@ -225,7 +225,7 @@ class EquationSearch:
             factor = LARGEST_FACTOR ** rng.uniform(-1.0, 1.0, int(plain.sum()))
             start = np.array(self.start)
             start[plain] *= factor
-            yield np.clip(start, self.coordinates.lower, self.coordinates.upper), False
+            yield np.clip(start, self.parameters.lower, self.parameters.upper), False
 
     def _searched(self, start: Array) -> FoundEquations:
         """Linearise and solve in turn, until the rows are those of the linearisation.
@@ -406,8 +406,8 @@ class EquationSearch:
         step[chosen] = sizes * bounded_least_squares(
             J[:, chosen] * sizes,
             -values,
-            np.minimum(self.coordinates.lower - x, 0.0)[chosen] / sizes,
-            np.maximum(self.coordinates.upper - x, 0.0)[chosen] / sizes,
+            np.minimum(self.parameters.lower - x, 0.0)[chosen] / sizes,
+            np.maximum(self.parameters.upper - x, 0.0)[chosen] / sizes,
         )
         return step
 
