@@ -290,9 +290,9 @@ def robust_uncertainty(
     # The hull of the formal, the sandwich and the bootstrap interval. Quantiles of Student's
     # distribution allow for the number of blocks from which the sandwich covariance comes.
     upper_tail = 0.5 + LEVEL / 2.0
-    student = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail))
+    factor = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail)) / NORMAL_95
     half_width = np.maximum(
-        NORMAL_95 * np.hypot(formal, between), student * np.hypot(sandwich, between)
+        NORMAL_95 * np.hypot(formal, between), factor * NORMAL_95 * np.hypot(sandwich, between)
     )
     low, high = theta - half_width, theta + half_width
     if len(replicates):
@@ -306,7 +306,7 @@ def robust_uncertainty(
         each=each,
         blocks=count,
         draws=theta + replicates,
-        covariance=covering_covariance(of_noise, (student / NORMAL_95) ** 2 * of_scatter),
+        covariance=covering_covariance(of_noise, factor**2 * of_scatter),
     )
 
 
