@@ -285,11 +285,11 @@ class FitProblem(SegmentSimulation):
     @property
     def segments_with_values(self) -> np.ndarray:
         """Indices of the segments that contain a measured value that counts."""
-        indices = []
-        for i, segment in enumerate(self.segments):
-            if self.masks[segment.recording][segment.rows].any():
-                indices.append(i)
-
+        indices = [
+            i
+            for i, segment in enumerate(self.segments)
+            if self.masks[segment.recording][segment.rows].any()
+        ]
         return np.array(indices, dtype=np.intp)
 
     @property
@@ -321,14 +321,8 @@ class FitProblem(SegmentSimulation):
     def errors_at(self, at: UnknownValues) -> list[Array] | None:
         """Predicted minus measured values of every output; None where a simulation diverges."""
         predicted = self.predict(at)
-        return None if predicted is None else self.errors(predicted)
-
-    def errors(self, predicted: Sequence[Array]) -> list[Array]:
-        """Predicted minus measured values of every output, for all recordings in their order.
-
-        Args:
-            predicted: (M, ny) predicted outputs of every recording [y-unit].
-        """
+        if predicted is None:
+            return None
         return [self.errors_of(j, predicted) for j in range(len(self.system.outputs))]
 
     def errors_of(self, output: int, predicted: Sequence[Array]) -> Array:

@@ -625,12 +625,13 @@ def _predicted(
     """
     part, at = with_initial_states(problem, theta, masks, budget)
     predicted = part.predict(at)
-    errors = [] if predicted is None else part.masked(masks).errors(predicted)
     names = problem.system.outputs.names
     rms, mae = np.full((2, len(names)), np.nan)
-    for j, of_output in enumerate(errors):
-        if len(of_output):
-            rms[j] = np.sqrt(np.mean(of_output**2))
-            mae[j] = np.mean(np.abs(of_output))
+    counted = part.masked(masks)
+    for j in range(len(names)):
+        errors = np.zeros(0) if predicted is None else counted.errors_of(j, predicted)
+        if len(errors):
+            rms[j] = np.sqrt(np.mean(errors**2))
+            mae[j] = np.mean(np.abs(errors))
     found = PredictionErrors(name=name, outputs=names, rms=rms, mae=mae)
     return found, predicted or [np.full(mask.shape, np.nan) for mask in masks]
