@@ -367,8 +367,10 @@ def covariance_root(covariance: Array, tolerance: float = -1.0) -> Array:
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(std > 0.0, std, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > tolerance * values.max(initial=0.0)
-    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)))
+    first = int(np.searchsorted(values, tolerance * values.max(initial=0.0), side="right"))
+    return np.asarray(
+        scale[:, None] * vectors[:, first:] * np.sqrt(np.maximum(values[first:], 0.0))
+    )
 
 
 def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
