@@ -312,13 +312,10 @@ def start_from_segments(
     best, least, dynamics = None, np.inf, None
     theta = np.array(search.task.start)
     lengths = segment_lengths(problem.recordings)
-    for length in lengths:
-        part = problem.cut(length)
-        if part is None or search.interrupted:
-            continue
-        if null_space is not None:
-            part = part.pinned(theta, null_space)
-        part = part.of_segments(part.spread(RESTART_SAMPLES, MIN_RESTART_SEGMENTS))
+    for length, cut in _cut(problem, RESTART_SAMPLES, MIN_RESTART_SEGMENTS):
+        if search.interrupted:
+            break
+        part = cut if null_space is None else cut.pinned(theta, null_space)
         if not used:
             first, dynamics = _first_start(search, part, spread=spread)
             if first is None:
@@ -353,6 +350,20 @@ def _first_start(
     if found is not None and part.cost(part.begin(found.theta)) < part.cost(part.begin(start)):
         return found.theta, found
     return start, None
+
+
+def _cut(problem: FitProblem, samples: int, least: int) -> Iterator[tuple[float, FitProblem]]:
+    """Lengths of segments [s], shortest first, and their problems, with segments over all data.
+
+    Args:
+        problem: The problem of the whole recordings.
+        samples: About the number of samples of a problem, at most.
+        least: Least number of its segments, if there are as many.
+    """
+    for length in segment_lengths(problem.recordings):
+        part = problem.cut(length)
+        if part is not None:
+            yield length, part.of_segments(part.spread(samples, least))
 
 
 def segment_lengths(recordings: Sequence[AlignedRecording]) -> tuple[float, ...]:
@@ -414,7 +425,12 @@ def choose_length(
     system = search.task.system
     if system.parameters.initial_state_derivative(system.space.nx).any():
         return None
-    tried = _problems(search, problem, whole)
+    tried: list[tuple[float | None, FitProblem]] = [
+        (length, part.pinned(search.task.start, whole.null_space))
+        for length, part in _cut(problem, MAX_SAMPLES, MAX_FOLDS)
+    ]
+    if problem.sample_count <= MAX_WHOLE_SAMPLES:
+        tried.append((None, problem.of_segments(problem.spread(MAX_SAMPLES, MAX_FOLDS))))
     parts = _parts(problem)
     lengths: list[float | None] = []
     problems: list[FitProblem] = []
@@ -470,22 +486,6 @@ def choose_length(
         ),
     )
     return study, lengths[chosen], fits[chosen][0]
-
-
-def _problems(
-    search: FitSearch, problem: FitProblem, whole: FitResult
-) -> list[tuple[float | None, FitProblem]]:
-    """Lengths of segments [s], shortest first, and their problems; None for the whole."""
-    found: list[tuple[float | None, FitProblem]] = []
-    for length in segment_lengths(problem.recordings):
-        part = problem.cut(length)
-        if part is not None:
-            found.append((length, part.pinned(search.task.start, whole.null_space)))
-    if problem.sample_count <= MAX_WHOLE_SAMPLES:
-        found.append((None, problem))
-    return [
-        (length, part.of_segments(part.spread(MAX_SAMPLES, MAX_FOLDS))) for length, part in found
-    ]
 
 
 def _fitted(

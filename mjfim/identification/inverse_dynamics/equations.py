@@ -83,6 +83,11 @@ class Equation:
     force: int = -1
 
 
+# Averages of a series of n points: their (k, n) weights, the (k,) middles of their windows [s], and
+# the length of a window [s].
+Windows = tuple[scipy.sparse.csr_array, Array, float]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordedEquations:
     """The equations along one recording.
@@ -92,18 +97,14 @@ class RecordedEquations:
         forces: (n, f) measured forces.
         has_force: (f,) True for those that the recording holds.
         moments: (n, f, nv) forces on the degrees of freedom per measured force.
-        windows: (k, n) weights of the points in the averages of each equation.
-        times: (k,) middles of these windows [s].
-        lengths: Lengths of the windows of each equation [s].
+        windows: Windows of each equation.
     """
 
     motion: MeasuredMotion
     forces: Array
     has_force: np.ndarray
     moments: Array
-    windows: tuple[scipy.sparse.csr_array, ...]
-    times: tuple[Array, ...]
-    lengths: tuple[float, ...]
+    windows: tuple[Windows, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -251,7 +252,7 @@ class MotionEquations:
 
     def _of_rows(self, values: Sequence[Sequence[float]]) -> np.ndarray:
         """(R,) a number for each row, from one for each recording and equation."""
-        counts = [[len(t) for t in each.times] for each in self.recorded]
+        counts = [[len(t) for _, t, _ in each.windows] for each in self.recorded]
         return np.repeat(np.array(values).ravel(), np.array(counts).ravel())
 
     @cached_property
@@ -267,7 +268,7 @@ class MotionEquations:
     @property
     def times(self) -> Array:
         """(R,) time of each row [s]."""
-        return np.concatenate([t for each in self.recorded for t in each.times])
+        return np.concatenate([t for each in self.recorded for _, t, _ in each.windows])
 
     @property
     def usual_speeds(self) -> Array:
@@ -277,7 +278,7 @@ class MotionEquations:
 
     def cutoff(self, equation: int) -> float:
         """Frequency up to which an equation is used, the lowest of all recordings [Hz]."""
-        return 1.0 / max(each.lengths[equation] for each in self.recorded)
+        return 1.0 / max(each.windows[equation][2] for each in self.recorded)
 
     def rows(self, thetas: Array) -> list[Array]:
         """Rows at several values of the parameters.
@@ -319,13 +320,13 @@ class MotionEquations:
 
         parts = []
         nothing = np.zeros(len(measured))
-        for equation, windows in zip(self.equations, each.windows, strict=True):
+        for equation, (weights, _, _) in zip(self.equations, each.windows, strict=True):
             dof, place = equation.dof, equation.force
             if dof >= 0:
                 series = [terms.needed[:, dof], measured[:, dof], terms.inertial[:, dof]]
             else:
                 series = [modelled[:, place], each.forces[:, place], nothing]
-            parts.append(np.stack([windows @ values for values in series]))
+            parts.append(np.stack([weights @ values for values in series]))
         return np.concatenate(parts, axis=1)
 
 
@@ -385,20 +386,14 @@ def _recorded(
         forces=measured,
         has_force=np.asarray(near.any(axis=0)),
         moments=moments,
-        windows=tuple(weights for weights, _, _ in windows),
-        times=tuple(t for _, t, _ in windows),
-        lengths=tuple(length for _, _, length in windows),
+        windows=tuple(windows),
     )
 
 
 def _windows(
     motion: MeasuredMotion, spacing: float, usable: np.ndarray, slow: np.ndarray
-) -> tuple[scipy.sparse.csr_array, Array, float]:
-    """Windows of an equation, most of which are not at rest where that is possible.
-
-    Returns:
-        (k, n) weights of the points, (k,) middles of the windows, and their length [s].
-    """
+) -> Windows:
+    """Windows of an equation, most of which are not at rest where that is possible."""
     length = WINDOW_PER_SPACING * max(spacing, motion.step)
     length = min(length, LONGEST_WINDOW * float(motion.t[-1]))
     half = max(round(0.5 * length / motion.step), 1) - 1
