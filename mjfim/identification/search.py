@@ -110,12 +110,6 @@ class FitTask:
         )
 
     @property
-    def start_in_words(self) -> str:
-        """The parameters of the stated start and their values, for a message."""
-        names = self.system.parameters.names
-        return listed([f"{n} = {v:.6g}" for n, v in zip(names, self.start, strict=True)])
-
-    @property
     def noise_is_stated(self) -> bool:
         """True for the noise of the experiment; False where it is estimated from the residuals."""
         return self.settings.noise == "stated"
@@ -128,6 +122,12 @@ class FitTask:
         """
         problem = FitProblem.of(self.system, self.recordings)
         return problem.unbounded() if self.method == "newton" else problem
+
+
+def values_of_start(task: FitTask) -> str:
+    """The parameters of the stated start and their values, for a message."""
+    names = task.system.parameters.names
+    return listed([f"{n} = {v:.6g}" for n, v in zip(names, task.start, strict=True)])
 
 
 def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTask:

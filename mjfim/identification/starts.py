@@ -37,7 +37,7 @@ from mjfim.identification.left_out import (
     losses_of,
     stretches_of,
 )
-from mjfim.identification.search import FitSearch, FitTask, of_subset, quick_subset
+from mjfim.identification.search import FitSearch, FitTask, of_subset, quick_subset, values_of_start
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameter_ranges import make_physical
 from mjfim.model.parameters import ParameterSet
@@ -181,7 +181,7 @@ def divergence_at_start(task: FitTask, problem: FitProblem, extreme: str) -> Exc
     if not extreme:
         cause = f": {_why_diverged(problem, task.start)}"
     return SimulationDivergedError(
-        f"the simulation diverges at the start ({task.start_in_words}){cause}"
+        f"the simulation diverges at the start ({values_of_start(task)}){cause}"
     )
 
 

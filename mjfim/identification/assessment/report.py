@@ -32,6 +32,7 @@ from mjfim.identification.assessment.term_tests import TermTests, find_missing_t
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.left_out import predict_unfitted
 from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.search import values_of_start
 from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
@@ -396,7 +397,7 @@ def _warnings_of_search(
     quality, accuracy = result.quality, result.accuracy
     if result.begun_instead:
         yield (
-            f"the model diverges at the start ({result.task.start_in_words}): the search began "
+            f"the model diverges at the start ({values_of_start(result.task)}): the search began "
             f"{result.begun_instead} instead"
         )
 
