@@ -155,13 +155,11 @@ def _number(
 def _at_joint(words: str, name: str, joint: str, number: Effect) -> Candidate:
     """A candidate that is one number of a joint, or of a driver of this joint with its own name."""
     return Candidate(
-        description=words.format(name), tested=(number,), kind=_kind_of(words), joint=joint
+        description=words.format(name),
+        tested=(number,),
+        kind=words.replace(" of {}", ""),
+        joint=joint,
     )
-
-
-def _kind_of(words: str) -> str:
-    """Words without the place of the name."""
-    return words.replace(" of {}", "")
 
 
 def _joint_terms(system: System) -> Iterator[Candidate]:
@@ -370,7 +368,7 @@ def _library_term(
         tested=(tested,),
         further=further,
         tables={name: stated_table},
-        kind=_kind_of(kind.words) if kind.acts_on == "joint" else "",
+        kind=kind.words.replace(" of {}", "") if kind.acts_on == "joint" else "",
         joint=element if kind.acts_on == "joint" else "",
         source=kind.sources[0],
         alone=kind.kind if kind.alone else "",

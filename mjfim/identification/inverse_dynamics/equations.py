@@ -73,14 +73,12 @@ class Equation:
     Attributes:
         name: Name of the degree of freedom, or of the law.
         unit: Unit of its forces; empty for laws.
-        dof: Degree of freedom; -1 for the law of a measured force.
-        force: Index of the measured force; -1 for a degree of freedom.
+        place: Degree of freedom, or index of the measured force whose law it is.
     """
 
     name: str
-    unit: str = ""
-    dof: int = -1
-    force: int = -1
+    unit: str
+    place: int
 
 
 # Averages of a series of n points: their (k, n) weights, the (k,) middles of their windows [s], and
@@ -321,9 +319,9 @@ class MotionEquations:
         parts = []
         nothing = np.zeros(len(measured))
         for equation, (weights, _, _) in zip(self.equations, each.windows, strict=True):
-            dof, place = equation.dof, equation.force
-            if dof >= 0:
-                series = [terms.needed[:, dof], measured[:, dof], terms.inertial[:, dof]]
+            place = equation.place
+            if equation.unit:
+                series = [terms.needed[:, place], measured[:, place], terms.inertial[:, place]]
             else:
                 series = [modelled[:, place], each.forces[:, place], nothing]
             parts.append(np.stack([weights @ values for values in series]))
@@ -334,10 +332,10 @@ def _equations(system: System, forces: Sequence[MeasuredForce]) -> Iterator[Equa
     """Equations of all degrees of freedom, and laws of the actuators whose force is measured."""
     is_translation = translations(system.model)
     for dof, name in enumerate(dof_names(system.model)):
-        yield Equation(name=name, unit="N" if is_translation[dof] else "N m", dof=dof)
+        yield Equation(name=name, unit="N" if is_translation[dof] else "N m", place=dof)
     for place, force in enumerate(forces):
         if force.is_modelled:
-            yield Equation(name=f"law of {force.name}", force=place)
+            yield Equation(name=f"law of {force.name}", unit="", place=place)
 
 
 def _recorded(
@@ -373,9 +371,9 @@ def _recorded(
 
     windows = []
     for equation in of.equations:
-        dof, place = equation.dof, equation.force
-        if dof >= 0:
-            found = _windows(motion, spacing[dof], usable[:, dof], slow[:, dof])
+        place = equation.place
+        if equation.unit:
+            found = _windows(motion, spacing[place], usable[:, place], slow[:, place])
         else:
             known = near[:, place] & motion.usable[:, touched[place]].all(axis=1)
             finest = motion.spacing[touched[place]].max(initial=0.0)

@@ -504,8 +504,8 @@ def _force_sizes(system: System, rows: Array, equations: MotionEquations) -> Arr
 
     # The law of an actuator is compared with its own force.
     sizes = np.where(measured > 0.0, measured, needed)
-    dofs = np.array([each.dof for each in equations.equations])
-    is_dof = dofs >= 0
+    dofs = np.array([each.place for each in equations.equations])
+    is_dof = np.array([bool(each.unit) for each in equations.equations])
     of_dofs = measured if measured[is_dof].any() else needed
     largest = float((of_dofs[is_dof] / arms[dofs[is_dof]]).max(initial=0.0))
     sizes[is_dof] = largest * arms[dofs[is_dof]]
