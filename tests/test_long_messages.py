@@ -43,23 +43,18 @@ NAMES = tuple(f"inertia_of_link_{i}" for i in range(300))
 
 
 def test_warnings_about_many_parameters_list_the_first_ones_and_count_the_others() -> None:
-    findings = SimpleNamespace(at_bound=NAMES, outside=False)
-    (warning,) = _warnings_of_bounds(findings)
+    (warning,) = _warnings_of_bounds(NAMES, outside=False)
     assert len(warning) < LONGEST_MESSAGE
     assert "inertia_of_link_0" in warning and " more" in warning
 
 
 def test_a_warning_about_many_outputs_lists_the_first_ones() -> None:
-    findings = SimpleNamespace(
-        interrupted=False,
-        unpredictable=None,
-        result=SimpleNamespace(
-            begun_instead="",
-            quality=SimpleNamespace(unexplained=NAMES),
-            accuracy=SimpleNamespace(groups=(), singular=False),
-        ),
+    result = SimpleNamespace(
+        begun_instead="",
+        quality=SimpleNamespace(unexplained=NAMES),
+        accuracy=SimpleNamespace(groups=(), singular=False),
     )
-    (warning,) = _warnings_of_search(findings)
+    (warning,) = _warnings_of_search(result, "", interrupted=False)
     assert len(warning) < LONGEST_MESSAGE
 
 

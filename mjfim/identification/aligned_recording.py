@@ -6,7 +6,7 @@ because that would colour their noise. Predictions are interpolated instead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -172,7 +172,7 @@ class AlignedRecording:
             has_before = middle >= count or first == 0
             has_after = len(rows) - middle >= count or last == len(column)
             if has_before and has_after:
-                return np.asarray(rows[max(middle - count, 0) : middle + count])
+                return rows[max(middle - count, 0) : middle + count]
             reach *= 4
 
 
@@ -200,7 +200,8 @@ def on_grid_of(system: System, recordings: Sequence[Recording]) -> System:
     if all(_lie_on_grid(t, timestep) for t in times):
         steps = np.concatenate([np.rint(t / timestep).astype(np.int64) for t in times])
         common = int(np.gcd.reduce(steps))
-        return system.with_substeps(_largest_divisor(common, stated))
+        divisors = (k for k in range(min(common, stated), 0, -1) if common % k == 0)
+        return system.with_substeps(next(divisors, 1))
     return system.with_substeps(1)
 
 
@@ -210,12 +211,6 @@ def _lie_on_grid(t: Array, dt: float) -> bool:
     False for times that are missing, which `align` refuses.
     """
     return bool(np.abs(t - np.rint(t / dt) * dt).max() <= GRID_TOLERANCE * dt)
-
-
-def _largest_divisor(number: int, limit: int) -> int:
-    """Largest divisor of a number that does not exceed a limit; 1 for the number 0."""
-    divisors = (k for k in range(min(number, limit), 0, -1) if number % k == 0)
-    return next(divisors, 1)
 
 
 def align(system: System, recording: Recording) -> AlignedRecording:
@@ -308,20 +303,23 @@ def _outputs(system: System, recording: Recording) -> Array:
     Raises RecordingError where the recording has none of them.
     """
     names = system.outputs.names
-    recorded = [name for name in names if name in recording.outputs]
-    if not recorded:
+    if not set(names) & set(recording.outputs):
         raise RecordingError(
             f"{recording.name}: no measured column; "
             f"{unknown('column', listed(recording.outputs), names)}"
         )
 
     # An array in the order of the outputs is shared.
-    if recording.outputs == tuple(names):
-        return recording.y
+    return recording.y if recording.outputs == tuple(names) else _in_order(system, recording)
 
+
+def _in_order(system: System, recording: Recording) -> Array:
+    """(M, ny) measured values in the order of the outputs, NaN for those without a column."""
+    names = system.outputs.names
     y = np.full((len(recording.t), len(names)), np.nan)
-    for name in recorded:
-        y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
+    for name in recording.outputs:
+        if name in names:
+            y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
     return y
 
 
@@ -383,7 +381,7 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     first = np.clip(first, 0, len(ctrl) - 1)
     last = np.clip(last, 0, len(ctrl) - 1)
     constant = first == last
-    return np.asarray(np.where(constant[:, None], ctrl[first], mean))
+    return np.where(constant[:, None], ctrl[first], mean)
 
 
 def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array:
@@ -458,14 +456,11 @@ def measured_trajectory(
     recording = recording.first_rows(max(rows, 2))
 
     # Joints that physical terms have added show a robot that is not deflected.
+    y = _in_order(system, recording)
     qpos = np.tile(model.qpos0, (len(recording.t), 1))
     layout = system.source.layout
     for q in range(model.nq) if layout is None else layout.qpos.tolist():
-        name = system.outputs.names[measured[q]] if q in measured else ""
-        if name not in recording.outputs:
-            return None
-
-        column = recording.y[:, recording.outputs.index(name)]
+        column = y[:, measured[q]] if q in measured else np.full(len(y), np.nan)
         finite = np.isfinite(column)
         if not finite.any():
             return None
@@ -476,31 +471,16 @@ def measured_trajectory(
         norms = np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True)
         qpos[:, q : q + 4] /= np.maximum(norms, SMALLEST_NORM)
 
-    n = len(qpos)
+    known = [dof for dof in range(model.nv) if model.nq + dof in measured]
+    qvel = np.full((len(y), model.nv), np.nan)
+    qvel[:, known] = y[:, [measured[model.nq + dof] for dof in known]]
     ctrl = recording.ctrl
     if system.laws is not None:
-        ctrl = np.full((n - 1, model.nu), np.nan)
+        ctrl = np.full((len(y) - 1, model.nu), np.nan)
     return Trajectory(
         t=recording.t,
         qpos=qpos,
-        qvel=_measured_velocities(system, recording, measured),
-        act=np.zeros((n, model.na)),
+        qvel=qvel,
+        act=np.zeros((len(y), model.na)),
         ctrl=ctrl,
     )
-
-
-def _measured_velocities(
-    system: System, recording: Recording, measured: Mapping[int, int]
-) -> Array:
-    """(M, nv) measured velocities [m/s or rad/s]; NaN where there is none.
-
-    The index of the output that measures a component of the state is `measured[address]`.
-    """
-    model = system.model
-    qvel = np.full((len(recording.t), model.nv), np.nan)
-    for dof in range(model.nv):
-        output = measured.get(model.nq + dof)
-        name = "" if output is None else system.outputs.names[output]
-        if name in recording.outputs:
-            qvel[:, dof] = recording.y[:, recording.outputs.index(name)]
-    return qvel

@@ -6,7 +6,7 @@ linearised rows are condensed block by block.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, zip_longest
@@ -17,7 +17,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
+from mjfim.identification.aligned_recording import align, on_grid_of
 from mjfim.identification.segment_simulation import (
     SegmentBatch,
     SegmentRows,
@@ -27,11 +27,14 @@ from mjfim.identification.segments import (
     free_segments,
     has_free_starts,
     recorded_release,
+    spread_over_data,
     stated_segments,
 )
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
 from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step, triangle
+from mjfim.information.null_space import COARSER_STEP_FACTOR
+from mjfim.optimize.condensed_least_squares import Condensed, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.plant.outputs import Noise
@@ -93,7 +96,6 @@ class FitProblem(SegmentSimulation):
         recordings: Sequence[Recording],
         *,
         data_only: bool = False,
-        calibrated: Collection[str] | None = None,
     ) -> FitProblem:
         """The problem that the `[fit]` table of a system's experiment states.
 
@@ -101,9 +103,6 @@ class FitProblem(SegmentSimulation):
             system: The system.
             recordings: Recordings in SI units.
             data_only: Whether to leave priors and bounds out.
-            calibrated: Names of the parameters whose difference steps are calibrated; None for all.
-                There are none for a problem that is never linearised, or that gets the steps of
-                another one.
 
         Returns:
             The problem.
@@ -122,34 +121,39 @@ class FitProblem(SegmentSimulation):
         system = on_grid_of(system, recordings)
         aligned = tuple(align(system, recording) for recording in recordings)
 
-        # Difference steps depend on how strongly each parameter changes the recorded motion.
-        if calibrated is None or len(calibrated):
-            longest = max(aligned, key=lambda recording: len(recording.ctrl))
-            samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
-            wanted = None if calibrated is None else np.isin(parameters.names, list(calibrated))
-            system = _calibrated_along(system, longest, samples, wanted)
+        # Difference steps suit the first samples of the longest recording: they depend on how
+        # strongly each parameter changes the recorded motion.
+        longest = max(aligned, key=lambda recording: len(recording.ctrl))
+        samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
+        nominal = system.plant.nominal_initial_state
+        begun = system.plant.with_initial_state(recorded_release(system, longest))
+        system = replace(system, plant=begun).calibrated(parameters.guess, longest.ctrl[:samples])
+        system = replace(system, plant=system.plant.with_initial_state(nominal))
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = has_free_starts(system)
+        is_held = np.isin(parameters.names, list(settings.hold))
         segments, directions = stated_segments(system, aligned)
 
-        masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
+        # Values at a stated initial state do not count, because they contain no information.
+        masks = tuple(np.array(recording.measured) for recording in aligned)
+        for mask in () if free_starts else masks:
+            mask[0] = False
         if not any(mask.any() for mask in masks):
             raise RecordingError("the recordings contain no measured value after t = 0")
 
-        layout = UnknownLayout.of(
-            parameters,
-            len(aligned),
-            free_starts=free_starts,
-            data_only=data_only,
-            held=settings.hold,
-        )
         return cls(
             system=system,
             recordings=aligned,
             segments=segments,
-            layout=layout,
             start_directions=directions,
+            parameters=parameters,
+            shared=np.flatnonzero(~parameters.recording_specific & ~is_held),
+            free_starts=free_starts,
+            bounded=not data_only,
+            with_priors=not data_only,
+            pins=np.zeros((0, len(parameters))),
+            pinned_at=parameters.guess,
             masks=masks,
             noise=system.noise,
             loss=RobustLoss(kind=settings.loss, scale=settings.loss_scale),
@@ -164,14 +168,6 @@ class FitProblem(SegmentSimulation):
             workers: The workers.
         """
         return replace(self, workers=workers)
-
-    def unbounded(self) -> FitProblem:
-        """This problem without bounds."""
-        return replace(self, layout=self.layout.unbounded())
-
-    def with_shared_held(self) -> FitProblem:
-        """This problem with all shared parameters held."""
-        return replace(self, layout=self.layout.without_shared())
 
     def with_noise(self, noise: Noise) -> FitProblem:
         """This problem with other noise.
@@ -207,6 +203,17 @@ class FitProblem(SegmentSimulation):
             masks[segment.recording][segment.rows] = self.masks[segment.recording][segment.rows]
         return replace(self, segments=segments, masks=masks)
 
+    def spread(self, samples: int, least: int) -> np.ndarray:
+        """Indices of some segments that are spread over the data.
+
+        Args:
+            samples: About the number of their samples.
+            least: Least number of segments, if there are as many.
+        """
+        count = len(self.segments)
+        wanted = max(samples * count // self.sample_count, least)
+        return spread_over_data(count, min(wanted, count))
+
     def of_first_parts(self, share: float) -> FitProblem:
         """The problem of the first part of every segment only.
 
@@ -235,20 +242,22 @@ class FitProblem(SegmentSimulation):
         Returns:
             The problem without pins; None where the segments would be too short.
         """
-        parameters = self.system.parameters
-        moving = parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
-        held = [*self.system.experiment.fit.hold, *np.array(parameters.names)[moving].tolist()]
+        parameters = self.parameters
+        is_held = parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
+        is_held |= np.isin(parameters.names, list(self.system.experiment.fit.hold))
         try:
             segments, directions = free_segments(self.system, self.recordings, length)
         except RecordingError:
             return None
-        count = len(self.recordings)
         return replace(
             self,
             segments=segments,
-            layout=UnknownLayout.of(parameters, count, free_starts=True, held=held),
+            shared=np.flatnonzero(~parameters.recording_specific & ~is_held),
+            free_starts=True,
+            bounded=True,
             start_directions=directions,
             masks=tuple(np.array(recording.measured) for recording in self.recordings),
+            pins=self.pins[:0],
         )
 
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
@@ -263,18 +272,6 @@ class FitProblem(SegmentSimulation):
         both = tuple(mask & counted for mask, counted in zip(masks, self.masks, strict=True))
         return replace(self, masks=both)
 
-    def pinned(self, theta: Array, null_space: NullSpace) -> FitProblem:
-        """This problem with the combinations of parameters held that no recording determines.
-
-        Args:
-            theta: (p,) parameters at which the combinations are held.
-            null_space: Directions of theta about which there is no information.
-
-        Returns:
-            The problem.
-        """
-        return replace(self, layout=self.layout.pinned(theta, null_space))
-
     # ---- sizes
 
     @property
@@ -285,85 +282,22 @@ class FitProblem(SegmentSimulation):
     @property
     def unknown_count(self) -> int:
         """Number of all unknowns."""
-        return self.layout.column_count + len(self.segments) * self.private_count
+        return self.column_count + len(self.segments) * self.private_count
 
     @property
     def segments_with_values(self) -> np.ndarray:
         """Indices of the segments that contain a measured value that counts."""
-        indices = []
-        for i, segment in enumerate(self.segments):
-            if self.masks[segment.recording][segment.rows].any():
-                indices.append(i)
-
+        indices = [
+            i
+            for i, segment in enumerate(self.segments)
+            if self.masks[segment.recording][segment.rows].any()
+        ]
         return np.array(indices, dtype=np.intp)
-
-    def private_prior_rows(self, at: UnknownValues) -> Array:
-        """(P, k, m) rows `[J_private, J_common, r]` on the private unknowns of every segment."""
-        sizes = np.abs(self.start_directions).T @ self.system.plant.sizes.state
-        return self.layout.private_rows(at, sizes)
 
     @property
     def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:
         """Rows of priors and pins along a step, where inertias of whole bodies are unknown."""
-        return self.layout.common_rows_after if self.layout.shared_bodies else None
-
-    # ---- unknowns
-
-    @property
-    def lower(self) -> Array:
-        """(c,) lower bounds of the common unknowns."""
-        return self.layout.lower
-
-    @property
-    def upper(self) -> Array:
-        """(c,) upper bounds of the common unknowns."""
-        return self.layout.upper
-
-    def begin(self, theta: Array) -> UnknownValues:
-        """Unknowns at given parameters, with every initial state as stated or measured.
-
-        Args:
-            theta: (p,) parameters.
-
-        Returns:
-            The unknowns.
-        """
-        return self.layout.begin(theta, len(self.segments), self.private_count)
-
-    def common_values(self, at: UnknownValues) -> Array:
-        """Values of the common unknowns.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (c,) values.
-        """
-        return self.layout.common_values(at)
-
-    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step, clipped to the bounds.
-
-        Args:
-            at: The unknowns.
-            step: Step of all unknowns.
-            fraction: Fraction of the step.
-
-        Returns:
-            The moved unknowns.
-        """
-        return self.layout.moved(at, step, fraction)
-
-    def theta(self, at: UnknownValues) -> Array:
-        """Parameters, with the values of the first recording.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (p,) parameters [theta-unit].
-        """
-        return self.layout.theta(at)
+        return self.common_rows_after if self.shared_bodies else None
 
     # ---- residuals
 
@@ -389,14 +323,8 @@ class FitProblem(SegmentSimulation):
     def errors_at(self, at: UnknownValues) -> list[Array] | None:
         """Predicted minus measured values of every output; None where a simulation diverges."""
         predicted = self.predict(at)
-        return None if predicted is None else self.errors(predicted)
-
-    def errors(self, predicted: Sequence[Array]) -> list[Array]:
-        """Predicted minus measured values of every output, for all recordings in their order.
-
-        Args:
-            predicted: (M, ny) predicted outputs of every recording [y-unit].
-        """
+        if predicted is None:
+            return None
         return [self.errors_of(j, predicted) for j in range(len(self.system.outputs))]
 
     def errors_of(self, output: int, predicted: Sequence[Array]) -> Array:
@@ -433,8 +361,8 @@ class FitProblem(SegmentSimulation):
                 total += loss
 
         # Priors and pins.
-        common = self.layout.common_rows(at)[:, -1]
-        private = self.private_prior_rows(at)[:, :, -1]
+        common = self.common_rows(at)[:, -1]
+        private = self.private_rows(at)[:, :, -1]
         return 0.5 * total + 0.5 * (float(common @ common) + float(np.sum(private**2)))
 
     def condense(self, at: UnknownValues) -> Condensed | None:
@@ -446,7 +374,7 @@ class FitProblem(SegmentSimulation):
         Returns:
             The linearisation; None where a perturbed simulation diverges.
         """
-        m = self.private_count + self.layout.column_count + 1
+        m = self.private_count + self.column_count + 1
         blocks = np.zeros((self.block_count, m, m))
 
         batches = self.batches(derivatives=True)
@@ -459,8 +387,8 @@ class FitProblem(SegmentSimulation):
         return Condensed(
             blocks=blocks,
             segment_of_block=self.segment_of_block,
-            private_rows=self.private_prior_rows(at),
-            common_rows=self.layout.common_rows(at),
+            private_rows=self.private_rows(at),
+            common_rows=self.common_rows(at),
         )
 
     def outputs_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[SegmentRows] | None:
@@ -499,7 +427,7 @@ class FitProblem(SegmentSimulation):
         Returns:
             (m, m) triangle of each block by its index; None where a perturbed simulation diverges.
         """
-        m = self.private_count + self.layout.column_count + 1
+        m = self.private_count + self.column_count + 1
         empty = np.zeros((m, m))
         blocks: dict[int, Array] = {}
         for rows in self.rows_of_batch(at, batch):
@@ -540,7 +468,7 @@ class FitProblem(SegmentSimulation):
         """
         mask = self.mask_of(rows)
         common, private = rows.jacobians
-        columns = self.layout.to_columns(common, self.segments[rows.segment].recording)
+        columns = self.to_columns(common, self.segments[rows.segment].recording)
         J = self.noise.whiten_present(np.concatenate([private, columns], axis=2), mask)
         return np.nonzero(mask)[0], self.residual(rows), J
 
@@ -603,33 +531,6 @@ def have_same_initial_states(problem: FitProblem, other: FitProblem) -> bool:
     return begins == others and width == other.private_count
 
 
-def _calibrated_along(
-    system: System, recording: AlignedRecording, samples: int, wanted: np.ndarray | None
-) -> System:
-    """The system with difference steps that suit the first samples of a recording.
-
-    wanted: (p,) True for the parameters whose steps are calibrated; None for all.
-    """
-    guess, control = system.parameters.guess, recording.ctrl[:samples]
-    nominal = system.plant.nominal_initial_state
-    begun = replace(
-        system, plant=system.plant.with_initial_state(recorded_release(system, recording))
-    )
-    calibrated = begun.calibrated(guess, control, wanted)
-    return replace(calibrated, plant=calibrated.plant.with_initial_state(nominal))
-
-
-def _counted_values(recording: AlignedRecording, free_starts: bool) -> np.ndarray:
-    """(M, ny) True for the measured values that count.
-
-    Those at a stated initial state do not count, because they contain no information.
-    """
-    mask = np.array(recording.measured)
-    if not free_starts:
-        mask[0] = False
-    return mask
-
-
 def sensitivity_rows(
     problem: FitProblem,
     at: UnknownValues,
@@ -656,7 +557,7 @@ def sensitivity_rows(
         SimulationDivergedError: A perturbed simulation diverges.
     """
     if wanted is None:
-        wanted = np.ones(len(problem.system.parameters), dtype=bool)
+        wanted = np.ones(len(problem.parameters), dtype=bool)
     work: BatchWork[dict[int, Array]] = partial(_of_batch, with_error=with_error)
     batches = list(
         problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)
@@ -670,7 +571,7 @@ def sensitivity_rows(
                 f"{' or '.join(names)}: the simulation diverges under the recorded control"
             )
         condensed.update(of_batch)
-    n = problem.private_count if problem.layout.free_starts else 0
+    n = problem.private_count if problem.free_starts else 0
 
     found = []
     for segment in sorted(condensed):
@@ -703,7 +604,7 @@ def _of_batch(
     def sensitivity(rows: SegmentRows) -> Array:
         """(k, n+p) derivatives by the initial state where that is free, then by theta."""
         common, private = rows.jacobians
-        both = [private, common] if problem.layout.free_starts else [common]
+        both = [private, common] if problem.free_starts else [common]
         G = np.concatenate(both, axis=2)
         return problem.noise.whiten_present(G, problem.mask_of(rows))
 

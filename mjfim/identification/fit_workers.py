@@ -187,14 +187,25 @@ class FitWorkers:
         return known[threads]
 
     def _shared_recording(self, recording: AlignedRecording) -> SharedValue[_SharedRecording]:
-        """A recording, which workers of this computer find as files where it is large."""
+        """A recording, which workers of this computer find as files where it is large.
+
+        The files are removed with this object.
+        """
         if recording not in self._recordings:
             is_file = self._executor.is_local and not self._executor.shares_memory
             folder = None
             if is_file and recording.size > MIN_FILE_BYTES:
                 # Without room on the disk, the recording is sent.
                 with suppress(OSError):
-                    folder = self._written(recording)
+                    if self._folder is None:
+                        self._folder = Path(tempfile.mkdtemp(prefix="mjfim-recordings-"))
+                        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+                    written = self._folder / str(len(self._recordings))
+                    written.mkdir()
+                    for name in ARRAYS:
+                        array = getattr(recording, name)
+                        np.save(written / f"{name}.npy", array, allow_pickle=False)
+                    folder = written
             rest, size = recording, recording.size
             if folder is not None:
                 nothing = np.zeros(0)
@@ -202,14 +213,3 @@ class FitWorkers:
                 size = 0
             self._recordings[recording] = SharedValue(uuid.uuid4().hex, (rest, folder), size)
         return self._recordings[recording]
-
-    def _written(self, recording: AlignedRecording) -> Path:
-        """The folder of the arrays of a recording, which is removed with this object."""
-        if self._folder is None:
-            self._folder = Path(tempfile.mkdtemp(prefix="mjfim-recordings-"))
-            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
-        folder = self._folder / str(len(self._recordings))
-        folder.mkdir()
-        for name in ARRAYS:
-            np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
-        return folder

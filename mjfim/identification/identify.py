@@ -22,7 +22,6 @@ from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
-from mjfim.identification.horizons import choose_length
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import (
     FitSearch,
@@ -33,7 +32,7 @@ from mjfim.identification.search import (
     quick_subset,
     with_length,
 )
-from mjfim.identification.starts import SPREAD_STARTS, begin_fit, start_from_segments
+from mjfim.identification.starts import SPREAD_STARTS, begin_fit, choose_length, start_from_segments
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -373,16 +372,16 @@ def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> U
         begin: Its unknowns at the parameters where the search begins.
         near: The similar fit to the same recordings.
     """
-    found, layout = near.solution.unknowns, near.problem.layout
+    found = near.solution.unknowns
 
     if have_same_initial_states(problem, near.problem):
         begin = replace(begin, private=found.private)
 
     # A parameter with a value for each recording keeps these values.
-    names, known = problem.system.parameters.names, near.problem.system.parameters.names
-    columns = {known[j]: column for column, j in enumerate(layout.per_recording.tolist())}
+    names, known = problem.parameters.names, near.problem.parameters.names
+    columns = {known[j]: column for column, j in enumerate(near.problem.per_recording.tolist())}
     per_recording = np.array(begin.per_recording)
-    for place, j in enumerate(problem.layout.per_recording.tolist()):
+    for place, j in enumerate(problem.per_recording.tolist()):
         if names[j] in columns:
             per_recording[:, place] = found.per_recording[:, columns[names[j]]]
     return replace(begin, per_recording=per_recording)
@@ -390,11 +389,10 @@ def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> U
 
 def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, FitProblem | None]:
     """The least-squares problems of the fitted and of the held-out recordings."""
-    problem = task.problem()
-    held_out = task.held_out_problem()
-    if workers is None:
-        return problem, held_out
-    return problem.on_workers(workers), None if held_out is None else held_out.on_workers(workers)
+    problem = replace(task.problem(), workers=workers)
+    if not task.held_out:
+        return problem, None
+    return problem, replace(FitProblem.of(task.system, task.held_out), workers=workers)
 
 
 def least_squares(

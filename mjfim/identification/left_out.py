@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices, freeze
+from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import jackknife_std
@@ -170,13 +170,13 @@ def with_initial_states(
     """
     problem = problem.of_segments(problem.masked(masks).segments_with_values)
     at = problem.begin(theta)
-    if problem.unknown_count <= len(problem.layout.shared):
+    if problem.unknown_count <= len(problem.shared):
         return problem, at
 
     # Deviations of the initial state that were fitted belong to other recordings.
     private = np.zeros_like(at.private)
-    if not problem.layout.free_starts:
-        guess = problem.system.parameters.guess[problem.layout.private]
+    if not problem.free_starts:
+        guess = problem.parameters.guess[problem.private]
         private = np.tile(guess, (len(problem.segments), 1))
 
     known = problem.masked(_masks_for_initial_states(problem, masks))
@@ -248,7 +248,7 @@ def fit_without(
         starts.append((cost_at_end, own(moved)))
 
     # The data that are left out may have led the estimate to a minimum that the others lack.
-    guess = others.begin(problem.system.parameters.guess)
+    guess = others.begin(problem.parameters.guess)
     starts.append((others.cost(guess), guess))
     found = minimise(others, min(starts, key=lambda start: start[0])[1], SEARCH, budget)
     return None if found is None or budget.exhausted is not None else found.unknowns
@@ -288,10 +288,6 @@ class HeldOutLosses:
     counts: Array
     parts: np.ndarray
     estimates: Array
-
-    def __post_init__(self) -> None:
-        freeze(self, "losses", "counts", "estimates")
-        self.parts.setflags(write=False)
 
     @property
     def error(self) -> float:
@@ -583,11 +579,15 @@ def _cross_validate(
     """Prediction of every part of the data by a fit to the others."""
     whole = problem
     problem, solution = affordable_part(problem, solution)
-    parts = [
-        replace(part, name=part.name + _note_of_subset(part.recordings, problem, whole))
-        for part in left_out_parts(problem)
-        if any(segment.recording in part.recordings for segment in problem.segments)
-    ]
+    parts = []
+    for part in left_out_parts(problem):
+        tested, count = (
+            sum(segment.recording in part.recordings for segment in each.segments)
+            for each in (problem, whole)
+        )
+        note = "" if tested == count else f" ({tested} of {count} segments)"
+        if tested:
+            parts.append(replace(part, name=part.name + note))
     works = [partial(_prediction_by_others, solution=solution, part=part) for part in parts]
     for prediction in of_parts(problem, works, budget):
         if budget.exhausted is not None:
@@ -606,22 +606,13 @@ def _prediction_by_others(
     others = fit_without(problem, budget, solution=solution, part=part)
     if others is None:
         return None
-    guess, masks = problem.system.parameters.guess, part.masks(problem)
+    guess, masks = problem.parameters.guess, part.masks(problem)
     return Prediction(
         name=part.name,
         identified=_predicted(problem, others.theta, masks, part.name, budget)[0],
         nominal=_predicted(problem, guess, masks, part.name, budget)[0],
         held_out=False,
     )
-
-
-def _note_of_subset(recordings: Sequence[int], subset: FitProblem, whole: FitProblem) -> str:
-    """How many segments of some recordings are in a subset; empty where all of them are."""
-    tested, count = (
-        sum(segment.recording in recordings for segment in problem.segments)
-        for problem in (subset, whole)
-    )
-    return "" if tested == count else f" ({tested} of {count} segments)"
 
 
 def _predicted(
@@ -634,12 +625,13 @@ def _predicted(
     """
     part, at = with_initial_states(problem, theta, masks, budget)
     predicted = part.predict(at)
-    errors = [] if predicted is None else part.masked(masks).errors(predicted)
     names = problem.system.outputs.names
     rms, mae = np.full((2, len(names)), np.nan)
-    for j, of_output in enumerate(errors):
-        if len(of_output):
-            rms[j] = np.sqrt(np.mean(of_output**2))
-            mae[j] = np.mean(np.abs(of_output))
+    counted = part.masked(masks)
+    for j in range(len(names)):
+        errors = np.zeros(0) if predicted is None else counted.errors_of(j, predicted)
+        if len(errors):
+            rms[j] = np.sqrt(np.mean(errors**2))
+            mae[j] = np.mean(np.abs(errors))
     found = PredictionErrors(name=name, outputs=names, rms=rms, mae=mae)
     return found, predicted or [np.full(mask.shape, np.nan) for mask in masks]

@@ -78,10 +78,7 @@ class UnknownBody:
 
     def derivative(self, linear: Array) -> Array:
         """(10, 10) derivatives of the parameters by the barycentric coordinates."""
-        if not self.is_logcholesky:
-            return np.eye(COUNT)
-        by_parameters = barycentric_of(logcholesky_derivatives(self.values(linear))).T
-        return np.asarray(np.linalg.inv(by_parameters))
+        return np.asarray(np.linalg.inv(self.linear_slopes(self.values(linear)).T))
 
     def physical_share(self, values: Array, step: Array) -> float:
         """Largest share, at most 1, of a step (10,) of the parameters that `moved` may take.
@@ -118,8 +115,8 @@ class UnknownBody:
         Forces are linear along it, so that Gauss-Newton steps err far less than along a straight
         line of log-Cholesky coordinates.
         """
-        if not self.is_logcholesky or not step.any():
-            return np.asarray(values + step)
+        if not step.any():
+            return values
         return self.values(self.linear(values) + step @ self.linear_slopes(values))
 
     def is_physical(self, linear: Array) -> bool:
@@ -216,14 +213,10 @@ class LinearCoordinates:
 
     Attributes:
         bodies: Bodies with barycentric coordinates in x.
-        lower: (p,) lower bounds of x.
-        upper: (p,) upper bounds of x.
         sizes: (p,) sizes of x.
     """
 
     bodies: tuple[UnknownBody, ...]
-    lower: Array
-    upper: Array
     sizes: Array
 
     @staticmethod
@@ -243,9 +236,7 @@ class LinearCoordinates:
         )
         for body in bodies:
             sizes[body.columns] = body.linear_sizes
-        return LinearCoordinates(
-            bodies=bodies, lower=parameters.lower, upper=parameters.upper, sizes=sizes
-        )
+        return LinearCoordinates(bodies=bodies, sizes=sizes)
 
     def linear(self, theta: Array) -> Array:
         """(p,) linear coordinates of parameters theta: (p,)."""
@@ -267,10 +258,6 @@ class LinearCoordinates:
         for body in self.bodies:
             blocks[np.ix_(body.columns, body.columns)] = body.derivative(x[body.columns])
         return blocks
-
-    def are_physical(self, x: Array) -> bool:
-        """Whether all bodies are physical at x: (p,)."""
-        return all(body.is_physical(x[body.columns]) for body in self.bodies)
 
     def slopes(self, differences: Array, moves: Array) -> Array:
         """Slopes of rows by the linear coordinates from differences along moves.
@@ -361,4 +348,4 @@ class CadPrior:
     def information(self, theta: Array) -> Array:
         """(p, p) information of the priors about the parameters at theta: (p,)."""
         J = self.rows(theta)[:, :-1]
-        return np.asarray(J.T @ J)
+        return J.T @ J

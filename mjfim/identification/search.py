@@ -109,12 +109,6 @@ class FitTask:
         )
 
     @property
-    def start_in_words(self) -> str:
-        """The parameters of the stated start and their values, for a message."""
-        names = self.system.parameters.names
-        return listed([f"{n} = {v:.6g}" for n, v in zip(names, self.start, strict=True)])
-
-    @property
     def noise_is_stated(self) -> bool:
         """True for the noise of the experiment; False where it is estimated from the residuals."""
         return self.settings.noise == "stated"
@@ -128,13 +122,11 @@ class FitTask:
         problem = FitProblem.of(self.system, self.recordings)
         return problem.unbounded() if self.method == "newton" else problem
 
-    def held_out_problem(self) -> FitProblem | None:
-        """The least-squares problem of the held-out recordings; None without any.
 
-        Raises:
-            RecordingError: A recording cannot be used.
-        """
-        return FitProblem.of(self.system, self.held_out) if self.held_out else None
+def values_of_start(task: FitTask) -> str:
+    """The parameters of the stated start and their values, for a message."""
+    names = task.system.parameters.names
+    return listed([f"{n} = {v:.6g}" for n, v in zip(names, task.start, strict=True)])
 
 
 def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTask:
@@ -272,11 +264,6 @@ FIRST_SHARE = 0.25
 MIN_FIRST_SAMPLES = 2_000
 MIN_FIRST_SEGMENTS = 3
 
-# Number of samples, and least number of segments, that lead near enough to a minimum for a search
-# over all data to begin there.
-RESTART_SAMPLES = 3_000
-MIN_RESTART_SEGMENTS = 12
-
 Callback = Callable[[FitEvent], None]
 
 
@@ -286,7 +273,7 @@ Callback = Callable[[FitEvent], None]
 def quick_subset(problem: FitProblem) -> np.ndarray:
     """Indices of segments that are quick to simulate, evenly spread over the data."""
     count = len(problem.segments)
-    wanted = max(min(QUICK_SAMPLES * count // problem.sample_count, count), 1)
+    wanted = max(QUICK_SAMPLES * count // problem.sample_count, 1)
     return evenly_spread_indices(count, wanted)
 
 
@@ -299,13 +286,6 @@ def first_subset(problem: FitProblem) -> np.ndarray:
     if not enough or 2 * wanted > count:
         return quick
     return spread_over_data(count, min(wanted, len(quick)))
-
-
-def restart_subset(problem: FitProblem) -> np.ndarray:
-    """Indices of the segments of a fit that only leads to a start for another one."""
-    count = len(problem.segments)
-    wanted = max(RESTART_SAMPLES * count // problem.sample_count, MIN_RESTART_SEGMENTS)
-    return spread_over_data(count, min(wanted, count))
 
 
 def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
@@ -480,7 +460,7 @@ class FitSearch:
         iterations: int = INITIAL_STATES.max_iterations,
     ) -> UnknownValues:
         """Unknowns with measured initial states improved for the given theta."""
-        if not problem.layout.free_starts or self.interrupted:
+        if not problem.free_starts or self.interrupted:
             return begin
         settings = replace(INITIAL_STATES, max_iterations=iterations)
         found = self.minimise(problem.with_shared_held(), begin, settings, "initial states")

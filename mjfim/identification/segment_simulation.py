@@ -10,10 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.segments import Segment, batches
-from mjfim.identification.unknowns import UnknownLayout
+from mjfim.identification.segments import batches
+from mjfim.identification.unknowns import FitUnknowns
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.outputs import OutputDelay
@@ -50,26 +49,14 @@ class SegmentRows:
         segment: Index of the segment.
         rows: (k,) rows of its recording.
         y: (k, ny) predicted outputs [y-unit].
-        common: (k, ny, p) derivatives by theta [y-unit / theta-unit], or None if not requested.
-        private: (k, ny, n) derivatives by the private unknowns, or None if not requested.
+        jacobians: (k, ny, p) derivatives by theta [y-unit / theta-unit], and (k, ny, n) derivatives
+            by the private unknowns; none if not requested.
     """
 
     segment: int
     rows: np.ndarray
     y: Array
-    common: Array | None
-    private: Array | None
-
-    @property
-    def jacobians(self) -> tuple[Array, Array]:
-        """Derivatives by theta and by the private unknowns.
-
-        Raises:
-            ValueError: These rows were simulated without derivatives.
-        """
-        if self.common is None or self.private is None:
-            raise ValueError("these rows were simulated without derivatives")
-        return self.common, self.private
+    jacobians: tuple[Array, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,25 +81,14 @@ class SegmentBatch:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SegmentSimulation:
+class SegmentSimulation(FitUnknowns):
     """Predicted outputs of all segments as functions of the unknowns.
 
     Attributes:
-        system: The system, with difference steps calibrated along a recording.
-        recordings: The K recordings on the sample grid.
-        segments: The P segments.
-        layout: Which parameters are common, and which are private.
-        start_directions: (nx, n) directions of the initial state along which the private unknowns
-            move it.
         difference_step: Relative step of the two-sided differences of a linearisation.
         central: True for two-sided differences; None for two-sided ones unless there is much data.
     """
 
-    system: System
-    recordings: tuple[AlignedRecording, ...]
-    segments: tuple[Segment, ...]
-    layout: UnknownLayout
-    start_directions: Array
     difference_step: float = SENSITIVITY_STEP
     central: bool | None = None
 
@@ -120,11 +96,6 @@ class SegmentSimulation:
     def sample_count(self) -> int:
         """Number of samples of all segments together."""
         return sum(segment.samples for segment in self.segments)
-
-    @property
-    def private_count(self) -> int:
-        """Number of private unknowns of a segment n."""
-        return int(self.start_directions.shape[1])
 
     def segments_of(self, recording: int) -> list[int]:
         """Segments of one recording.
@@ -207,7 +178,7 @@ class SegmentSimulation:
     def _simulated(self, at: UnknownValues, index: int, samples: int) -> Rollouts:
         """One segment over some samples."""
         plant, segment = self.system.plant, self.segments[index]
-        theta = self.layout.theta_of_recording(at, segment.recording)
+        theta = self.theta_of_recording(at, segment.recording)
         start = self._initial_state(at, index)[None]
         if plant.laws is None:
             return plant.simulator.rollout(
@@ -245,13 +216,13 @@ class SegmentSimulation:
             The batches.
         """
         if wanted is None:
-            wanted = self.layout.estimated
+            wanted = self.estimated
 
         # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
         central = self.central if central is None else central
         if central is None:
-            central = self.affords_two_sided(directions)
+            central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
         step = self.difference_step if step is None else step
         if not central:
             step = ONE_SIDED_STEP_FACTOR * step
@@ -260,7 +231,11 @@ class SegmentSimulation:
         if derivatives:
             simulations += directions * (2 if central else 1)
 
-        for recording, segments in self._batches(self._max_samples(simulations)):
+        # The states of a batch have to fit into memory.
+        numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
+        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
+        max_samples = max(most // (simulations * self.system.grid.substeps), 1)
+        for recording, segments in self._batches(max_samples):
             yield SegmentBatch(
                 recording=recording,
                 segments=tuple(segments),
@@ -269,17 +244,6 @@ class SegmentSimulation:
                 step=step,
                 wanted=wanted,
             )
-
-    def affords_two_sided(self, directions: int) -> bool:
-        """Whether two-sided differences along some directions take little time.
-
-        Args:
-            directions: Number of the directions.
-
-        Returns:
-            True where they simulate few samples.
-        """
-        return self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
 
     def rows_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> Iterator[SegmentRows | None]:
         """Simulate a batch over one interval of time after the other.
@@ -292,7 +256,7 @@ class SegmentSimulation:
             Predictions of some rows of one segment. Where a simulation diverges, None is the last
             item.
         """
-        theta = self.layout.theta_of_recording(at, batch.recording)
+        theta = self.theta_of_recording(at, batch.recording)
         longest = max(self.segments[i].samples for i in batch.segments)
         lead = self.system.plant.lead(theta)
         begins = np.array([self.segments[i].begin for i in batch.segments])
@@ -316,17 +280,6 @@ class SegmentSimulation:
                 if found is not None:
                     yield found
 
-    def _max_samples(self, simulations: int) -> int:
-        """Largest number of samples of a batch, whose states have to fit into memory.
-
-        Args:
-            simulations: Number of simulations of every segment.
-        """
-        steps_per_sample = simulations * self.system.grid.substeps
-        numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
-        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
-        return max(most // steps_per_sample, 1)
-
     def _batches(self, max_samples: int) -> Iterator[tuple[int, list[int]]]:
         """Segments that are simulated together.
 
@@ -337,7 +290,7 @@ class SegmentSimulation:
             Index of a recording whose parameters the segments have, and indices of the segments.
         """
         # Without parameters of single recordings, a batch may contain segments of all recordings.
-        if not len(self.layout.per_recording):
+        if not len(self.per_recording):
             for batch in batches(self.segments, max_samples):
                 yield 0, batch
             return
@@ -351,13 +304,13 @@ class SegmentSimulation:
     def _initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""
         space = self.system.space
-        parameters = self.system.parameters
+        parameters = self.parameters
         start = self.segments[index].start
-        if self.layout.free_starts:
+        if self.free_starts:
             return space.plus(start, self.start_directions @ at.private[index])
 
         theta = np.array(at.theta)
-        theta[self.layout.private] = at.private[index]
+        theta[self.private] = at.private[index]
         return space.plus(start, parameters.initial_state_derivative(space.nx) @ theta)
 
     def _control(self, index: int, samples: int, lead: int) -> Array:
@@ -374,16 +327,6 @@ class SegmentSimulation:
         after = np.repeat(ctrl[-1:], lead + samples - len(before) - len(ctrl), axis=0)
         return np.concatenate([before, ctrl, after])
 
-    def _row_times(self, theta: Array, segment: Segment) -> Array:
-        """(M,) times in the simulation of a segment that its rows measure.
-
-        They are counted in samples since the begin of the segment. Delayed outputs measure an
-        earlier time than that of their row. theta: (p,) parameters of the recording.
-        """
-        recording = self.recordings[segment.recording]
-        delay_samples = float(self.system.parameters.delay_derivative @ theta) / recording.dt
-        return recording.t[segment.rows] / recording.dt - segment.begin - delay_samples
-
     def _rows_of_segment(
         self, theta: Array, index: int, place: int, response: Response
     ) -> SegmentRows | None:
@@ -397,7 +340,11 @@ class SegmentSimulation:
         """
         segment = self.segments[index]
         recording = self.recordings[segment.recording]
-        times = self._row_times(theta, segment)
+
+        # Times that the rows measure, in samples since the begin of the segment. Delayed outputs
+        # measure an earlier time than that of their row.
+        delay = float(self.parameters.delay_derivative @ theta)
+        times = recording.t[segment.rows] / recording.dt - segment.begin - delay / recording.dt
 
         # Rows in this interval; the last interval includes its end.
         samples = response.y.shape[1] - 1
@@ -408,18 +355,13 @@ class SegmentSimulation:
         if not inside.any():
             return None
 
-        y, common, private = self._at_times(response, place, recording, times[inside])
-        return SegmentRows(
-            segment=index,
-            rows=np.flatnonzero(inside) + segment.rows.start,
-            y=y,
-            common=common,
-            private=private,
-        )
+        y, *jacobians = self._at_times(response, place, recording, times[inside])
+        rows = np.flatnonzero(inside) + segment.rows.start
+        return SegmentRows(segment=index, rows=rows, y=y, jacobians=tuple(jacobians))
 
     def _at_times(
         self, response: Response, place: int, recording: AlignedRecording, times: Array
-    ) -> tuple[Array, Array | None, Array | None]:
+    ) -> list[Array]:
         """(k, ny) outputs of a segment at some times, and their derivatives if there are any.
 
         Args:
@@ -428,28 +370,26 @@ class SegmentSimulation:
             recording: Recording of the segment.
             times: (k,) times of the rows [samples since the begin of the segment].
         """
-        y = response.y[place]
-        common = None if response.common is None else response.common[place]
-        private = None if response.private is None else response.private[place]
-
-        delay_derivative = self.system.parameters.delay_derivative
+        found = [
+            each[place]
+            for each in (response.y, response.common, response.private)
+            if each is not None
+        ]
+        delay_derivative = self.parameters.delay_derivative
         is_delayed = bool(delay_derivative.any())
 
         # Rows on the grid are samples of the simulation.
         if recording.on_grid and not is_delayed:
             sample = np.rint(times).astype(int) - response.first
-            common = None if common is None else common[sample]
-            private = None if private is None else private[sample]
-            return y[sample], common, private
+            return [each[sample] for each in found]
 
         # Other rows are interpolated between the samples; the derivative by the delay is added.
-        interpolation = OutputDelay.at(times - response.first, len(y), recording.dt)
-        private = None if private is None else interpolation.apply(private)
-        if common is not None:
-            common = interpolation.apply(common)
-            if is_delayed:
-                common = common + interpolation.derivative(y)[..., None] * delay_derivative
-        return interpolation.apply(y), common, private
+        interpolation = OutputDelay.at(times - response.first, len(found[0]), recording.dt)
+        at_times = [interpolation.apply(each) for each in found]
+        if is_delayed and len(found) > 1:
+            change = interpolation.derivative(found[0])
+            at_times[1] = at_times[1] + change[..., None] * delay_derivative
+        return at_times
 
     # ---- blocks of rows; every segment is divided evenly into its blocks
 

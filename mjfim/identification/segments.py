@@ -55,12 +55,7 @@ class Bristle:
             model: The compiled model (`mujoco.MjModel`).
             qvel: (n, nv) velocities [m/s or rad/s].
         """
-        return np.asarray(actuator_gear(model, self.actuator) * qvel[:, self.dof])
-
-    def friction(self, model: Any) -> tuple[float, ...]:
-        """Stiffness, Coulomb friction, static friction and Stribeck speed in a model."""
-        stiffness = model.actuator_dynprm[self.actuator, BRISTLE_STIFFNESS_COLUMN]
-        return (float(stiffness), *model.actuator_biasprm[self.actuator, FRICTION_COLUMNS].tolist())
+        return actuator_gear(model, self.actuator) * qvel[:, self.dof]
 
     def deflection(self, model: Any, speed: Array, direction: Array) -> Array:
         """(n,) deflections in steady sliding.
@@ -70,7 +65,8 @@ class Bristle:
             speed: (n,) speeds of the device.
             direction: (n,) the signs of the speeds, or numbers between -1 and 1 near rest.
         """
-        stiffness, coulomb, static, stribeck = self.friction(model)
+        stiffness = model.actuator_dynprm[self.actuator, BRISTLE_STIFFNESS_COLUMN]
+        coulomb, static, stribeck = model.actuator_biasprm[self.actuator, FRICTION_COLUMNS]
         ratio = speed / max(stribeck, mujoco.mjMINVAL)
         force = coulomb + (static - coulomb) * np.exp(-(ratio**2))
         return np.asarray(direction * force / stiffness)
@@ -247,7 +243,9 @@ def has_free_starts(system: System) -> bool:
     """Whether the initial states of segments are free, and begin at measured values."""
     settings = system.experiment.fit
     is_measured = settings.start != "stated" or settings.segment_length is not None
-    return is_measured or free_release(system)
+    # Recordings may begin at releases that only they show, where nothing else moves the start.
+    moves = system.parameters.initial_state_derivative(system.space.nx).any()
+    return is_measured or (bool(system.experiment.initial.free) and not moves)
 
 
 def stated_segments(
@@ -325,16 +323,6 @@ def whole_recordings(system: System, recordings: Sequence[AlignedRecording]) -> 
         )
         for i, recording in enumerate(recordings)
     )
-
-
-def free_release(system: System) -> bool:
-    """Whether recordings begin at releases that only they show, and nothing else moves the start.
-
-    The whole initial state of a recording is then unknown.
-    """
-    if not system.experiment.initial.free:
-        return False
-    return not system.parameters.initial_state_derivative(system.space.nx).any()
 
 
 def recorded_release(system: System, recording: AlignedRecording) -> Array:
@@ -470,7 +458,7 @@ def measured_initial_states(
     space = system.space
     known = KnownActivations.of(system)
     states = _nominal_states(system, recording, begins, known)
-    output_of = _measured_states(system, recording)
+    output_of = measured_states(system, recording)
 
     quaternion_components = {a for q, _ in space.quaternions for a in range(q, q + 4)}
     velocity_addresses = (space.nq + space.scalar_v).tolist()
@@ -527,7 +515,7 @@ def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: flo
     row_after = int(np.searchsorted(recording.t, t0))
     candidates = recording.measured_rows_near(columns[0], row_after, 1)
     nearest = min(candidates, key=lambda row: abs(recording.t[row] - t0))
-    return np.asarray(recording.y[nearest, list(columns)])
+    return recording.y[nearest, list(columns)]
 
 
 def _nominal_states(
@@ -543,7 +531,7 @@ def _nominal_states(
     # No simulation is needed where the whole state is measured, or where all segments begin at the
     # first sample.
     first = system.space.nq + system.space.nv
-    measured = {*_measured_states(system, recording), *(first + a for a in known.addresses)}
+    measured = {*measured_states(system, recording), *(first + a for a in known.addresses)}
     if measured.issuperset(range(len(start))) or not begins.any():
         return states
 
@@ -553,10 +541,14 @@ def _nominal_states(
     return np.array(simulated.states[0][begins]) if simulated.finite[0] else states
 
 
-def _measured_states(system: System, recording: AlignedRecording) -> dict[int, int]:
+def measured_states(system: System, recording: AlignedRecording) -> dict[int, int]:
     """Output that measures each component of the state, by the address of the component.
 
     Outputs without any value in the recording are left out.
+
+    Args:
+        system: System that was recorded.
+        recording: The recording.
     """
     outputs = outputs_by_state(system.model, system.outputs)
     has_values = np.asarray(recording.measured.any(axis=0))

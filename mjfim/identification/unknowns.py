@@ -7,14 +7,17 @@ unknowns of the segments.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unknown_bodies
+from mjfim.identification.segments import Segment
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Step
@@ -26,117 +29,104 @@ FREE_START_SIGMA = 1e3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class UnknownLayout:
-    """Positions of the p parameters among the c = s + K e common and the n private unknowns.
+class FitUnknowns:
+    """The p parameters among the c = s + K e common and the n private unknowns of a segment.
 
     Attributes:
+        system: The system, with difference steps calibrated along a recording.
         parameters: The p parameters.
+        recordings: The K recordings on the sample grid.
+        segments: The P segments.
+        start_directions: (nx, n) directions of the initial state along which the private unknowns
+            move it.
         shared: (s,) indices in theta of the parameters that all recordings share.
-        per_recording: (e,) indices in theta of the parameters with a value for each recording.
-        private: (n,) indices in theta of the nuisance deviations of the initial state.
-        recordings: Number of recordings K.
-        lower: (c,) lower bounds of the common unknowns [theta-unit].
-        upper: (c,) upper bounds of the common unknowns [theta-unit].
         free_starts: True where the whole initial state of every segment is private, and theta holds
             none of it.
+        bounded: Whether the parameters have bounds.
         with_priors: Whether priors of the parameters count.
         pins: (k, p) coefficients of combinations that no recording determines and that are held,
             each over the magnitude of the parameter.
         pinned_at: (p,) parameters at which these combinations are held.
     """
 
+    system: System
     parameters: ParameterSet
+    recordings: tuple[AlignedRecording, ...]
+    segments: tuple[Segment, ...]
+    start_directions: Array
     shared: np.ndarray
-    per_recording: np.ndarray
-    private: np.ndarray
-    recordings: int
-    lower: Array
-    upper: Array
     free_starts: bool
+    bounded: bool
     with_priors: bool
     pins: Array
     pinned_at: Array
 
-    @staticmethod
-    def of(
-        parameters: ParameterSet,
-        recordings: int,
-        *,
-        free_starts: bool,
-        data_only: bool = False,
-        held: Collection[str] = (),
-    ) -> UnknownLayout:
-        """The layout of the unknowns of a fit.
+    def unbounded(self) -> Self:
+        """This problem without bounds."""
+        return replace(self, bounded=False)
 
-        Args:
-            parameters: The parameters.
-            recordings: Number of recordings.
-            free_starts: Whether initial states are measured and then free.
-            data_only: Whether to leave priors and bounds out.
-            held: Names of parameters that are no unknowns.
+    def with_shared_held(self) -> Self:
+        """This problem with all shared parameters held: they have no columns, and need no pins."""
+        return replace(self, shared=self.shared[:0], pins=self.pins[:0])
 
-        Returns:
-            The layout.
-        """
-        is_per_recording = parameters.recording_specific & ~parameters.initial_deviations
-        is_held = np.isin(parameters.names, list(held))
-        shared = np.flatnonzero(~parameters.recording_specific & ~is_held)
-        per_recording = np.flatnonzero(is_per_recording)
-
-        columns = np.concatenate([shared, np.tile(per_recording, recordings)])
-        layout = UnknownLayout(
-            parameters=parameters,
-            shared=shared,
-            per_recording=per_recording,
-            private=np.flatnonzero(parameters.initial_deviations),
-            recordings=recordings,
-            lower=parameters.lower[columns],
-            upper=parameters.upper[columns],
-            free_starts=free_starts,
-            with_priors=not data_only,
-            pins=np.zeros((0, len(parameters))),
-            pinned_at=parameters.guess,
-        )
-        return layout.unbounded() if data_only else layout
-
-    def pinned(self, theta: Array, null_space: NullSpace) -> UnknownLayout:
-        """This layout with the directions held about which there is no information.
+    def pinned(self, theta: Array, null_space: NullSpace) -> Self:
+        """This problem with the combinations of parameters held that no recording determines.
 
         A pin has the weight of a prior whose standard deviation is the magnitude of the parameters.
 
         Args:
             theta: (p,) parameters at which the combinations are held.
             null_space: Directions of theta about which there is no information.
+
+        Returns:
+            The problem.
         """
         magnitude = self.parameters.magnitude
         orthonormal = np.linalg.qr(null_space.directions / magnitude[:, None])[0]
         return replace(self, pins=orthonormal.T / magnitude, pinned_at=np.array(theta))
 
-    def unbounded(self) -> UnknownLayout:
-        """This layout without bounds."""
-        infinite = np.full(self.column_count, np.inf)
-        return replace(self, lower=-infinite, upper=infinite)
+    # ---- positions
 
-    def without_shared(self) -> UnknownLayout:
-        """This layout with the shared parameters held: they have no columns, and need no pins."""
-        count = len(self.shared)
-        return replace(
-            self,
-            shared=self.shared[:0],
-            lower=self.lower[count:],
-            upper=self.upper[count:],
-            pins=self.pins[:0],
-        )
+    @cached_property
+    def per_recording(self) -> np.ndarray:
+        """(e,) indices in theta of the parameters with a value for each recording."""
+        parameters = self.parameters
+        return np.flatnonzero(parameters.recording_specific & ~parameters.initial_deviations)
+
+    @cached_property
+    def private(self) -> np.ndarray:
+        """(n,) indices in theta of the nuisance deviations of the initial state."""
+        return np.flatnonzero(self.parameters.initial_deviations)
+
+    @property
+    def private_count(self) -> int:
+        """Number of private unknowns of a segment n."""
+        return int(self.start_directions.shape[1])
 
     @property
     def column_count(self) -> int:
         """Number of common unknowns c."""
-        return len(self.shared) + self.recordings * len(self.per_recording)
+        return len(self.shared) + len(self.recordings) * len(self.per_recording)
 
-    @property
+    @cached_property
     def parameter_of_column(self) -> np.ndarray:
         """(c,) index in theta of every common column."""
-        return np.concatenate([self.shared, np.tile(self.per_recording, self.recordings)])
+        return np.concatenate([self.shared, np.tile(self.per_recording, len(self.recordings))])
+
+    @cached_property
+    def lower(self) -> Array:
+        """(c,) lower bounds of the common unknowns [theta-unit]."""
+        return self.parameters.lower[self.parameter_of_column] if self.bounded else -self._infinite
+
+    @cached_property
+    def upper(self) -> Array:
+        """(c,) upper bounds of the common unknowns [theta-unit]."""
+        return self.parameters.upper[self.parameter_of_column] if self.bounded else self._infinite
+
+    @property
+    def _infinite(self) -> Array:
+        """(c,) upper bounds where there are none."""
+        return np.full(self.column_count, np.inf)
 
     @property
     def first_columns(self) -> np.ndarray:
@@ -147,8 +137,8 @@ class UnknownLayout:
     def own_columns(self) -> np.ndarray:
         """(K, e) common columns of the unknowns that belong to each recording."""
         count = len(self.per_recording)
-        columns = len(self.shared) + np.arange(self.recordings * count)
-        return columns.reshape(self.recordings, count)
+        columns = np.arange(len(self.shared), self.column_count)
+        return columns.reshape(len(self.recordings), count)
 
     @property
     def estimated(self) -> np.ndarray:
@@ -157,23 +147,21 @@ class UnknownLayout:
         mask[self.parameter_of_column] = True
         return mask
 
-    def begin(self, theta: Array, segments: int, width: int) -> UnknownValues:
-        """Unknowns at given parameters, with stated or measured initial states.
+    def begin(self, theta: Array) -> UnknownValues:
+        """Unknowns at given parameters, with every initial state as stated or measured.
 
         Args:
-            theta: (p,) parameter values.
-            segments: Number of segments.
-            width: Number of private unknowns of a segment.
+            theta: (p,) parameters.
 
         Returns:
             The unknowns.
         """
         theta = np.array(theta, dtype=np.float64)
-        start = np.zeros(width) if self.free_starts else theta[self.private]
+        start = np.zeros(self.private_count) if self.free_starts else theta[self.private]
         return UnknownValues(
             theta=theta,
-            private=np.tile(start, (segments, 1)),
-            per_recording=np.tile(theta[self.per_recording], (self.recordings, 1)),
+            private=np.tile(start, (len(self.segments), 1)),
+            per_recording=np.tile(theta[self.per_recording], (len(self.recordings), 1)),
         )
 
     def common_values(self, at: UnknownValues) -> Array:
@@ -305,7 +293,7 @@ class UnknownLayout:
 
         # An inertia with a value for each recording has a prior in each of them.
         is_own = np.isin(np.arange(len(parameters)), self.per_recording)
-        for is_wanted, count in ((~is_own, 1), (is_own, self.recordings)):
+        for is_wanted, count in ((~is_own, 1), (is_own, len(self.recordings))):
             prior = self._cad.of_bodies(is_wanted)
             for recording in range(count if prior.bodies else 0):
                 found = prior.rows(self.theta_of_recording(at, recording))
@@ -369,12 +357,11 @@ class UnknownLayout:
         rows[:, :count] = rows[:, :count] @ follows[np.ix_(self.shared, self.shared)]
         return rows
 
-    def private_rows(self, at: UnknownValues, start_sizes: Array) -> Array:
+    def private_rows(self, at: UnknownValues) -> Array:
         """Rows on the private unknowns of every segment.
 
         Args:
             at: The unknowns.
-            start_sizes: (n,) natural sizes of the private unknowns of a segment.
 
         Returns:
             (P, k, m) rows `[J_private, J_common, r]`.
@@ -386,7 +373,8 @@ class UnknownLayout:
         # A weak prior on a free initial state, for components that no output determines.
         if self.free_starts:
             rows = np.zeros((count, n, m))
-            sigma = FREE_START_SIGMA * start_sizes
+            sizes = np.abs(self.start_directions).T @ self.system.plant.sizes.state
+            sigma = FREE_START_SIGMA * sizes
             rows[:, diagonal, diagonal] = 1.0 / sigma
             rows[:, :, -1] = at.private / sigma
             return rows

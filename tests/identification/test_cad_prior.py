@@ -108,8 +108,7 @@ def test_the_prior_of_barycentric_coordinates_is_that_metric_to_second_order(
 def test_inertias_move_along_straight_lines_of_barycentric_coordinates(
     tmp_path: Path, log: Recording
 ) -> None:
-    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log], calibrated=())
-    layout = problem.layout
+    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log])
     begin = problem.begin(problem.system.parameters.guess)
     sizes = problem.system.parameters.magnitude
     common = 0.02 * sizes * np.random.default_rng(6).standard_normal(20)
@@ -120,21 +119,21 @@ def test_inertias_move_along_straight_lines_of_barycentric_coordinates(
         common_length=1.0,
         private_length=0.0,
     )
-    body = layout.shared_bodies[0]
-    points = [layout.moved(begin, step, share).theta[body.columns] for share in (0.0, 0.5, 1.0)]
+    body = problem.shared_bodies[0]
+    points = [problem.moved(begin, step, share).theta[body.columns] for share in (0.0, 0.5, 1.0)]
     first, middle, last = (body.linear(point) for point in points)
     np.testing.assert_allclose(middle, 0.5 * (first + last), rtol=1e-9, atol=1e-12)
 
     # The step begins in the direction of the parameters.
-    begun = layout.moved(begin, step, 1e-5).theta[body.columns] - points[0]
+    begun = problem.moved(begin, step, 1e-5).theta[body.columns] - points[0]
     error = (begun / 1e-5 - common[:10]) / sizes[:10]
     assert np.abs(error).max() < 1e-5
 
     # A step to where no body is ends before it.
-    far = layout.moved(begin, replace(step, common=100.0 * common), 1.0).theta
+    far = problem.moved(begin, replace(step, common=100.0 * common), 1.0).theta
     assert not body.is_physical_after(begin.theta[body.columns], 100.0 * common[:10])
     assert body.is_physical(body.linear(far[body.columns]))
-    assert problem.layout.common_rows_after(begin, 100.0 * common) is None
+    assert problem.common_rows_after(begin, 100.0 * common) is None
 
 
 def test_a_step_to_a_rod_ends_before_it(tmp_path: Path) -> None:
@@ -158,11 +157,11 @@ def test_a_step_to_a_rod_ends_before_it(tmp_path: Path) -> None:
 def test_rows_along_a_step_have_the_derivatives_of_differences(
     tmp_path: Path, log: Recording
 ) -> None:
-    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log], calibrated=())
+    problem = FitProblem.of(System.resolve(arm(tmp_path)), [log])
     parameters = problem.system.parameters
     begin = problem.begin(moved(parameters.guess, 0.01))
     common = 0.02 * parameters.magnitude * np.random.default_rng(7).standard_normal(20)
-    along = problem.layout.common_rows_after
+    along = problem.common_rows_after
     rows = along(begin, common)
     assert rows is not None
     step = 1e-6

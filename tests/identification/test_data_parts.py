@@ -13,7 +13,6 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.assessment import term_tests
 from mjfim.identification.assessment.term_tests import (
-    DataPart,
     TermTests,
     find_missing_terms,
     part_of_data,
@@ -38,7 +37,7 @@ def problem_of(folder: Path, count: int, segments: float | str = "whole") -> Fit
     fit = {"bootstrap": 0, "segments": segments}
     system = System.resolve(experiment_of(folder, "tilt", fit=fit))
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in range(count)]
-    return FitProblem.of(system, logs, calibrated=())
+    return FitProblem.of(system, logs)
 
 
 def test_a_part_has_the_begin_of_each_recording(tmp_path: Path) -> None:
@@ -139,10 +138,8 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
     assert solution is not None
     at = solution.unknowns
 
-    first = DataPart(problem=problem, segments=np.zeros(1, dtype=int), share=0.25)
-    assert not find_missing_terms(
-        problem.of_segments(first.segments), logs, first.unknowns(at)
-    ).terms
+    first = np.zeros(1, dtype=int)
+    assert not find_missing_terms(problem.of_segments(first), logs, of_subset(at, first)).terms
 
     monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
     found = find_missing_terms(problem, logs, at)

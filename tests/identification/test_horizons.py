@@ -18,6 +18,9 @@ from mjfim.identification.identify import DIVERGED
 from mjfim.identification.left_out import HeldOutLosses
 from mjfim.identification.search import FitSearch
 from mjfim.output.pages.estimate import horizon_parts
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.starts import _chosen
+from mjfim.output.pages.estimate_parts import horizon_parts
 from mjfim.records.estimate import HorizonStudy
 from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT
@@ -181,7 +184,7 @@ def test_a_failed_fit_over_the_chosen_length_is_said(monkeypatch: pytest.MonkeyP
             return solve(search, problem, begin, phase, **settings)
         raise SimulationDivergedError("it diverges")
 
-    monkeypatch.setattr("mjfim.identification.horizons._chosen", lambda _: 0)
+    monkeypatch.setattr("mjfim.identification.starts._chosen", lambda _: 0)
     monkeypatch.setattr(FitSearch, "solve", failing)
     found = mjfim.identify(stated(), recorded(0.6, 2))
     assert found.horizons is not None

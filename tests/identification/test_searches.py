@@ -200,7 +200,7 @@ class Parts(OneParameter):
     sample_count = 24_800
     workers = None
     curved_rows = None
-    layout = SimpleNamespace(free_starts=False)
+    free_starts = False
 
     def residuals(self, theta: float) -> Array:
         """One residual of each segment."""

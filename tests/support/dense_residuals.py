@@ -49,12 +49,12 @@ def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
             residuals.append(r)
             jacobians.append(_wide_jacobian(problem, J[:, n:], J[:, :n], rows.segment))
 
-    common_rows = problem.layout.common_rows(at)
+    common_rows = problem.common_rows(at)
     no_private = np.zeros((len(common_rows), n))
     residuals.append(common_rows[:, -1])
     jacobians.append(_wide_jacobian(problem, common_rows[:, :-1], no_private, 0))
 
-    for segment, private_rows in enumerate(problem.private_prior_rows(at)):
+    for segment, private_rows in enumerate(problem.private_rows(at)):
         common, private = private_rows[:, n:-1], private_rows[:, :n]
         residuals.append(private_rows[:, -1])
         jacobians.append(_wide_jacobian(problem, common, private, segment))

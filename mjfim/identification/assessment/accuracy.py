@@ -5,7 +5,7 @@ That is the formal covariance, robust intervals, and the poorly known parameters
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -157,30 +157,13 @@ class Accuracy:
     prior_directions: PriorDirections | None
 
 
-def accuracy_of(
-    problem: FitProblem,
-    solution: Solution,
-    null_space: NullSpace,
-    correlation_rows: Sequence[float],
-    inflation: float = 1.0,
-) -> Accuracy:
-    """Assess the accuracy of a solution.
-
-    Args:
-        problem: The least-squares problem.
-        solution: Its solution.
-        null_space: Directions of theta about which neither recordings nor priors contain
-            information.
-        correlation_rows: Autocorrelation time of the residuals of every output [rows].
-        inflation: Factor by which the residuals' size and correlation widen variances.
-
-    Returns:
-        The accuracy.
-    """
-    system, layout = problem.system, problem.layout
+def _accuracy_of(fit: FitResult) -> Accuracy:
+    """Assess the accuracy of a fit."""
+    problem, solution = fit.problem, fit.solution
+    system = problem.system
     parameters, theta = system.parameters, problem.theta(solution.unknowns)
-    columns = layout.first_columns
-    index = layout.parameter_of_column[columns]
+    columns = problem.first_columns
+    index = problem.parameter_of_column[columns]
 
     # The formal covariance; unknowns of each recording have the values of the first one.
     H = solution.condensed.information()
@@ -193,13 +176,13 @@ def accuracy_of(
     formal = _of_parameters(problem, solution, common)
     std = np.zeros(len(formal))
     std[index] = common_std[columns]
-    if not layout.free_starts:
-        std[layout.private] = np.sqrt(np.diag(formal)[layout.private])
+    if not problem.free_starts:
+        std[problem.private] = np.sqrt(np.diag(formal)[problem.private])
 
     # Members of a group are not identifiable separately, though pins make their information
     # regular.
     units = [parameter.unit for parameter in parameters.parameters]
-    groups = parameter_groups(null_space, parameters.names, parameters.magnitude, units)
+    groups = parameter_groups(fit.null_space, parameters.names, parameters.magnitude, units)
     members = [name for group in groups for name in group.members]
     in_group = np.isin(parameters.names, members)
     std = np.where(in_group, np.inf, std)
@@ -217,11 +200,11 @@ def accuracy_of(
             problem.common_values(solution.unknowns),
             problem.recording_of_block,
             problem.mean_block_rows,
-            min_rows=independent_rows(problem, correlation_rows),
+            min_rows=fit.independent_rows,
             draws=settings.bootstrap,
             rng=np.random.default_rng(settings.seed),
-            own=layout.own_columns,
-            inflation=inflation,
+            own=problem.own_columns,
+            inflation=fit.quality.inflation,
         )
         covariance = _of_parameters(
             problem, solution, robust.covariance + between_covariance(robust)
@@ -244,11 +227,11 @@ def accuracy_of(
 
     # Information of the recordings alone about the parameters that they share. Only the priors on
     # the other unknowns, which are marginalised, count.
-    J = layout.prior_rows(solution.unknowns)[:, :-1]
+    J = problem.prior_rows(solution.unknowns)[:, :-1]
     of_data = solution.condensed.information(with_common_rows=False)
     data = np.zeros_like(formal)
-    shared = np.arange(len(layout.shared))
-    data[np.ix_(layout.shared, layout.shared)] = marginal(of_data, J.T @ J, shared)
+    shared = np.arange(len(problem.shared))
+    data[np.ix_(problem.shared, problem.shared)] = marginal(of_data, J.T @ J, shared)
     return Accuracy(
         std=std,
         covariance=formal,
@@ -272,15 +255,14 @@ def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Ar
     Unknowns of each recording have the values of the first recording. Deviations of the first
     initial state, which are private unknowns, follow the common ones.
     """
-    layout = problem.layout
-    p = len(problem.system.parameters)
-    columns = layout.first_columns
-    index = layout.parameter_of_column[columns]
+    p = len(problem.parameters)
+    columns = problem.first_columns
+    index = problem.parameter_of_column[columns]
     covariance = np.zeros((p, p))
     covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
 
-    private = layout.private
-    if not len(private) or layout.free_starts:
+    private = problem.private
+    if not len(private) or problem.free_starts:
         return covariance
 
     # The private unknowns follow the common ones linearly; both are infinite where an unknown is
@@ -296,23 +278,6 @@ def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Ar
     covariance[np.ix_(private, index)] = cross
     covariance[np.ix_(index, private)] = cross.T
     return covariance
-
-
-def independent_rows(problem: FitProblem, correlation_rows: Sequence[float]) -> float:
-    """Number of rows of a block that counts as independent.
-
-    It is stated in seconds, or follows from the autocorrelation of the residuals.
-
-    Args:
-        problem: The least-squares problem.
-        correlation_rows: Autocorrelation time of the residuals of every output [rows].
-    """
-    stated = problem.system.experiment.fit.blocks
-    rows = problem.row_count
-    if stated is None:
-        return block_length(correlation_rows, rows)
-    duration = sum(float(recording.t[-1]) for recording in problem.recordings)
-    return stated * rows / duration
 
 
 def _poorly_known(
@@ -397,6 +362,16 @@ class FitResult:
     @cached_property
     def accuracy(self) -> Accuracy:
         """Accuracy of the estimate."""
-        rows = self.quality.correlation_rows(self.problem.row_count)
-        inflation = self.quality.inflation
-        return accuracy_of(self.problem, self.solution, self.null_space, rows, inflation)
+        return _accuracy_of(self)
+
+    @cached_property
+    def independent_rows(self) -> float:
+        """Number of rows of a block of the data that counts as independent.
+
+        It is stated in seconds, or follows from the autocorrelation of the residuals.
+        """
+        stated, rows = self.problem.system.experiment.fit.blocks, self.problem.row_count
+        if stated is not None:
+            return stated * rows / sum(float(each.t[-1]) for each in self.problem.recordings)
+        tests = self.quality.whiteness
+        return block_length([test.time * rows / max(test.count, 1) for test in tests], rows)

@@ -133,8 +133,10 @@ def with_honest_covariance(
     inner = found[place]
     if covariance is not None and estimate.horizons is not None:
         inner = _covering(inner, _differences(inner, estimate.horizons, known))
-    if without_parts is not None:
-        inner = _covering(inner, _between_parts(without_parts)[:, known])
+    if without_parts is not None and len(without_parts) > 1:
+        # Deviations between the parts of the data, by Student's factor, like the intervals.
+        factor = student_quantile(len(without_parts), LEVEL) / NORMAL_95
+        inner = _covering(inner, factor * jackknife_deviations(without_parts)[:, known])
     found[place] = agreeing_covariance(inner, std[known])
     return replace(estimate, honest_covariance=found)
 
@@ -250,7 +252,7 @@ def agreeing_covariance(covariance: Array, std: Array) -> Array:
 
     # Parameters about which the covariance says nothing are uncorrelated.
     alone = np.where(is_wanted & ~is_moving, std, 0.0)
-    return np.asarray(root @ root.T + np.diag(alone**2))
+    return root @ root.T + np.diag(alone**2)
 
 
 def _stretch(root: Array, j: int, factor: float) -> None:
@@ -294,13 +296,3 @@ def _differences(covariance: Array, study: HorizonStudy, known: np.ndarray) -> A
             along = np.linalg.pinv(root[is_apart]) @ difference[is_apart]
             found.append((root @ along)[None])
     return np.concatenate(found)
-
-
-def _between_parts(without_parts: Array) -> Array:
-    """(K, p) deviations between the parts of the data, by Student's factor, like the intervals.
-
-    Args:
-        without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
-    """
-    deviations, K = jackknife_deviations(without_parts), len(without_parts)
-    return student_quantile(K, LEVEL) / NORMAL_95 * deviations if K > 1 else deviations

@@ -254,7 +254,7 @@ def draw_parameters_system(
         root = covariance_root(covariance)
         _, _, axes = np.linalg.svd(combinations @ root)
         kept = root @ axes[len(combinations) :].T
-        covariance = np.asarray(kept @ kept.T)
+        covariance = kept @ kept.T
     values, replaced = _physical_draws(
         system, estimate, drawn, centre, covariance, count=count, rng=rng
     )
@@ -362,7 +362,11 @@ def _physical_draws(
         is_physical = np.zeros(len(missing), dtype=bool)
         for row, i in enumerate(missing):
             robot = _moved(places, centre, tried[row])
-            if robot is not None and _is_physical(system, estimate, drawn, robot):
+            if robot is None:
+                continue
+            theta = np.array(estimate.theta)
+            theta[drawn] = robot
+            if _is_physical(system, theta):
                 values[i], is_physical[row] = robot, True
         missing = missing[~is_physical]
         if not len(missing):
@@ -395,10 +399,8 @@ def _moved(
     return robot
 
 
-def _is_physical(system: System, estimate: Estimate, drawn: np.ndarray, values: Array) -> bool:
-    """Whether all bodies have physical inertias at drawn values: (q,) of the parameters `drawn`."""
-    theta = np.array(estimate.theta)
-    theta[drawn] = values
+def _is_physical(system: System, theta: Array) -> bool:
+    """Whether all bodies have physical inertias at parameters theta: (p,)."""
     if system.impossible(theta):
         return False
 

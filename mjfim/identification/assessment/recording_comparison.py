@@ -25,7 +25,7 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array, scaled_to_unit_diagonal
-from mjfim.identification.assessment.accuracy import independent_rows
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.robust_covariance import (
     Blocks,
     independent_blocks,
@@ -36,6 +36,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.criteria import standard_deviations
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Uncertainty
+from mjfim.information.marginal import standard_deviations
 from mjfim.records.robots import OddParameter, OddRecording, RecordingComparison
 
 # Newton steps for tau², of which the weighted squares are a decreasing function.
@@ -108,7 +109,7 @@ def random_effects(values: Array, variances: Array, freedom: float) -> RandomEff
         mean=mean,
         variance=variance,
         tau2=tau2,
-        share=np.asarray(np.where(count > 1, share, 0.0)),
+        share=(np.where(count > 1, share, 0.0)),
         p=p,
         prediction=np.column_stack([mean - reach, mean + reach]),
     )
@@ -223,7 +224,7 @@ def satterthwaite(share: Array, within: float, between: int | np.ndarray) -> Arr
         between: Degrees of freedom of the part between recordings, one number or (s,).
     """
     share = np.clip(share, 0.0, 1.0)
-    return np.asarray(1.0 / ((1.0 - share) ** 2 / within + share**2 / np.maximum(between, 1)))
+    return 1.0 / ((1.0 - share) ** 2 / within + share**2 / np.maximum(between, 1))
 
 
 def t_quantile(freedom: np.ndarray) -> Array:
@@ -282,7 +283,7 @@ class RecordingViews:
             tau2: (s,) variances of theta between recordings.
         """
         inverse = np.linalg.pinv(self.directions)
-        return np.asarray(inverse * tau2 @ inverse.T)
+        return inverse * tau2 @ inverse.T
 
     def mean(self, chosen: Sequence[int], tau2: Array) -> tuple[Array, Array]:
         """(s,) mean of theta over recordings that scatter, and (s,) its standard deviations.
@@ -484,50 +485,43 @@ def _left_out(
     return p, each, effects
 
 
-def compare_recordings(
-    problem: FitProblem,
-    solution: Solution,
-    correlation_rows: Sequence[float],
-    robust: Uncertainty | None,
-) -> RecordingComparison | None:
+def compare_recordings(fit: FitResult) -> RecordingComparison | None:
     """Compare the recordings of a fit with each other.
 
     Args:
-        problem: The least-squares problem.
-        solution: Its solution.
-        correlation_rows: Autocorrelation time of the residuals of every output [rows].
-        robust: Robust uncertainty of the common unknowns, or None.
+        fit: The fit.
 
     Returns:
         The comparison; None for a single recording, and where the recordings have no parameter of
         the robot in common.
     """
-    layout = problem.layout
-    parameters = problem.system.parameters
+    problem, solution, robust = fit.problem, fit.solution, fit.accuracy.robust
+    parameters = problem.parameters
     recordings = tuple(PurePath(recording.name).name for recording in problem.recordings)
-    if len(recordings) < 2 or not len(layout.shared):
+    if len(recordings) < 2 or not len(problem.shared):
         return None
 
     condensed = solution.condensed
     recording_of_block = problem.recording_of_block
-    min_rows = independent_rows(problem, correlation_rows)
-    blocks = independent_blocks(condensed, recording_of_block, problem.mean_block_rows, min_rows)
-    evidence = recording_evidence(condensed, blocks, recording_of_block, layout.own_columns)
+    blocks = independent_blocks(
+        condensed, recording_of_block, problem.mean_block_rows, fit.independent_rows
+    )
+    evidence = recording_evidence(condensed, blocks, recording_of_block, problem.own_columns)
     # Parameters of the robot that are stated to differ have their values already.
-    stated = [i for i, j in enumerate(layout.per_recording) if parameters.changes_model[j]]
+    stated = [i for i, j in enumerate(problem.per_recording) if parameters.changes_model[j]]
     std = standard_deviations(condensed.information())
     if robust is not None:
         std = np.maximum(std, robust.sandwich)
-    index = [*layout.shared.tolist(), *layout.per_recording[stated].tolist()]
+    index = [*problem.shared.tolist(), *problem.per_recording[stated].tolist()]
     theta = solution.unknowns.theta
     found = compare_evidence(
-        theta[layout.shared],
+        theta[problem.shared],
         evidence,
         recordings=recordings,
         parameters=tuple(parameters.names[j] for j in index),
         units=tuple(problem.system.units[j] for j in index),
-        is_single=(parameters.sizes(theta) == np.abs(theta))[layout.shared],
-        stated=(solution.unknowns.per_recording[:, stated], std[layout.own_columns[:, stated]]),
+        is_single=(parameters.sizes(theta) == np.abs(theta))[problem.shared],
+        stated=(solution.unknowns.per_recording[:, stated], std[problem.own_columns[:, stated]]),
     )
 
     # Intervals end at the bounds of the parameters.

@@ -31,6 +31,7 @@ from mjfim.identification.assessment.term_tests import TermTests, find_missing_t
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.left_out import predict_unfitted
 from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.search import values_of_start
 from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
@@ -173,9 +174,8 @@ def estimate_from(
 
     begin_stage("computing the intervals")
     accuracy = result.accuracy
-    rows = quality.correlation_rows(problem.row_count)
     at_bound, outside = _at_bounds(parameters, result.theta, task.settings.hold)
-    comparison = compare_recordings(problem, solution, rows, accuracy.robust)
+    comparison = compare_recordings(result)
 
     # A good fit needs no advice.
     unpredictable = ""
@@ -199,7 +199,7 @@ def estimate_from(
     )
     undetermined = accuracy.singular or accuracy.single_unidentifiable
     per_recording = zip(
-        problem.layout.per_recording, solution.unknowns.per_recording.T.tolist(), strict=True
+        problem.per_recording, solution.unknowns.per_recording.T.tolist(), strict=True
     )
     quick, at = result.quick
     interval = accuracy.interval
@@ -244,7 +244,10 @@ def estimate_from(
         labels=labels_of_system(system),
         trace=np.array([task.start, *(problem.theta(each) for each in solution.iterates)]),
         nominal=_nominal_outputs(result),
-        segments=_beginnings(problem),
+        segments=tuple(
+            np.array([each.t[s.rows.start] for s in problem.segments if s.recording == k])
+            for k, each in enumerate(problem.recordings)
+        ),
         sizes=parameters.sizes(result.theta),
         restart=result.restart,
         controllers=laws_in_loop(system, result.theta, quick.clipped_shares(at)),
@@ -302,18 +305,9 @@ def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:
     if problem.row_count > MAX_NOMINAL_ROWS:
         return ()
     guess = problem.begin(result.task.start)
-    if problem.layout.free_starts:
+    if problem.free_starts:
         guess = replace(guess, private=at.private)
     return tuple(problem.predict(guess) or ())
-
-
-def _beginnings(problem: FitProblem) -> tuple[Array, ...]:
-    """Times at which the segments of each recording begin [s]."""
-    begins: list[list[float]] = [[] for _ in problem.recordings]
-    for segment in problem.segments:
-        t = problem.recordings[segment.recording].t[segment.rows]
-        begins[segment.recording] += t[:1].tolist()
-    return tuple(np.array(times) for times in begins)
 
 
 def _as_aligned(problem: FitProblem, recordings: Sequence[Recording]) -> tuple[Recording, ...]:
@@ -383,19 +377,16 @@ def _warnings_of_rate(result: FitResult) -> Iterator[str]:
         if share < MIN_SHARE_WITHIN_SAMPLES:
             continue
 
+        # The longest timestep of which the period of the log is a whole number.
         period = float(np.median(np.diff(recording.t)))
+        timestep = period / math.ceil(period / dt * (1.0 - ROUNDING))
         yield (
             f"{100 * share:.0f} % of the changes of the control in {Path(recording.name).name} lie "
             f"inside the engine steps of the model ({dt:g} s), which hold its mean: this alone can "
             f"cause a misfit. State a timestep in the MJCF that divides the period of the log, for "
-            f'example timestep="{_dividing_timestep(period, dt):.4g}", and rate = '
+            f'example timestep="{timestep:.4g}", and rate = '
             f"{1.0 / period:.4g} in the experiment file"
         )
-
-
-def _dividing_timestep(period: float, timestep: float) -> float:
-    """Longest timestep [s] of at most `timestep` [s] of which a period [s] is a whole number."""
-    return period / math.ceil(period / timestep * (1.0 - ROUNDING))
 
 
 def _warnings_of_search(
@@ -405,7 +396,7 @@ def _warnings_of_search(
     quality, accuracy = result.quality, result.accuracy
     if result.begun_instead:
         yield (
-            f"the model diverges at the start ({result.task.start_in_words}): the search began "
+            f"the model diverges at the start ({values_of_start(result.task)}): the search began "
             f"{result.begun_instead} instead"
         )
 
@@ -458,7 +449,7 @@ def _warnings_of_recordings(
         return
 
     names = result.task.system.parameters.names
-    index = result.problem.layout.parameter_of_column
+    index = result.problem.parameter_of_column
     apart = [names[index[column]] for column in robust.apart]
     yield (
         f"recordings disagree on {listed(apart)} by more than the scatter within each recording: "

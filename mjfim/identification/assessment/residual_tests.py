@@ -278,38 +278,37 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     series = [part for part in series if len(part) > 1]
     count = sum(len(part) for part in series)
     squares = sum(float(part @ part) for part in series)
-    if count < 2 * MIN_VALUES or not squares > 0.0:
-        return Whiteness(
-            output=output,
-            count=count,
-            variance=squares / max(count, 1),
-            correlation=0.0,
-            p=1.0,
-            inflation=1.0,
-            time=1.0,
-        )
+    variance = squares / max(count, 1)
+    correlation, p, inflation, time = 0.0, 1.0, 1.0, 1.0
+    if count >= 2 * MIN_VALUES and squares > 0.0:
+        # Ljung & Box (1978).
+        lags = min(LAGS, count // 5)
+        longest_lag = max(max(len(part) for part in series) // 4, 1)
+        rho = _autocorrelation(series, lags, max(lags, longest_lag))
+        terms = rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))
+        statistic = count * (count + 2) * float(np.sum(terms))
+        correlation = float(rho[1])
 
-    # Ljung & Box (1978).
-    lags = min(LAGS, count // 5)
-    longest_lag = max(max(len(part) for part in series) // 4, 1)
-    rho = _autocorrelation(series, lags, max(lags, longest_lag))
-    terms = rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))
-    statistic = count * (count + 2) * float(np.sum(terms))
+        # The integrated autocorrelation time ends where the autocorrelation first vanishes (initial
+        # positive sequence).
+        vanishing = np.flatnonzero(rho < NO_AUTOCORRELATION)
+        end = int(vanishing[0]) if len(vanishing) else len(rho)
+        time = float(1.0 + 2.0 * rho[1:end].sum())
 
-    # Means over runs show slow drifts that short lags miss. The smallest probability is multiplied
-    # by the number of tests (Bonferroni).
-    variance = squares / count
-    runs = list(_run_tests(series, variance))
-    probabilities = [float(scipy.special.chdtrc(lags, statistic)), *(p for _, p in runs)]
-    inflation = max((ratio for ratio, _ in runs), default=1.0)
+        # Means over runs show slow drifts that short lags miss. The smallest probability is
+        # multiplied by the number of tests (Bonferroni).
+        runs = list(_run_tests(series, variance))
+        probabilities = [float(scipy.special.chdtrc(lags, statistic)), *(p for _, p in runs)]
+        p = min(min(probabilities) * len(probabilities), 1.0)
+        inflation = max((ratio for ratio, _ in runs), default=1.0)
     return Whiteness(
         output=output,
         count=count,
         variance=variance,
-        correlation=float(rho[1]),
-        p=min(min(probabilities) * len(probabilities), 1.0),
+        correlation=correlation,
+        p=p,
         inflation=max(inflation, 1.0),
-        time=_autocorrelation_time(rho),
+        time=time,
     )
 
 
@@ -333,19 +332,6 @@ def _autocorrelation(series: Sequence[Array], least_lag: int, longest_lag: int) 
         if lag >= longest_lag or (rho[least_lag:] < NO_AUTOCORRELATION).any():
             return np.asarray(rho)
         lag = min(LAG_GROWTH * lag, longest_lag)
-
-
-def _autocorrelation_time(rho: Array) -> float:
-    """Integrated autocorrelation time `1 + 2 sum rho` [rows].
-
-    The sum ends where rho: (lags,) first vanishes (initial positive sequence).
-    """
-    end = len(rho)
-    vanishing = np.flatnonzero(rho < NO_AUTOCORRELATION)
-    if len(vanishing):
-        end = int(vanishing[0])
-
-    return float(1.0 + 2.0 * rho[1:end].sum())
 
 
 def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float, float]]:
@@ -409,17 +395,6 @@ class FitQuality:
         """
         longest = max((test.time for test in self.whiteness), default=1.0)
         return max(self.chi2 / self.dof, 1.0) * max(longest, 1.0)
-
-    def correlation_rows(self, rows: int) -> list[float]:
-        """Autocorrelation times of the residuals.
-
-        Args:
-            rows: Number of rows of all recordings.
-
-        Returns:
-            One time for every output, in rows of the recordings.
-        """
-        return [test.time * rows / max(test.count, 1) for test in self.whiteness]
 
 
 def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:

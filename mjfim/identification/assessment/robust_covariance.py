@@ -290,9 +290,9 @@ def robust_uncertainty(
     # The hull of the formal, the sandwich and the bootstrap interval. Quantiles of Student's
     # distribution allow for the number of blocks from which the sandwich covariance comes.
     upper_tail = 0.5 + LEVEL / 2.0
-    student = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail))
+    factor = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail)) / NORMAL_95
     half_width = np.maximum(
-        NORMAL_95 * np.hypot(formal, between), student * np.hypot(sandwich, between)
+        NORMAL_95 * np.hypot(formal, between), factor * NORMAL_95 * np.hypot(sandwich, between)
     )
     low, high = theta - half_width, theta + half_width
     if len(replicates):
@@ -306,7 +306,7 @@ def robust_uncertainty(
         each=each,
         blocks=count,
         draws=theta + replicates,
-        covariance=covering_covariance(of_noise, (student / NORMAL_95) ** 2 * of_scatter),
+        covariance=covering_covariance(of_noise, factor**2 * of_scatter),
     )
 
 
@@ -336,7 +336,7 @@ def _in_unknowns(covariance: Array, root: Array) -> Array:
             not be small in combinations that are known well.
         root: (c, k) the root.
     """
-    return np.asarray(root @ (0.5 * (covariance + covariance.T)) @ root.T)
+    return root @ (0.5 * (covariance + covariance.T)) @ root.T
 
 
 def covering_covariance(first: Array, second: Array) -> Array:
@@ -356,18 +356,21 @@ def covering_covariance(first: Array, second: Array) -> Array:
     return np.asarray((spread * np.maximum(ratios, 1.0)) @ spread.T)
 
 
-def covariance_root(covariance: Array, tolerance: float = 0.0) -> Array:
+def covariance_root(covariance: Array, tolerance: float = -1.0) -> Array:
     """(p, k) factor A of a covariance `A A'`: (p, p), which may be singular.
 
     Args:
         covariance: (p, p) the covariance.
-        tolerance: Eigenvalues of the correlations below this share of the largest one are left out.
+        tolerance: Eigenvalues of the correlations up to this share of the largest one are left out;
+            default: none of them.
     """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(std > 0.0, std, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values >= tolerance * values.max(initial=0.0)
-    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+    first = int(np.searchsorted(values, tolerance * values.max(initial=0.0), side="right"))
+    return np.asarray(
+        scale[:, None] * vectors[:, first:] * np.sqrt(np.maximum(values[first:], 0.0))
+    )
 
 
 def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:

@@ -115,7 +115,12 @@ def candidates_of(system: System, speeds: Array) -> tuple[list[Candidate], list[
     Returns:
         The candidates, and terms in words, each with the reason, that the model cannot have.
     """
-    targets = _targeted_paths(system)
+    # Paths of the numbers that parameters set, those of first entries without their index.
+    targets = {
+        _without_index(target.path)
+        for parameter in system.parameters.parameters
+        for target in parameter.targets
+    }
     library, impossible = _library_terms(system, speeds, targets)
     numbers = (*_joint_terms(system), *_latencies(system), *_gains(system), *_tilts(system))
     further = (*_misalignments(system), *_output_errors(system))
@@ -125,15 +130,6 @@ def candidates_of(system: System, speeds: Array) -> tuple[list[Candidate], list[
         if not targets & {_without_index(each.path) for each in candidate.tested}
     ]
     return found, impossible
-
-
-def _targeted_paths(system: System) -> set[str]:
-    """Paths of the numbers that parameters set, those of first entries without their index."""
-    return {
-        _without_index(target.path)
-        for parameter in system.parameters.parameters
-        for target in parameter.targets
-    }
 
 
 def _without_index(path: str) -> str:
@@ -164,13 +160,11 @@ def _number(
 def _at_joint(words: str, name: str, joint: str, number: Effect) -> Candidate:
     """A candidate that is one number of a joint, or of a driver of this joint with its own name."""
     return Candidate(
-        description=words.format(name), tested=(number,), kind=_kind_of(words), joint=joint
+        description=words.format(name),
+        tested=(number,),
+        kind=words.replace(" of {}", ""),
+        joint=joint,
     )
-
-
-def _kind_of(words: str) -> str:
-    """Words without the place of the name."""
-    return words.replace(" of {}", "")
 
 
 def _joint_terms(system: System) -> Iterator[Candidate]:
@@ -379,7 +373,7 @@ def _library_term(
         tested=(tested,),
         further=further,
         tables={name: stated_table},
-        kind=_kind_of(kind.words) if kind.acts_on == "joint" else "",
+        kind=kind.words.replace(" of {}", "") if kind.acts_on == "joint" else "",
         joint=element if kind.acts_on == "joint" else "",
         source=kind.sources[0],
         alone=kind.kind if kind.alone else "",

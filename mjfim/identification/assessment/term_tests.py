@@ -76,7 +76,7 @@ def extended_problem(
     # The rows are those of the solution; a delay as a parameter would let the segments begin
     # earlier.
     wider: FitProblem | None = FitProblem.of(extended, recordings)
-    if wider is not None and problem.layout.free_starts and not wider.layout.free_starts:
+    if wider is not None and problem.free_starts and not wider.free_starts:
         wider = wider.cut(None)
     if wider is None:
         return None
@@ -157,8 +157,8 @@ def _extended_private(problem: FitProblem, wider: FitProblem, at: UnknownValues)
 
 def _private_names(problem: FitProblem) -> list[str]:
     """Names of the private unknowns of a segment."""
-    if not problem.layout.free_starts:
-        return [problem.system.parameters.names[i] for i in problem.layout.private]
+    if not problem.free_starts:
+        return [problem.parameters.names[i] for i in problem.private]
     names = np.array(tangent_names(problem.system.model))
     directions = problem.start_directions
     return [str(names[np.flatnonzero(column)[0]]) for column in directions.T]
@@ -314,7 +314,7 @@ def find_missing_terms(
         for group in in_groups([each for each in linear if each.alone == kind])
     ]
     largest = max((sum(len(each.tested) for each in group) for group in groups), default=0)
-    columns = problem.layout.column_count + problem.private_count + largest
+    columns = problem.column_count + problem.private_count + largest
     part, segments = part_of_data(problem, MAX_SIMULATED / columns)
     at = of_subset(at, segments)
     search = _TermSearch(
@@ -508,8 +508,8 @@ class _TermSearch:
         if condensed is None:
             return None
 
-        names = wider.system.parameters.names
-        column_of = {names[j]: i for i, j in enumerate(wider.layout.parameter_of_column.tolist())}
+        names = wider.parameters.names
+        column_of = {names[j]: i for i, j in enumerate(wider.parameter_of_column.tolist())}
         tested = np.array(
             [
                 column_of[f"?{i}.{k}"]
@@ -603,7 +603,7 @@ class _TermSearch:
         if extended is None:
             return None
         wider, begin = extended
-        place = wider.system.parameters.names.index("?")
+        place = wider.parameters.names.index("?")
         best, least = 0.0, self.squares
         for k in range(MAX_VALUES):
             theta = np.array(begin.theta)

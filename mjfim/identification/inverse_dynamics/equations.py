@@ -73,14 +73,17 @@ class Equation:
     Attributes:
         name: Name of the degree of freedom, or of the law.
         unit: Unit of its forces; empty for laws.
-        dof: Degree of freedom; -1 for the law of a measured force.
-        force: Index of the measured force; -1 for a degree of freedom.
+        place: Degree of freedom, or index of the measured force whose law it is.
     """
 
     name: str
-    unit: str = ""
-    dof: int = -1
-    force: int = -1
+    unit: str
+    place: int
+
+
+# Averages of a series of n points: their (k, n) weights, the (k,) middles of their windows [s], and
+# the length of a window [s].
+Windows = tuple[scipy.sparse.csr_array, Array, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,18 +95,14 @@ class RecordedEquations:
         forces: (n, f) measured forces.
         has_force: (f,) True for those that the recording holds.
         moments: (n, f, nv) forces on the degrees of freedom per measured force.
-        windows: (k, n) weights of the points in the averages of each equation.
-        times: (k,) middles of these windows [s].
-        lengths: Lengths of the windows of each equation [s].
+        windows: Windows of each equation.
     """
 
     motion: MeasuredMotion
     forces: Array
     has_force: np.ndarray
     moments: Array
-    windows: tuple[scipy.sparse.csr_array, ...]
-    times: tuple[Array, ...]
-    lengths: tuple[float, ...]
+    windows: tuple[Windows, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -251,7 +250,7 @@ class MotionEquations:
 
     def _of_rows(self, values: Sequence[Sequence[float]]) -> np.ndarray:
         """(R,) a number for each row, from one for each recording and equation."""
-        counts = [[len(t) for t in each.times] for each in self.recorded]
+        counts = [[len(t) for _, t, _ in each.windows] for each in self.recorded]
         return np.repeat(np.array(values).ravel(), np.array(counts).ravel())
 
     @cached_property
@@ -267,7 +266,7 @@ class MotionEquations:
     @property
     def times(self) -> Array:
         """(R,) time of each row [s]."""
-        return np.concatenate([t for each in self.recorded for t in each.times])
+        return np.concatenate([t for each in self.recorded for _, t, _ in each.windows])
 
     @property
     def usual_speeds(self) -> Array:
@@ -277,7 +276,7 @@ class MotionEquations:
 
     def cutoff(self, equation: int) -> float:
         """Frequency up to which an equation is used, the lowest of all recordings [Hz]."""
-        return 1.0 / max(each.lengths[equation] for each in self.recorded)
+        return 1.0 / max(each.windows[equation][2] for each in self.recorded)
 
     def rows(self, thetas: Array) -> list[Array]:
         """Rows at several values of the parameters.
@@ -319,13 +318,13 @@ class MotionEquations:
 
         parts = []
         nothing = np.zeros(len(measured))
-        for equation, windows in zip(self.equations, each.windows, strict=True):
-            dof, place = equation.dof, equation.force
-            if dof >= 0:
-                series = [terms.needed[:, dof], measured[:, dof], terms.inertial[:, dof]]
+        for equation, (weights, _, _) in zip(self.equations, each.windows, strict=True):
+            place = equation.place
+            if equation.unit:
+                series = [terms.needed[:, place], measured[:, place], terms.inertial[:, place]]
             else:
                 series = [modelled[:, place], each.forces[:, place], nothing]
-            parts.append(np.stack([windows @ values for values in series]))
+            parts.append(np.stack([weights @ values for values in series]))
         return np.concatenate(parts, axis=1)
 
 
@@ -333,10 +332,10 @@ def _equations(system: System, forces: Sequence[MeasuredForce]) -> Iterator[Equa
     """Equations of all degrees of freedom, and laws of the actuators whose force is measured."""
     is_translation = translations(system.model)
     for dof, name in enumerate(dof_names(system.model)):
-        yield Equation(name=name, unit="N" if is_translation[dof] else "N m", dof=dof)
+        yield Equation(name=name, unit="N" if is_translation[dof] else "N m", place=dof)
     for place, force in enumerate(forces):
         if force.is_modelled:
-            yield Equation(name=f"law of {force.name}", force=place)
+            yield Equation(name=f"law of {force.name}", unit="", place=place)
 
 
 def _recorded(
@@ -372,9 +371,9 @@ def _recorded(
 
     windows = []
     for equation in of.equations:
-        dof, place = equation.dof, equation.force
-        if dof >= 0:
-            found = _windows(motion, spacing[dof], usable[:, dof], slow[:, dof])
+        place = equation.place
+        if equation.unit:
+            found = _windows(motion, spacing[place], usable[:, place], slow[:, place])
         else:
             known = near[:, place] & motion.usable[:, touched[place]].all(axis=1)
             finest = motion.spacing[touched[place]].max(initial=0.0)
@@ -385,20 +384,14 @@ def _recorded(
         forces=measured,
         has_force=np.asarray(near.any(axis=0)),
         moments=moments,
-        windows=tuple(weights for weights, _, _ in windows),
-        times=tuple(t for _, t, _ in windows),
-        lengths=tuple(length for _, _, length in windows),
+        windows=tuple(windows),
     )
 
 
 def _windows(
     motion: MeasuredMotion, spacing: float, usable: np.ndarray, slow: np.ndarray
-) -> tuple[scipy.sparse.csr_array, Array, float]:
-    """Windows of an equation, most of which are not at rest where that is possible.
-
-    Returns:
-        (k, n) weights of the points, (k,) middles of the windows, and their length [s].
-    """
+) -> Windows:
+    """Windows of an equation, most of which are not at rest where that is possible."""
     length = WINDOW_PER_SPACING * max(spacing, motion.step)
     length = min(length, LONGEST_WINDOW * float(motion.t[-1]))
     half = max(round(0.5 * length / motion.step), 1) - 1

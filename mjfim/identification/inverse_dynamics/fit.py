@@ -121,7 +121,7 @@ class FoundEquations:
 
     def residual(self, x: Array) -> Array:
         """(R,) residuals that the linearisation predicts for linear coordinates: (p,)."""
-        return np.asarray(_residual(self.rows) + self.slopes @ (x - self.x))
+        return _residual(self.rows) + self.slopes @ (x - self.x)
 
 
 def _residual(rows: Array) -> Array:
@@ -212,7 +212,7 @@ class EquationSearch:
         for shape in self.shapes:
             moved = np.array(self.start)
             moved[list(shape)] = list(shape.values())
-            yield np.clip(moved, self.coordinates.lower, self.coordinates.upper), True
+            yield np.clip(moved, self.parameters.lower, self.parameters.upper), True
 
         # Other values of the parameters that are no inertias of whole bodies.
         plain = np.isin(np.arange(len(self.start)), self.active)
@@ -225,7 +225,7 @@ class EquationSearch:
             factor = LARGEST_FACTOR ** rng.uniform(-1.0, 1.0, int(plain.sum()))
             start = np.array(self.start)
             start[plain] *= factor
-            yield np.clip(start, self.coordinates.lower, self.coordinates.upper), False
+            yield np.clip(start, self.parameters.lower, self.parameters.upper), False
 
     def _searched(self, start: Array) -> FoundEquations:
         """Linearise and solve in turn, until the rows are those of the linearisation.
@@ -378,7 +378,7 @@ class EquationSearch:
             residual = R @ np.append(x - at.x, 1.0)
             return np.concatenate([residual, priors]), np.concatenate([R[:, :-1], J])
 
-        x = begin
+        x, bodies = begin, self.coordinates.bodies
         values, J = all_rows(x)
         cost = first = float(values @ values)
         for _ in range(MAX_STEPS):
@@ -389,7 +389,7 @@ class EquationSearch:
                 break
             for _ in range(MAX_HALVINGS):
                 moved = x + step
-                if self.coordinates.are_physical(moved):
+                if all(body.is_physical(moved[body.columns]) for body in bodies):
                     values, J = all_rows(moved)
                     if float(values @ values) < cost - MIN_DECREASE_RATIO * predicted:
                         break
@@ -406,8 +406,8 @@ class EquationSearch:
         step[chosen] = sizes * bounded_least_squares(
             J[:, chosen] * sizes,
             -values,
-            np.minimum(self.coordinates.lower - x, 0.0)[chosen] / sizes,
-            np.maximum(self.coordinates.upper - x, 0.0)[chosen] / sizes,
+            np.minimum(self.parameters.lower - x, 0.0)[chosen] / sizes,
+            np.maximum(self.parameters.upper - x, 0.0)[chosen] / sizes,
         )
         return step
 
@@ -504,8 +504,8 @@ def _force_sizes(system: System, rows: Array, equations: MotionEquations) -> Arr
 
     # The law of an actuator is compared with its own force.
     sizes = np.where(measured > 0.0, measured, needed)
-    dofs = np.array([each.dof for each in equations.equations])
-    is_dof = dofs >= 0
+    dofs = np.array([each.place for each in equations.equations])
+    is_dof = np.array([bool(each.unit) for each in equations.equations])
     of_dofs = measured if measured[is_dof].any() else needed
     largest = float((of_dofs[is_dof] / arms[dofs[is_dof]]).max(initial=0.0))
     sizes[is_dof] = largest * arms[dofs[is_dof]]
@@ -587,7 +587,18 @@ def fit_equations(
     start = np.clip(start, parameters.lower, parameters.upper)
     equations = MotionEquations.of(system, recordings, start, forces=forces, laws=laws)
     search = EquationSearch.of(system, equations, start)
-    _require_rows(search, recordings)
+    rows, count = len(search.of_row), len(search.active)
+    if not count:
+        raise RecordingError(
+            f"{recordings[0].name}: the equation of motion contains none of the parameters; "
+            'remove fit.start = "inverse_dynamics"'
+        )
+    if rows < ROWS_PER_PARAMETER * count:
+        raise RecordingError(
+            f"{recordings[0].name}: the equation of motion has only {rows} rows for {count} "
+            "parameters; rows near gaps, stops and contacts do not count: use longer recordings, "
+            'or fit.start = "measured"'
+        )
 
     found = search.run()
     taken = equations.system.plant.engine_steps + system.plant.engine_steps - steps
@@ -615,22 +626,6 @@ def try_fit_equations(
         return None
     has_forces = any(each.measured.any() for each in found.degrees_of_freedom)
     return found if has_forces else None
-
-
-def _require_rows(search: EquationSearch, recordings: Sequence[AlignedRecording]) -> None:
-    """Raise RecordingError where the equations have too few rows."""
-    rows, count = len(search.of_row), len(search.active)
-    if not count:
-        raise RecordingError(
-            f"{recordings[0].name}: the equation of motion contains none of the parameters; "
-            'remove fit.start = "inverse_dynamics"'
-        )
-    if rows < ROWS_PER_PARAMETER * count:
-        raise RecordingError(
-            f"{recordings[0].name}: the equation of motion has only {rows} rows for {count} "
-            "parameters; rows near gaps, stops and contacts do not count: use longer recordings, "
-            'or fit.start = "measured"'
-        )
 
 
 # ---- record

@@ -20,10 +20,10 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.segments import measured_states
 from mjfim.model.coordinates import actuator_names, dof_names
 from mjfim.model.elements import element_name, is_rk4
 from mjfim.model.units import acts_at_joint
-from mjfim.plant.outputs import outputs_by_state
 
 # Degree of the spline. Its second derivative is a cubic spline.
 DEGREE = 5
@@ -337,7 +337,9 @@ def measured_motion(
     Raises:
         RecordingError: A degree of freedom was not measured, or too seldom.
     """
-    space, lag = system.space, engine_lag(system.model)
+    # A velocity of the engine's state is older than the position.
+    space = system.space
+    lag = 0.0 if is_rk4(system.model) else 0.5 * float(system.model.opt.timestep)
     curves = _curves(system, recording)
     y = recording.y - system.parameters.bias_derivative(recording.y.shape[1]) @ theta
     splines: dict[int, RegressionSpline] = {}
@@ -391,11 +393,6 @@ def measured_motion(
     )
 
 
-def engine_lag(model: mujoco.MjModel) -> float:
-    """Time by which a velocity of the engine's state is older than the position [s]."""
-    return 0.0 if is_rk4(model) else 0.5 * float(model.opt.timestep)
-
-
 # ---- curves
 
 
@@ -408,9 +405,7 @@ Curves = dict[int, tuple[int | None, int | None, tuple[int, ...]]]
 def _curves(system: System, recording: AlignedRecording) -> Curves:
     """The curves of all degrees of freedom. Raises RecordingError where one was not measured."""
     space = system.space
-    has_values = np.asarray(recording.measured.any(axis=0))
-    outputs = outputs_by_state(system.model, system.outputs)
-    output_of = {address: i for address, i in outputs.items() if has_values[i]}
+    output_of = measured_states(system, recording)
 
     curves: Curves = {
         q: (output_of.get(q), output_of.get(space.nq + v), (v,))
