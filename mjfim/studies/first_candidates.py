@@ -1,4 +1,4 @@
-"""What a first experiment may propose: the user's wishes, parameters, noise, and motors of a URDF."""
+"""What a first experiment may propose: wishes, parameters, noise, and motors for a URDF."""
 
 from __future__ import annotations
 

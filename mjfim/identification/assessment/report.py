@@ -42,7 +42,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.parallel.budget import Budget
-from mjfim.recordings.plausibility import plausibility_remarks
+from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
     ControlLawInLoop,

@@ -34,7 +34,7 @@ from mjfim.errors import ExperimentError
 from mjfim.files import remove_earlier_result, replacing, write_json
 from mjfim.model.coordinates import state_components
 from mjfim.output.export.plan import RobotPlan
-from mjfim.recordings.formats.ros2_bag import CONTROL_TOPIC, JOINT_STATE, rosbags_module
+from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, rosbags_module
 
 # Files of a dataset with one episode, relative to its folder.
 INFO_FILE = "meta/info.json"
