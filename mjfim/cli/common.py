@@ -196,7 +196,7 @@ class Run:
 
     def __post_init__(self) -> None:
         if self.executor != LOCAL:
-            from mjfim.parallel.stated import StatedExecutor
+            from mjfim.parallel.workers import StatedExecutor
 
             StatedExecutor.parse(self.executor)  # a fault is said before the work
 
@@ -221,7 +221,7 @@ class Run:
             The workers; None where all work is done by this process.
         """
         from mjfim.parallel import LOST_SENTENCE, Pool, Workers
-        from mjfim.parallel.stated import ExecutorKind, StatedExecutor
+        from mjfim.parallel.workers import ExecutorKind, StatedExecutor
 
         stated = StatedExecutor.parse(self.executor)
         if stated.kind is not ExecutorKind.LOCAL:

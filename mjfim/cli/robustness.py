@@ -55,7 +55,7 @@ def robustness(
     from mjfim.experiment.system import System
     from mjfim.output.folders import ROBUSTNESS_FILES
     from mjfim.parallel import cores
-    from mjfim.records.robustness import RobotConditions
+    from mjfim.records.studies import RobotConditions
     from mjfim.studies.robustness import default_latency
 
     conditions = RobotConditions(

@@ -15,7 +15,7 @@ from mjfim.model.coordinates import (
     tangent_components,
 )
 from mjfim.model.units import per_second
-from mjfim.records.labels import Labels
+from mjfim.records.trajectory import Labels
 
 
 def labels_of_model(model: mujoco.MjModel) -> Labels:

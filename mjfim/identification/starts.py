@@ -26,8 +26,8 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
 from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
 from mjfim.plant.dynamics import UNSTABLE_LOOP
+from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.events import begin_stage
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.trajectory import Recording
 
 # Number of starts that are spread about a guess, with the guess, and the largest factor between

@@ -19,7 +19,7 @@ from mjfim.model.coordinates import ModelCoordinates
 from mjfim.model.model_files import PackedFiles, files_of_model, name_of
 from mjfim.model.terms.extension import StateLayout, extended_spec
 from mjfim.model.terms.term import Term
-from mjfim.parallel.kept import Kept
+from mjfim.parallel.shared_value import Kept
 
 
 def load_spec(path: Path, files: Any = None) -> Any:

@@ -14,9 +14,8 @@ from typing import Any, Generic, TypeVar
 
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.parallel.budget import Budget, StopToken, hurried
-from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.pool import one_blas_thread, pool_stop_token
-from mjfim.parallel.shared_value import AbsentValue, SentValue, attempt, owned_value
+from mjfim.parallel.shared_value import AbsentValue, KeptPerThread, SentValue, attempt, owned_value
 from mjfim.parallel.workers import ExecutorLike, Workers, is_loss, is_refused_by_pickle
 
 T = TypeVar("T")

@@ -1,14 +1,15 @@
-"""Large values that tasks hold by their hash, so that a worker process need not get them each time.
+"""Large values that tasks hold by their hash, and objects that a worker makes once and keeps.
 
-A task that needs a value which its process does not have fails with AbsentValueError; `attempt`
-turns that into an answer, and `dispatch` sends the task again, together with the value.
+A worker process need not get a value each time. A task that needs a value which its process does
+not have fails with AbsentValueError; `attempt` turns that into an answer, and `dispatch` sends the
+task again, together with the value.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
@@ -171,3 +172,44 @@ def _referenced(digest: str, size: int) -> SharedValue[Any]:
     reference.size = size
     reference._value = ()
     return reference
+
+
+class Kept(Generic[T]):
+    """Objects by key. Those that were not used for the longest time are forgotten.
+
+    Args:
+        count: Number of objects that are kept.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._objects: OrderedDict[Hashable, T] = OrderedDict()
+
+    def __len__(self) -> int:
+        """Number of objects that are kept now."""
+        return len(self._objects)
+
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the object of a key, made where it is not kept.
+
+        Args:
+            key: What identifies the object, such as a hash.
+            make: Makes it.
+        """
+        if key not in self._objects:
+            self._objects[key] = make()
+        self._objects.move_to_end(key)
+        while len(self._objects) > self._count:
+            self._objects.popitem(last=False)
+        return self._objects[key]
+
+
+class KeptPerThread(threading.local, Kept[T]):
+    """Objects that the tasks of a worker share, made by the first of them.
+
+    A worker process does one task after the other; a worker of several threads, as of Dask, has
+    objects of each thread.
+
+    Args:
+        count: Number of objects that each thread keeps.
+    """

@@ -10,8 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Labels, Trajectory
 
 # Largest number of iterates of one search whose motions are kept, and number of samples of each.
 MAX_MOTIONS, MOTION_SAMPLES = 40, 200

@@ -34,9 +34,9 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, carry_out
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import saturated_actuators
-from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
+from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.studies.baselines import METHODS, TITLES, BaselineSearch, SearchResult, run_baseline
 
 # Name of the design for the user.

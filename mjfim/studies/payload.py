@@ -34,8 +34,8 @@ from mjfim.model.terms.base import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate
+from mjfim.records.estimate_parts import PayloadEstimate
 from mjfim.records.events import begin_stage, shown_progress
-from mjfim.records.payload import PayloadEstimate
 from mjfim.records.trajectory import Recording
 from mjfim.studies.first_candidates import PAYLOAD_SHARE
 from mjfim.studies.selected_models import selected_experiment

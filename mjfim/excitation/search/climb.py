@@ -28,8 +28,7 @@ from mjfim.parallel import (
     pool_stop_token,
 )
 from mjfim.parallel.budget import Budget, StopReason, StopToken
-from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue
+from mjfim.parallel.shared_value import KeptPerThread, SharedValue
 from mjfim.records.design import (
     HistoryRow,
     IterateMotion,

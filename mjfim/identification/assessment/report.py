@@ -51,8 +51,8 @@ from mjfim.records.estimate import (
     Prediction,
     Restart,
 )
+from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.events import begin_stage
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
 

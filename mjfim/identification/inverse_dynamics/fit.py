@@ -26,7 +26,7 @@ from mjfim.identification.inverse_dynamics.equations import MotionEquations
 from mjfim.identification.inverse_dynamics.forces import measured_forces
 from mjfim.identification.inverse_dynamics.search import EquationSearch, FoundEquations
 from mjfim.parallel import one_blas_thread
-from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
+from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
 from mjfim.records.trajectory import Recording
 
 # Largest number of averages of an equation that a record holds.

@@ -34,11 +34,18 @@ from mjfim.output.page import (
 )
 from mjfim.output.words import BEST_CASE, NOT_ALONE, CampaignParameters, complete_labels
 from mjfim.records.campaign import Campaign, CampaignStatus
-from mjfim.records.comparison import DESIGN, Comparison, MethodResult
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.robots import RobotComparison, p_text
-from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
+from mjfim.records.studies import (
+    CONFIDENCE,
+    DESIGN,
+    REQUIRED_COVERAGE,
+    Comparison,
+    MethodResult,
+    MonteCarloStudy,
+    Robustness,
+    TrialStatistics,
+)
 
 # Largest number of missed limits that have a sentence each.
 MAX_MISSED_LIMITS = 8

@@ -43,8 +43,7 @@ from mjfim.output.words import (
     size_sentence,
 )
 from mjfim.records.design import Design, LimitUsage
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Labels, Trajectory
 
 # Number of turning points above which a curve would be a solid area; its envelope is drawn instead.
 MAX_TURNS = 120

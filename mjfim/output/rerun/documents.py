@@ -71,8 +71,7 @@ from mjfim.output.rerun.scene import (
 )
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Labels, Trajectory
 
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
 FURTHER_ROLES = ("series2", "series5", IDENTIFIED.word, "series4")
