@@ -1,4 +1,4 @@
-"""Records of studies: methods compared, many trials of the estimator, and a design on other robots."""
+"""Records of studies: methods, many trials of the estimator, and a design on other robots."""
 
 from __future__ import annotations
 
