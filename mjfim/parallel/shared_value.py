@@ -10,12 +10,14 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
 
 T = TypeVar("T")
 Order = TypeVar("Order")
+
+# A value on its way to a worker and in its memory, and about its size [bytes].
+SentValue = tuple[Any, int]
 
 # Size of the values that a process keeps [bytes]. Those that were not used for the longest time are
 # sent again when a task needs them.
@@ -80,14 +82,6 @@ class SharedValue(Generic[T]):
         return _referenced, (self.digest, self.size)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SentValue:
-    """A value on its way to a worker and in its memory, and about its size [bytes]."""
-
-    value: Any
-    size: int
-
-
 class _ReceivedValues:
     """The latest values that this process has received. Its threads share them."""
 
@@ -103,9 +97,9 @@ class _ReceivedValues:
                 self._values.move_to_end(digest)
 
             # The values of one task are kept together, however large they are.
-            size = sum(sent.size for sent in self._values.values())
+            size = sum(taken for _, taken in self._values.values())
             while len(self._values) > len(values) and size > KEPT_BYTES:
-                size -= self._values.popitem(last=False)[1].size
+                size -= self._values.popitem(last=False)[1][1]
 
     def get(self, digest: str) -> Any:
         """Return a value; AbsentValueError where it was not received, or forgotten since."""
@@ -113,7 +107,7 @@ class _ReceivedValues:
             if digest not in self._values:
                 raise AbsentValueError(digest)
             self._values.move_to_end(digest)
-            return self._values[digest].value
+            return self._values[digest][0]
 
 
 # Values that this process has made and still uses, and values that it has received.
@@ -130,7 +124,7 @@ def require_values(values: Iterable[SharedValue[Any]]) -> None:
 
 def keep_value(shared: SharedValue[T], value: T) -> None:
     """Keep a value in a worker that has made it itself instead of receiving it."""
-    _received.put({shared.digest: SentValue(value=value, size=shared.size)})
+    _received.put({shared.digest: (value, shared.size)})
 
 
 def owned_value(digest: str) -> SentValue:
@@ -138,28 +132,21 @@ def owned_value(digest: str) -> SentValue:
     shared = _owned.get(digest)
     if shared is None:
         raise AbsentValueError(digest)
-    return SentValue(value=shared.to_send(), size=shared.size)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AbsentValue:
-    """Answer of a worker that lacks shared values, in place of a result: their hashes."""
-
-    digests: tuple[str, ...]
+    return shared.to_send(), shared.size
 
 
 def attempt(
     function: Callable[[Order], T], values: Mapping[str, SentValue], order: Order
-) -> T | AbsentValue:
-    """Carry out an order in a worker, if the values are there that it needs.
+) -> tuple[tuple[T, ...], tuple[str, ...]]:
+    """Carry out an order in a worker: the result, or the hashes of values that are absent.
 
     An error would be the other way to say that one is absent, but Dask prints the errors of tasks.
     """
     _received.put(values)
     try:
-        return function(order)
+        return (function(order),), ()
     except AbsentValueError as error:
-        return AbsentValue(digests=error.digests)
+        return (), error.digests
 
 
 def _referenced(digest: str, size: int) -> SharedValue[Any]:

@@ -183,10 +183,6 @@ class Status(NamedEnum):
         "widen it, or begin with an initial control of smaller amplitude"
     )
     LEFT = "discarded: another start was more promising"
-    LOST = (
-        "ended early because its worker was lost three times (its process was ended from outside, "
-        "perhaps because the memory was full)"
-    )
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"
 
     @property

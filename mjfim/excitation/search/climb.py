@@ -133,7 +133,7 @@ class Candidate:
     @property
     def ended(self) -> Status:
         """Status at the end of the search."""
-        if self.status in (Status.LOST, Status.INTERRUPTED, Status.LEFT):
+        if self.status in (Status.INTERRUPTED, Status.LEFT):
             return self.status
         if self.best is None:
             return self.status if self.status is Status.STALLED else Status.INFEASIBLE
