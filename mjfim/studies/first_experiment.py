@@ -135,8 +135,9 @@ class Proposal:
         """Keys and tables of the experiment file."""
         initial: dict[str, Any] = {}
         if self.release is not None:
-            initial["qpos"] = self.release.qpos.tolist()
-            initial["free"] = {name: list(ends) for name, ends in self.release.free.items()}
+            qpos, free = self.release
+            initial["qpos"] = qpos.tolist()
+            initial["free"] = {name: list(ends) for name, ends in free.items()}
         elif self.start.keyframe is not None:
             initial["keyframe"] = self.start.keyframe
         else:
@@ -159,7 +160,7 @@ class Proposal:
         if self.release is None:
             initial["control"] = self.control()
         else:
-            values["nuisance"] = {"initial": dict.fromkeys(self.release.free, True)}
+            values["nuisance"] = {"initial": dict.fromkeys(self.release[1], True)}
         values["limits"] = {key: table for key, table in limits.items() if table}
         if self.rest:
             values["boundary"] = {"start": "rest"}
@@ -231,7 +232,7 @@ def propose_experiment(
         )
     else:
         release = propose_release(model, start.qpos, length)
-        if not release.free:
+        if not release[1]:
             raise ExperimentError(
                 f"{path}: the model has neither an actuator nor a slide, hinge or ball joint with "
                 "a name that could be released; add <actuator> elements to the MJCF, or name its "

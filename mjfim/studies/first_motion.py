@@ -599,17 +599,9 @@ FIRST_SHARE = 0.4
 MOST_COORDINATES = 4
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ProposedRelease:
-    """Initial state from which a model without actuators is released at rest.
-
-    Attributes:
-        qpos: (nq,) positions of the release.
-        free: Ranges of the coordinates that a design chooses, by name.
-    """
-
-    qpos: Array
-    free: dict[str, tuple[float, float]]
+# Positions, (nq,), from which a model is released, and ranges of the coordinates that a design
+# chooses, by name.
+ProposedRelease = tuple[Array, dict[str, tuple[float, float]]]
 
 
 def propose_release(
@@ -645,7 +637,12 @@ def propose_release(
 
     qpos = np.array(start, dtype=np.float64)
     mujoco.mj_integratePos(model, qpos, move, 1.0)
-    return ProposedRelease(qpos=_readable_positions(model, qpos), free=free)
+    # Slides and hinges have three significant digits.
+    for j in range(model.njnt):
+        if joint_dofs(model, j) == 1:
+            address = int(model.jnt_qposadr[j])
+            qpos[address] = _rounded(float(qpos[address]))
+    return qpos, free
 
 
 def _range_of(model: Any, joint: int, start: Array, length: float) -> tuple[float, float, float]:
@@ -666,16 +663,6 @@ def _range_of(model: Any, joint: int, start: Array, length: float) -> tuple[floa
     slides = kind == int(mujoco.mjtJoint.mjJNT_SLIDE)
     width = LENGTH_SHARE * length if slides else RELEASE_ANGLE
     return at, _rounded(at - width), _rounded(at + width)
-
-
-def _readable_positions(model: Any, qpos: Array) -> Array:
-    """Positions whose slides and hinges have three significant digits."""
-    found = np.array(qpos)
-    for j in range(model.njnt):
-        if joint_dofs(model, j) == 1:
-            address = int(model.jnt_qposadr[j])
-            found[address] = _rounded(float(qpos[address]))
-    return found
 
 
 def _rounded(value: float) -> float:

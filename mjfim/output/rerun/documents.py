@@ -313,7 +313,7 @@ def _log_iterates(
     end = end_point(model, designed)
     if end is not None:
         rec.set_time("sim_time", duration=0.0)
-        path = strip_of_path(end.path(designed), style)
+        path = strip_of_path(designed.world_paths(*end)[:, 0], style)
         rec.log(entity_path((*root, "path")), path, strict=True)
         rec.reset_time()
     motions = design.motions
@@ -326,7 +326,7 @@ def _log_iterates(
         log_pose(rec, model, root, poses, len(qpos) // 2)
         log_pose(rec, model, ("robots", INITIAL.word), still_poses, 0)
         if end is not None:
-            path = strip_of_path(end.path(poses), style)
+            path = strip_of_path(poses.world_paths(*end)[:, 0], style)
             rec.log(entity_path((*root, "path")), path, strict=True)
         for plane, _, curves in plots:
             curve = plane.curve(*curves[i], DESIGNED.word)

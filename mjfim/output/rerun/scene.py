@@ -604,7 +604,7 @@ def log_end_path(
     """
     point = end_point(model, poses)
     if point is not None:
-        path = strip_of_path(point.path(poses), style)
+        path = strip_of_path(poses.world_paths(*point)[:, 0], style)
         rec.log(entity_path((*root, "path")), path, static=True, strict=True)
 
 
@@ -698,29 +698,8 @@ def _moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
     return bodies.astype(np.intp), points
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EndPoint:
-    """The end of a robot, whose path is drawn.
-
-    Attributes:
-        body: Number of its body.
-        point: (3,) the point in the frame of the body [m].
-    """
-
-    body: int
-    point: Array
-
-    def path(self, poses: BodyPoses) -> Array:
-        """Return the (N+1, 3) path in the world [m].
-
-        Args:
-            poses: Poses of the bodies.
-        """
-        return poses.world_paths(np.array([self.body]), self.point[None])[:, 0]
-
-
-def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
-    """Return the end of a robot.
+def end_point(model: mujoco.MjModel, poses: BodyPoses) -> tuple[Array, Array] | None:
+    """Return the end of a robot, whose path is drawn.
 
     Of the points deepest in the tree, it is the one that travels farthest.
 
@@ -729,7 +708,8 @@ def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
         poses: Poses of its bodies.
 
     Returns:
-        The end; None where nothing moves.
+        (1,) number of its body, and (1, 3) the point in the frame of the body [m]; None where
+        nothing moves.
     """
     bodies, points = _moving_centres(model)
     if not len(bodies):
@@ -742,5 +722,5 @@ def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
 
     paths = poses.world_paths(bodies[deepest], points[deepest])
     steps = np.linalg.norm(np.diff(paths, axis=0), axis=2)
-    farthest = int(np.argmax(steps.sum(axis=0)))
-    return EndPoint(body=int(bodies[deepest][farthest]), point=points[deepest][farthest])
+    farthest = [int(np.argmax(steps.sum(axis=0)))]
+    return bodies[deepest][farthest], points[deepest][farthest]
