@@ -573,13 +573,12 @@ LEAST_SHARE = 1e-4
 MOST_PARAMETERS = 10
 
 
-def identifiable(F: Array, sizes: Array, *, most: int = MOST_PARAMETERS) -> Sequence[int]:
+def identifiable(F: Array, sizes: Array) -> Sequence[int]:
     """Choose parameters that a motion identifies together, one after the other.
 
     Args:
         F: (p, p) information of the motion [1 / (theta_i theta_j unit)].
         sizes: (p,) sizes of the parameters [theta-unit].
-        most: Largest number of parameters.
 
     Returns:
         Indices of the candidates, in their order, that are known accurately together; the one about
@@ -589,7 +588,7 @@ def identifiable(F: Array, sizes: Array, *, most: int = MOST_PARAMETERS) -> Sequ
     relative = F * np.outer(sizes, sizes)
     chosen: list[int] = []
     for i in range(len(sizes)):
-        if len(chosen) < most and _largest_std(relative, [*chosen, i]) <= LARGEST_STD:
+        if len(chosen) < MOST_PARAMETERS and _largest_std(relative, [*chosen, i]) <= LARGEST_STD:
             chosen.append(i)
     return chosen or [int(np.argmax(np.diag(relative)))]
 
