@@ -157,7 +157,11 @@ class _Dispatch(Generic[Order, T]):
         if future.cancelled() or is_loss(error):
             self._losses[index] += 1
             if self._losses[index] == MAX_LOSSES:
-                return Outcome(index=index, loss=self._sentence_of_loss())
+                loss = (
+                    f"the worker was lost {MAX_LOSSES} times while it did this work "
+                    f"({self._workers.probable_fault}), so this work is left out"
+                )
+                return Outcome(index=index, loss=loss)
         elif is_refused_by_pickle(error):
             raise ExperimentError(
                 f"executor: the work cannot be sent to other processes ({error}). Functions, such "
@@ -173,13 +177,6 @@ class _Dispatch(Generic[Order, T]):
             self._values[index].update({digest: owned_value(digest) for digest in absent})
         self._waiting.appendleft(index)
         return None
-
-    def _sentence_of_loss(self) -> str:
-        """Why an order has no result."""
-        return (
-            f"the worker was lost {MAX_LOSSES} times while it did this work "
-            f"({self._workers.probable_fault}), so this work is left out"
-        )
 
     def _is_overdue(self) -> bool:
         """Check whether the time has been over for so long that nobody waits for what runs."""

@@ -608,34 +608,31 @@ class Robustness(ShownRecord):
         """The contents of the record in JSON."""
         return {
             **super().summary(),
-            "parameters": [self._parameter_summary(j) for j in range(len(self.names))],
+            "parameters": [
+                {
+                    "name": name,
+                    "unit": self.units[j],
+                    "wrong": self.wrong[j],
+                    "predicted": self.predicted[j],
+                    "stated": self.formal[j],
+                    "error": self.observed[j],
+                    "inside": int(self.inside[j]),
+                }
+                for j, name in enumerate(self.names)
+            ],
             "joint": {"parameters": self.joint[0], "all": self.joint[1]},
-            "limits": [self._limit_summary(i) for i in range(len(self.limits))],
+            "limits": [
+                {
+                    "kind": limit.kind,
+                    "name": limit.name,
+                    "range": [limit.lower, limit.upper],
+                    "planned": self.planned[i] * limit.scale,
+                    "worst": self.margins[:, i].min() * limit.scale,
+                    "kept": int(self.kept[:, i].sum()),
+                }
+                for i, limit in enumerate(self.limits)
+            ],
             "reserve": self.reserve(),
-        }
-
-    def _parameter_summary(self, j: int) -> dict[str, Any]:
-        """Return the entry of one unknown in playback.json."""
-        return {
-            "name": self.names[j],
-            "unit": self.units[j],
-            "wrong": self.wrong[j],
-            "predicted": self.predicted[j],
-            "stated": self.formal[j],
-            "error": self.observed[j],
-            "inside": int(self.inside[j]),
-        }
-
-    def _limit_summary(self, i: int) -> dict[str, Any]:
-        """Return the entry of one limit in playback.json."""
-        limit = self.limits[i]
-        return {
-            "kind": limit.kind,
-            "name": limit.name,
-            "range": [limit.lower, limit.upper],
-            "planned": self.planned[i] * limit.scale,
-            "worst": self.margins[:, i].min() * limit.scale,
-            "kept": int(self.kept[:, i].sum()),
         }
 
 

@@ -508,19 +508,15 @@ def _checked(
     """
     missing = []
 
-    def is_stopped() -> bool:
-        """Whether a stop is requested."""
-        return stop.requested
-
     # Random controls are tried only where there is a doubt.
     begin_stage("testing which parameters can be told apart")
-    found = test(is_stopped)
+    found = test(lambda: stop.requested)
     here, everywhere = found.along_trajectory, found.along_all
     if here.count and stop.requested:
         missing.append("what other controls would show")
     # The slope is that of a criterion of the identifiable combinations.
     visible = replace(problem, information=replace(problem.information, basis=found.basis))
-    tested = self_test(task, visible, visible.reevaluated(point), is_stopped)
+    tested = self_test(task, visible, visible.reevaluated(point), lambda: stop.requested)
     if not tested.finished:
         missing.append("the test of the derivatives")
     refused: tuple[str, ...] = ()

@@ -328,7 +328,7 @@ def _payload(model: Any, name: str) -> Iterator[Candidate]:
         meaning=f"mass of the load at {name}",
         offset=mass,
         guess=0.0,
-        scale=_two_digits(PAYLOAD_SHARE * mass),
+        scale=float(f"{PAYLOAD_SHARE * mass:.2g}"),
     )
     moments = mass * np.asarray(model.body_ipos[body])
     for i, axis in enumerate(AXES):
@@ -339,13 +339,8 @@ def _payload(model: Any, name: str) -> Iterator[Candidate]:
             meaning=f"mass times {axis} of the load's centre of mass, in the frame of {name}",
             offset=float(moments[i]),
             guess=0.0,
-            scale=_two_digits(PAYLOAD_SHARE * mass * radius),
+            scale=float(f"{PAYLOAD_SHARE * mass * radius:.2g}"),
         )
-
-
-def _two_digits(value: float) -> float:
-    """A number with two significant digits."""
-    return float(f"{value:.2g}")
 
 
 def _bodies_from_the_end(model: Any) -> list[int]:

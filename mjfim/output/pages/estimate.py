@@ -579,7 +579,24 @@ def sample_parts(estimate: Estimate) -> Iterator[Part]:
     if draws is None:
         return
     yield Text(f"{draws}.")
-    yield _sample_table(draws)
+    low, middle, high = np.quantile(draws.values, (0.0, 0.5, 1.0), axis=0)
+    yield tabulated(
+        "Parameters of the drawn robots",
+        {
+            "parameter": list(map(named, draws.parameters, draws.units)),
+            "centre": numbers(draws.centre, 4),
+            "σ": numbers(draws.std, 2),
+            "smallest": numbers(low, 4),
+            "median": numbers(middle, 4),
+            "largest": numbers(high, 4),
+        },
+        spare=("median",),
+        note=(
+            "σ is that of the 95 % intervals, before the bounds cut the distribution off; a bound "
+            "shifts the median. It is smaller where combinations of inertias stay at the estimate."
+        ),
+        detail=True,
+    )
     yield from (Text(caution, Emphasis.WARNING) for caution in _not_covered(estimate, draws))
     yield Plot("samples")
 
@@ -617,25 +634,3 @@ def _not_covered(estimate: Estimate, draws: ParameterDraws) -> Iterator[str]:
             f"The drawn robots do not differ in {first_ones(held)}, which the fit held at the "
             "guess; its error is not covered."
         )
-
-
-def _sample_table(draws: ParameterDraws) -> Table:
-    """Tabulate the range of every drawn parameter."""
-    low, middle, high = np.quantile(draws.values, (0.0, 0.5, 1.0), axis=0)
-    return tabulated(
-        "Parameters of the drawn robots",
-        {
-            "parameter": list(map(named, draws.parameters, draws.units)),
-            "centre": numbers(draws.centre, 4),
-            "σ": numbers(draws.std, 2),
-            "smallest": numbers(low, 4),
-            "median": numbers(middle, 4),
-            "largest": numbers(high, 4),
-        },
-        spare=("median",),
-        note=(
-            "σ is that of the 95 % intervals, before the bounds cut the distribution off; a bound "
-            "shifts the median. It is smaller where combinations of inertias stay at the estimate."
-        ),
-        detail=True,
-    )

@@ -593,12 +593,25 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
     steps = ('Identify with `fit.start = "inverse_dynamics"`, which predicts the motion itself.',)
     if verdict.level is not Level.GOOD:
         steps = ("Look at the forces in `inverse_dynamics.png`: signs, units, delays, friction.",)
+    std = [
+        number(value, 2, infinite="-" if name in fit.absent else NOT_ALONE)
+        for name, value in zip(fit.parameters, fit.std, strict=True)
+    ]
+    table = tabulated(
+        "Parameters",
+        {
+            "parameter": list(map(named, fit.parameters, fit.units)),
+            "start": numbers(fit.start, 4),
+            "estimate": numbers(fit.theta, 5),
+            "formal σ": std,
+        },
+    )
     return Page(
         kind="Parameters fitted to the equation of motion",
         verdict=verdict,
         next_steps=steps,
         sections=[
-            Section("Parameters", [Text(capitalised(fit.status)), _parameter_table(fit)]),
+            Section("Parameters", [Text(capitalised(fit.status)), table]),
             Section("Equation of motion", list(equation_parts(fit))),
         ],
     )
@@ -648,20 +661,3 @@ def equation_parts(fit: InverseDynamicsFit) -> Iterator[Part]:
     )
     yield Text(text, Emphasis.WEAK, detail=True)
     yield Plot("inverse_dynamics")
-
-
-def _parameter_table(fit: InverseDynamicsFit) -> Table:
-    """Tabulate the parameters."""
-    std = [
-        number(value, 2, infinite="-" if name in fit.absent else NOT_ALONE)
-        for name, value in zip(fit.parameters, fit.std, strict=True)
-    ]
-    return tabulated(
-        "Parameters",
-        {
-            "parameter": list(map(named, fit.parameters, fit.units)),
-            "start": numbers(fit.start, 4),
-            "estimate": numbers(fit.theta, 5),
-            "formal σ": std,
-        },
-    )

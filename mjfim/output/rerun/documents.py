@@ -121,7 +121,9 @@ def log_design(
         "optimiser": planes_of("optimiser", convergence(design).panels),
     }
     iterates = _iterate_plots(design, labels)
-    grids = [each for name, found in planes.items() for each in _plane_tabs(name, found)]
+    grids = []
+    for name, found in planes.items():
+        grids += grid_tabs(name, [plane.view() for plane, _ in found])
     grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
 
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in both.items()}
@@ -392,11 +394,6 @@ def blueprint_of(layout: rrb.Container, time_panel: rrb.TimePanel) -> rrb.Bluepr
         auto_layout=False,
         auto_views=False,
     )
-
-
-def _plane_tabs(name: str, planes: Sequence[tuple[Plane, Panel]]) -> list[rrb.Container]:
-    """Return the tab of plots of 2D lines."""
-    return grid_tabs(name, [plane.view() for plane, _ in planes])
 
 
 def robot_views(
