@@ -673,7 +673,7 @@ def _moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
     return bodies.astype(np.intp), points
 
 
-def end_point(model: mujoco.MjModel, poses: BodyPoses) -> tuple[Array, Array] | None:
+def end_point(model: mujoco.MjModel, poses: BodyPoses) -> tuple[NDArray[np.intp], Array] | None:
     """Return the end of a robot, whose path is drawn.
 
     Of the points deepest in the tree, it is the one that travels farthest.
