@@ -36,7 +36,7 @@ from mjfim.output.pages.studies import equation_parts
 from mjfim.output.words import NOT_ALONE, relative
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
-from mjfim.records.terms import Decision, HeldOutRefit, Selection, SelectionStep
+from mjfim.records.terms import Decision, Selection, SelectionStep
 
 # Largest number of digits of an estimate.
 MAX_DIGITS = 9
@@ -353,27 +353,22 @@ def selection_parts(selection: Selection) -> Sequence[Part]:
         if step.alternatives and step.path in kept
     ]
     if selection.refit is not None:
-        parts.append(_about_refit(selection.refit))
+        differs = selection.refit.differs
+        same = "the same parameters within the intervals."
+        other = (
+            f"other values of {listed(differs)}, by more than both intervals explain; the "
+            "intervals are widened to hold both."
+        )
+        text = (
+            "The held-out recordings took no part in the selection. Fitted to them alone, the "
+            f"selected model has {other if differs else same}"
+        )
+        parts.append(Text(text, Emphasis.WARNING if differs else Emphasis.NORMAL))
     tables = tuple(_tables_to_keep(selection))
     if tables:
         title = "To keep this model, put these tables into the experiment file"
         parts.append(Listing(title, tables, Emphasis.WEAK, code=True))
     return (*parts, Plot("selection"))
-
-
-def _about_refit(refit: HeldOutRefit) -> Text:
-    """Say whether the held-out recordings alone give the same parameters."""
-    text = (
-        "The held-out recordings took no part in the selection. Fitted to them alone, the selected "
-        "model has "
-    )
-    if not refit.differs:
-        return Text(text + "the same parameters within the intervals.")
-    text += (
-        f"other values of {listed(refit.differs)}, by more than both intervals explain; the "
-        "intervals are widened to hold both."
-    )
-    return Text(text, Emphasis.WARNING)
 
 
 def _about_alternatives(step: SelectionStep) -> str:

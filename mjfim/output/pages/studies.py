@@ -268,11 +268,18 @@ def robots_page(comparison: RobotComparison) -> Page:
         parts.append(Listing("Differences", items, Emphasis.STRONG))
     if comparison.parameters:
         parts += [_robot_table(comparison), Plot("robots")]
+    limits = list(comparison.remarks)
+    others = len(comparison.parameters) - len(comparison.changed)
+    if comparison.changed and others:
+        limits.append(
+            f"no difference was found in the other {others} parameters, which is not a proof that "
+            "they are equal: see which differences would have been found"
+        )
     return Page(
         kind="Comparison of two robots",
         verdict=_robots_verdict(comparison),
         next_steps=tuple(_steps_after_robots(comparison)),
-        warnings=tuple(_limits_of(comparison)),
+        warnings=tuple(limits),
         facts={
             f"recordings of {first}": str(comparison.recordings[0]),
             f"recordings of {second}": str(comparison.recordings[1]),
@@ -301,17 +308,6 @@ def _steps_after_robots(comparison: RobotComparison) -> Iterator[str]:
         yield (
             "Smaller differences are found with longer recordings, or with a motion from "
             "`mjfim design`."
-        )
-
-
-def _limits_of(comparison: RobotComparison) -> Iterator[str]:
-    """Yield sentences that limit a comparison."""
-    yield from comparison.remarks
-    others = len(comparison.parameters) - len(comparison.changed)
-    if comparison.changed and others:
-        yield (
-            f"no difference was found in the other {others} parameters, which is not a proof that "
-            "they are equal: see which differences would have been found"
         )
 
 
