@@ -221,49 +221,32 @@ class PayloadEstimate(Record):
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences about the inertia, and about what is taken as known."""
-        return tuple(
-            sentence
-            for sentence in (self._about_inertia, self._about_known, self._about_held)
-            if sentence
-        )
-
-    @property
-    def _about_inertia(self) -> str:
-        """Sentence about the rotational inertia."""
-        if not self.is_seen:
-            return ""
-        if self.edge is None:
+        found = []
+        if self.is_seen and self.edge is None:
             inertia = _with_half_width(self.inertia, self.inertia_interval)
-            return (
+            found.append(
                 "The recordings determine the rotational inertia about the centre of mass, taken "
                 f"as equal about all axes: {inertia} kg m²."
             )
-        return (
-            "The recordings do not determine the rotational inertia. Assumed is that of a uniform "
-            f"cube with an edge of {self.edge:.2g} m, give or take as much, about a fitted value "
-            f"of {self.inertia:.2g} kg m²; --size states the edge."
-        )
-
-    @property
-    def _about_known(self) -> str:
-        """Sentence about the robot's parameters that an earlier estimate knows."""
-        if not self.known:
-            return ""
-        return (
-            f"The robot's {join_names(list(self.known))} are known from {self.source}; the "
-            "intervals of the payload contain their uncertainty."
-        )
-
-    @property
-    def _about_held(self) -> str:
-        """Sentence about the robot's parameters that are held."""
-        if not self.held:
-            return ""
-        verb = "is" if len(self.held) == 1 else "are"
-        return (
-            f"The robot's {join_names(list(self.held))} {verb} held, so that the intervals of the "
-            "payload do not contain their errors; --from or --without give their uncertainty."
-        )
+        elif self.is_seen:
+            found.append(
+                "The recordings do not determine the rotational inertia. Assumed is that of a "
+                f"uniform cube with an edge of {self.edge:.2g} m, give or take as much, about a "
+                f"fitted value of {self.inertia:.2g} kg m²; --size states the edge."
+            )
+        if self.known:
+            found.append(
+                f"The robot's {join_names(list(self.known))} are known from {self.source}; the "
+                "intervals of the payload contain their uncertainty."
+            )
+        if self.held:
+            verb = "is" if len(self.held) == 1 else "are"
+            found.append(
+                f"The robot's {join_names(list(self.held))} {verb} held, so that the intervals of "
+                "the payload do not contain their errors; --from or --without give their "
+                "uncertainty."
+            )
+        return tuple(found)
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
