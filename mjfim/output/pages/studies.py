@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import PurePath
 
 import numpy as np
-import scipy.stats
+import scipy
 
 from mjfim.errors import first_ones
 from mjfim.output.page import (
