@@ -32,12 +32,11 @@ if TYPE_CHECKING:
     from mjfim.parallel.budget import Budget, StopToken
     from mjfim.records.campaign import Campaign
     from mjfim.records.check import Check
-    from mjfim.records.comparison import Comparison
     from mjfim.records.design import Design
     from mjfim.records.estimate import Estimate
-    from mjfim.records.inverse_dynamics import InverseDynamicsFit
-    from mjfim.records.monte_carlo import MonteCarloStudy
+    from mjfim.records.estimate_parts import InverseDynamicsFit
     from mjfim.records.robots import RobotComparison
+    from mjfim.records.studies import Comparison, MonteCarloStudy
     from mjfim.records.trajectory import Recording, Trajectory
     from mjfim.studies.campaign import run_campaign
     from mjfim.studies.check import check
@@ -118,11 +117,11 @@ MODULES = {
     "Workers": "mjfim.parallel",
     "Campaign": "mjfim.records.campaign",
     "Check": "mjfim.records.check",
-    "Comparison": "mjfim.records.comparison",
+    "Comparison": "mjfim.records.studies",
     "Design": "mjfim.records.design",
     "Estimate": "mjfim.records.estimate",
-    "InverseDynamicsFit": "mjfim.records.inverse_dynamics",
-    "MonteCarloStudy": "mjfim.records.monte_carlo",
+    "InverseDynamicsFit": "mjfim.records.estimate_parts",
+    "MonteCarloStudy": "mjfim.records.studies",
     "Recording": "mjfim.records.trajectory",
     "RobotComparison": "mjfim.records.robots",
     "Trajectory": "mjfim.records.trajectory",

@@ -28,7 +28,7 @@ from mjfim.output.archive import write_design
 from mjfim.output.plots.pictures import draw
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
-from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.studies import MonteCarloStudy
 from mjfim.records.trajectory import Trajectory
 
 # Experiment of the study.

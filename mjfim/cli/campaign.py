@@ -80,8 +80,9 @@ def campaign(
         lab = _Lab(task=task, folder=folder, display=display, rounds=rounds)
         if simulated:
             # The campaign in the folder may have ended between a design and its recording.
-            for number in folder.unrecorded_rounds():
-                lab.record(mjfim.Design.load(folder.round(number)), number, seed)
+            for number in range(1, folder.designed + 1):
+                if not folder.recordings(number):
+                    lab.record(mjfim.Design.load(folder.round(number)), number, seed)
         else:
             folder.add_recordings(recordings or [])
 

@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
@@ -196,7 +196,7 @@ class Run:
 
     def __post_init__(self) -> None:
         if self.executor != LOCAL:
-            from mjfim.parallel.stated import StatedExecutor
+            from mjfim.parallel.workers import StatedExecutor
 
             StatedExecutor.parse(self.executor)  # a fault is said before the work
 
@@ -221,7 +221,7 @@ class Run:
             The workers; None where all work is done by this process.
         """
         from mjfim.parallel import LOST_SENTENCE, Pool, Workers
-        from mjfim.parallel.stated import ExecutorKind, StatedExecutor
+        from mjfim.parallel.workers import ExecutorKind, StatedExecutor
 
         stated = StatedExecutor.parse(self.executor)
         if stated.kind is not ExecutorKind.LOCAL:
@@ -279,16 +279,25 @@ class Run:
         result: ShownRecord,
         system: System,
         *,
+        design: Path | None = None,
         further: Mapping[str, object] = NOTHING,
         verdict: str = "",
         remark: str = "",
     ) -> None:
-        """Print a result and write its files; see `print` and `write`."""
+        """Print a result and write its files; see `print` and `write`.
+
+        The next step names the design, where the result is one or is about one.
+        """
         from mjfim.output.archive import summary_with_origin
         from mjfim.output.pages import page_of
 
         values = {**summary_with_origin(result, system, self.output), **further}
-        self.print(values, page_of(result), verdict)
+        page = page_of(result)
+        if design is not None:
+            place = shlex.quote(str(design))
+            steps = (step.replace("DESIGN_FOLDER", place) for step in page.next_steps)
+            page = replace(page, next_steps=tuple(steps))
+        self.print(values, page, verdict)
         self.write(result, system, further, remark)
 
 

@@ -98,7 +98,7 @@ def design(
         further["shortest"] = found.summary()
     verdict = "" if result.success else "; ".join([result.outcome, *result.warnings])
     motion = f"\nto see the motion: mjfim replay {run.output}"
-    run.finish(result, system, further=further, verdict=verdict, remark=motion)
+    run.finish(result, system, design=run.output, further=further, verdict=verdict, remark=motion)
     if found is not None:
         found.save(run.output)
         say(f"{found}" if found.reached else f"mjfim: {found}")

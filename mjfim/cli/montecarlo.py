@@ -58,7 +58,7 @@ def montecarlo(
     if not study.sets:
         raise NoResultError
 
-    run.finish(study, system)
+    run.finish(study, system, design=design_file)
     done = {name: found.trials for name, found in study.sets.items()}
     is_complete = done == dict.fromkeys(named, trials)
     if not is_complete:

@@ -100,11 +100,10 @@ class ProgressDisplay:
 
     def __call__(self, event: Event) -> None:
         """Show an event."""
-        line = progress_line(event)
-        text = line.text
+        text, done, count = progress_line(event)
         if isinstance(event, DesignEvent) and event.row.mu:
             text = f"{design_stage(event)}: {text}"
-        self.show(text, line.count, line.done or 0.0)
+        self.show(text, count, done or 0.0)
 
 
 class _Times(ProgressColumn):

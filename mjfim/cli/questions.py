@@ -117,7 +117,7 @@ def _with_times(proposal: Proposal, wishes: Wishes) -> Wishes:
 
 def _sigmas(proposal: Proposal) -> dict[str, float]:
     """Standard deviations of the measured joints by kind; those of the MJCF are not asked for."""
-    proposed = {each.kind: each.sigma for each in proposal.noise if each.kind}
+    proposed = {kind: sigma for _, sigma, kind in proposal.noise if kind}
     return {
         kind: _asked(f"Noise of each measured {kind} [{UNITS[kind]}]", f"{sigma:g}", _positive)
         for kind, sigma in proposed.items()

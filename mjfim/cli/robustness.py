@@ -55,7 +55,7 @@ def robustness(
     from mjfim.experiment.system import System
     from mjfim.output.folders import ROBUSTNESS_FILES
     from mjfim.parallel import cores
-    from mjfim.records.robustness import RobotConditions
+    from mjfim.records.studies import RobotConditions
     from mjfim.studies.robustness import default_latency
 
     conditions = RobotConditions(
@@ -80,7 +80,13 @@ def robustness(
     seconds = time.perf_counter() - begun
 
     remark = f" ({result.runs} runs in {seconds:.0f} s)"
-    run.finish(result, System.resolve(stated), further={"seconds": seconds}, remark=remark)
+    run.finish(
+        result,
+        System.resolve(stated),
+        design=design_folder,
+        further={"seconds": seconds},
+        remark=remark,
+    )
     if result.runs < runs:
         say_from_program(f"interrupted; only {result.runs} of {runs} robots are done")
     raise typer.Exit(0 if result.ok and result.runs == runs else 1)

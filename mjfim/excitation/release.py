@@ -37,8 +37,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification
 from mjfim.parallel import ExecutorLike, Workers, carry_out, one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget
-from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue
+from mjfim.parallel.shared_value import KeptPerThread, SharedValue
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
 from mjfim.records.design import Design, HistoryRow, StartResult, Status, extended

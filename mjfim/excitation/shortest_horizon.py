@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from mjfim import recordings
 from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
@@ -32,7 +33,6 @@ from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
-from mjfim.recordings import formats
 from mjfim.records.base import SavedRecord
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
@@ -544,7 +544,7 @@ def _default_longest(task: DesignTask) -> float:
         return longest
 
     with opened(experiment, str(experiment.initial.control)) as file:
-        columns = formats.read_table(file)
+        columns = recordings.read_table(file)
     name = task.controls[0]
     values = columns[name if name in columns else f"ctrl:{name}"]
     t = columns["t"][np.isfinite(values)]

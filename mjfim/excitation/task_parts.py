@@ -593,8 +593,8 @@ class _Drift(NamedTuple):
     def under(self, controls: Array) -> Array:
         """(m, nx) change of the state under each of (m, nu) controls."""
         states = np.broadcast_to(self.state, (len(controls), len(self.state)))
-        stepped = self.simulator.step([self.model], states, controls)
-        return np.asarray(self.system.space.minus(stepped.states, self.state))
+        after, _, _ = self.simulator.step([self.model], states, controls)
+        return np.asarray(self.system.space.minus(after, self.state))
 
 
 def _without_clamps(model: Any) -> Any:

@@ -25,8 +25,14 @@ from mjfim.experiment.system_tables import (
 )
 from mjfim.experiment.task_tables import Boundary, Cost, Descent, FitSpec, Limits, Robust
 from mjfim.model.model_files import PackedFiles
-from mjfim.recordings.section import Hertz, PositiveWithUnit, Seconds, Section, explain
-from mjfim.recordings.spec import RecordingSpec
+from mjfim.recordings.section import (
+    Hertz,
+    PositiveWithUnit,
+    RecordingSpec,
+    Seconds,
+    Section,
+    explain,
+)
 
 # Endings of files of other kinds, which are no experiments.
 MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")

@@ -47,8 +47,7 @@ from mjfim.plant.outputs import Noise, Outputs
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.recordings.channels import Channels
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Recording, Trajectory
+from mjfim.records.trajectory import Labels, Recording, Trajectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

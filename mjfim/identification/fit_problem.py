@@ -30,11 +30,8 @@ from mjfim.identification.segments import (
     spread_over_data,
     stated_segments,
 )
-from mjfim.identification.unknowns import UnknownLayout
-from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
-from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step, triangle
 from mjfim.information.null_space import COARSER_STEP_FACTOR
-from mjfim.optimize.condensed_least_squares import Condensed, triangle
+from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.plant.outputs import Noise

@@ -31,8 +31,7 @@ from mjfim.parallel import (
     results,
 )
 from mjfim.parallel.budget import Budget, StopToken, hurried
-from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue, require_values
+from mjfim.parallel.shared_value import KeptPerThread, SharedValue, require_values
 
 T = TypeVar("T")
 

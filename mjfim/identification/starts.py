@@ -42,11 +42,9 @@ from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet, make_physical
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
 from mjfim.plant.dynamics import NO_WARNING, UNSTABLE_LOOP, explain_divergence, find_divergence
-from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
-from mjfim.plant.dynamics import UNSTABLE_LOOP
 from mjfim.records.estimate import HorizonStudy
+from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.events import begin_stage
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.trajectory import Recording
 
 # Number of starts that are spread about a guess, with the guess, and the largest factor between

@@ -18,7 +18,7 @@ from mjfim.errors import ModelError, ModelWarning
 from mjfim.model.coordinates import ModelCoordinates
 from mjfim.model.model_files import PackedFiles, files_of_model, name_of
 from mjfim.model.terms.term import StateLayout, Term, extended_spec
-from mjfim.parallel.kept import Kept
+from mjfim.parallel.shared_value import Kept
 
 
 def load_spec(path: Path, files: Any = None) -> Any:

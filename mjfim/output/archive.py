@@ -35,8 +35,7 @@ from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.state_space import logarithm
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import TRAJECTORY_ARRAYS, Design
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Playback, Recording, Trajectory
+from mjfim.records.trajectory import Labels, Playback, Recording, Trajectory
 
 # Angle of a whole turn [rad].
 TURN = 2.0 * np.pi

@@ -100,21 +100,15 @@ class CampaignFolder:
     @property
     def designed(self) -> int:
         """Number of rounds that have a design."""
-        numbers = itertools.takewhile(self._has_design, itertools.count(1))
-        return sum(1 for _ in numbers)
+        number = 0
+        while all((self.round(number + 1) / f"design.{end}").is_file() for end in ("json", "npz")):
+            number += 1
+        return number
 
     @property
     def recorded(self) -> int:
         """Number of rounds that have a design and recordings."""
         return sum(1 for _ in itertools.takewhile(self.recordings, range(1, self.designed + 1)))
-
-    def _has_design(self, number: int) -> bool:
-        """Whether both files of a round's design exist."""
-        return all((self.round(number) / name).is_file() for name in ("design.json", "design.npz"))
-
-    def unrecorded_rounds(self) -> list[int]:
-        """Numbers of the rounds that have a design, but no recording."""
-        return [n for n in range(1, self.designed + 1) if not self.recordings(n)]
 
     def next_files(self, *, simulated: bool) -> list[str]:
         """List the files that the next call may write; in the folders of rounds, existing ones.

@@ -36,10 +36,10 @@ from mjfim.output.report import Media, kinds_in, write_report
 from mjfim.output.video import report_video
 from mjfim.parallel.budget import current_interruption
 from mjfim.records.base import ShownRecord
-from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import begin_stage
+from mjfim.records.studies import DESIGN, Comparison
 
 # Table of the drawn robots, and folder of their models.
 SAMPLES_TABLE = "samples.csv"
@@ -455,10 +455,17 @@ def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureForm
     Returns:
         The files.
     """
+
+    def write(make: Callable[[], Picture], file: Path) -> None:
+        """Draw a picture and write it."""
+        from mjfim.output.plots.draw import save  # imports matplotlib, which is slow
+
+        save(make(), file)
+
     _clear_other_formats(folder, pictures, picture_format)
     files = {name: folder / picture_format.file_of(name) for name in pictures}
     for name, draw in pictures.items():
-        write_optional(files[name].name, partial(_write_picture, draw, files[name]))
+        write_optional(files[name].name, partial(write, draw, files[name]))
     return [file for file in files.values() if file.is_file()]
 
 
@@ -468,13 +475,6 @@ def _clear_other_formats(
     """Remove pictures of an earlier run in other formats."""
     others = "|".join(other for other in PictureFormat if other is not picture_format)
     clear(folder, rf"({'|'.join(re.escape(name) for name in names)})\.({others})")
-
-
-def _write_picture(make: Callable[[], Picture], file: Path) -> None:
-    """Draw a picture and write it."""
-    from mjfim.output.plots.draw import save  # imports matplotlib, which is slow
-
-    save(make(), file)
 
 
 def clear(folder: Path, names: str) -> None:

@@ -226,6 +226,7 @@ class Page:
         warnings: What limits the result.
         facts: Short facts by their names.
         sections: Sections, the main results first.
+        verbose: Whether a terminal shows all of it, or a screen of text at most.
     """
 
     kind: str
@@ -234,6 +235,29 @@ class Page:
     warnings: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     sections: Sequence[Section] = ()
+    verbose: bool = False
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Lay out the page for the width of the terminal which shows it."""
+        verdict = capitalised(self.verdict.text)
+        if verdict:
+            is_good = self.verdict.level is Level.GOOD
+            yield _styled(verdict, "bold" if is_good else "bold yellow")
+        parts: list[Shown] = [
+            *(Text(f"warning: {warning}", Emphasis.WARNING) for warning in self.warnings),
+            *(part for part in self.parts if self.verbose or not part.detail),
+            *(Text(f"Next: {step}") for step in self.next_steps[:1]),
+        ]
+        width, hidden = options.max_width, 0
+        if not self.verbose:
+            parts, hidden = _shortened(parts, width, MAX_LINES - _height(Text(verdict), width))
+        for part in parts:
+            if self.verbose and not isinstance(part, Text):
+                yield Styled()
+            yield from _rendered(part, width, verbose=self.verbose)
+        if hidden:
+            rows = "1 row or sentence" if hidden == 1 else f"{hidden} rows and sentences"
+            yield _styled(f"Not shown here: {rows}; --verbose shows everything", "dim")
 
     @property
     def every_part(self) -> Iterator[Part]:
@@ -354,46 +378,14 @@ STYLES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class TerminalPage:
-    """A page that is laid out for the width of the terminal which shows it."""
-
-    page: Page
-    verbose: bool = False
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        verdict = capitalised(self.page.verdict.text)
-        if verdict:
-            is_good = self.page.verdict.level is Level.GOOD
-            yield _styled(verdict, "bold" if is_good else "bold yellow")
-        parts: list[Shown] = [
-            *(Text(f"warning: {warning}", Emphasis.WARNING) for warning in self.page.warnings),
-            *(part for part in self.page.parts if self.verbose or not part.detail),
-            *(Text(f"Next: {step}") for step in self.page.next_steps[:1]),
-        ]
-        width, hidden = options.max_width, 0
-        if not self.verbose:
-            parts, hidden = _shortened(parts, width, MAX_LINES - _height(Text(verdict), width))
-        for part in parts:
-            if self.verbose and not isinstance(part, Text):
-                yield Styled()
-            yield from _rendered(part, width, verbose=self.verbose)
-        if hidden:
-            rows = "1 row or sentence" if hidden == 1 else f"{hidden} rows and sentences"
-            yield _styled(f"Not shown here: {rows}; --verbose shows everything", "dim")
-
-
-def render(page: Page, *, verbose: bool = False) -> TerminalPage:
-    """Lay out a page for a terminal.
+def render(page: Page, *, verbose: bool = False) -> Page:
+    """Choose what a Rich console prints of a page.
 
     Args:
         page: The page.
         verbose: True for all tables and sentences, False for a screen of text at most.
-
-    Returns:
-        What a Rich console prints.
     """
-    return TerminalPage(page=page, verbose=verbose)
+    return replace(page, verbose=verbose)
 
 
 def _styled(text: str, style: str) -> Styled:

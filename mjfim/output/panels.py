@@ -268,11 +268,11 @@ def words(x: Numbers, y: Numbers, texts: Sequence[str], role: str, **look: Any) 
 # ---- axes and places
 
 
-def row_axis(names: Sequence[str], roles: Sequence[str] = (), label: str = "") -> Axis:
+def row_axis(names: Sequence[str], roles: Sequence[str] = ()) -> Axis:
     """Return a vertical axis with a name for each row, the first one at the top."""
     count = len(names)
     limits = (count - 0.5, -0.5)
-    return Axis(label=label, ticks=range(count), names=names, roles=roles, limits=limits)
+    return Axis(ticks=range(count), names=names, roles=roles, limits=limits)
 
 
 def in_grid(panels: Sequence[Panel], columns: int, first_row: int = 0) -> list[Panel]:
@@ -291,17 +291,18 @@ def around(values: Array, *, factor: float = 1.4) -> tuple[float, float]:
     return float(usable.min()) / factor, float(usable.max()) * factor
 
 
-def range_of_intervals(
-    centre: Array, low: Array, high: Array, *, near: float = 3.0, farthest: float = 20.0
-) -> tuple[float, float]:
+# Largest reach of an interval that is shown, over the median one, and largest distance from the
+# median, over the median reach.
+NEAR, FARTHEST = 3.0, 20.0
+
+
+def range_of_intervals(centre: Array, low: Array, high: Array) -> tuple[float, float]:
     """Return ends of an axis that shows intervals; few wide or distant ones do not widen it.
 
     Args:
         centre: (n,) middles of the intervals.
         low: (n,) their lower ends.
         high: (n,) their upper ends.
-        near: Largest reach of an interval that is shown, over the median one.
-        farthest: Largest distance from the median that is shown, over the median reach.
     """
     known = np.isfinite(centre) & np.isfinite(low) & np.isfinite(high)
     if not known.any():
@@ -309,8 +310,8 @@ def range_of_intervals(
     centre, low, high = centre[known], low[known], high[known]
     usual = float(np.median(high - low)) / 2.0
     distance = np.abs(centre - np.median(centre))
-    shown = distance <= farthest * max(usual, float(np.median(distance)))
-    begin = float(np.maximum(low, centre - near * usual)[shown].min())
-    end = float(np.minimum(high, centre + near * usual)[shown].max())
+    shown = distance <= FARTHEST * max(usual, float(np.median(distance)))
+    begin = float(np.maximum(low, centre - NEAR * usual)[shown].min())
+    end = float(np.minimum(high, centre + NEAR * usual)[shown].max())
     margin = 0.06 * (end - begin) or 1e-3 * max(abs(begin), np.finfo(float).tiny)
     return begin - margin, end + margin

@@ -9,26 +9,13 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from html import escape
 
 from mjfim.output.page import shown_word
-from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
+from mjfim.records.events import DesignEvent, Event, FitEvent
 
-
-@dataclass(frozen=True, kw_only=True)
-class ProgressLine:
-    """State of long work.
-
-    Attributes:
-        text: What is done, in one line.
-        done: Number of finished parts; None if the number of parts is not known.
-        count: Number of parts; None if it is not known.
-    """
-
-    text: str
-    done: float | None = None
-    count: int | None = None
+# What is done, in one line; then the number of finished parts and of all, None where not known.
+ProgressLine = tuple[str, float | None, int | None]
 
 
 def progress_line(event: Event) -> ProgressLine:
@@ -38,14 +25,16 @@ def progress_line(event: Event) -> ProgressLine:
         event: The event.
     """
     if isinstance(event, DesignEvent):
-        return ProgressLine(text=design_text(event))
+        return design_text(event), None, None
     if isinstance(event, FitEvent):
-        return ProgressLine(text=fit_text(event))
+        iteration = f"{event.phase}: iteration {event.iteration}"
+        text = f"{iteration}, cost {event.cost:.6g}, step {event.step:.2g} σ"
+        return text, None, None
     if event.count is None:
-        return ProgressLine(text=event.message)
+        return event.message, None, None
 
-    text = f"{part_text(event)}  {event.message}".rstrip()
-    return ProgressLine(text=text, done=event.index + event.share, count=event.count)
+    text = f"{event.index + 1}/{event.count} {shown_word(event.part)}  {event.message}".rstrip()
+    return text, event.index + event.share, event.count
 
 
 def design_text(event: DesignEvent) -> str:
@@ -78,25 +67,6 @@ def design_stage(event: DesignEvent) -> str:
     return f"searching inside the limits {at_rate}, barrier {row.mu:.1g}"
 
 
-def fit_text(event: FitEvent) -> str:
-    """Describe an iterate of an estimation.
-
-    Args:
-        event: The event.
-    """
-    iteration = f"{event.phase}: iteration {event.iteration}"
-    return f"{iteration}, cost {event.cost:.6g}, step {event.step:.2g} σ"
-
-
-def part_text(event: StudyEvent) -> str:
-    """Name the part of a study that is running, with its number.
-
-    Args:
-        event: The event of a study with a known number of parts.
-    """
-    return f"{event.index + 1}/{event.count} {shown_word(event.part)}"
-
-
 # Shortest time between two updates of the display [s].
 UPDATE_SECONDS = 0.2
 
@@ -113,7 +83,7 @@ class NotebookProgress:
         from IPython.display import display  # slow, and only notebooks have it
 
         self._description = description
-        self._line = ProgressLine(text=description)
+        self._line: ProgressLine = (description, None, None)
         self._begun = self._shown = time.monotonic()
         self._handle = display(self._running(), raw=True, display_id=True)
 
@@ -144,8 +114,9 @@ class NotebookProgress:
     def _running(self) -> dict[str, str]:
         """Return the bar, and a text for displays without HTML."""
         state = ""
-        if self._line.count is not None:
-            state = f' max="{self._line.count}" value="{self._line.done:.3f}"'
+        _, done, count = self._line
+        if count is not None:
+            state = f' max="{count}" value="{done:.3f}"'
 
         text = f"{self._text()} ({self._seconds():.0f} s)"
         html = f"<div><progress{state}></progress> {escape(text)}</div>"
@@ -153,7 +124,7 @@ class NotebookProgress:
 
     def _text(self) -> str:
         """Return what is done, with the description before the line of the last event."""
-        line = self._line.text
+        line, _, _ = self._line
         return line if line == self._description else f"{self._description}: {line}"
 
     def _seconds(self) -> float:

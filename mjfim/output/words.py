@@ -14,8 +14,8 @@ from mjfim.output.page import number
 from mjfim.records.campaign import Campaign
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.labels import Labels
-from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.studies import MonteCarloStudy
+from mjfim.records.trajectory import Labels
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

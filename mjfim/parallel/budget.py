@@ -180,12 +180,11 @@ class Budget:
 
         return None
 
-    def share(self, fraction: float = 1.0, *, iterations: int | None = None) -> Budget:
+    def share(self, fraction: float = 1.0) -> Budget:
         """Make a budget for a part of the computation; both budgets share one token.
 
         Args:
             fraction: Fraction of the remaining time and of the remaining engine steps.
-            iterations: Iterations of the part; None without a limit.
 
         Returns:
             A budget that begins to count now.
@@ -194,7 +193,6 @@ class Budget:
         return Budget(
             seconds=fraction * self.seconds_left,
             steps=fraction * steps_left if math.isfinite(steps_left) else None,
-            iterations=iterations,
             stop=self.stop,
         )
 

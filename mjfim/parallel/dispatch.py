@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.parallel.budget import Budget, StopToken, hurried
-from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.pool import one_blas_thread, pool_stop_token
-from mjfim.parallel.shared_value import AbsentValue, SentValue, attempt, owned_value
+from mjfim.parallel.shared_value import KeptPerThread, SentValue, attempt, owned_value
 from mjfim.parallel.workers import ExecutorLike, Workers, is_loss, is_refused_by_pickle
 
 T = TypeVar("T")
@@ -72,16 +71,6 @@ class Outcome(Generic[T]):
         return self.found[0]
 
 
-@dataclass(kw_only=True, eq=False)
-class _Work(Generic[Order]):
-    """An order that has no result yet, the losses so far, and values that its worker lacked."""
-
-    index: int
-    order: Order
-    losses: int = 0
-    values: dict[str, SentValue] = field(default_factory=dict)
-
-
 class _Dispatch(Generic[Order, T]):
     """Orders under way on workers. An order whose worker was killed is carried out again."""
 
@@ -95,8 +84,12 @@ class _Dispatch(Generic[Order, T]):
         self._workers = workers
         self._function = function
         self._budget = budget
-        self._waiting = deque(_Work(index=i, order=order) for i, order in enumerate(orders))
-        self._running: dict[Future[Any], _Work[Order]] = {}
+        self._orders = list(orders)
+        self._waiting = deque(range(len(self._orders)))
+        self._losses = [0] * len(self._orders)
+        # Values that the worker of an order lacked, by the number of the order.
+        self._values: dict[int, dict[str, SentValue]] = defaultdict(dict)
+        self._running: dict[Future[Any], int] = {}
         self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
 
     def withdraw(self) -> None:
@@ -132,11 +125,12 @@ class _Dispatch(Generic[Order, T]):
             if self._running:
                 self._collected()
 
-    def _submit(self, work: _Work[Order]) -> None:
-        """Submit an order with the values that a worker did not have."""
+    def _submit(self, index: int) -> None:
+        """Submit the order of a number with the values that a worker did not have."""
         future: Future[Any]
         try:
-            future = self._workers.submit(partial(attempt, self._function, work.values), work.order)
+            task = partial(attempt, self._function, self._values[index])
+            future = self._workers.submit(task, self._orders[index])
         except Exception as error:
             # Some executors, such as Dask, pickle a task while it is submitted; in one whose
             # processes have ended, it is lost at once.
@@ -144,7 +138,7 @@ class _Dispatch(Generic[Order, T]):
                 raise
             future = Future()
             future.set_exception(error)
-        self._running[future] = work
+        self._running[future] = index
         future.add_done_callback(self._ended.put)
 
     def _next_outcome(self) -> Outcome[T] | None:
@@ -155,15 +149,19 @@ class _Dispatch(Generic[Order, T]):
             return None
 
         # A task that was withdrawn has no outcome.
-        work = self._running.pop(future, None)
-        if work is None:
+        index = self._running.pop(future, None)
+        if index is None:
             return None
 
         error = None if future.cancelled() else future.exception()
         if future.cancelled() or is_loss(error):
-            work.losses += 1
-            if work.losses == MAX_LOSSES:
-                return Outcome(index=work.index, loss=self._sentence_of_loss())
+            self._losses[index] += 1
+            if self._losses[index] == MAX_LOSSES:
+                loss = (
+                    f"the worker was lost {MAX_LOSSES} times while it did this work "
+                    f"({self._workers.probable_fault}), so this work is left out"
+                )
+                return Outcome(index=index, loss=loss)
         elif is_refused_by_pickle(error):
             raise ExperimentError(
                 f"executor: the work cannot be sent to other processes ({error}). Functions, such "
@@ -171,19 +169,14 @@ class _Dispatch(Generic[Order, T]):
                 "that the workers can import; lambdas and functions inside functions can be used "
                 "without an executor, or with threads"
             ) from error
-        elif isinstance(result := future.result(), AbsentValue):
-            work.values.update({digest: owned_value(digest) for digest in result.digests})
         else:
-            return Outcome(index=work.index, found=(result,))
-        self._waiting.appendleft(work)
+            found, absent = future.result()
+            if found:
+                del self._values[index]
+                return Outcome(index=index, found=found)
+            self._values[index].update({digest: owned_value(digest) for digest in absent})
+        self._waiting.appendleft(index)
         return None
-
-    def _sentence_of_loss(self) -> str:
-        """Why an order has no result."""
-        return (
-            f"the worker was lost {MAX_LOSSES} times while it did this work "
-            f"({self._workers.probable_fault}), so this work is left out"
-        )
 
     def _is_overdue(self) -> bool:
         """Check whether the time has been over for so long that nobody waits for what runs."""
@@ -211,19 +204,15 @@ class _Dispatch(Generic[Order, T]):
             _, left = wait(self._running, timeout=min(POLL_INTERVAL, GRACE))
 
         found: list[Outcome[T]] = []
-        for future, work in self._running.items():
-            results: list[Any] = []
+        for future, index in self._running.items():
+            results: Sequence[Any] = ()
             if future in left:
                 # Nobody waits any longer for a task that does not look at the request.
                 future.cancel()
-                results = [] if pool is None else pool.offered(future)
+                results = () if pool is None else pool.offered(future)
             elif not future.cancelled() and future.exception() is None:
-                results = [future.result()]
-            found += [
-                Outcome(index=work.index, found=(result,))
-                for result in results
-                if not isinstance(result, AbsentValue)
-            ]
+                results, _ = future.result()
+            found += [Outcome(index=index, found=(result,)) for result in results]
 
         if pool is not None and left:
             pool.end_running()

@@ -153,7 +153,10 @@ class Pool(Executor):
 
         # Tasks that cannot end in time send their results so far to this address, at which somebody
         # listens after a request to stop only.
-        self._address = _private_address()
+        name = f"mjfim-{uuid.uuid4().hex}"
+        self._address = str(Path(tempfile.gettempdir()) / name)
+        if sys.platform == "win32":
+            self._address = rf"\\.\pipe\{name}"
         self._listener: connection.Listener | None = None
         self._offers: dict[int, Any] = {}
         self._next_number = itertools.count()
@@ -275,14 +278,6 @@ def _starting_processes() -> Iterator[None]:
             os.environ["PYTHONSAFEPATH"] = "1"
             restored.callback(os.environ.pop, "PYTHONSAFEPATH", None)
         yield
-
-
-def _private_address() -> str:
-    """Return an unused address for processes of this computer."""
-    name = f"mjfim-{uuid.uuid4().hex}"
-    if sys.platform == "win32":
-        return rf"\\.\pipe\{name}"
-    return str(Path(tempfile.gettempdir()) / name)
 
 
 def _receive(heard: connection.Connection, offers: dict[int, Any]) -> None:

@@ -1,20 +1,23 @@
-"""Large values that tasks hold by their hash, so that a worker process need not get them each time.
+"""Large values that tasks hold by their hash, and objects that a worker makes once and keeps.
 
-A task that needs a value which its process does not have fails with AbsentValueError; `attempt`
-turns that into an answer, and `dispatch` sends the task again, together with the value.
+A worker process need not get a value each time. A task that needs a value which its process does
+not have fails with AbsentValueError; `attempt` turns that into an answer, and `dispatch` sends the
+task again, together with the value.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
 
 T = TypeVar("T")
 Order = TypeVar("Order")
+
+# A value on its way to a worker and in its memory, and about its size [bytes].
+SentValue = tuple[Any, int]
 
 # Size of the values that a process keeps [bytes]. Those that were not used for the longest time are
 # sent again when a task needs them.
@@ -79,14 +82,6 @@ class SharedValue(Generic[T]):
         return _referenced, (self.digest, self.size)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SentValue:
-    """A value on its way to a worker and in its memory, and about its size [bytes]."""
-
-    value: Any
-    size: int
-
-
 class _ReceivedValues:
     """The latest values that this process has received. Its threads share them."""
 
@@ -102,9 +97,9 @@ class _ReceivedValues:
                 self._values.move_to_end(digest)
 
             # The values of one task are kept together, however large they are.
-            size = sum(sent.size for sent in self._values.values())
+            size = sum(taken for _, taken in self._values.values())
             while len(self._values) > len(values) and size > KEPT_BYTES:
-                size -= self._values.popitem(last=False)[1].size
+                size -= self._values.popitem(last=False)[1][1]
 
     def get(self, digest: str) -> Any:
         """Return a value; AbsentValueError where it was not received, or forgotten since."""
@@ -112,7 +107,7 @@ class _ReceivedValues:
             if digest not in self._values:
                 raise AbsentValueError(digest)
             self._values.move_to_end(digest)
-            return self._values[digest].value
+            return self._values[digest][0]
 
 
 # Values that this process has made and still uses, and values that it has received.
@@ -129,7 +124,7 @@ def require_values(values: Iterable[SharedValue[Any]]) -> None:
 
 def keep_value(shared: SharedValue[T], value: T) -> None:
     """Keep a value in a worker that has made it itself instead of receiving it."""
-    _received.put({shared.digest: SentValue(value=value, size=shared.size)})
+    _received.put({shared.digest: (value, shared.size)})
 
 
 def owned_value(digest: str) -> SentValue:
@@ -137,28 +132,21 @@ def owned_value(digest: str) -> SentValue:
     shared = _owned.get(digest)
     if shared is None:
         raise AbsentValueError(digest)
-    return SentValue(value=shared.to_send(), size=shared.size)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AbsentValue:
-    """Answer of a worker that lacks shared values, in place of a result: their hashes."""
-
-    digests: tuple[str, ...]
+    return shared.to_send(), shared.size
 
 
 def attempt(
     function: Callable[[Order], T], values: Mapping[str, SentValue], order: Order
-) -> T | AbsentValue:
-    """Carry out an order in a worker, if the values are there that it needs.
+) -> tuple[tuple[T, ...], tuple[str, ...]]:
+    """Carry out an order in a worker: the result, or the hashes of values that are absent.
 
     An error would be the other way to say that one is absent, but Dask prints the errors of tasks.
     """
     _received.put(values)
     try:
-        return function(order)
+        return (function(order),), ()
     except AbsentValueError as error:
-        return AbsentValue(digests=error.digests)
+        return (), error.digests
 
 
 def _referenced(digest: str, size: int) -> SharedValue[Any]:
@@ -171,3 +159,44 @@ def _referenced(digest: str, size: int) -> SharedValue[Any]:
     reference.size = size
     reference._value = ()
     return reference
+
+
+class Kept(Generic[T]):
+    """Objects by key. Those that were not used for the longest time are forgotten.
+
+    Args:
+        count: Number of objects that are kept.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._objects: OrderedDict[Hashable, T] = OrderedDict()
+
+    def __len__(self) -> int:
+        """Number of objects that are kept now."""
+        return len(self._objects)
+
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the object of a key, made where it is not kept.
+
+        Args:
+            key: What identifies the object, such as a hash.
+            make: Makes it.
+        """
+        if key not in self._objects:
+            self._objects[key] = make()
+        self._objects.move_to_end(key)
+        while len(self._objects) > self._count:
+            self._objects.popitem(last=False)
+        return self._objects[key]
+
+
+class KeptPerThread(threading.local, Kept[T]):
+    """Objects that the tasks of a worker share, made by the first of them.
+
+    A worker process does one task after the other; a worker of several threads, as of Dask, has
+    objects of each thread.
+
+    Args:
+        count: Number of objects that each thread keeps.
+    """

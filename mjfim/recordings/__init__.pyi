@@ -1,8 +1,7 @@
 from .channels import Channels
-from .formats.read import read_table
-from .read import Log, read_log, read_recording, recording_paths
-from .spec import ColumnSpec, RecordingSpec
-from .summary import LogSummary, summarize
+from .formats import read_table
+from .read import Log, LogSummary, read_log, read_recording, recording_paths, summarize
+from .section import ColumnSpec, RecordingSpec
 
 __all__ = [
     "Channels",

@@ -21,7 +21,7 @@ from mjfim.model.coordinates import (
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.units import sensor_unit
 from mjfim.recordings.quantities import Unit, units_like
-from mjfim.recordings.spec import LAW_PREFIXES, LogUnit, RecordingSpec
+from mjfim.recordings.section import LAW_PREFIXES, LogUnit, RecordingSpec
 
 # Factor that converts each unit of a log to the model's unit.
 UNIT_FACTORS = {unit: Unit.parse(unit).factor for unit in get_args(LogUnit)}

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mjfim import recordings
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, listed, unknown
 from mjfim.model.coordinates import gain_names, state_names
-from mjfim.recordings import formats
 from mjfim.recordings.channels import Channels
 from mjfim.records.trajectory import Playback
 
@@ -48,7 +48,7 @@ def read_control(
         RecordingError: A column is missing or unknown, a number is missing, the times do not
             increase, or the table does not cover the sample times.
     """
-    columns = formats.read_table(path)
+    columns = recordings.read_table(path)
     keys = [name if name in columns else f"ctrl:{name}" for name in names]
     _check_columns(path, columns, names, keys)
 
@@ -108,7 +108,7 @@ def read_playback(path: Path, channels: Channels) -> Playback:
     Raises:
         RecordingError: A column or a number is missing, or the times are not equally spaced.
     """
-    table = formats.read_table(path)
+    table = recordings.read_table(path)
     states = state_names(channels.model)
     controls = channels.control_columns
     gains = gain_names(channels.model, channels.controls)

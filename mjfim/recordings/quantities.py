@@ -100,7 +100,7 @@ class Unit:
         for sign, part in zip(parts[::2], parts[1::2], strict=True):
             symbol = FACTOR.match(part)
             if symbol is None:
-                raise ValueError(_unknown_unit(text))
+                raise ValueError(unknown("unit", text, USUAL_UNITS))
 
             power = int(symbol[2] or EXPONENT_SIGNS.get(symbol[3], 1))
             power = -power if sign == "/" else power
@@ -137,18 +137,13 @@ def _symbol(name: str) -> tuple[float, Exponents]:
     if name[1:] in WITH_PREFIX and name[0] in PREFIXES:
         factor, exponents = SYMBOLS[name[1:]]
         return PREFIXES[name[0]] * factor, exponents
-    raise ValueError(_unknown_unit(name))
+    raise ValueError(unknown("unit", name, USUAL_UNITS))
 
 
 def _sum(left: Exponents, right: Exponents, times: int) -> Exponents:
     """Exponents of a product with a power of another unit."""
     angle, length, mass, time, current = (a + times * b for a, b in zip(left, right, strict=True))
     return angle, length, mass, time, current
-
-
-def _unknown_unit(name: str) -> str:
-    """Message about a unit that is not in the table."""
-    return unknown("unit", name, USUAL_UNITS)
 
 
 class Quantity(float):

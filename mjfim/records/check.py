@@ -443,7 +443,14 @@ class Check(ShownRecord):
 
 def verdict_of_check(check: Check) -> Iterator[str]:
     """Yield what a check found, the most serious first."""
-    yield from _about_design(check)
+    for reason in check.refused:
+        yield f"`mjfim design` refuses this experiment: {reason}"
+    if check.violations:
+        broken = first_ones([str(violation) for violation in check.violations], "; ")
+        yield (
+            f"the initial control violates limits: {broken}; σ is that of a motion outside the "
+            "limits. A design looks for a motion inside"
+        )
     if check.missing:
         yield f"interrupted, so this check is incomplete; it lacks {join_names(check.missing)}"
     yield from _about_derivatives(check)
@@ -462,18 +469,6 @@ def verdict_of_check(check: Check) -> Iterator[str]:
         yield (
             f"confounded pairs (correlation of the estimates): {first_ones(pairs)}; "
             "fixing one parameter of a pair makes the other more accurate"
-        )
-
-
-def _about_design(check: Check) -> Iterator[str]:
-    """Judgement of a design about the initial control, before it begins."""
-    for reason in check.refused:
-        yield f"`mjfim design` refuses this experiment: {reason}"
-    if check.violations:
-        broken = first_ones([str(violation) for violation in check.violations], "; ")
-        yield (
-            f"the initial control violates limits: {broken}; σ is that of a motion outside the "
-            "limits. A design looks for a motion inside"
         )
 
 

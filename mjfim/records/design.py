@@ -10,8 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Labels, Trajectory
 
 # Largest number of iterates of one search whose motions are kept, and number of samples of each.
 MAX_MOTIONS, MOTION_SAMPLES = 40, 200
@@ -184,10 +183,6 @@ class Status(NamedEnum):
         "widen it, or begin with an initial control of smaller amplitude"
     )
     LEFT = "discarded: another start was more promising"
-    LOST = (
-        "ended early because its worker was lost three times (its process was ended from outside, "
-        "perhaps because the memory was full)"
-    )
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"
 
     @property

@@ -13,12 +13,10 @@ from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import first_ones
 from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.check import join_names
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.labels import Labels
-from mjfim.records.payload import PayloadEstimate
+from mjfim.records.estimate_parts import InverseDynamicsFit, PayloadEstimate
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Selection, Term, TermTestData
-from mjfim.records.trajectory import Recording, Trajectory
+from mjfim.records.trajectory import Labels, Recording, Trajectory
 
 # Ratio of the errors over the longest and the shortest horizon above which they grow.
 GROWTH = 1.2

@@ -473,23 +473,8 @@ class Selection(Record):
     def __str__(self) -> str:
         words = ", ".join(term.description for term in self.terms)
         added = f"Added: {words}." if self.terms else "No term was added."
-        return " ".join([added, *self._simplifications, *self._about_errors, self.ending])
-
-    @property
-    def _about_errors(self) -> list[str]:
-        """Sentence about the errors of left-out data; none where no part was predicted."""
-        before, after = self.errors
-        if isnan(before):
-            return []
-        begin = self.phases[-1][0]
-        over = f" over {begin.description}" if begin.decision is Decision.SHORTENED else ""
-        change = f" → {after:.3g}" if self.is_changed else ""
-        return [f"Error of left-out data{over} {before:.3g}{change} σ."]
-
-    @property
-    def _simplifications(self) -> list[str]:
-        """Sentences about pooled and held parameters."""
-        sentences = [
+        sentences = [added]
+        sentences += [
             f"Pooled: {pool.name} in place of {', '.join(pool.members)}." for pool in self.pooled
         ]
         if self.held:
@@ -497,4 +482,11 @@ class Selection(Record):
                 f"Held at the guess: {', '.join(self.held)}; an error of a held guess is in no "
                 "interval."
             )
-        return sentences
+        # There is no error where no part was predicted.
+        before, after = self.errors
+        if not isnan(before):
+            begin = self.phases[-1][0]
+            over = f" over {begin.description}" if begin.decision is Decision.SHORTENED else ""
+            change = f" → {after:.3g}" if self.is_changed else ""
+            sentences.append(f"Error of left-out data{over} {before:.3g}{change} σ.")
+        return " ".join([*sentences, self.ending])

@@ -57,66 +57,6 @@ SAMPLING_RANGE = 2.5
 MIN_SAMPLING_RANGE = 1e-9
 
 
-def redesign(
-    base: DesignTask,
-    rounds: Sequence[Round],
-    theta: Array,
-    *,
-    callback: Callback | None = None,
-    executor: ExecutorLike | None = None,
-    stop: StopToken | None = None,
-) -> Design:
-    """Design again with the information of the recordings so far.
-
-    One design starts at the initial control and one at the control of the last design; the better
-    of the two is returned.
-
-    Args:
-        base: Task of the experiment as stated.
-        rounds: Earlier rounds.
-        theta: (p,) parameters at which the design is made [theta-unit].
-        callback: Called with a `DesignEvent` for every iterate.
-        executor: Runs several optimisations at once, under hard limits.
-        stop: Ends the design early.
-
-    Raises:
-        MjfimError: As `mjfim.design` raises it.
-    """
-    last = rounds[-1]
-    known = last.estimate.data
-    moved = restate_experiment(base, theta, last.estimate)
-    weight = _information_weight(base, moved, rounds)
-    moved = moved.replace(cost={"information": weight})
-
-    task = base.restated(moved, added_information=known)
-    first = design_task(
-        task, callback=callback, executor=executor, budget=design_budget(task, stop)
-    )
-    if last.control.shape != task.control.shape or first.status is Status.INTERRUPTED:
-        return first
-
-    # The second design starts at the control of the last design, and nowhere else.
-    only_start = {"starts": 1, "previous": (), "fourier": (), "repeats": ()}
-    task = base.restated(moved.replace(descent=only_start), added_information=known)
-    try:
-        second = design_task(
-            task,
-            callback=callback,
-            initial_control=last.control,
-            budget=design_budget(task, stop),
-        )
-    except SimulationDivergedError:
-        # The old control may be too strong for the new parameters.
-        return first
-
-    if second.status is Status.INTERRUPTED:
-        return second
-    return min(
-        (first, second),
-        key=lambda design: (design.status is Status.INFEASIBLE, design.final.cost),
-    )
-
-
 def _information_weight(base: DesignTask, moved: Experiment, rounds: Sequence[Round]) -> float:
     """Weight of the criterion that keeps the balance between information and effort.
 
@@ -381,11 +321,7 @@ class _CampaignRun:
         """
         if not self.rounds:
             task = self.base.restated(restate_experiment(self.base))
-            budget = design_budget(task, self._stop)
-            design = design_task(
-                task, callback=self._callback, executor=self._executor, budget=budget
-            )
-            return design, ()
+            return self._designed(task, executor=self._executor), ()
 
         last = self.rounds[-1]
         try:
@@ -398,15 +334,42 @@ class _CampaignRun:
             return self._redesign(last.theta), (remark,)
 
     def _redesign(self, theta: Array) -> Design:
-        """Design again at theta: (p,)."""
-        return redesign(
-            self.base,
-            self.rounds,
-            theta,
-            callback=self._callback,
-            executor=self._executor,
-            stop=self._stop,
+        """Design again at theta, (p,), with the information of the recordings so far.
+
+        One design starts at the initial control and one at the control of the last design; the
+        better of the two is returned.
+        """
+        base, last = self.base, self.rounds[-1]
+        known = last.estimate.data
+        moved = restate_experiment(base, theta, last.estimate)
+        weight = _information_weight(base, moved, self.rounds)
+        moved = moved.replace(cost={"information": weight})
+
+        task = base.restated(moved, added_information=known)
+        first = self._designed(task, executor=self._executor)
+        if last.control.shape != task.control.shape or first.status is Status.INTERRUPTED:
+            return first
+
+        # The second design starts at the control of the last design, and nowhere else.
+        only_start = {"starts": 1, "previous": (), "fourier": (), "repeats": ()}
+        task = base.restated(moved.replace(descent=only_start), added_information=known)
+        try:
+            second = self._designed(task, initial_control=last.control)
+        except SimulationDivergedError:
+            # The old control may be too strong for the new parameters.
+            return first
+
+        if second.status is Status.INTERRUPTED:
+            return second
+        return min(
+            (first, second),
+            key=lambda design: (design.status is Status.INFEASIBLE, design.final.cost),
         )
+
+    def _designed(self, task: DesignTask, **further: Any) -> Design:
+        """Design within the budget of a task."""
+        budget = design_budget(task, self._stop)
+        return design_task(task, callback=self._callback, budget=budget, **further)
 
     def _add_round(
         self, recorded: EarlierRound, design: Design | None = None, remarks: Sequence[str] = ()

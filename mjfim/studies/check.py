@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -346,17 +346,15 @@ def check_task(
     with stop_on_interrupt(stop) as token:
         test = _identifiability_test(task, executor, token)
         return _checked(
-            _Evidence(
-                task=task,
-                problem=problem,
-                point=point,
-                test=partial(test.along, curve, sensitivity),
-                data=_common_information(task, [information - task.information.prior]),
-                source=source,
-                duration=float(curve.t[-1]),
-                is_start=trajectory is None,
-            ),
+            task,
+            problem,
+            point,
+            partial(test.along, curve, sensitivity),
+            _common_information(task, [information - task.information.prior]),
             token,
+            source=source,
+            duration=float(curve.t[-1]),
+            is_start=trajectory is None,
         )
 
 
@@ -401,45 +399,19 @@ def check_recordings(
     with stop_on_interrupt(stop) as token:
         test = _identifiability_test(task, executor, token)
         return _checked(
-            _Evidence(
-                task=task,
-                problem=problem,
-                point=point,
-                test=partial(test.of_rows, task.initial, J, error),
-                data=_common_information(task, [rows.T @ rows for rows, _ in recorded]),
-                source=f"{count} recording{'s' if count > 1 else ''}",
-                duration=float(sum(recording.t[-1] for recording in fit.recordings)),
-            ),
+            task,
+            problem,
+            point,
+            partial(test.of_rows, task.initial, J, error),
+            _common_information(task, [rows.T @ rows for rows, _ in recorded]),
             token,
+            source=f"{count} recording{'s' if count > 1 else ''}",
+            duration=float(sum(recording.t[-1] for recording in fit.recordings)),
+            is_start=False,
         )
 
 
 # ---- what is looked at
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Evidence:
-    """What a check is computed from.
-
-    Attributes:
-        task: The task.
-        problem: Its cost about the motion along which derivatives are tested.
-        point: This motion.
-        test: Test of identifiability; it gets a function that says whether to stop.
-        data: (p, p) information of the data alone.
-        source: What is checked, in words.
-        duration: Duration of the data [s].
-        is_start: Whether it is the initial control, at which a design begins.
-    """
-
-    task: DesignTask
-    problem: DesignProblem
-    point: DesignPoint
-    test: Callable[[Callable[[], bool]], Identifiability]
-    data: Array
-    source: str
-    duration: float
-    is_start: bool = False
 
 
 def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
@@ -506,33 +478,49 @@ def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
 # ---- what is found
 
 
-def _checked(evidence: _Evidence, stop: StopToken) -> Check:
-    """The record for the user; what a request to stop leaves out is named in it."""
-    task = evidence.task
-    missing = []
+def _checked(
+    task: DesignTask,
+    problem: DesignProblem,
+    point: DesignPoint,
+    test: Callable[[Callable[[], bool]], Identifiability],
+    data: Array,
+    stop: StopToken,
+    *,
+    source: str,
+    duration: float,
+    is_start: bool,
+) -> Check:
+    """The record for the user; what a request to stop leaves out is named in it.
 
-    def is_stopped() -> bool:
-        """Whether a stop is requested."""
-        return stop.requested
+    Args:
+        task: The task.
+        problem: Its cost about the motion along which derivatives are tested.
+        point: This motion.
+        test: Test of identifiability; it gets a function that says whether to stop.
+        data: (p, p) information of the data alone.
+        stop: Ends the check early.
+        source: What is checked, in words.
+        duration: Duration of the data [s].
+        is_start: Whether it is the initial control, at which a design begins.
+    """
+    missing = []
 
     # Random controls are tried only where there is a doubt.
     begin_stage("testing which parameters can be told apart")
-    found = evidence.test(is_stopped)
+    found = test(lambda: stop.requested)
     here, everywhere = found.along_trajectory, found.along_all
     if here.count and stop.requested:
         missing.append("what other controls would show")
     # The slope is that of a criterion of the identifiable combinations.
-    visible = replace(
-        evidence.problem, information=replace(evidence.problem.information, basis=found.basis)
-    )
-    tested = self_test(task, visible, visible.reevaluated(evidence.point), is_stopped)
+    visible = replace(problem, information=replace(problem.information, basis=found.basis))
+    tested = self_test(task, visible, visible.reevaluated(point), lambda: stop.requested)
     if not tested.finished:
         missing.append("the test of the derivatives")
     refused: tuple[str, ...] = ()
     violations: tuple[LimitViolation, ...] = ()
     warning = ""
     # Without actuators there is no control that a design could begin with.
-    if evidence.is_start and task.controls and task.release is None and not stop.requested:
+    if is_start and task.controls and task.release is None and not stop.requested:
         refused, violations = _refusals(task, found)
         warning = growth_warning(growth_along(task, task.initial)) or ""
 
@@ -540,7 +528,7 @@ def _checked(evidence: _Evidence, stop: StopToken) -> Check:
     # identified individually.
     basis = here.basis if here.count else None
     information = replace(task.information, prior=task.prior, basis=basis)
-    total = evidence.data + task.prior
+    total = data + task.prior
     covariance = information.covariance(total)
     spread = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(spread, spread)
@@ -549,7 +537,7 @@ def _checked(evidence: _Evidence, stop: StopToken) -> Check:
 
     # Eigenvalues of the criterion, without combinations that no experiment can identify.
     criterion = replace(task.information, basis=found.basis)
-    eigenvalues = criterion.evaluate(evidence.data + criterion.prior).eigenvalues
+    eigenvalues = criterion.evaluate(data + criterion.prior).eigenvalues
     # Groups that the checked data do not separate, although another control would.
     never = {str(group) for group in found.groups_along_all}
     groups = found.groups_along_trajectory if here.count > everywhere.count else ()
@@ -564,9 +552,9 @@ def _checked(evidence: _Evidence, stop: StopToken) -> Check:
     ]
 
     check = Check(
-        source=evidence.source,
-        horizon=evidence.duration,
-        rows=tuple(_rows(evidence, information, std)),
+        source=source,
+        horizon=duration,
+        rows=tuple(_rows(task, data, duration, information, std)),
         wanted=found.names,
         information=total,
         eigenvalues=np.maximum(eigenvalues, 0.0),
@@ -608,15 +596,15 @@ def _refusals(
 
 
 def _rows(
-    evidence: _Evidence, information: FisherInformation, std: Array
+    task: DesignTask, data: Array, duration: float, information: FisherInformation, std: Array
 ) -> Iterator[ParameterCheck]:
     """Predicted accuracy of every parameter; std: (p,) [theta-unit]."""
-    p, theta = evidence.task.parameters, evidence.task.theta
+    p, theta = task.parameters, task.theta
     for j, (parameter, size) in enumerate(zip(p.parameters, p.sizes(theta).tolist(), strict=True)):
         wanted = parameter.wanted or DEFAULT_RELATIVE_STD * size
         repetitions = 0
         if not parameter.nuisance:
-            repetitions = _repetitions(evidence, information, j, wanted)
+            repetitions = _repetitions(task, data, information, j, wanted)
         yield ParameterCheck(
             name=parameter.name,
             unit=parameter.unit,
@@ -628,20 +616,20 @@ def _rows(
             wanted=wanted,
             stated=parameter.wanted is not None,
             repetitions=repetitions,
-            seconds=repetitions * evidence.duration,
+            seconds=repetitions * duration,
         )
 
 
 def _repetitions(
-    evidence: _Evidence, information: FisherInformation, parameter: int, wanted: float
+    task: DesignTask, data: Array, information: FisherInformation, parameter: int, wanted: float
 ) -> int:
     """Smallest number of repetitions that reaches the wanted standard deviation; 0 for none."""
-    interest = evidence.task.parameters.interest
+    interest = task.parameters.interest
     place = int(np.flatnonzero(interest == parameter)[0])
 
     def suffices(repetitions: int) -> bool:
         """Whether this number of repetitions reaches the wanted standard deviation."""
-        covariance = information.covariance(repetitions * evidence.data + evidence.task.prior)
+        covariance = information.covariance(repetitions * data + task.prior)
         return bool(covariance[place, place] <= wanted**2)
 
     if suffices(1):

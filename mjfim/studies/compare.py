@@ -34,13 +34,13 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, carry_out
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import saturated_actuators
-from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
+from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.studies.baselines import METHODS, TITLES, BaselineSearch, SearchResult, run_baseline
 
-# Name of the design for the user.
-DESIGN_TITLE = "mjfim's design"
+# Names of all methods for the user.
+METHOD_TITLES = {**TITLES, DESIGN: "mjfim's design"}
 
 # Remark about a method that the user interrupted.
 INTERRUPTED_NOTE = "interrupted"
@@ -190,19 +190,13 @@ class _MethodRun:
     identifiability: Identifiability
     begun: float = field(default_factory=time.monotonic)
 
-    @property
-    def title(self) -> str:
-        """Name of the method for the user."""
-        method = self.search.method
-        return DESIGN_TITLE if method == DESIGN else TITLES[method]
-
     def report(self, cost: float) -> None:
         """Report the used share of the time and the lowest J so far."""
         if self.callback is None:
             return
         event = StudyEvent(
             study="compare",
-            part=self.title,
+            part=METHOD_TITLES[self.search.method],
             index=self.index,
             count=self.count,
             share=min((time.monotonic() - self.begun) / self.search.seconds, 1.0),
@@ -221,9 +215,8 @@ class _MethodRun:
         interrupted = self.stop.requested
         if result is None or (interrupted and result.control is None):
             return None
-        return evaluation.result(
-            self.search.method, self.title, result, INTERRUPTED_NOTE if interrupted else ""
-        )
+        note = INTERRUPTED_NOTE if interrupted else ""
+        return evaluation.result(self.search.method, result, note)
 
     def _divided(self, executor: ExecutorLike, system: System) -> SearchResult | None:
         """Run a part of a baseline in every worker; a part that is lost is left out."""
@@ -281,7 +274,7 @@ class _MethodRun:
             )
         except SimulationDivergedError:
             nothing = SearchResult(seconds=time.monotonic() - self.begun)
-            return evaluation.result(DESIGN, self.title, nothing)
+            return evaluation.result(DESIGN, nothing)
         except NoResultError:
             return None
 
@@ -295,7 +288,7 @@ class _MethodRun:
         # A design that its time ended needs no remark about its status.
         status = design.status.value.split(":")[0].split(";")[0]
         is_late = design.status is Status.MAX_ITERATIONS
-        return evaluation.result(DESIGN, self.title, result, "" if is_late else status)
+        return evaluation.result(DESIGN, result, "" if is_late else status)
 
 
 class MethodEvaluation:
@@ -316,7 +309,7 @@ class MethodEvaluation:
         count = interest if combinations is None else combinations.shape[1]
         self.nats = cost.information * count if cost.criterion == "D" else 0.0
 
-    def result(self, method: str, title: str, found: SearchResult, note: str = "") -> MethodResult:
+    def result(self, method: str, found: SearchResult, note: str = "") -> MethodResult:
         """Evaluate the control that a method has found.
 
         The control of a baseline that violates a limit on the user's model is shrunk until no limit
@@ -324,14 +317,13 @@ class MethodEvaluation:
 
         Args:
             method: Key of the method.
-            title: Its name for the user.
             found: The best control of its search.
             note: Remark about the result.
         """
         has_control = found.control is not None
         nothing = MethodResult(
             method=method,
-            title=title,
+            title=METHOD_TITLES[method],
             outcome=MethodOutcome.NOTHING if has_control else MethodOutcome.NONE,
             control=None,
             cost=np.nan,
@@ -348,7 +340,7 @@ class MethodEvaluation:
         if found.control is None:
             return nothing
 
-        evaluated = self._evaluate(method, title, found, note) or nothing
+        evaluated = self._evaluate(nothing, found) or nothing
         if method == DESIGN or evaluated.outcome is not MethodOutcome.OUTSIDE:
             return evaluated
 
@@ -361,13 +353,16 @@ class MethodEvaluation:
             return evaluated
         remark = ", ".join(filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"]))
         smaller = replace(found, control=inside.control)
-        return self._evaluate(method, title, smaller, remark) or nothing
+        return self._evaluate(replace(nothing, note=remark), smaller) or nothing
 
-    def _evaluate(
-        self, method: str, title: str, found: SearchResult, note: str
-    ) -> MethodResult | None:
-        """Evaluate a control without changing it; None where the simulation diverges."""
-        task = self.task
+    def _evaluate(self, nothing: MethodResult, found: SearchResult) -> MethodResult | None:
+        """Evaluate a control without changing it; None where the simulation diverges.
+
+        Args:
+            nothing: The row of the method where it has no usable control.
+            found: The control.
+        """
+        task, note = self.task, nothing.note
         point = None
         if found.control is not None:
             point = point_at_stated_rate(self.stage, found.control)
@@ -393,9 +388,8 @@ class MethodEvaluation:
 
         smallest = float(point.criterion.eigenvalues[0])
         worst = (smallest * task.system.measure_rate) ** -0.5 if smallest > 0.0 else np.inf
-        return MethodResult(
-            method=method,
-            title=title,
+        return replace(
+            nothing,
             outcome=outcome,
             control=found.control,
             cost=point.cost,
@@ -403,8 +397,6 @@ class MethodEvaluation:
             std=self.stage.problem.information.std(point.information),
             min_eigenvalue=smallest,
             worst_relative_std=worst,
-            seconds=found.seconds,
-            steps=found.steps,
             margins=verification.margins,
             relative_margins=verification.relative_margins,
             found_by=found.found_by,

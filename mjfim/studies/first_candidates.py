@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -25,38 +25,39 @@ COMMENT = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class UrdfModel:
-    """A URDF and the motors that it lacks.
+def read_urdf(path: Path) -> tuple[Callable[[str], str], dict[str, float]]:
+    """Read a URDF, and give each revolute or prismatic joint a motor.
 
-    Attributes:
-        name: Name of the robot.
-        motors: One motor for each revolute or prismatic joint: its name, which is also that of the
-            motor, and the lower and upper end of its force [N or N m], equal where the URDF states
-            none.
-        velocities: Velocity limits of the URDF by joint name [m/s or rad/s]. MJCF has none.
+    Args:
+        path: The URDF.
+
+    Returns:
+        A function that writes an MJCF which attaches the URDF, whose path it gets, and adds the
+        motors; and the velocity limits of the URDF by joint name [m/s or rad/s]. MJCF has none.
+
+    Raises:
+        ModelError: The URDF cannot be read, or has no joint to drive.
     """
+    spec = load_spec(path)
+    driven = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    joints = [joint for joint in spec.joints if joint.name and joint.type in driven]
+    if not joints:
+        raise ModelError(f"{path}: the URDF has no revolute or prismatic joint that a motor drives")
 
-    name: str
-    motors: tuple[tuple[str, tuple[float, float]], ...]
-    velocities: dict[str, float]
-
-    def mjcf(self, file: str) -> str:
-        """Text of an MJCF that attaches the URDF and adds the motors.
-
-        Args:
-            file: Path of the URDF, relative to the MJCF or absolute.
-        """
-        root = ElementTree.Element("mujoco", model=f"{self.name} with motors")
+    def mjcf(file: str) -> str:
+        """Text of the MJCF; the path of the URDF is relative to it or absolute."""
+        root = ElementTree.Element("mujoco", model=f"{spec.modelname} with motors")
         root.append(ElementTree.Comment(COMMENT))
         asset = ElementTree.SubElement(root, "asset")
         ElementTree.SubElement(asset, "model", name="robot", file=file)
         world = ElementTree.SubElement(root, "worldbody")
         ElementTree.SubElement(world, "attach", model="robot", prefix="")
 
+        # The range of a motor is that of the force of its joint, where the URDF states one.
         actuators = ElementTree.SubElement(root, "actuator")
-        for joint, (low, high) in self.motors:
-            attributes = {"name": joint, "joint": joint}
+        for joint in joints:
+            attributes = {"name": joint.name, "joint": joint.name}
+            low, high = map(float, joint.actfrcrange)
             if low < high:
                 attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
             ElementTree.SubElement(actuators, "motor", attributes)
@@ -64,27 +65,7 @@ class UrdfModel:
         ElementTree.indent(root)
         return ElementTree.tostring(root, encoding="unicode") + "\n"
 
-
-def read_urdf(path: Path) -> UrdfModel:
-    """Read a URDF, and give each joint a motor.
-
-    Args:
-        path: The URDF.
-
-    Raises:
-        ModelError: The URDF cannot be read, or has no joint to drive.
-    """
-    spec = load_spec(path)
-    driven = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    motors = tuple(
-        (joint.name, (float(joint.actfrcrange[0]), float(joint.actfrcrange[1])))
-        for joint in spec.joints
-        if joint.name and joint.type in driven
-    )
-    if not motors:
-        raise ModelError(f"{path}: the URDF has no revolute or prismatic joint that a motor drives")
-
-    return UrdfModel(name=spec.modelname, motors=motors, velocities=_velocities(path))
+    return mjcf, _velocities(path)
 
 
 def _velocities(path: Path) -> dict[str, float]:
@@ -296,7 +277,7 @@ def _with_unique_names(found: Iterable[Candidate]) -> Iterator[Candidate]:
             name, number = f"{each.name}_{number}", number + 1
         paths.add(key)
         names.add(name)
-        yield Candidate(**{**each.__dict__, "name": name})
+        yield replace(each, name=name)
 
 
 def require_carrier(model: Any, name: str) -> int:
@@ -328,7 +309,7 @@ def _payload(model: Any, name: str) -> Iterator[Candidate]:
         meaning=f"mass of the load at {name}",
         offset=mass,
         guess=0.0,
-        scale=_two_digits(PAYLOAD_SHARE * mass),
+        scale=float(f"{PAYLOAD_SHARE * mass:.2g}"),
     )
     moments = mass * np.asarray(model.body_ipos[body])
     for i, axis in enumerate(AXES):
@@ -339,13 +320,8 @@ def _payload(model: Any, name: str) -> Iterator[Candidate]:
             meaning=f"mass times {axis} of the load's centre of mass, in the frame of {name}",
             offset=float(moments[i]),
             guess=0.0,
-            scale=_two_digits(PAYLOAD_SHARE * mass * radius),
+            scale=float(f"{PAYLOAD_SHARE * mass * radius:.2g}"),
         )
-
-
-def _two_digits(value: float) -> float:
-    """A number with two significant digits."""
-    return float(f"{value:.2g}")
 
 
 def _bodies_from_the_end(model: Any) -> list[int]:
@@ -439,21 +415,9 @@ LENGTH_SIGMA = 1e-3
 VELOCITY_SIGMA = 1e-2
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProposedNoise:
-    """Noise of one output.
-
-    Attributes:
-        key: Key of the table `noise`.
-        sigma: Standard deviation [output unit].
-        stated: Whether the MJCF states it.
-        kind: Kind of a joint's coordinate, see `Wishes.sigmas`; empty for sensors.
-    """
-
-    key: str
-    sigma: float
-    stated: bool
-    kind: str = ""
+# Noise of an output: key of the table `noise`, standard deviation [output unit], and kind of a
+# joint's coordinate, see `Wishes.sigmas`; the kind is empty where the MJCF states the noise.
+ProposedNoise = tuple[str, float, str]
 
 
 def proposed_noise(
@@ -482,7 +446,7 @@ def _sensors(model: Any) -> Iterator[ProposedNoise]:
         name = element_name(model, "sensor", i)
         sigma = float(model.sensor_noise[i])
         if name and sigma > 0.0:
-            yield ProposedNoise(key=name, sigma=sigma, stated=True)
+            yield name, sigma, ""
 
 
 def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
@@ -493,16 +457,11 @@ def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
             kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
             key = f"{quantity}:{name}"
             if kind == mujoco.mjtJoint.mjJNT_FREE:
-                yield _noise(f"{key}.pos", length_kind, sigmas)
-                yield _noise(f"{key}.rot", angle_kind, sigmas)
+                yield f"{key}.pos", sigmas[length_kind], length_kind
+                yield f"{key}.rot", sigmas[angle_kind], angle_kind
                 continue
-            slides = kind == mujoco.mjtJoint.mjJNT_SLIDE
-            yield _noise(key, length_kind if slides else angle_kind, sigmas)
-
-
-def _noise(key: str, kind: str, sigmas: Mapping[str, float]) -> ProposedNoise:
-    """Noise of an output of some kind."""
-    return ProposedNoise(key=key, sigma=sigmas[kind], stated=False, kind=kind)
+            moved = length_kind if kind == mujoco.mjtJoint.mjJNT_SLIDE else angle_kind
+            yield key, sigmas[moved], moved
 
 
 def _rounded(value: float) -> float:

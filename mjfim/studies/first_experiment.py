@@ -29,7 +29,6 @@ from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.studies.first_candidates import (
     Candidate,
     ProposedNoise,
-    UrdfModel,
     Wishes,
     candidates,
     proposed_noise,
@@ -133,8 +132,9 @@ class Proposal:
         """Keys and tables of the experiment file."""
         initial: dict[str, Any] = {}
         if self.release is not None:
-            initial["qpos"] = self.release.qpos.tolist()
-            initial["free"] = {name: list(ends) for name, ends in self.release.free.items()}
+            qpos, free = self.release
+            initial["qpos"] = qpos.tolist()
+            initial["free"] = {name: list(ends) for name, ends in free.items()}
         elif self.start.keyframe is not None:
             initial["keyframe"] = self.start.keyframe
         else:
@@ -152,12 +152,12 @@ class Proposal:
             "horizon": self.times.horizon,
             "initial": initial,
             "parameters": {each.name: each.table() for each in self.chosen},
-            "noise": {each.key: each.sigma for each in self.noise},
+            "noise": {key: sigma for key, sigma, _ in self.noise},
         }
         if self.release is None:
             initial["control"] = self.control()
         else:
-            values["nuisance"] = {"initial": dict.fromkeys(self.release.free, True)}
+            values["nuisance"] = {"initial": dict.fromkeys(self.release[1], True)}
         values["limits"] = {key: table for key, table in limits.items() if table}
         if self.rest:
             values["boundary"] = {"start": "rest"}
@@ -201,7 +201,7 @@ def propose_experiment(
         ExperimentError: The model has neither an actuator nor a joint that can be released, or no
             parameter of the wanted groups, or a wish cannot be fulfilled.
     """
-    urdf, source = _model(path)
+    source, companion, velocities = _model(path, folder)
     model = source.model
     if not model.njnt:
         raise ExperimentError(f"{path}: the model has no joint, so that nothing in it can move")
@@ -229,7 +229,7 @@ def propose_experiment(
         )
     else:
         release = propose_release(model, start.qpos, length)
-        if not release.free:
+        if not release[1]:
             raise ExperimentError(
                 f"{path}: the model has neither an actuator nor a slide, hinge or ball joint with "
                 "a name that could be released; add <actuator> elements to the MJCF, or name its "
@@ -245,8 +245,8 @@ def propose_experiment(
         if not is_limited
     }
     draft = Proposal(
-        model=companion_name if urdf else os.path.relpath(path, folder),
-        companion=None if urdf is None else urdf.mjcf(os.path.relpath(path, folder)),
+        model=os.path.relpath(path, folder) if companion is None else companion_name,
+        companion=companion,
         compiled=model,
         times=times,
         start=start,
@@ -259,7 +259,7 @@ def propose_experiment(
         chosen=found,
         others=(),
         control_limits=ranges,
-        velocity_limits={} if urdf is None else urdf.velocities,
+        velocity_limits=velocities,
         rest=False,
         remarks=(),
         release=release,
@@ -294,19 +294,19 @@ def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
     return replace(times, rate=rate, samples=samples, unstable=unstable)
 
 
-def _model(path: Path) -> tuple[UrdfModel | None, ModelSource]:
-    """The model with actuators, and what was added to a URDF."""
+def _model(path: Path, folder: Path) -> tuple[ModelSource, str | None, dict[str, float]]:
+    """The model with actuators, the MJCF that adds them to a URDF, and its velocity limits."""
     if not is_urdf(path):
-        return None, ModelSource(path)
+        return ModelSource(path), None, {}
 
     # The MJCF around the URDF exists only in memory so far; its path of the URDF is absolute.
-    urdf = read_urdf(path)
+    mjcf, velocities = read_urdf(path)
     try:
         with silence_mujoco_log():
-            spec = mujoco.MjSpec.from_string(urdf.mjcf(str(path.resolve())))
+            spec = mujoco.MjSpec.from_string(mjcf(str(path.resolve())))
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot add motors: {str(error).strip()}") from None
-    return urdf, ModelSource(path, spec)
+    return ModelSource(path, spec), mjcf(os.path.relpath(path, folder)), velocities
 
 
 def _with_amplitudes(draft: Proposal, amplitudes: Array) -> Proposal:
@@ -570,13 +570,12 @@ LEAST_SHARE = 1e-4
 MOST_PARAMETERS = 10
 
 
-def identifiable(F: Array, sizes: Array, *, most: int = MOST_PARAMETERS) -> Sequence[int]:
+def identifiable(F: Array, sizes: Array) -> Sequence[int]:
     """Choose parameters that a motion identifies together, one after the other.
 
     Args:
         F: (p, p) information of the motion [1 / (theta_i theta_j unit)].
         sizes: (p,) sizes of the parameters [theta-unit].
-        most: Largest number of parameters.
 
     Returns:
         Indices of the candidates, in their order, that are known accurately together; the one about
@@ -586,7 +585,7 @@ def identifiable(F: Array, sizes: Array, *, most: int = MOST_PARAMETERS) -> Sequ
     relative = F * np.outer(sizes, sizes)
     chosen: list[int] = []
     for i in range(len(sizes)):
-        if len(chosen) < most and _largest_std(relative, [*chosen, i]) <= LARGEST_STD:
+        if len(chosen) < MOST_PARAMETERS and _largest_std(relative, [*chosen, i]) <= LARGEST_STD:
             chosen.append(i)
     return chosen or [int(np.argmax(np.diag(relative)))]
 
@@ -663,7 +662,7 @@ def _about(proposal: Proposal) -> dict[str, list[str]]:
         "Standard deviations of the measurements. To measure them, hold the robot still for 10 s,",
         "record, and take the standard deviation of each column.",
     ]
-    if proposal.noise[0].stated:
+    if not proposal.noise[0][2]:
         noise = ["Standard deviations of the sensors, as the MJCF states them."]
 
     initial = [f"The release, at rest, away from {start.reason}."]

@@ -156,7 +156,10 @@ def _period(model: Any, data: Any, eigenvalues: Array) -> float:
     if time is not None:
         return 2.0 * np.pi * time
 
-    speeds = _pole_speeds(eigenvalues, float(model.opt.timestep))
+    # An eigenvalue of zero is infinitely fast; it says nothing about the motion.
+    moving = eigenvalues[np.abs(eigenvalues) > np.finfo(float).eps]
+    speeds = np.abs(np.log(moving.astype(complex))) / float(model.opt.timestep)
+    speeds = speeds[speeds > SLOWEST_POLE * speeds.max(initial=0.0)]
     if len(speeds):
         return min(2.0 * np.pi / float(speeds.min()), free_time(model))
     return free_time(model)
@@ -175,14 +178,6 @@ def _eigenvalues(model: Any, data: Any) -> Array:
     if not np.isfinite(A).all():
         return np.empty(0)
     return np.asarray(np.linalg.eigvals(A))
-
-
-def _pole_speeds(eigenvalues: Array, timestep: float) -> Array:
-    """(n,) magnitudes of the moving poles [1/s] from eigenvalues of one step of `timestep` s."""
-    # An eigenvalue of zero is infinitely fast; it says nothing about the motion.
-    moving = eigenvalues[np.abs(eigenvalues) > np.finfo(float).eps]
-    speeds = np.abs(np.log(moving.astype(complex))) / timestep
-    return np.asarray(speeds[speeds > SLOWEST_POLE * speeds.max(initial=0.0)])
 
 
 def _rate(timestep: float, wanted: float) -> float:
@@ -319,27 +314,24 @@ def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reaso
     control = _holding_control(model, data, qpos, guess)
     drift = _drift(model, data, qpos, control)
 
-    # The control of a keyframe is kept where it holds its state.
-    if keyframe is not None:
-        by_guess = _drift(model, data, qpos, guess)
-        if by_guess <= 1.0:
-            control, drift = np.array(guess), by_guess
-
+    # The control of a keyframe is kept where it holds its state. Others have six significant
+    # digits; those that hardly differ from zero are zero.
+    shown = control
+    if keyframe is None:
+        _, _, width = _ranges(model, data, control)
+        values = np.array([float(f"{value:.6g}") for value in control])
+        shown = np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0)
+    elif (by_guess := _drift(model, data, qpos, guess)) <= 1.0:
+        control = shown = np.array(guess)
+        drift = by_guess
     return Start(
         keyframe=keyframe,
         qpos=np.array(qpos),
         act=_activations(model, data, control),
-        control=control if keyframe is not None else _readable(model, data, control),
+        control=shown,
         drift=drift,
         reason=reason,
     )
-
-
-def _readable(model: Any, data: Any, control: Array) -> Array:
-    """(nu,) controls with six significant digits; those that hardly differ from zero are zero."""
-    _, _, width = _ranges(model, data, control)
-    values = np.array([float(f"{value:.6g}") for value in control])
-    return np.asarray(np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0))
 
 
 def _inside_ranges(model: Any, qpos: Array) -> Array:
@@ -598,17 +590,9 @@ FIRST_SHARE = 0.4
 MOST_COORDINATES = 4
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ProposedRelease:
-    """Initial state from which a model without actuators is released at rest.
-
-    Attributes:
-        qpos: (nq,) positions of the release.
-        free: Ranges of the coordinates that a design chooses, by name.
-    """
-
-    qpos: Array
-    free: dict[str, tuple[float, float]]
+# Positions, (nq,), from which a model is released, and ranges of the coordinates that a design
+# chooses, by name.
+ProposedRelease = tuple[Array, dict[str, tuple[float, float]]]
 
 
 def propose_release(
@@ -644,7 +628,12 @@ def propose_release(
 
     qpos = np.array(start, dtype=np.float64)
     mujoco.mj_integratePos(model, qpos, move, 1.0)
-    return ProposedRelease(qpos=_readable_positions(model, qpos), free=free)
+    # Slides and hinges have three significant digits.
+    for j in range(model.njnt):
+        if joint_dofs(model, j) == 1:
+            address = int(model.jnt_qposadr[j])
+            qpos[address] = _rounded(float(qpos[address]))
+    return qpos, free
 
 
 def _range_of(model: Any, joint: int, start: Array, length: float) -> tuple[float, float, float]:
@@ -665,16 +654,6 @@ def _range_of(model: Any, joint: int, start: Array, length: float) -> tuple[floa
     slides = kind == int(mujoco.mjtJoint.mjJNT_SLIDE)
     width = LENGTH_SHARE * length if slides else RELEASE_ANGLE
     return at, _rounded(at - width), _rounded(at + width)
-
-
-def _readable_positions(model: Any, qpos: Array) -> Array:
-    """Positions whose slides and hinges have three significant digits."""
-    found = np.array(qpos)
-    for j in range(model.njnt):
-        if joint_dofs(model, j) == 1:
-            address = int(model.jnt_qposadr[j])
-            found[address] = _rounded(float(qpos[address]))
-    return found
 
 
 def _rounded(value: float) -> float:

@@ -26,7 +26,7 @@ from mjfim.information.identifiability import require_visible
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.events import Callback, StudyEvent, shown_progress
-from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.studies import MonteCarloStudy, TrialStatistics
 from mjfim.records.trajectory import Recording, Trajectory
 
 # Length of the last step, in standard deviations, below which a trial has converged.

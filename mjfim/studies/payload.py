@@ -33,11 +33,11 @@ from mjfim.model.terms.library import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate
+from mjfim.records.estimate_parts import PayloadEstimate
 from mjfim.records.events import begin_stage, shown_progress
-from mjfim.records.payload import PayloadEstimate
 from mjfim.records.trajectory import Recording
 from mjfim.studies.first_candidates import PAYLOAD_SHARE
-from mjfim.studies.selected_models import selected_experiment
+from mjfim.studies.selected_models import free_name, selected_experiment
 
 # Kind of the term that is a payload, and the name of the one that is added.
 KIND = "payload"
@@ -186,9 +186,9 @@ class RobotExperiment:
             )
 
         taken = {*names_of(model, "body"), *self.values["terms"]}
-        term = _free(KIND, taken)
+        term = free_name(KIND, taken)
         used = set(self.values["parameters"])
-        names = {field: _free(f"payload_{field}", used) for field in FIELDS}
+        names = {field: free_name(f"payload_{field}", used) for field in FIELDS}
         return PayloadPlace(
             body=body,
             term=term,
@@ -233,14 +233,6 @@ def _carriers(model: Any) -> list[str]:
         for name in names_of(model, "body")
         if int(model.body_weldid[identifier(model, "body", name)])
     ]
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """A name that is not taken: `name`, or `name_2` and so on."""
-    found, number = name, 2
-    while found in taken:
-        found, number = f"{name}_{number}", number + 1
-    return found
 
 
 # Density of the uniform cube whose size is assumed where none is stated [kg/m³]: that of water, and

@@ -31,7 +31,7 @@ from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.recordings.control_table import read_playback
 from mjfim.records.estimate import Estimate
-from mjfim.records.robustness import RobotConditions, RobotRun
+from mjfim.records.studies import RobotConditions, RobotRun
 from mjfim.records.trajectory import Recording
 
 # Largest number of attempts to draw a robot whose bodies are physical.

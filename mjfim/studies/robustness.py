@@ -22,7 +22,7 @@ from mjfim.experiment.system import System
 from mjfim.parallel import ExecutorLike, results_on
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.events import Callback, StudyEvent, shown_progress
-from mjfim.records.robustness import (
+from mjfim.records.studies import (
     CONFIDENCE,
     LATENCY,
     AssessedLimit,

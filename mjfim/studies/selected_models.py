@@ -94,7 +94,10 @@ def selected_term(candidate: Term, taken: Iterable[str]) -> Term:
     used = set(taken)
     numbers = []
     for number in candidate.numbers:
-        name = _name_of(number.path, used)
+        # Such as `pivot_damping` for `joint/pivot:damping`.
+        place, _, field = number.path.partition(":")
+        words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
+        name = free_name("_".join(words), used)
         used.add(name)
         numbers.append(replace(number, name=name, scale=float(f"{number.scale:.2g}")))
     return replace(candidate, numbers=tuple(numbers))
@@ -203,16 +206,11 @@ def start_of(
     return np.clip(start, parameters.lower, parameters.upper)
 
 
-def _name_of(path: str, taken: Iterable[str]) -> str:
-    """Name of a new parameter, such as `pivot_damping` for `joint/pivot:damping`."""
-    place, _, field = path.partition(":")
-    words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
-    name = "_".join(words)
-    used = set(taken)
-    number = 2
-    while name in used:
-        name = f"{'_'.join(words)}_{number}"
-        number += 1
+def free_name(stem: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: the stem, or `stem_2` and so on."""
+    name, number = stem, 2
+    while name in taken:
+        name, number = f"{stem}_{number}", number + 1
     return name
 
 
@@ -306,12 +304,6 @@ def _pool(
     Where all guesses have one sign and differ, it is a factor on the guesses, because elements of
     different size have different values.
     """
-    name = stem
-    number = 2
-    while name in taken:
-        name = f"{stem}_{number}"
-        number += 1
-
     guesses = np.array([member.guess for member in members])
     is_factor = bool((guesses > 0.0).all() or (guesses < 0.0).all()) and np.ptp(guesses) > 0.0
     scales = guesses if is_factor else np.ones(len(members))
@@ -325,7 +317,7 @@ def _pool(
     guess = float(np.clip(guess, low, high))
     sizes = [m.scale / abs(s) for m, s in zip(members, scales, strict=True)]
     return PooledParameter(
-        name=name,
+        name=free_name(stem, taken),
         members=tuple(member.name for member in members),
         paths=tuple(member.targets[0].path for member in members),
         scales=tuple(float(scale) for scale in scales),

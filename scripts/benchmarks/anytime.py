@@ -32,7 +32,7 @@ from mjfim.errors import MjfimError
 from mjfim.experiment.schema import Experiment
 from mjfim.output.page import DESIGNED, OTHER
 from mjfim.parallel.budget import measured_by, stop_on_interrupt
-from mjfim.records.comparison import DESIGN
+from mjfim.records.studies import DESIGN
 from mjfim.studies.baselines import TITLES
 from scripts.benchmarks import arms
 

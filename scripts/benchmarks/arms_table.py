@@ -25,7 +25,7 @@ from rich.console import Console
 import mjfim
 from mjfim.parallel import cores
 from mjfim.parallel.budget import stop_on_interrupt
-from mjfim.records.comparison import Comparison, MethodResult
+from mjfim.records.studies import Comparison, MethodResult
 from scripts.benchmarks import arms
 
 # Methods with five and with fifteen harmonics.

@@ -15,17 +15,13 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import open_boundary_warnings
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import limits_of
-from mjfim.excitation.limits.magnitudes import Magnitude, VectorBarrier
-from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
 from mjfim.excitation.limits.magnitudes import Magnitude
-from mjfim.excitation.limits.verification import require_feasible_start, verify
-from mjfim.excitation.limits.violations import violations_of
+from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
 from mjfim.optimize.cost_models import BarrierDerivatives
-from mjfim.output.labels import complete_labels
 from mjfim.output.pages.files import experiment_page
 from mjfim.output.plots.design import limits as limits_picture
 from mjfim.output.words import complete_labels

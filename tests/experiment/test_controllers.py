@@ -14,7 +14,7 @@ from mjfim.excitation.task_parts import stated_inputs
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import Quantity
 from mjfim.recordings.read import read_recording
-from mjfim.recordings.spec import LAW_PREFIXES
+from mjfim.recordings.section import LAW_PREFIXES
 from mjfim.studies.inventory import stated_experiment
 from tests.support.closed_loop import arm_experiment
 from tests.support.paths import MODELS

@@ -18,7 +18,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model import loading
-from mjfim.parallel.kept import Kept
+from mjfim.parallel.shared_value import Kept
 from tests.support.mesh_model import write_mesh_model
 from tests.support.paths import SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS

@@ -12,7 +12,7 @@ from mjfim.identification import left_out
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
 from mjfim.parallel.budget import Budget
-from mjfim.recordings.plausibility import plausibility_remarks
+from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.trajectory import Recording
 from tests.support.dense_residuals import dense_residuals
 from tests.support.paths import ROOT

@@ -13,14 +13,11 @@ import mjfim
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
-from mjfim.identification.horizons import _chosen
 from mjfim.identification.identify import DIVERGED
 from mjfim.identification.left_out import HeldOutLosses
 from mjfim.identification.search import FitSearch
-from mjfim.output.pages.estimate import horizon_parts
-from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.starts import _chosen
-from mjfim.output.pages.estimate_parts import horizon_parts
+from mjfim.output.pages.estimate import horizon_parts
 from mjfim.records.estimate import HorizonStudy
 from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT

@@ -15,7 +15,7 @@ from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.inverse_dynamics import inverse_dynamics
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
+from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.trajectory import Recording
 from tests.support.hinged_arm import arm_experiment, arm_log
 from tests.support.numerics import CART_PENDULUM, Array

@@ -18,7 +18,6 @@ from mjfim.output.plots.pictures import pictures_of
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.check import Check, ParameterCheck, SelfTest
-from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import (
     Estimate,
@@ -28,12 +27,19 @@ from mjfim.records.estimate import (
     PredictionErrors,
     Whiteness,
 )
-from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
-from mjfim.records.labels import Labels
-from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
 from mjfim.records.robots import RobotComparison
-from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
+from mjfim.records.studies import (
+    DESIGN,
+    AssessedLimit,
+    Comparison,
+    MethodOutcome,
+    MonteCarloStudy,
+    RobotConditions,
+    Robustness,
+)
 from mjfim.records.terms import Decision, Selection, SelectionStep
+from mjfim.records.trajectory import Labels
 from tests.support.figure_text import misplaced_texts
 from tests.support.made_records import (
     make_comparison,

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 
 from mjfim.errors import MjfimError
 from mjfim.files import replacing
-from mjfim.output import plots
+from mjfim.output import plots, words
 from mjfim.output.archive import rotation_vectors
-from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals, words
+from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals
 from mjfim.output.plots.design import (
     convergence,
     limits,

@@ -23,7 +23,7 @@ from mjfim.output.plots.pictures import Pictures
 from mjfim.output.report import STYLES, template
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import Design
-from mjfim.records.robustness import RobotConditions, Robustness
+from mjfim.records.studies import RobotConditions, Robustness
 from tests.support.pages import page_with
 from tests.support.paths import MODELS
 

@@ -15,7 +15,7 @@ from mjfim.experiment import System
 from mjfim.output import archive
 from mjfim.output.export.trajectories import yaml_number
 from mjfim.recordings import read_recording
-from mjfim.recordings.formats.read import read_table
+from mjfim.recordings.formats import read_table
 from tests.output.conftest import Designed, designed
 from tests.support.cli import misused, names, run
 from tests.support.paths import MODELS

@@ -20,7 +20,7 @@ from mjfim.experiment import System
 from mjfim.output.export.design import write_player
 from mjfim.output.export.plan import RobotPlan
 from mjfim.recordings import read_recording
-from mjfim.recordings.formats.read import read_table
+from mjfim.recordings.formats import read_table
 from tests.output.conftest import Designed
 from tests.support.cli import run
 from tests.support.numerics import body_task

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import pytest
 
 from mjfim.errors import ExperimentError
-from mjfim.parallel import stated
-from mjfim.parallel.stated import StatedExecutor
+from mjfim.parallel import workers as stated_workers
+from mjfim.parallel.workers import StatedExecutor
 
 FACTORY = """
 from __future__ import annotations
@@ -124,7 +124,7 @@ def test_missing_certificates_are_explained(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.slow
 def test_an_address_at_which_nobody_answers_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(stated, "CONNECTION_SECONDS", 0.5)
+    monkeypatch.setattr(stated_workers, "CONNECTION_SECONDS", 0.5)
     place = StatedExecutor.parse("dask://127.0.0.1:9")
     with pytest.raises(ExperimentError, match="no scheduler answers there"), place.started():
         pass

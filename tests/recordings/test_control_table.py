@@ -12,7 +12,7 @@ import pytest
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.recordings.control_table import read_control
-from mjfim.recordings.formats.read import read_table
+from mjfim.recordings.formats import read_table
 
 Read = Callable[..., Array]
 

@@ -20,9 +20,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mjfim.errors import RecordingError
-from mjfim.recordings.formats.read import read_columns
-from mjfim.recordings.formats.table import Table
-from mjfim.recordings.spec import RecordingSpec
+from mjfim.recordings.formats import Table, read_columns
+from mjfim.recordings.section import RecordingSpec
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]

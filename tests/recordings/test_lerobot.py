@@ -12,7 +12,7 @@ import mjfim
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment import System
 from mjfim.recordings import RecordingSpec, read_recording, recording_paths
-from mjfim.recordings.formats.read import read_columns
+from mjfim.recordings.formats import read_columns
 from tests.support.cli import misused, run
 from tests.support.lerobot import write_dataset
 from tests.support.paths import MODELS

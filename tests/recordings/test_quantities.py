@@ -10,7 +10,7 @@ import pytest
 from pydantic_core import PydanticCustomError
 
 from mjfim.recordings.quantities import USUAL_UNITS, Quantity, Unit, units_like
-from mjfim.recordings.spec import LogUnit
+from mjfim.recordings.section import LogUnit
 
 
 @pytest.mark.parametrize(

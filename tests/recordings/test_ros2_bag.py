@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mjfim.errors import RecordingError
-from mjfim.recordings.formats.read import read_columns
-from mjfim.recordings.spec import RecordingSpec
+from mjfim.recordings.formats import read_columns
+from mjfim.recordings.section import RecordingSpec
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
 

@@ -30,11 +30,9 @@ from mjfim.output import archive
 from mjfim.records.base import RECORD, SavedRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
-from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate, PredictionErrors
-from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.robustness import Robustness
+from mjfim.records.studies import Comparison, MonteCarloStudy, Robustness
 from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies.check import check_task
 from mjfim.studies.monte_carlo import monte_carlo

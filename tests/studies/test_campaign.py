@@ -254,13 +254,13 @@ def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_are_
 ) -> None:
     first, asked = campaign.rounds[0], []
 
-    def fails_once(base: DesignTask, past: object, theta: Array, **options: object) -> Design:
+    def fails_once(run: object, theta: Array) -> Design:
         asked.append(theta)
         if len(asked) == 1:
             raise SimulationDivergedError("too fast")
         return campaign.designs[1]
 
-    monkeypatch.setattr(campaign_module, "redesign", fails_once)
+    monkeypatch.setattr(campaign_module._CampaignRun, "_redesign", fails_once)
     done = [
         EarlierRound(
             recordings=first.recordings,

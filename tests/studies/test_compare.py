@@ -25,9 +25,9 @@ from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.draw import save
 from mjfim.output.plots.studies import compare
 from mjfim.parallel.budget import StopToken
-from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design
 from mjfim.records.events import Event, StudyEvent
+from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.studies import compare as compare_module
 from mjfim.studies.compare import chosen_methods
 from tests.support.baselines import pendulum, played

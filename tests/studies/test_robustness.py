@@ -26,7 +26,7 @@ from mjfim.output import archive
 from mjfim.output.archive import design_columns, reference_columns, simulate_playback
 from mjfim.output.pages.studies import robustness_sentences
 from mjfim.recordings.control_table import read_playback
-from mjfim.records.robustness import RobotConditions, Robustness
+from mjfim.records.studies import RobotConditions, Robustness
 from mjfim.records.trajectory import Playback, Recording
 from mjfim.studies import robot_bench
 from mjfim.studies.robot_bench import RobotBench

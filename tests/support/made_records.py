@@ -7,17 +7,21 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.records.comparison import Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, Evaluation, HistoryRow, Status
 from mjfim.records.estimate import Estimate
-from mjfim.records.labels import Labels
-from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.robots import (
     OddParameter,
     OddRecording,
     RecordingComparison,
 )
-from mjfim.records.trajectory import Recording, Trajectory
+from mjfim.records.studies import (
+    Comparison,
+    MethodOutcome,
+    MethodResult,
+    MonteCarloStudy,
+    TrialStatistics,
+)
+from mjfim.records.trajectory import Labels, Recording, Trajectory
 
 
 def padded(name: str, width: int) -> str:

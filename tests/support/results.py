@@ -9,7 +9,6 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.check import Check, ConfoundedPair, ParameterCheck, SelfTest
-from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import (
     Design,
     Evaluation,
@@ -23,12 +22,20 @@ from mjfim.records.estimate import (
     PredictionErrors,
     Whiteness,
 )
-from mjfim.records.labels import Labels
-from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.robots import RobotComparison
-from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
+from mjfim.records.studies import (
+    DESIGN,
+    AssessedLimit,
+    Comparison,
+    MethodOutcome,
+    MethodResult,
+    MonteCarloStudy,
+    RobotConditions,
+    Robustness,
+    TrialStatistics,
+)
 from mjfim.records.terms import Term, TermNumber
-from mjfim.records.trajectory import Recording, Trajectory
+from mjfim.records.trajectory import Labels, Recording, Trajectory
 from tests.support.made_records import make_recording_comparison, ten_iterates
 
 # Names of the parameters of all results.

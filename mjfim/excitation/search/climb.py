@@ -28,8 +28,7 @@ from mjfim.parallel import (
     pool_stop_token,
 )
 from mjfim.parallel.budget import Budget, StopReason, StopToken
-from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue
+from mjfim.parallel.shared_value import KeptPerThread, SharedValue
 from mjfim.records.design import (
     HistoryRow,
     IterateMotion,
@@ -136,7 +135,7 @@ class Candidate:
     @property
     def ended(self) -> Status:
         """Status at the end of the search."""
-        if self.status in (Status.LOST, Status.INTERRUPTED, Status.LEFT):
+        if self.status in (Status.INTERRUPTED, Status.LEFT):
             return self.status
         if self.best is None:
             return self.status if self.status is Status.STALLED else Status.INFEASIBLE

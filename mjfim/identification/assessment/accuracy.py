@@ -30,7 +30,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.records.check import ParameterGroup
 from mjfim.records.estimate import HorizonStudy, PriorDirections, Restart, Uncertainty
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
+from mjfim.records.estimate_parts import InverseDynamicsFit
 
 # A combination is determined by the recordings where these leave at most this share of the standard
 # deviation of the prior.

@@ -32,11 +32,7 @@ from mjfim.identification.assessment.robust_covariance import (
     recording_evidence,
     weighted,
 )
-from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.criteria import standard_deviations
-from mjfim.optimize.levenberg_marquardt import Solution
-from mjfim.records.estimate import Uncertainty
-from mjfim.information.marginal import standard_deviations
 from mjfim.records.robots import OddParameter, OddRecording, RecordingComparison
 
 # Newton steps for tau², of which the weighted squares are a decreasing function.

@@ -36,7 +36,7 @@ from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
 from mjfim.parallel.budget import Budget
-from mjfim.recordings.plausibility import plausibility_remarks
+from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
     ControlLawInLoop,

@@ -32,7 +32,7 @@ from mjfim.model.elements import model_length, translations
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
 from mjfim.parallel import one_blas_thread
-from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
+from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
 from mjfim.records.trajectory import Recording
 
 # Steps of differences, relative to the sizes of the parameters. Those of inertias may be long,

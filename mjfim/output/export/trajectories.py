@@ -34,7 +34,7 @@ from mjfim.errors import ExperimentError
 from mjfim.files import remove_earlier_result, replacing, write_json
 from mjfim.model.coordinates import state_components
 from mjfim.output.export.plan import RobotPlan
-from mjfim.recordings.formats.ros2_bag import CONTROL_TOPIC, JOINT_STATE, rosbags_module
+from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, rosbags_module
 
 # Files of a dataset with one episode, relative to its folder.
 INFO_FILE = "meta/info.json"
@@ -123,7 +123,22 @@ def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: str = "rad") -> N
     }
     for key, values in defaults.items():
         features[key] = {"dtype": values.dtype.name, "shape": [1], "names": None}
-    write_json(folder / INFO_FILE, _info(plan.name, rows, fps, features))
+    info = {
+        "codebase_version": "v3.0",
+        "robot_type": plan.name,
+        "total_episodes": 1,
+        "total_frames": rows,
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": "0:1"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": None,
+        "features": features,
+    }
+    write_json(folder / INFO_FILE, info)
 
 
 def _episode(task: str, rows: int, stats: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -142,25 +157,6 @@ def _episode(task: str, rows: int, stats: Mapping[str, Mapping[str, Any]]) -> di
     for name, numbers in stats.items():
         episode |= {f"stats/{name}/{key}": [value] for key, value in numbers.items()}
     return episode
-
-
-def _info(name: str, rows: int, fps: int, features: Mapping[str, Any]) -> dict[str, Any]:
-    """The contents of info.json."""
-    return {
-        "codebase_version": "v3.0",
-        "robot_type": name,
-        "total_episodes": 1,
-        "total_frames": rows,
-        "total_tasks": 1,
-        "chunks_size": 1000,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "fps": fps,
-        "splits": {"train": "0:1"},
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": None,
-        "features": features,
-    }
 
 
 def _actions(plan: RobotPlan, factor: float) -> tuple[list[str], Array]:

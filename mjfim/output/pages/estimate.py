@@ -36,7 +36,7 @@ from mjfim.output.pages.studies import equation_parts
 from mjfim.output.words import NOT_ALONE, relative
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
-from mjfim.records.terms import Decision, HeldOutRefit, Selection, SelectionStep
+from mjfim.records.terms import Decision, Selection, SelectionStep
 
 # Largest number of digits of an estimate.
 MAX_DIGITS = 9
@@ -353,27 +353,22 @@ def selection_parts(selection: Selection) -> Sequence[Part]:
         if step.alternatives and step.path in kept
     ]
     if selection.refit is not None:
-        parts.append(_about_refit(selection.refit))
+        differs = selection.refit.differs
+        same = "the same parameters within the intervals."
+        other = (
+            f"other values of {listed(differs)}, by more than both intervals explain; the "
+            "intervals are widened to hold both."
+        )
+        text = (
+            "The held-out recordings took no part in the selection. Fitted to them alone, the "
+            f"selected model has {other if differs else same}"
+        )
+        parts.append(Text(text, Emphasis.WARNING if differs else Emphasis.NORMAL))
     tables = tuple(_tables_to_keep(selection))
     if tables:
         title = "To keep this model, put these tables into the experiment file"
         parts.append(Listing(title, tables, Emphasis.WEAK, code=True))
     return (*parts, Plot("selection"))
-
-
-def _about_refit(refit: HeldOutRefit) -> Text:
-    """Say whether the held-out recordings alone give the same parameters."""
-    text = (
-        "The held-out recordings took no part in the selection. Fitted to them alone, the selected "
-        "model has "
-    )
-    if not refit.differs:
-        return Text(text + "the same parameters within the intervals.")
-    text += (
-        f"other values of {listed(refit.differs)}, by more than both intervals explain; the "
-        "intervals are widened to hold both."
-    )
-    return Text(text, Emphasis.WARNING)
 
 
 def _about_alternatives(step: SelectionStep) -> str:
@@ -579,7 +574,24 @@ def sample_parts(estimate: Estimate) -> Iterator[Part]:
     if draws is None:
         return
     yield Text(f"{draws}.")
-    yield _sample_table(draws)
+    low, middle, high = np.quantile(draws.values, (0.0, 0.5, 1.0), axis=0)
+    yield tabulated(
+        "Parameters of the drawn robots",
+        {
+            "parameter": list(map(named, draws.parameters, draws.units)),
+            "centre": numbers(draws.centre, 4),
+            "σ": numbers(draws.std, 2),
+            "smallest": numbers(low, 4),
+            "median": numbers(middle, 4),
+            "largest": numbers(high, 4),
+        },
+        spare=("median",),
+        note=(
+            "σ is that of the 95 % intervals, before the bounds cut the distribution off; a bound "
+            "shifts the median. It is smaller where combinations of inertias stay at the estimate."
+        ),
+        detail=True,
+    )
     yield from (Text(caution, Emphasis.WARNING) for caution in _not_covered(estimate, draws))
     yield Plot("samples")
 
@@ -617,25 +629,3 @@ def _not_covered(estimate: Estimate, draws: ParameterDraws) -> Iterator[str]:
             f"The drawn robots do not differ in {first_ones(held)}, which the fit held at the "
             "guess; its error is not covered."
         )
-
-
-def _sample_table(draws: ParameterDraws) -> Table:
-    """Tabulate the range of every drawn parameter."""
-    low, middle, high = np.quantile(draws.values, (0.0, 0.5, 1.0), axis=0)
-    return tabulated(
-        "Parameters of the drawn robots",
-        {
-            "parameter": list(map(named, draws.parameters, draws.units)),
-            "centre": numbers(draws.centre, 4),
-            "σ": numbers(draws.std, 2),
-            "smallest": numbers(low, 4),
-            "median": numbers(middle, 4),
-            "largest": numbers(high, 4),
-        },
-        spare=("median",),
-        note=(
-            "σ is that of the 95 % intervals, before the bounds cut the distribution off; a bound "
-            "shifts the median. It is smaller where combinations of inertias stay at the estimate."
-        ),
-        detail=True,
-    )

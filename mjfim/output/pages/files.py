@@ -19,7 +19,7 @@ from mjfim.output.page import (
     named,
     number,
 )
-from mjfim.recordings.summary import ColumnSummary, LogSummary
+from mjfim.recordings.read import ColumnSummary, LogSummary
 from mjfim.records.inventory import Inventory, StatedExperiment
 
 # Jitter of a log below this fraction of the sample period is round-off of the time stamps.

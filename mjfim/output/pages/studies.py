@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import PurePath
 
 import numpy as np
-import scipy.stats
+import scipy
 
 from mjfim.errors import first_ones
 from mjfim.output.page import (
@@ -34,11 +34,18 @@ from mjfim.output.page import (
 )
 from mjfim.output.words import BEST_CASE, NOT_ALONE, CampaignParameters, complete_labels
 from mjfim.records.campaign import Campaign, CampaignStatus
-from mjfim.records.comparison import DESIGN, Comparison, MethodResult
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.robots import RobotComparison, p_text
-from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
+from mjfim.records.studies import (
+    CONFIDENCE,
+    DESIGN,
+    REQUIRED_COVERAGE,
+    Comparison,
+    MethodResult,
+    MonteCarloStudy,
+    Robustness,
+    TrialStatistics,
+)
 
 # Largest number of missed limits that have a sentence each.
 MAX_MISSED_LIMITS = 8
@@ -261,11 +268,18 @@ def robots_page(comparison: RobotComparison) -> Page:
         parts.append(Listing("Differences", items, Emphasis.STRONG))
     if comparison.parameters:
         parts += [_robot_table(comparison), Plot("robots")]
+    limits = list(comparison.remarks)
+    others = len(comparison.parameters) - len(comparison.changed)
+    if comparison.changed and others:
+        limits.append(
+            f"no difference was found in the other {others} parameters, which is not a proof that "
+            "they are equal: see which differences would have been found"
+        )
     return Page(
         kind="Comparison of two robots",
         verdict=_robots_verdict(comparison),
         next_steps=tuple(_steps_after_robots(comparison)),
-        warnings=tuple(_limits_of(comparison)),
+        warnings=tuple(limits),
         facts={
             f"recordings of {first}": str(comparison.recordings[0]),
             f"recordings of {second}": str(comparison.recordings[1]),
@@ -294,17 +308,6 @@ def _steps_after_robots(comparison: RobotComparison) -> Iterator[str]:
         yield (
             "Smaller differences are found with longer recordings, or with a motion from "
             "`mjfim design`."
-        )
-
-
-def _limits_of(comparison: RobotComparison) -> Iterator[str]:
-    """Yield sentences that limit a comparison."""
-    yield from comparison.remarks
-    others = len(comparison.parameters) - len(comparison.changed)
-    if comparison.changed and others:
-        yield (
-            f"no difference was found in the other {others} parameters, which is not a proof that "
-            "they are equal: see which differences would have been found"
         )
 
 
@@ -586,12 +589,25 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
     steps = ('Identify with `fit.start = "inverse_dynamics"`, which predicts the motion itself.',)
     if verdict.level is not Level.GOOD:
         steps = ("Look at the forces in `inverse_dynamics.png`: signs, units, delays, friction.",)
+    std = [
+        number(value, 2, infinite="-" if name in fit.absent else NOT_ALONE)
+        for name, value in zip(fit.parameters, fit.std, strict=True)
+    ]
+    table = tabulated(
+        "Parameters",
+        {
+            "parameter": list(map(named, fit.parameters, fit.units)),
+            "start": numbers(fit.start, 4),
+            "estimate": numbers(fit.theta, 5),
+            "formal σ": std,
+        },
+    )
     return Page(
         kind="Parameters fitted to the equation of motion",
         verdict=verdict,
         next_steps=steps,
         sections=[
-            Section("Parameters", [Text(capitalised(fit.status)), _parameter_table(fit)]),
+            Section("Parameters", [Text(capitalised(fit.status)), table]),
             Section("Equation of motion", list(equation_parts(fit))),
         ],
     )
@@ -641,20 +657,3 @@ def equation_parts(fit: InverseDynamicsFit) -> Iterator[Part]:
     )
     yield Text(text, Emphasis.WEAK, detail=True)
     yield Plot("inverse_dynamics")
-
-
-def _parameter_table(fit: InverseDynamicsFit) -> Table:
-    """Tabulate the parameters."""
-    std = [
-        number(value, 2, infinite="-" if name in fit.absent else NOT_ALONE)
-        for name, value in zip(fit.parameters, fit.std, strict=True)
-    ]
-    return tabulated(
-        "Parameters",
-        {
-            "parameter": list(map(named, fit.parameters, fit.units)),
-            "start": numbers(fit.start, 4),
-            "estimate": numbers(fit.theta, 5),
-            "formal σ": std,
-        },
-    )

@@ -43,8 +43,7 @@ from mjfim.output.words import (
     size_sentence,
 )
 from mjfim.records.design import Design, LimitUsage
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Labels, Trajectory
 
 # Number of turning points above which a curve would be a solid area; its envelope is drawn instead.
 MAX_TURNS = 120
@@ -71,18 +70,6 @@ def would_be_solid(usage: LimitUsage) -> bool:
     change = np.diff(usage.share)
     rising = np.sign(change[change != 0.0])
     return int(np.count_nonzero(np.diff(rising))) > MAX_TURNS
-
-
-def closest_to_bounds(usage: Sequence[LimitUsage]) -> list[str]:
-    """Return the names of joints, actuators and pairs of geoms, the closest to a bound first.
-
-    Args:
-        usage: The use of all limits.
-    """
-    largest: dict[str, float] = {}
-    for each in usage:
-        largest[each.name] = max(largest.get(each.name, 0.0), largest_share(each))
-    return sorted(largest, key=lambda name: -largest[name])
 
 
 def envelope(usage: LimitUsage) -> tuple[Array, Array, Array]:
@@ -501,7 +488,11 @@ def limit_panels(design: Design, labels: Labels, *, rows: bool = True) -> list[P
         for kind in (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
         if (curves := [usage for usage in design.usage if usage.kind == kind])
     }
-    closest = closest_to_bounds(design.usage)[: len(SERIES)]
+    # Names of joints, actuators and pairs of geoms, the closest to a bound first.
+    largest: dict[str, float] = {}
+    for each in design.usage:
+        largest[each.name] = max(largest.get(each.name, 0.0), largest_share(each))
+    closest = sorted(largest, key=lambda name: -largest[name])[: len(SERIES)]
     names = [name for name in dict.fromkeys(u.name for u in design.usage) if name in closest]
     roles = {name: f"series{i}" for i, name in enumerate(names)}
     return [

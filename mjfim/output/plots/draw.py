@@ -464,10 +464,10 @@ def _fitting(label: str, width: float, size: float, *, breaks: bool = False) -> 
     return shorten(name, characters) + suffix
 
 
-def legend_columns(labels: Sequence[str], width: float, size: float = NORMAL_FONT) -> int:
+def legend_columns(labels: Sequence[str], width: float) -> int:
     """Return into how many columns a legend is put, so that it fits into a width [inch]."""
-    entry = (LEGEND_LINE + LEGEND_GAP) * size / 72.0
-    widths = [text_width(label, size) + entry for label in labels]
+    entry = (LEGEND_LINE + LEGEND_GAP) * NORMAL_FONT / 72.0
+    widths = [text_width(label) + entry for label in labels]
     for columns in range(len(labels), 1, -1):
         # The entries of a legend run down its columns.
         rows = -(-len(labels) // columns)

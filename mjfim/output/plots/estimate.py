@@ -38,9 +38,8 @@ from mjfim.output.words import (
     without_zeros,
 )
 from mjfim.records.estimate import Estimate, Prediction
-from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
-from mjfim.records.labels import Labels, with_unit
-from mjfim.records.trajectory import Recording
+from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
+from mjfim.records.trajectory import Labels, Recording, with_unit
 
 # Number of segments that are transformed at once.
 SEGMENTS_AT_ONCE = 64

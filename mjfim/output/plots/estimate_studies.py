@@ -27,9 +27,9 @@ from mjfim.output.panels import (
 )
 from mjfim.output.words import as_sentence, format_number, normal_density, shorten
 from mjfim.records.estimate import Estimate, HorizonStudy
-from mjfim.records.labels import with_unit
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Decision, SelectionStep
+from mjfim.records.trajectory import with_unit
 
 # Largest numbers of parameters of pictures of pairs and of lengths, of parameters and of recordings
 # that are compared; of more, those that say most are drawn.

@@ -29,13 +29,11 @@ from mjfim.output.words import CampaignParameters, complete_labels
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
-from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.robots import RobotComparison
-from mjfim.records.robustness import Robustness
+from mjfim.records.studies import Comparison, MonteCarloStudy, Robustness
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

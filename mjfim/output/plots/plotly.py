@@ -12,6 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.output.panels import Axis, Cells, Mark, Panel, Picture
+from mjfim.output.words import shorten
 
 # Values that JSON can hold, for the plotting library.
 Plotly = dict[str, Any]
@@ -280,7 +281,7 @@ def _axis(axis: Axis, label: str) -> Plotly:
     if axis.ticks is not None:
         shown |= {"tickmode": "array", "tickvals": [float(tick) for tick in axis.ticks]}
     if axis.names is not None:
-        names = [escape(shortened_name(name)) for name in axis.names]
+        names = [escape(shorten(name, NAME_WIDTH)) for name in axis.names]
         shown |= {"ticktext": names, "showgrid": False, "zeroline": False, "fixedrange": True}
     return shown
 
@@ -318,14 +319,6 @@ def _words_beside(panel: Panel) -> list[Plotly]:
 def _letters(heading: str, texts: Sequence[str]) -> int:
     """Number of letters of the widest of some words, with a space."""
     return 2 + max(map(len, (heading, *texts)))
-
-
-def shortened_name(name: str, width: int = NAME_WIDTH) -> str:
-    """Shorten a long name; both of its ends stay."""
-    if len(name) <= width:
-        return name
-    kept = (width - 1) // 2
-    return f"{name[:kept]}…{name[-kept:]}"
 
 
 # ---- numbers

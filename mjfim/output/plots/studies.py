@@ -55,11 +55,18 @@ from mjfim.output.words import (
 )
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check
-from mjfim.records.comparison import DESIGN, Comparison, MethodResult
-from mjfim.records.labels import Labels, with_unit
-from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.robots import RobotComparison
-from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
+from mjfim.records.studies import (
+    CONFIDENCE,
+    DESIGN,
+    REQUIRED_COVERAGE,
+    Comparison,
+    MethodResult,
+    MonteCarloStudy,
+    Robustness,
+    TrialStatistics,
+)
+from mjfim.records.trajectory import Labels, with_unit
 
 # What a picture says of it.
 SCALE_IN_WORDS = "strength of the colour: root of its size"

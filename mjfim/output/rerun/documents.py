@@ -71,8 +71,7 @@ from mjfim.output.rerun.scene import (
 )
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.labels import Labels
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Labels, Trajectory
 
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
 FURTHER_ROLES = ("series2", "series5", IDENTIFIED.word, "series4")
@@ -122,7 +121,9 @@ def log_design(
         "optimiser": planes_of("optimiser", convergence(design).panels),
     }
     iterates = _iterate_plots(design, labels)
-    grids = [each for name, found in planes.items() for each in _plane_tabs(name, found)]
+    grids = []
+    for name, found in planes.items():
+        grids += grid_tabs(name, [plane.view() for plane, _ in found])
     grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
 
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in both.items()}
@@ -314,7 +315,7 @@ def _log_iterates(
     end = end_point(model, designed)
     if end is not None:
         rec.set_time("sim_time", duration=0.0)
-        path = strip_of_path(end.path(designed), style)
+        path = strip_of_path(designed.world_paths(*end)[:, 0], style)
         rec.log(entity_path((*root, "path")), path, strict=True)
         rec.reset_time()
     motions = design.motions
@@ -327,7 +328,7 @@ def _log_iterates(
         log_pose(rec, model, root, poses, len(qpos) // 2)
         log_pose(rec, model, ("robots", INITIAL.word), still_poses, 0)
         if end is not None:
-            path = strip_of_path(end.path(poses), style)
+            path = strip_of_path(poses.world_paths(*end)[:, 0], style)
             rec.log(entity_path((*root, "path")), path, strict=True)
         for plane, _, curves in plots:
             curve = plane.curve(*curves[i], DESIGNED.word)
@@ -393,11 +394,6 @@ def blueprint_of(layout: rrb.Container, time_panel: rrb.TimePanel) -> rrb.Bluepr
         auto_layout=False,
         auto_views=False,
     )
-
-
-def _plane_tabs(name: str, planes: Sequence[tuple[Plane, Panel]]) -> list[rrb.Container]:
-    """Return the tab of plots of 2D lines."""
-    return grid_tabs(name, [plane.view() for plane, _ in planes])
 
 
 def robot_views(

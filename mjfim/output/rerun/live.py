@@ -232,7 +232,7 @@ class LiveShow:
         log_pose(self._rec, self._model, ROBOT, poses, round(share * (len(rows) - 1)))
         end = end_point(self._model, poses)
         if end is not None:
-            path = strip_of_path(end.path(poses), STYLE)
+            path = strip_of_path(poses.world_paths(*end)[:, 0], STYLE)
             self._rec.log(entity_path((*ROBOT, "path")), path, strict=True)
         for group, values in self._signals(motion).items():
             for k, (plane, y) in enumerate(zip(self._planes[group], values.T, strict=True)):
@@ -311,7 +311,7 @@ def _rank(row: HistoryRow) -> tuple[float, bool, float]:
 def _text_of(event: Event, best: DesignEvent | None) -> str:
     """Describe the newest event, and from where the iterate comes that is shown."""
     if not isinstance(event, DesignEvent):
-        return progress_line(event).text
+        return progress_line(event)[0]
     lines = [f"newest: {event.start}, {design_stage(event)}", design_text(event)]
     if best is not None:
         lines += [f"best so far, shown: {best.start}", design_text(best)]

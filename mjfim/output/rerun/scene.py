@@ -553,15 +553,25 @@ def log_robot(
     """
     for body in range(model.nbody):
         parts = body_parts(model, root, body)
-        _log_shapes(rec, model, parts, body, style)
+        for shape in drawn_shapes(model, body, style):
+            pose = rr.Transform3D(
+                translation=shape.position, quaternion=rerun_quaternion(shape.quaternion)
+            )
+            path = entity_path((*parts, shape.name))
+            rec.log(path, pose, shape.archetype, static=True, strict=True)
 
         # Body 0 is the world, which stays at the origin.
         if body == 0:
             continue
+        # No pose of a moving body is static, because static data would override the others.
+        xyz, wxyz = poses.positions[:, body], poses.quaternions[:, body]
         if is_moving(model, body):
-            _log_motion(rec, entity_path(parts), poses, body)
+            xyzw = np.roll(wxyz, -1, axis=1)
+            rows = rr.Transform3D.columns(translation=xyz, quaternion=xyzw)
+            rec.send_columns(entity_path(parts), [time_column(poses.t)], rows, strict=True)
         else:
-            _log_fixed_pose(rec, entity_path(parts), poses, body)
+            pose = rr.Transform3D(translation=xyz[0], quaternion=rerun_quaternion(wxyz[0]))
+            rec.log(entity_path(parts), pose, static=True, strict=True)
 
 
 def pale_shapes(
@@ -604,7 +614,7 @@ def log_end_path(
     """
     point = end_point(model, poses)
     if point is not None:
-        path = strip_of_path(point.path(poses), style)
+        path = strip_of_path(poses.world_paths(*point)[:, 0], style)
         rec.log(entity_path((*root, "path")), path, static=True, strict=True)
 
 
@@ -617,25 +627,6 @@ def strip_of_path(path: Array, style: RobotStyle) -> rr.LineStrips3D:
     """
     radius = rr.Radius.ui_points(PATH_THICKNESS)
     return rr.LineStrips3D([path], colors=[[*style.accent, 255]], radii=radius)
-
-
-def _log_fixed_pose(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int) -> None:
-    """Log the pose of a body that nothing moves, as static data."""
-    position = poses.positions[0, body]
-    quaternion = rerun_quaternion(poses.quaternions[0, body])
-    pose = rr.Transform3D(translation=position, quaternion=quaternion)
-    rec.log(path, pose, static=True, strict=True)
-
-
-def _log_motion(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int) -> None:
-    """Log the poses of a moving body, a row per sample.
-
-    No pose is static, because static data would override the others.
-    """
-    xyz = poses.positions[:, body]
-    xyzw = np.roll(poses.quaternions[:, body], -1, axis=1)
-    rows = rr.Transform3D.columns(translation=xyz, quaternion=xyzw)
-    rec.send_columns(path, [time_column(poses.t)], rows, strict=True)
 
 
 def log_pose(
@@ -652,22 +643,6 @@ def log_pose(
             quaternion=rerun_quaternion(poses.quaternions[sample, body]),
         )
         rec.log(entity_path(body_parts(model, root, body)), pose, strict=True)
-
-
-def _log_shapes(
-    rec: rr.RecordingStream,
-    model: mujoco.MjModel,
-    parts: EntityParts,
-    body: int,
-    style: RobotStyle,
-) -> None:
-    """Log the shapes of one body in its frame."""
-    for shape in drawn_shapes(model, body, style):
-        pose = rr.Transform3D(
-            translation=shape.position, quaternion=rerun_quaternion(shape.quaternion)
-        )
-        path = entity_path((*parts, shape.name))
-        rec.log(path, pose, shape.archetype, static=True, strict=True)
 
 
 # ---- points of moving bodies
@@ -698,29 +673,8 @@ def _moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
     return bodies.astype(np.intp), points
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EndPoint:
-    """The end of a robot, whose path is drawn.
-
-    Attributes:
-        body: Number of its body.
-        point: (3,) the point in the frame of the body [m].
-    """
-
-    body: int
-    point: Array
-
-    def path(self, poses: BodyPoses) -> Array:
-        """Return the (N+1, 3) path in the world [m].
-
-        Args:
-            poses: Poses of the bodies.
-        """
-        return poses.world_paths(np.array([self.body]), self.point[None])[:, 0]
-
-
-def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
-    """Return the end of a robot.
+def end_point(model: mujoco.MjModel, poses: BodyPoses) -> tuple[NDArray[np.intp], Array] | None:
+    """Return the end of a robot, whose path is drawn.
 
     Of the points deepest in the tree, it is the one that travels farthest.
 
@@ -729,7 +683,8 @@ def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
         poses: Poses of its bodies.
 
     Returns:
-        The end; None where nothing moves.
+        (1,) number of its body, and (1, 3) the point in the frame of the body [m]; None where
+        nothing moves.
     """
     bodies, points = _moving_centres(model)
     if not len(bodies):
@@ -742,5 +697,5 @@ def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
 
     paths = poses.world_paths(bodies[deepest], points[deepest])
     steps = np.linalg.norm(np.diff(paths, axis=0), axis=2)
-    farthest = int(np.argmax(steps.sum(axis=0)))
-    return EndPoint(body=int(bodies[deepest][farthest]), point=points[deepest][farthest])
+    farthest = [int(np.argmax(steps.sum(axis=0)))]
+    return bodies[deepest][farthest], points[deepest][farthest]

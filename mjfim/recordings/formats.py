@@ -1,0 +1,718 @@
+"""Reader of log files of all formats: their columns by name, which become numbers when needed.
+
+The ending of the name says the format; folders are ROS 2 bags or LeRobot datasets. No content of a
+file is executed or unpickled.
+
+A LeRobot dataset of format v2.x or v3.0 is a folder with `meta/info.json` and Parquet files, whose
+rows are the frames of all episodes. One episode is one recording.
+
+The library rosbags is an optional extra (`pip install 'mjfim[ros]'`); no ROS installation is
+needed. Messages of several topics or publishers are merged by their time stamps.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import zlib
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow
+import pyarrow.compute
+import pyarrow.csv
+import pyarrow.parquet
+
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError, listed, shortened, unknown
+from mjfim.files import read_arrays, read_json
+from mjfim.recordings.section import INPUT_PREFIXES, RecordingSpec
+
+# File that makes a folder a dataset, and the column that says to which episode a frame belongs.
+INFO_FILE = "meta/info.json"
+EPISODE_COLUMN = "episode_index"
+
+# Name of an episode of a dataset.
+EPISODE_NAME = re.compile(r"episode_(\d{6,9})")
+
+# Places of the data files by the first number of the version. The places that info.json states are
+# not used: they are patterns, which could lead to other files.
+DATA_FILES = {2: "data/chunk-*/episode_{episode:06d}.parquet", 3: "data/chunk-*/file-*.parquet"}
+
+# Kinds of features that hold no numbers, and may be large.
+NO_NUMBERS = ("image", "video", "string")
+
+# Errors that pyarrow raises for a damaged file.
+UNREADABLE = (pyarrow.ArrowException, OSError, EOFError, ValueError)
+
+# Rounding of a time stamp in single precision, relative to the time.
+SINGLE_PRECISION = 2.0 * float(np.finfo(np.float32).eps)
+
+# How to state the units of a dataset, which its files do not name.
+UNIT_HINT = (
+    "LeRobot robots store degrees, or -100 to 100 over the calibrated range of each joint: "
+    'state unit = "deg" for degrees, or for the range scale = (rad per unit) and '
+    "offset = (rad at 0), for the positions and for the actions"
+)
+
+
+def is_lerobot_dataset(path: Path) -> bool:
+    """Whether a path is the folder of a LeRobot dataset."""
+    return (path / INFO_FILE).is_file()
+
+
+def lerobot_episode(path: Path) -> tuple[Path, int] | None:
+    """Dataset and number of the episode that a path such as `set/episode_000003` names, or None."""
+    named = EPISODE_NAME.fullmatch(path.name)
+    if named is None or path.exists() or not is_lerobot_dataset(path.parent):
+        return None
+    return path.parent, int(named[1])
+
+
+def lerobot_episodes(path: Path, spec: RecordingSpec) -> list[Path]:
+    """Names of the episodes of a dataset that are to be read.
+
+    Raises:
+        RecordingError: The dataset is damaged, or has no such episode.
+    """
+    count = read_json(path / INFO_FILE).get("total_episodes")
+    if not isinstance(count, int) or count < 1:
+        raise RecordingError(
+            f"{path}: {INFO_FILE}: total_episodes is {count!r}; expected at least 1"
+        )
+
+    for episode in spec.episodes:
+        if episode >= count:
+            raise RecordingError(
+                f"{path}: recording.episodes: there is no episode {episode}; the dataset has the "
+                f"episodes 0 to {count - 1}"
+            )
+    return [path / f"episode_{episode:06d}" for episode in spec.episodes or range(count)]
+
+
+def read_lerobot(path: Path, spec: RecordingSpec) -> Table:
+    """Read one episode of a LeRobot dataset.
+
+    Args:
+        path: Name of an episode, or the folder of a dataset of which one episode is to be read.
+        spec: Table `[recording]`.
+
+    Raises:
+        RecordingError: The dataset is damaged or of another version, or has no such episode.
+    """
+    if spec.time_unit != "s":
+        raise RecordingError(
+            f"{path}: recording.time_unit: the time of a LeRobot dataset is in seconds; leave this "
+            "key out"
+        )
+    folder, episode = lerobot_episode(path) or _only_episode(path, spec)
+    info = read_json(folder / INFO_FILE)
+    features = info.get("features")
+    if not isinstance(features, Mapping):
+        raise RecordingError(f"{folder}: {INFO_FILE}: has no table of features")
+
+    described = {name: each for name, each in features.items() if isinstance(each, Mapping)}
+    held = [name for name, each in described.items() if each.get("dtype") not in NO_NUMBERS]
+    rows = _frames(folder, info, episode, [EPISODE_COLUMN, "timestamp", "frame_index", *held])
+    contents = {name: rows.column(name) for name in held if name in rows.column_names}
+    contents["t"] = _times(folder, info, rows)
+    labels = {name: _labels(name, described[name]) for name in held}
+    return Table.of(path, contents, RecordingSpec(time="t"), labels=labels, unit_hint=UNIT_HINT)
+
+
+def _only_episode(path: Path, spec: RecordingSpec) -> tuple[Path, int]:
+    """The dataset, and the number of the only episode that is to be read."""
+    episodes = lerobot_episodes(path, spec)
+    if len(episodes) != 1:
+        raise RecordingError(
+            f"{path}: has {len(episodes)} episodes; name one, as in {episodes[0].name}, or choose "
+            "one by recording.episodes"
+        )
+    return path, int(episodes[0].name.rpartition("_")[2])
+
+
+def _labels(feature: str, described: Mapping[str, Any]) -> list[str]:
+    """Names of the columns of a feature; one that has no names and one component keeps its own."""
+    names = list(_flat(described.get("names")))
+    if len(names) == len(set(names)) and [len(names)] == described.get("shape"):
+        return [f"{feature}:{name}" for name in names]
+    return [feature]
+
+
+def _flat(stated: Any) -> Iterator[str]:
+    """Names inside lists, and inside the lists of a table such as `{motors = [...]}`."""
+    if isinstance(stated, str):
+        yield stated
+    elif isinstance(stated, Mapping) and all(isinstance(v, int) for v in stated.values()):
+        # A table of numbers gives the place of each name.
+        yield from sorted(stated, key=stated.__getitem__)
+    elif isinstance(stated, (list, Mapping)):
+        for part in stated.values() if isinstance(stated, Mapping) else stated:
+            yield from _flat(part)
+
+
+def _frames(folder: Path, info: Mapping[str, Any], episode: int, names: list[str]) -> Any:
+    """Rows of an episode as an arrow table; the other row groups of a file are not read."""
+    stated = str(info.get("codebase_version"))
+    pattern = DATA_FILES.get(int(stated[1]) if re.fullmatch(r"v\d\.\d+", stated) else 0)
+    if pattern is None:
+        raise RecordingError(
+            f"{folder}: LeRobot format {stated!r}; the formats v2.0, v2.1 and v3.0 are read"
+        )
+    files = sorted(folder.glob(pattern.format(episode=episode)))
+    if not files:
+        raise RecordingError(f"{folder}: has no data file of episode {episode}")
+
+    parts = []
+    for file in files:
+        try:
+            schema = pyarrow.parquet.read_schema(file)
+            parts.append(
+                pyarrow.parquet.read_table(
+                    file,
+                    columns=[name for name in dict.fromkeys(names) if name in schema.names],
+                    filters=[(EPISODE_COLUMN, "==", episode)],
+                    partitioning=None,
+                )
+            )
+        except UNREADABLE as error:
+            raise RecordingError(
+                f"{file}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
+            ) from None
+
+    rows = pyarrow.concat_tables(parts, promote_options="default")
+    if not rows.num_rows:
+        raise RecordingError(f"{folder}: has no frame of episode {episode}")
+    return rows
+
+
+def _times(folder: Path, info: Mapping[str, Any], rows: Any) -> Array:
+    """(M,) times of the frames [s]."""
+    fps = info.get("fps")
+    if not isinstance(fps, (int, float)) or not 0.0 < fps < np.inf:
+        raise RecordingError(f"{folder}: {INFO_FILE}: fps is {fps!r}; expected a positive number")
+
+    held = {"timestamp", "frame_index"} & set(rows.column_names)
+    table = Table.of(folder, {name: rows.column(name) for name in held}, RecordingSpec())
+    if "frame_index" not in held:
+        return table.column("timestamp")
+    exact = table.column("frame_index") / fps
+    if "timestamp" not in held:
+        return exact
+    # Time stamps in single precision would make a jitter that the log does not have.
+    stamps = table.column("timestamp")
+    rounding = SINGLE_PRECISION * np.abs(exact).max()
+    return exact if (np.abs(stamps - exact) <= rounding).all() else stamps
+
+
+# Longest quotation of another library's error message [characters].
+MAX_QUOTATION = 200
+
+# Largest number of rows of a column of text in which one is looked for that is no number.
+MAX_SEARCHED_ROWS = 100_000
+
+# Fault of a column that holds text or objects.
+NOT_NUMERIC = "is not numeric"
+
+types = pyarrow.types
+NUMERIC = (types.is_integer, types.is_floating, types.is_decimal, types.is_boolean, types.is_null)
+LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Table:
+    """Columns of one file, all with M rows.
+
+    Attributes:
+        source: The file, for messages.
+        contents: What the file holds by the name of a column: an arrow array, or the words that
+            say why it cannot be used.
+        unit_hint: How to state units that the file does not name; it ends messages about them.
+    """
+
+    source: Path
+    contents: dict[str, Any]
+    unit_hint: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        source: Path,
+        contents: Mapping[str, Any],
+        spec: RecordingSpec,
+        *,
+        labels: Mapping[str, Sequence[str]] | None = None,
+        unit_hint: str = "",
+    ) -> Table:
+        """Make columns of vectors, of matrices, and of single values, which hold for all rows.
+
+        Args:
+            source: The file.
+            contents: Arrow arrays, NumPy vectors, lists or single values by name. A list of lists
+                is a matrix, whose columns are called `name[0]`, `name[1]` and so on.
+            spec: Table `[recording]`, which names the time. All columns have as many rows.
+            labels: Names of the columns of a matrix that has other ones.
+            unit_hint: See the attribute.
+        """
+        inputs = {s.column for key, s in spec.sources.items() if key.startswith(INPUT_PREFIXES)}
+        rows = _rows(contents, spec.time)
+        columns = {}
+        for key, values in contents.items():
+            parts = _parts(values if _has_rows(values) else [values] * rows)
+            names = (labels or {}).get(key, ())
+            if len(names) != len(parts):
+                names = [f"{key}{suffix}" for suffix in parts]
+
+            for name, part in zip(names, parts.values(), strict=True):
+                # A control is held from each row to the next one, so the last row may have none.
+                is_input = name in inputs or key.startswith(("ctrl", *INPUT_PREFIXES))
+                columns[name] = _of_length(part, rows, spec.time, is_input)
+        return cls(source=source, contents=columns, unit_hint=unit_hint)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all columns of the file, also of those that hold no numbers."""
+        return tuple(self.contents)
+
+    def column(self, name: str) -> Array:
+        """Return one column.
+
+        Args:
+            name: Its name.
+
+        Returns:
+            (M,) numbers, NaN where the file holds none.
+
+        Raises:
+            RecordingError: There is no such column, or it holds no numbers.
+        """
+        if name not in self.contents:
+            found = listed(self.names)
+            raise RecordingError(f"{self.source}: column {name!r} is missing; found: {found}")
+
+        values = self.contents[name]
+        fault = values if isinstance(values, str) else _fault(values)
+        if fault:
+            raise RecordingError(f"{self.source}: column {name!r} {fault}")
+        numbers = values.cast(pyarrow.float64(), safe=False)
+        return np.asarray(numbers.to_numpy(zero_copy_only=False))
+
+    def measurement(self, name: str) -> Array:
+        """Return one column that holds times or measured numbers.
+
+        Raises:
+            RecordingError: As `column`, or the column holds truth values.
+        """
+        values = self.contents.get(name)
+        if not isinstance(values, str) and types.is_boolean(_kind(values)):
+            raise RecordingError(
+                f"{self.source}: column {name!r} holds truth values (true and false), which are no "
+                "measurement; name a column of numbers, or write 1 and 0 if these are the numbers"
+            )
+        return self.column(name)
+
+
+def _has_rows(values: Any) -> bool:
+    """Whether a value of a file has rows, and does not hold for all of them."""
+    return not isinstance(values, (str, int, float, type(None)))
+
+
+def _rows(contents: Mapping[str, Any], time: str) -> int:
+    """Number of rows of a file: that of the time; without one, of the longest column."""
+    lengths = {name: len(values) for name, values in contents.items() if _has_rows(values)}
+    return lengths.get(time, max(lengths.values(), default=0))
+
+
+def _parts(values: Any) -> dict[str, Any]:
+    """Arrow arrays of a vector or of the columns of a matrix by the ends of their names."""
+    if isinstance(values, (list, np.ndarray)):
+        try:
+            values = pyarrow.array(values)
+        except (pyarrow.ArrowException, OverflowError):
+            return {"": NOT_NUMERIC}
+
+    if not _is_any(LISTS, values.type):
+        return {"": values}
+    column = values.combine_chunks() if isinstance(values, pyarrow.ChunkedArray) else values
+    width = len(column[0]) if len(column) and column[0].is_valid else 0
+    numbers = column.flatten()
+    lengths = pyarrow.compute.list_value_length(column).to_numpy(zero_copy_only=False)
+    if (lengths == width).all():
+        return {f"[{i}]": numbers[i::width] for i in range(width)}
+    row = int(np.argmax(lengths != width)) + 1
+    fault = f"is ragged: row {row} does not have {width} numbers, as the first row has"
+    return {f"[{i}]": fault for i in range(max(width, 1))}
+
+
+def _of_length(values: Any, rows: int, time: str, is_input: bool) -> Any:
+    """Values with as many rows as the time has; the last row of an input may be missing."""
+    if isinstance(values, str) or len(values) == rows:
+        return values
+    if is_input and len(values) == rows - 1:
+        return pyarrow.concat_arrays([values, pyarrow.nulls(1, values.type)])
+    return (
+        f"has {len(values)} rows, but {time!r} has {rows}; all columns need equal numbers of rows"
+    )
+
+
+def _kind(values: Any) -> Any:
+    """Type of the values of an arrow array; a dictionary holds what its values are."""
+    kind = getattr(values, "type", pyarrow.null())
+    return kind.value_type if types.is_dictionary(kind) else kind
+
+
+def _is_any(tests: Sequence[Any], kind: Any) -> bool:
+    """Whether an arrow type passes one of several tests."""
+    return any(test(kind) for test in tests)
+
+
+def _fault(values: Any) -> str:
+    """Why an arrow array holds no numbers, with its first text that is none; empty if it does."""
+    if _is_any(NUMERIC, _kind(values)):
+        return ""
+    texts = enumerate(values[:MAX_SEARCHED_ROWS].to_pylist(), start=1)
+    row, text = next(((row, text) for row, text in texts if _is_text(text)), (0, ""))
+    return f"{NOT_NUMERIC}: row {row} holds {shortened(repr(text))}" if row else NOT_NUMERIC
+
+
+def _is_text(value: object) -> bool:
+    """Whether a value is a text that does not look like a number."""
+    try:
+        return isinstance(value, str) and bool(value) and float(value) is None
+    except ValueError:
+        return True
+
+
+def one_line(error: Exception) -> str:
+    """Quote another library's error message in one short line."""
+    # A damaged file may hold control sequences of a terminal, which must not be printed.
+    printable = "".join(c if c.isprintable() or c.isspace() else "?" for c in str(error))
+    line = " ".join(printable.split()) or type(error).__name__
+    return line if len(line) <= MAX_QUOTATION else f"{line[:MAX_QUOTATION]}..."
+
+
+def leaves(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of nested objects; every value that is not an object is yielded."""
+    for key, inner in value.items():
+        if isinstance(inner, Mapping):
+            yield from leaves(inner, f"{prefix}{key}.")
+        else:
+            yield prefix + key, inner
+
+
+# Type of the messages that are read; all other messages are ignored.
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+# Topic of the controls that were sent: joint states that have the names of the controls, and the
+# controls as efforts. mjfim writes it, and a program that plays a design may publish it.
+CONTROL_TOPIC = "/mjfim/control"
+
+# Fields of a joint state that become columns.
+QUANTITIES = ("position", "velocity", "effort")
+
+# Nanoseconds per second.
+NANOSECONDS = 1_000_000_000
+
+# Time stamps [ns] and numbers of every column, by topic, quantity and joint.
+Samples = dict[tuple[str, str, str], "tuple[array[int], array[float]]"]
+
+
+def read_bag(path: Path, spec: RecordingSpec) -> Table:
+    """Read the joint states of a ROS 2 bag.
+
+    Args:
+        path: Folder of the bag, or the file in it.
+        spec: Table `[recording]`, which may choose topics.
+
+    Returns:
+        The time `t` since the first message [s], and `<quantity>:<joint>` for every quantity in
+        `QUANTITIES`; with several topics `<topic>:<quantity>:<joint>`. Controls are `ctrl:<name>`.
+
+    Raises:
+        RecordingError: The bag is damaged, has no joint states, or has several topics of them and
+            none is chosen.
+    """
+    if spec.time_unit != "s":
+        raise RecordingError(
+            f"{path}: recording.time_unit: the time of a bag is in seconds; leave this key out"
+        )
+    rosbag2 = rosbags_module(path, "rosbags.rosbag2")
+    typesys = rosbags_module(path, "rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    try:
+        with rosbag2.Reader(path) as reader:
+            connections = _connections(path, reader.connections, spec.topics)
+            samples = _samples(path, reader, connections, store)
+    except RecordingError:
+        raise
+    except Exception as error:
+        # The reader assumes an intact bag; a damaged one can cause any exception inside it.
+        raise RecordingError(
+            f"{path}: not a readable ROS 2 bag (damaged or truncated?): {one_line(error)}"
+        ) from None
+
+    if not samples:
+        topics = listed([connection.topic for connection in connections])
+        raise RecordingError(f"{path}: topic {topics} has no message")
+    measured = {topic for topic in spec.topics if topic != CONTROL_TOPIC}
+    return _merged(path, samples, with_topic=len(measured) > 1)
+
+
+def rosbags_module(path: Path, name: str) -> Any:
+    """Import a module of the optional library.
+
+    Args:
+        path: The bag, for the message.
+        name: Name of the module.
+
+    Raises:
+        RecordingError: The library is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        raise RecordingError(
+            f"{path}: ROS 2 bags need the library rosbags; pip install 'mjfim[ros]'"
+        ) from None
+
+
+def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]) -> list[Any]:
+    """Connections of the stated topics, or of the only topic with joint states."""
+    connections = list(connections)
+    states = [c for c in connections if c.msgtype == JOINT_STATE]
+    available = sorted({c.topic for c in states})
+    if not available:
+        others = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
+        raise RecordingError(
+            f"{path}: no topic of {JOINT_STATE}, the only type of message that is read; "
+            f"found: {listed(others)}"
+        )
+    for topic in topics:
+        if topic not in available:
+            raise RecordingError(f"{path}: recording.topics: {unknown('topic', topic, available)}")
+    measured = [topic for topic in available if topic != CONTROL_TOPIC]
+    if len(measured) > 1 and not topics:
+        raise RecordingError(
+            f"{path}: several topics of joint states: {listed(measured)}; select one by "
+            "recording.topics"
+        )
+    return [c for c in states if c.topic in (topics or available)]
+
+
+def _samples(path: Path, reader: Any, connections: list[Any], store: Any) -> Samples:
+    """Read all messages, and collect their numbers by column."""
+    samples: Samples = defaultdict(lambda: (array("q"), array("d")))
+    for number, (connection, received, raw) in enumerate(reader.messages(connections=connections)):
+        message = store.deserialize_cdr(raw, JOINT_STATE)
+        # A message without a stamp has the time at which it was received.
+        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec or received
+        for quantity in QUANTITIES:
+            values = getattr(message, quantity).tolist()
+            if values and len(values) != len(message.name):
+                raise RecordingError(
+                    f"{path}: topic {connection.topic!r}, message {number + 1}: a field does not "
+                    f"have one value for each of the {len(message.name)} joints"
+                )
+            for joint, value in zip(message.name, values, strict=False):
+                stamps, numbers = samples[connection.topic, quantity, joint]
+                stamps.append(stamp)
+                numbers.append(value)
+    return samples
+
+
+def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
+    """Merge all columns into one table with one row per stamp."""
+    all_stamps = [np.frombuffer(stamps, dtype=np.int64) for stamps, _ in samples.values()]
+    stamps = np.unique(np.concatenate(all_stamps))
+    # Subtract integers first: a float64 cannot hold nanoseconds since 1970 exactly.
+    columns = {"t": (stamps - stamps[0]).astype(np.float64) / NANOSECONDS}
+    for ((topic, quantity, joint), (_, numbers)), own in zip(
+        samples.items(), all_stamps, strict=True
+    ):
+        steps = np.diff(own)
+        if np.any(steps <= 0):
+            row = int(np.argmax(steps <= 0))
+            raise RecordingError(
+                f"{path}: topic {topic!r}: {quantity} of {joint!r}, message {row + 2} is "
+                f"{steps[row] / NANOSECONDS:g} s after the previous one; time must increase"
+            )
+        is_control = topic == CONTROL_TOPIC
+        prefix = f"{topic}:" if with_topic or is_control else ""
+        label = "ctrl" if is_control and quantity == "effort" else f"{prefix}{quantity}"
+        column: Array = np.full(len(stamps), np.nan)
+        column[np.searchsorted(stamps, own)] = np.frombuffer(numbers, dtype=np.float64)
+        columns[f"{label}:{joint}"] = column
+    return Table.of(path, columns, RecordingSpec(time="t"))
+
+
+Records = Sequence[Mapping[str, Any]]
+
+
+def _read_json(path: Path, spec: RecordingSpec) -> Table:
+    """Read the records of a JSON file; without records, its lists of numbers are the columns.
+
+    Values beside the list of records are constants, which hold for all rows.
+
+    Raises:
+        RecordingError: The file is damaged, or it holds no records, or several lists of them.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError, RecursionError) as error:
+        raise RecordingError(
+            f"{path}: not readable JSON (damaged or truncated?): {one_line(error)}"
+        ) from None
+
+    lists = dict(_lists_of_records(content))
+    outside = dict(leaves(content)) if isinstance(content, Mapping) else {}
+    if not lists and any(isinstance(value, list) for value in outside.values()):
+        return Table.of(path, outside, spec)
+    records = _chosen(path, lists, spec.records)
+    rows = [dict(leaves(record)) for record in records]
+    names = dict.fromkeys(name for row in rows for name in row)
+    constants = {n: value for n, value in outside.items() if not isinstance(value, list)}
+    return Table.of(path, constants | {n: [row.get(n) for row in rows] for n in names}, spec)
+
+
+def _lists_of_records(value: Any, place: str = "") -> Iterator[tuple[str, Records]]:
+    """Dotted name and contents of every list of objects inside a value."""
+    if isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value):
+        yield place, value
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _lists_of_records(inner, f"{place}.{key}" if place else key)
+
+
+def _chosen(path: Path, lists: Mapping[str, Records], stated: str | None) -> Records:
+    """The list of records that the experiment file names, or the only one."""
+    if stated is not None and stated not in lists:
+        fault = unknown("list of records", stated, lists)
+        raise RecordingError(f"{path}: recording.records: {fault}")
+    if stated is not None:
+        return lists[stated]
+    if len(lists) > 1:
+        raise RecordingError(
+            f"{path}: several lists of records: {listed([*lists])}; select one by recording.records"
+        )
+    if not lists:
+        raise RecordingError(
+            f"{path}: holds no list of records (objects); a log is such a list, or an object that "
+            "holds one"
+        )
+    return next(iter(lists.values()))
+
+
+# Errors that pyarrow and gzip raise for a damaged file.
+DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
+
+
+def read_columns(path: Path, spec: RecordingSpec) -> Table:
+    """Read the columns of a log.
+
+    Args:
+        path: A file whose ending is in `READERS`, the folder of a ROS 2 bag, or the folder or the
+            name of an episode of a LeRobot dataset.
+        spec: Table `[recording]` of the experiment file.
+
+    Raises:
+        RecordingError: There is no such file, or it is damaged, empty, or of an unknown format.
+    """
+    if lerobot_episode(path) is not None or is_lerobot_dataset(path):
+        return read_lerobot(path, spec)
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file")
+    if path.is_dir():
+        if not (path / "metadata.yaml").is_file():
+            raise RecordingError(
+                f"{path}: a folder without metadata.yaml is not a ROS 2 bag, and one without "
+                "meta/info.json is not a LeRobot dataset; name a file"
+            )
+        return read_bag(path, spec)
+
+    name = path.name.lower()
+    reader = next((read for ending, read in READERS.items() if name.endswith(ending)), None)
+    if reader is None:
+        raise RecordingError(
+            f"{path}: unknown format; a log is a file that ends in {', '.join(READERS)}, or the "
+            "folder of a ROS 2 bag or of a LeRobot dataset"
+        )
+    if path.stat().st_size == 0:
+        raise RecordingError(f"{path}: the file is empty")
+    return reader(path, spec)
+
+
+def read_table(path: Path) -> dict[str, Array]:
+    """Read all columns of a numeric CSV file, packed by gzip if it ends in `.gz`.
+
+    Raises:
+        RecordingError: There is no such file, or it is damaged, or a column is not numeric.
+    """
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file")
+    table = _read_csv(path, RecordingSpec())
+    return {name: table.column(name) for name in table.names}
+
+
+def _read_csv(path: Path, spec: RecordingSpec) -> Table:
+    """Read a CSV file."""
+    try:
+        packed = path.suffix.lower() == ".gz"
+        # A thread of pyarrow that reads from Python can abort the process at its end.
+        source = pyarrow.BufferReader(gzip.decompress(path.read_bytes())) if packed else str(path)
+        return _table(path, pyarrow.csv.read_csv(source), spec)
+    except DAMAGED as error:
+        raise RecordingError(f"{path}: not a readable CSV table: {one_line(error)}") from None
+
+
+def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
+    """Read a Parquet file."""
+    try:
+        with pyarrow.parquet.ParquetFile(path) as file:
+            return _table(path, file.read(), spec)
+    except DAMAGED as error:
+        raise RecordingError(
+            f"{path}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
+        ) from None
+
+
+def _table(path: Path, rows: Any, spec: RecordingSpec) -> Table:
+    """Columns of an arrow table; one name for several of them is refused."""
+    name, count = Counter(rows.column_names).most_common(1)[0] if rows.num_columns else ("", 0)
+    if count > 1:
+        raise RecordingError(
+            f"{path}: more than one column is named {name!r}; every column needs a name of its own"
+        )
+    return Table.of(path, dict(zip(rows.column_names, rows.columns, strict=True)), spec)
+
+
+def _read_npz(path: Path, spec: RecordingSpec) -> Table:
+    """Read the numbers, vectors and matrices of an archive; nothing is unpickled."""
+    contents: dict[str, Any] = {}
+    for name, values in read_arrays(path, "log").items():
+        if values.ndim == 2 and values.size:
+            flat = pyarrow.array(values.ravel())
+            contents[name] = pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+        elif values.ndim < 2:
+            contents[name] = values if values.ndim else values.item()
+    return Table.of(path, contents, spec)
+
+
+Reader = Callable[[Path, RecordingSpec], Table]
+
+# Reader of a log file by the ending of its name in lower case.
+READERS: dict[str, Reader] = {
+    ".csv": _read_csv,
+    ".csv.gz": _read_csv,
+    ".parquet": _read_parquet,
+    ".npz": _read_npz,
+    ".json": _read_json,
+    ".mcap": read_bag,
+    ".db3": read_bag,
+}

@@ -1,9 +1,0 @@
-"""Readers of columns of numbers from files of all supported formats.
-
-No content of a file is executed or unpickled.
-"""
-
-import lazy_loader
-
-# A name is imported from its module, which `__init__.pyi` states, when it is used first.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,643 @@
+"""Records of studies: methods, many trials of the estimator, and a design on other robots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import NORMAL_95, Array, freeze
+from mjfim.errors import MAX_NOISE, MAX_WRONG, ExperimentError
+from mjfim.records.base import NamedEnum, Record, ShownRecord, record
+from mjfim.records.trajectory import Labels
+
+# Key of mjfim's own design among the methods.
+DESIGN = "design"
+
+
+# Relative difference of two costs J below which they count as equal.
+TIE_TOLERANCE = 1e-3
+
+
+class MethodOutcome(NamedEnum):
+    """Outcome of a method; the value is a verb phrase for the user."""
+
+    INSIDE = "keeps all limits"
+    OUTSIDE = "violates a limit"
+    NOTHING = "found no control that keeps all limits"
+    CLAMPED = "relies on saturated actuators"
+    NONE = "had no time for a single evaluation"
+
+
+@record
+class MethodResult(Record):
+    """The best control that one method found. All numbers are NaN if it found none.
+
+    Attributes:
+        method: Key of the method.
+        title: Name of the method in reports.
+        outcome: Outcome of the method.
+        control: (N, nu) control, or None [unit of the actuator].
+        cost: J.
+        criterion: phi, the information term of the cost.
+        std: (p,) Cramér-Rao standard deviations [theta-unit].
+        min_eigenvalue: Smallest eigenvalue of the information per second that the criterion uses.
+        worst_relative_std: `(lambda_min(S I S))^-1/2`: standard deviation of the worst combination
+            of parameters, relative to their scales S.
+        seconds: Wall time [s].
+        steps: MuJoCo steps taken.
+        margins: Worst margin of each kind of limit [unit of the limit].
+        relative_margins: These margins divided by half of the limits' ranges.
+        found_by: Name of the attempt that led to the control.
+        note: Remark about the result; may be empty.
+    """
+
+    method: str
+    title: str
+    outcome: MethodOutcome
+    control: Array | None
+    cost: float
+    criterion: float
+    std: Array
+    min_eigenvalue: float
+    worst_relative_std: float
+    seconds: float
+    steps: int
+    margins: dict[str, float]
+    relative_margins: dict[str, float]
+    found_by: str = ""
+    note: str = ""
+
+    in_json = (
+        "method",
+        "title",
+        "outcome",
+        "cost",
+        "criterion",
+        "min_eigenvalue",
+        "worst_relative_std",
+        "std",
+        "seconds",
+        "steps",
+        "found_by",
+        "note",
+    )
+    json_names = {
+        "min_eigenvalue": "smallest_eigenvalue",
+        "worst_relative_std": "worst_relative_sigma",
+    }
+
+    def __post_init__(self) -> None:
+        if self.control is not None:
+            freeze(self, "control")
+
+    @property
+    def sound(self) -> bool:
+        """True if the control keeps all limits without relying on saturated actuators."""
+        return self.outcome is MethodOutcome.INSIDE
+
+    @property
+    def tightest(self) -> tuple[str, float]:
+        """Kind and relative size of the smallest margin; an empty kind without limits."""
+        return min(self.relative_margins.items(), key=lambda item: item[1], default=("", np.inf))
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        return {
+            **super().summary(),
+            "message": self.outcome.value,
+            "limits": {"margins": self.margins, "shares": self.relative_margins},
+        }
+
+
+@record
+class Comparison(ShownRecord):
+    """Result of `mjfim.compare`: methods in the order in which they ran, all with equal budgets.
+
+    Attributes:
+        source: Name of the experiment.
+        criterion: "E", "A", "D" or "c".
+        nats: For D-optimality, the number by which differences of J are divided to obtain the
+            change per parameter; 0 for other criteria.
+        parameters: Names of the p parameters.
+        units: Units of the parameters.
+        scale: (p,) scales of the parameters [theta-unit].
+        nuisance: Names of the nuisance parameters.
+        rows: Result of each method.
+        seconds: Time that each method had [s].
+        seed: Seed of the random numbers.
+        weighted: True if J has further terms besides the criterion.
+        interrupted: True if the user interrupted the comparison.
+    """
+
+    source: str
+    criterion: str
+    nats: float
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    scale: Array
+    nuisance: tuple[str, ...]
+    rows: tuple[MethodResult, ...]
+    seconds: float
+    seed: int
+    weighted: bool
+    interrupted: bool = False
+
+    file_stem = "compare"
+    made_by = "`mjfim compare EXPERIMENT -o DIR`"
+    in_json = (
+        "ok",
+        "verdict",
+        "interrupted",
+        "criterion",
+        "seed",
+        "parameters",
+        "units",
+        "scale",
+        "nuisance",
+        "rows",
+    )
+    json_names = {"rows": "methods"}
+
+    @property
+    def wanted(self) -> tuple[int, ...]:
+        """Indices of the parameters that are not nuisance parameters."""
+        return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
+
+    @property
+    def design(self) -> MethodResult | None:
+        """Result of mjfim's own design; None if the comparison ended before it."""
+        return next((row for row in self.rows if row.method == DESIGN), None)
+
+    @property
+    def rival(self) -> MethodResult | None:
+        """The best sound result of a baseline; None if there is none."""
+        baselines = (row for row in self.rows if row.method != DESIGN and row.sound)
+        return min(baselines, key=lambda row: row.cost, default=None)
+
+    @property
+    def best(self) -> MethodResult | None:
+        """The best sound result of all methods, including the design; None if there is none."""
+        return min((row for row in self.rows if row.sound), key=lambda row: row.cost, default=None)
+
+    @property
+    def beating(self) -> tuple[MethodResult, ...]:
+        """Baselines with sound results that are better than the design, the best first."""
+        design = self.design
+        if design is None:
+            return ()
+
+        better = []
+        for row in self.rows:
+            if row is design or not row.sound:
+                continue
+            if not design.sound or self.gain(row, design) > TIE_TOLERANCE:
+                better.append(row)
+        return tuple(sorted(better, key=lambda row: row.cost))
+
+    def gain(self, row: MethodResult, other: MethodResult) -> float:
+        """Return the fraction by which the J of one result is lower than that of another.
+
+        Args:
+            row: The result with the lower J.
+            other: The result with which it is compared.
+
+        Returns:
+            Fraction of the J of `other`. For D-optimality, fraction of the geometric mean of its
+            variances.
+        """
+        if self.nats:
+            return float(-np.expm1((row.cost - other.cost) / self.nats))
+        return 1.0 - row.cost / other.cost
+
+    @property
+    def ok(self) -> bool:
+        """True if all methods ran, the design is sound, and no baseline is better."""
+        design = self.design
+        return not self.interrupted and design is not None and design.sound and not self.beating
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """Sentences for the user, the most important one first."""
+        sentences = [_verdict(self)]
+        if self.interrupted:
+            sentences.append(
+                "Interrupted: methods are missing, or have not used their whole budget."
+            )
+        return tuple(sentences)
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        return {
+            **super().summary(),
+            "budget": {"seconds": self.seconds},
+            "best": None if self.best is None else self.best.method,
+            "beating": [row.method for row in self.beating],
+        }
+
+
+def _verdict(comparison: Comparison) -> str:
+    """Return a sentence that says whether the design is the best."""
+    design = comparison.design
+    rival = comparison.rival
+
+    # Without a design, or without a sound baseline, there is nothing to compare.
+    if design is None:
+        return "The design was not run, so there is nothing to compare the baselines with."
+    if rival is None:
+        return (
+            f"No baseline found a control that keeps all limits; the design {design.outcome.value}."
+        )
+
+    sigmas = (
+        f"worst relative σ {design.worst_relative_std:.3g} against {rival.worst_relative_std:.3g}"
+    )
+    if not design.sound:
+        return (
+            f"The design {design.outcome.value}; the best control that may be used is from "
+            f"{rival.title} ({sigmas})."
+        )
+
+    if comparison.beating:
+        better = ", ".join(
+            f"{row.title} (J {_percent(comparison.gain(row, design))} lower)"
+            for row in comparison.beating
+        )
+        return f"The design is beaten by {better}: {sigmas}."
+
+    gain = comparison.gain(design, rival)
+    if gain <= TIE_TOLERANCE:
+        return f"The design is as good as the best baseline, {rival.title}: {sigmas}."
+    return (
+        f"The design is the best: J {_percent(gain)} lower than that of the best baseline, "
+        f"{rival.title}; {sigmas}."
+    )
+
+
+def _percent(fraction: float) -> str:
+    """Return a fraction in percent, to two digits."""
+    return f"{100.0 * fraction:.2g} %"
+
+
+@record
+class TrialStatistics(Record):
+    """Estimates from simulated recordings of one trajectory, and the Cramér-Rao bound.
+
+    Attributes:
+        estimates: (trials, p) estimated parameters; rows of NaN for failed trials.
+        mean: (p,) mean of the estimates.
+        covariance: (p, p) sample covariance of the estimates.
+        crlb: (p, p) Cramér-Rao lower bound of the covariance.
+        efficiency: (p,) ratio of the bound to the observed variance; 1 if the bound is reached.
+        efficiency_interval: (p, 2) 95 % confidence interval of each efficiency, from the
+            chi-squared distribution of the sample variance.
+        trials: Number of trials.
+        failed: Number of trials whose fit failed.
+        seconds: Wall time [s].
+    """
+
+    estimates: Array
+    mean: Array
+    covariance: Array
+    crlb: Array
+    efficiency: Array
+    efficiency_interval: Array
+    trials: int
+    failed: int
+    seconds: float = 0.0
+
+
+@record
+class MonteCarloStudy(ShownRecord):
+    """Result of `mjfim.monte_carlo`: statistics of estimates along one or more trajectories.
+
+    Attributes:
+        parameters: Names of the p parameters.
+        theta: (p,) true values.
+        measure_rate: Rate of the measurements [Hz].
+        sets: Statistics by name of the trajectory (`initial`, `final`).
+        information: (p, p) Fisher information of each trajectory, with the keys of `sets`.
+        labels: Names and units for figures and tables; None in records of earlier versions.
+    """
+
+    parameters: tuple[str, ...]
+    theta: Array
+    measure_rate: float
+    sets: dict[str, TrialStatistics]
+    information: dict[str, Array]
+    labels: Labels | None = None
+
+    file_stem = "montecarlo"
+    made_by = "`mjfim montecarlo EXPERIMENT DESIGN.npz -o DIR`"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of montecarlo.json."""
+        values: dict[str, Any] = {
+            "parameters": list(self.parameters),
+            "theta": self.theta,
+            "measure_rate": self.measure_rate,
+        }
+        for name, trials in self.sets.items():
+            values[name] = {
+                "mean": trials.mean,
+                "covariance": trials.covariance,
+                "crlb": trials.crlb,
+                "efficiency": trials.efficiency,
+                "efficiency_interval": trials.efficiency_interval,
+                "information": self.information[name],
+                "trials": trials.trials,
+                "failed": trials.failed,
+                "seconds": trials.seconds,
+            }
+        return values
+
+
+# Probability with which the intervals and joint regions should hold the true values.
+CONFIDENCE = 0.95
+
+
+# Required fraction of robots whose interval contains the true value, for every parameter.
+REQUIRED_COVERAGE = 0.90
+
+
+# Default delay of the control of a simulated robot [s]; it is rounded up to whole timesteps.
+LATENCY = 5e-3
+
+
+# Smallest reserve, as a fraction of half a range; smaller values are round-off.
+MIN_RESERVE = 1e-9
+
+
+@record
+class RobotConditions(Record):
+    """Differences between the simulated robots and the model.
+
+    Attributes:
+        wrong: Relative error of the nominal value of every parameter; its sign is random.
+        latency: Delay of the control [s].
+        feedback: True if the controller adds the gains times the measured deviation.
+        loudness: Ratio of the robot's noise to the stated noise.
+        seed: Seed of the random numbers.
+    """
+
+    wrong: float = 0.2
+    latency: float = LATENCY
+    feedback: bool = False
+    loudness: float = 1.0
+    seed: int = 0
+
+    def check(self) -> None:
+        """Check that every number is in its range.
+
+        Raises:
+            ExperimentError: A number is not.
+        """
+        for name, value, most in (
+            ("wrong", self.wrong, MAX_WRONG),
+            ("noise", self.loudness, MAX_NOISE),
+        ):
+            if not 0.0 <= value <= most:
+                raise ExperimentError(f"{name}: {value:g} is not a number from 0 to {most:g}")
+
+        if not 0.0 <= self.latency < np.inf:
+            raise ExperimentError(f"latency: {self.latency:g} is not a finite number of at least 0")
+
+
+@record
+class RobotRun(Record):
+    """One simulated robot on which the design was played, and the estimate from its recording.
+
+    Attributes:
+        theta: (p,) true parameters [theta-unit].
+        estimate: (p,) estimated parameters [theta-unit]; NaN if the robot could not be identified.
+        covariance: (p, p) covariance of the estimate [theta-unit²].
+        margins: (l,) smallest margin of each limit divided by half of its range; negative if the
+            limit is exceeded.
+        fit: Sum of squared whitened residuals divided by the degrees of freedom.
+        misfit: True if the residuals contradict the model or the noise.
+        restarted: True if the fit from the first initial guess was a misfit and others were tried.
+        trouble: Reason why there is no estimate, or why it is in doubt; else empty.
+    """
+
+    theta: Array
+    estimate: Array
+    covariance: Array
+    margins: Array
+    fit: float
+    misfit: bool
+    restarted: bool = False
+    trouble: str = ""
+
+    @property
+    def std(self) -> Array:
+        """(p,) formal standard deviations of the estimate [theta-unit]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def squared_distance(self, chosen: np.ndarray) -> float:
+        """Squared Mahalanobis distance between true and estimated values of several parameters.
+
+        It has a chi-squared distribution if the covariance is right.
+
+        Args:
+            chosen: Indices of the parameters.
+
+        Returns:
+            The squared distance.
+        """
+        error = (self.estimate - self.theta)[chosen]
+        covariance = self.covariance[np.ix_(chosen, chosen)]
+        return float(error @ np.linalg.solve(covariance, error))
+
+
+@record
+class AssessedLimit(Record):
+    """A limit whose margin is evaluated on every robot.
+
+    Attributes:
+        kind: Kind of the limit: `position`, `velocity`, `acceleration`, `control`, `control_rate`,
+            `force`, `joint_force` or `clearance`.
+        name: Name of the joint or actuator; "nearest pair" for a clearance.
+        lower: Lower bound [unit of the quantity].
+        upper: Upper bound [unit of the quantity].
+        scale: Half of the range, by which margins are divided [unit of the quantity]; the range
+            is from `lower` to `upper`.
+    """
+
+    kind: str
+    name: str
+    lower: float
+    upper: float
+    scale: float
+
+
+@record
+class Robustness(ShownRecord):
+    """Result of a robustness study with n robots, g of which could be identified.
+
+    Attributes:
+        conditions: How the robots differ from the model.
+        names: Names of the p unknowns.
+        units: Unit of each unknown.
+        limits: The l limits.
+        wrong: (p,) root mean square of the errors of the guess [theta-unit].
+        z: (g, p) errors of the estimates in standard deviations.
+        error: (g, p) errors of the estimates [theta-unit].
+        std: (g, p) formal standard deviations [theta-unit]; NaN for unknowns that are identifiable
+            only in combination with others.
+        predicted: (p,) standard deviations predicted before any run [theta-unit].
+        joint: Numbers of robots whose joint confidence region contains the true values: the region
+            of the parameters that the experiment states, and the region of all unknowns.
+        margins: (n, l) smallest margins divided by half of their ranges.
+        planned: (l,) margins of the design on the model divided by half of their ranges.
+        fit: Mean over robots of the sum of squared whitened residuals divided by the degrees of
+            freedom.
+        misfits: Number of misfits.
+        restarted: Number of fits that needed another initial guess.
+        troubles: Number of robots by the sentence that states their problem.
+    """
+
+    conditions: RobotConditions
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    limits: tuple[AssessedLimit, ...]
+    wrong: Array
+    z: Array
+    error: Array
+    std: Array
+    predicted: Array
+    joint: tuple[int, int]
+    margins: Array
+    planned: Array
+    fit: float
+    misfits: int
+    restarted: int
+    troubles: dict[str, int]
+
+    file_stem = "playback"
+    made_by = "`mjfim robustness EXPERIMENT -o DIR`"
+    in_json = (
+        "ok",
+        "conditions",
+        "runs",
+        "fit",
+        "misfits",
+        "restarted",
+        "troubles",
+        "all_kept",
+    )
+    json_names = {
+        "restarted": "begun_again",
+        "all_kept": "all_limits_kept",
+    }
+
+    @property
+    def runs(self) -> int:
+        """Number n of robots."""
+        return len(self.margins)
+
+    @property
+    def identified(self) -> np.ndarray:
+        """(p,) True if a parameter is identifiable alone, not only in combination with others."""
+        return np.asarray(np.isfinite(self.std).all(axis=0)) & (len(self.std) > 0)
+
+    @property
+    def inside(self) -> np.ndarray:
+        """(p,) number of robots whose interval contains the true value."""
+        return np.asarray((np.abs(self.z) <= NORMAL_95).sum(axis=0))
+
+    @property
+    def observed(self) -> Array:
+        """(p,) root mean square of the errors of the estimates [theta-unit]."""
+        return _root_mean_square(self.error)
+
+    @property
+    def formal(self) -> Array:
+        """(p,) root mean square of the formal standard deviations [theta-unit]."""
+        return _root_mean_square(self.std)
+
+    @property
+    def kept(self) -> np.ndarray:
+        """(n, l) True if a robot keeps a limit.
+
+        A force at its limit is clamped by the simulation, which does not count as kept.
+        """
+        clamped = [limit.kind in ("force", "joint_force", "tendon_force") for limit in self.limits]
+        return np.where(clamped, self.margins > 0.0, self.margins >= 0.0)
+
+    @property
+    def all_kept(self) -> int:
+        """Number of robots that keep every limit."""
+        return int(self.kept.all(axis=1).sum())
+
+    @property
+    def lost(self) -> Array:
+        """(l,) distance by which the worst robot is closer to a limit than the design.
+
+        It is divided by half of the limit's range.
+        """
+        worst = self.margins.min(axis=0)
+        return np.asarray(np.maximum(self.planned - worst, 0.0))
+
+    @property
+    def covered(self) -> bool:
+        """True if the intervals of all parameters contain the true values often enough."""
+        inside = self.inside[self.identified]
+        often = inside >= REQUIRED_COVERAGE * self.runs - 1e-9
+        return bool(often.all()) and bool(self.identified.any())
+
+    @property
+    def ok(self) -> bool:
+        """True if the intervals cover often enough and every robot keeps all limits."""
+        return self.covered and self.all_kept == self.runs
+
+    def reserve(self) -> dict[str, float]:
+        """Reserve that a design needs so that all robots keep the limits, by kind of limit.
+
+        Returns:
+            Distance to the limit divided by half of its range, rounded up to 0.01; kinds that need
+            no reserve are left out.
+        """
+        needed: dict[str, float] = {}
+        for limit, share in zip(self.limits, self.lost.tolist(), strict=True):
+            if share > MIN_RESERVE:
+                needed[limit.kind] = max(needed.get(limit.kind, 0.0), share)
+
+        return {kind: float(np.ceil(100.0 * share) / 100.0) for kind, share in needed.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        return {
+            **super().summary(),
+            "parameters": [
+                {
+                    "name": name,
+                    "unit": self.units[j],
+                    "wrong": self.wrong[j],
+                    "predicted": self.predicted[j],
+                    "stated": self.formal[j],
+                    "error": self.observed[j],
+                    "inside": int(self.inside[j]),
+                }
+                for j, name in enumerate(self.names)
+            ],
+            "joint": {"parameters": self.joint[0], "all": self.joint[1]},
+            "limits": [
+                {
+                    "kind": limit.kind,
+                    "name": limit.name,
+                    "range": [limit.lower, limit.upper],
+                    "planned": self.planned[i] * limit.scale,
+                    "worst": self.margins[:, i].min() * limit.scale,
+                    "kept": int(self.kept[:, i].sum()),
+                }
+                for i, limit in enumerate(self.limits)
+            ],
+            "reserve": self.reserve(),
+        }
+
+
+def _root_mean_square(values: Array) -> Array:
+    """Root mean square over the rows of (n, p) values: (p,), NaN where there are no rows."""
+    if not len(values):
+        return np.full(values.shape[1:], np.nan)
+    return np.asarray(np.sqrt((values**2).mean(axis=0)))
