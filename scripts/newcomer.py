@@ -357,15 +357,6 @@ def _excess(value: float, ends: Sequence[float]) -> float:
     return float(max(low - value, value - high) / size)
 
 
-def _names(models: Sequence[Path]) -> list[str]:
-    """A name for each model that no other one has: that of the file, else with its folder."""
-    stems = [model.stem for model in models]
-    return [
-        stem if stems.count(stem) == 1 else f"{model.resolve().parent.name}_{stem}"
-        for model, stem in zip(models, stems, strict=True)
-    ]
-
-
 def main() -> int:
     """Walk through all models, and print the table."""
     parser = argparse.ArgumentParser(
@@ -376,7 +367,8 @@ def main() -> int:
     options = parser.parse_args()
 
     walks = []
-    for model, name in zip(options.models, _names(options.models), strict=True):
+    for number, model in enumerate(options.models, start=1):
+        name = f"{number}_{model.stem}"
         folder = options.output / name
         if folder.exists():
             parser.error(f"{folder} exists; every model needs a fresh folder")

@@ -1,6 +1,6 @@
 """Time and memory to read and fit an hour of two joints at 1 kHz by the command line.
 
-    python -m scripts.benchmarks benchmark_hour [--hours 1.0] [--seed 0]
+    python -m scripts.benchmarks benchmark_hour [--hours 1.0]
 
 The 3.6 million samples are written as CSV first. The times of reading and fitting stand beside
 the time that the engine needs to simulate all samples once on as many threads. The memory is the
@@ -65,18 +65,17 @@ class Hour:
     parameters: int
 
 
-def played(system: System, seconds: float, seed: int) -> Recording:
+def played(system: System, seconds: float) -> Recording:
     """Simulate a recording under random multisines of a minute each, with noise on all outputs.
 
     Args:
         system: The system.
         seconds: Duration [s].
-        seed: Seed of controls and noise.
 
     Returns:
         The recording.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     rate = system.experiment.rate
 
     # Controls.
@@ -106,19 +105,18 @@ def bare(system: System, samples: int) -> float:
     return seconds / (count * steps) * samples
 
 
-def write_hour(hours: float, seed: int, file: Path) -> int:
+def write_hour(hours: float, file: Path) -> int:
     """Simulate a recording of the two joints and write it as CSV.
 
     Args:
         hours: Duration of the recording [h].
-        seed: Seed of controls and noise.
         file: The CSV file.
 
     Returns:
         Number of samples.
     """
     system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
-    recording = played(system, 3600.0 * hours, seed)
+    recording = played(system, 3600.0 * hours)
     write_recording(file, recording, system)
     return len(recording.ctrl)
 
@@ -143,12 +141,11 @@ def fit_hour(log: Path, folder: Path) -> tuple[CommandRun, dict[str, Any]]:
     return run, json.loads(estimate.read_text(encoding="utf-8"))
 
 
-def measured(hours: float, seed: int) -> Hour:
+def measured(hours: float) -> Hour:
     """Write, read and fit a recording.
 
     Args:
         hours: Duration of the recording [h].
-        seed: Seed of controls and noise.
 
     Returns:
         Measurements.
@@ -156,7 +153,7 @@ def measured(hours: float, seed: int) -> Hour:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         log = folder / "hour.csv"
-        samples = write_hour(hours, seed, log)
+        samples = write_hour(hours, log)
         size = log.stat().st_size / 1e6
 
         system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
@@ -223,6 +220,5 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    Console(width=160).print(hour_table(measured(args.hours, args.seed)), f"{cores()} cores")
+    Console(width=160).print(hour_table(measured(args.hours)), f"{cores()} cores")

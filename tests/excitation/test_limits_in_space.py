@@ -13,9 +13,9 @@ import pytest
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import open_boundary_warnings
+from mjfim.excitation.limits.constraint_kinds import Magnitude
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import limits_of
-from mjfim.excitation.limits.magnitudes import Magnitude
 from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
