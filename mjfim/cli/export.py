@@ -53,7 +53,7 @@ def export(
         require_options,
         write_export,
     )
-    from mjfim.output.export.plan import RobotPlan
+    from mjfim.output.export.trajectories import RobotPlan
     from mjfim.output.folders import find_experiment_file
 
     require_options(to, positions, storage, unit)

@@ -83,7 +83,7 @@ def robustness(
     run.finish(
         result,
         System.resolve(stated),
-        design=design_folder,
+        design=design_folder if design_folder.is_dir() else design_folder.parent,
         further={"seconds": seconds},
         remark=remark,
     )

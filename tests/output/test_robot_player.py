@@ -18,7 +18,7 @@ import pytest
 import mjfim
 from mjfim.experiment import System
 from mjfim.output.export.design import write_player
-from mjfim.output.export.plan import RobotPlan
+from mjfim.output.export.trajectories import RobotPlan
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats import read_table
 from tests.output.conftest import Designed

@@ -17,11 +17,11 @@ from mjfim.files import replacing
 from mjfim.model.coordinates import state_names
 from mjfim.output.archive import GAIN_NOTE, design_columns
 from mjfim.output.export import TARGETS
-from mjfim.output.export.plan import RobotPlan
 from mjfim.output.export.trajectories import (
     DATASET_FILES,
     ENDINGS,
     POSITIONS,
+    RobotPlan,
     bag_files,
     joint_trajectory,
     write_bag,
