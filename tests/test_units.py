@@ -181,11 +181,11 @@ def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path, name: str
         rescaled = rescale(original, units, tmp_path / "rescaled")
         clearance = constraint_set_of(DesignTask.resolve(rescaled.experiment)).clearance
         assert clearance is not None
-        measured = clearance.distances(motion * [units.length, 1.0], slopes=True)
-        assert measured.slope is not None
+        distances, slope = clearance.distances(motion * [units.length, 1.0], slopes=True)
+        assert slope is not None
         lengths = [clearance.distances.reach, clearance.least, clearance.scale]
-        slopes = measured.slope / [1.0, units.length]
-        found.append((np.array(lengths) / units.length, measured.d / units.length, slopes))
+        slopes = slope / [1.0, units.length]
+        found.append((np.array(lengths) / units.length, distances / units.length, slopes))
 
     assert (found[0][1] < 0.0).any() and (found[0][1] == found[0][0][0]).any()
     for value, expected in zip(found[1], found[0], strict=True):

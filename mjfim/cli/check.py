@@ -54,5 +54,5 @@ def check(
     if has_folder:
         run.finish(result, system)
     else:
-        run.print(result.summary(), page_of(result))
+        run.print(result.summary(), page_of(result, experiment=stated.source))
     raise typer.Exit(0 if result.ok else 1)

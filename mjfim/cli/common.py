@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
@@ -292,11 +292,7 @@ class Run:
         from mjfim.output.pages import page_of
 
         values = {**summary_with_origin(result, system, self.output), **further}
-        page = page_of(result)
-        if design is not None:
-            place = shlex.quote(str(design))
-            steps = (step.replace("DESIGN_FOLDER", place) for step in page.next_steps)
-            page = replace(page, next_steps=tuple(steps))
+        page = page_of(result, experiment=system.experiment.source, design=design)
         self.print(values, page, verdict)
         self.write(result, system, further, remark)
 

@@ -120,7 +120,7 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    page = page_of(result)
+    page = page_of(result, experiment=stated.source)
     if run.verbose:
         section = log_section([log.summary for log in logs])
         page = replace(page, sections=[*page.sections, section])

@@ -7,6 +7,7 @@ from files of others.
 from __future__ import annotations
 
 import base64
+import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -250,7 +251,13 @@ def write_report(folder: Path, made: ShownRecord | None = None, media: Media | N
     file = folder / REPORT
     names = [_name(folder, record) for record in records]
     facts = [_origin(folder, record) for record in records]
-    html = report_of(records, names, facts, media or media_in(file))
+    stated = [_stated(folder, record, "experiment") for record in records]
+    places = [os.path.normpath(folder / path) if path else None for path in stated]
+    pages = [
+        page_of(record, experiment=place, design=folder)
+        for record, place in zip(records, places, strict=True)
+    ]
+    html = report_of(records, names, facts, media or media_in(file), pages)
     with replacing(file) as temporary:
         temporary.write_text(html, encoding="utf-8", newline="\n")
     return file
@@ -261,6 +268,7 @@ def report_of(
     names: Sequence[str] = (),
     facts: Sequence[Mapping[str, str]] = (),
     media: Media | None = None,
+    pages: Sequence[Page] = (),
 ) -> str:
     """Return the report of some results as HTML.
 
@@ -269,6 +277,7 @@ def report_of(
         names: What each of them is named after.
         facts: Further facts of each of them.
         media: The video of the report.
+        pages: Page of each result; default: one without the paths of files.
     """
     # These libraries are slow to import, and only reports need them.
     from jinja2.utils import htmlsafe_json_dumps
@@ -276,7 +285,7 @@ def report_of(
     from plotly.offline import get_plotlyjs
 
     library, media = get_plotlyjs(), media or Media()
-    pages = [page_of(record) for record in records]
+    pages = pages or [page_of(record) for record in records]
     drawn = [_pictures(record, page) for record, page in zip(records, pages, strict=True)]
     limit = _limit_of([each for some in drawn for each in some.values()], len(library), media)
     results = [
@@ -360,7 +369,7 @@ def media_in(file: Path) -> Media:
 
 
 def _stated(folder: Path, record: ShownRecord, key: str) -> str:
-    """The name of a file that the JSON file of a result names; empty where it does not."""
+    """The path of a file that the JSON file of a result names; empty where it does not."""
     try:
         stated = read_json(folder / f"{record.file_stem}.json").get(key)
     except RecordingError:
@@ -368,12 +377,14 @@ def _stated(folder: Path, record: ShownRecord, key: str) -> str:
     # The file may have been written on another system.
     if not isinstance(stated, str):
         return ""
-    return PurePosixPath(PureWindowsPath(stated).as_posix()).name
+    return PureWindowsPath(stated).as_posix()
 
 
 def _origin(folder: Path, record: ShownRecord) -> dict[str, str]:
     """The experiment, the model and the recordings of a result, as far as they are known."""
-    found = {key: _stated(folder, record, key) for key in ("experiment", "model")}
+    found = {
+        key: PurePosixPath(_stated(folder, record, key)).name for key in ("experiment", "model")
+    }
     if isinstance(record, Estimate):
         names = [PurePath(recording.name).name for recording in record.recordings]
         found["recordings"] = first_ones(names, longest=MAX_RECORDINGS_TEXT)

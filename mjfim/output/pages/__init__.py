@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 
 from mjfim.errors import MjfimError
 from mjfim.output.page import Page
@@ -22,8 +25,15 @@ PAGES = {
 }
 
 
-def page_of(record: ShownRecord) -> Page:
+def page_of(
+    record: ShownRecord, *, experiment: str | None = None, design: Path | None = None
+) -> Page:
     """Return the page of a result.
+
+    Args:
+        record: The result.
+        experiment: Path of its experiment file, which the next steps name.
+        design: Folder or file of the design that it is or is about, likewise.
 
     Raises:
         MjfimError: If there is no page for this kind of record.
@@ -33,4 +43,8 @@ def page_of(record: ShownRecord) -> Page:
         raise MjfimError(f"a {kind} cannot be shown as a page")
     module, function = PAGES[kind]
     page: Page = getattr(import_module(f"{__name__}.{module}"), function)(record)
-    return page
+    steps = page.next_steps
+    for word, place in (("EXPERIMENT", experiment), ("DESIGN_FOLDER", design)):
+        if place is not None:
+            steps = tuple(step.replace(word, shlex.quote(str(place))) for step in steps)
+    return replace(page, next_steps=steps)

@@ -161,7 +161,10 @@ def _next_steps(estimate: Estimate) -> Iterator[str]:
         yield "Remove or fix one parameter of each group, give it a prior, or record other motions."
     if estimate.sloppy:
         names = first_ones(estimate.sloppy)
-        yield f"Design an experiment that tells more about {names}: `mjfim design EXPERIMENT`."
+        yield (
+            f"Design an experiment that tells more about {names}: "
+            "`mjfim design EXPERIMENT -o FOLDER`."
+        )
     if not any(prediction.held_out for prediction in estimate.predictions):
         yield (
             "Keep a recording out of the fit with `--held-out FILE`: a prediction of new data is "
