@@ -34,7 +34,7 @@ from mjfim.errors import (
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
 from mjfim.output.manifest import write_optional
-from mjfim.output.page import REPORT, Page, PictureFormat, render
+from mjfim.output.page import REPORT, Page, PictureFormat
 from mjfim.output.video import require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
@@ -306,7 +306,9 @@ def print_result(
 
         typer.echo(json_of(values), nl=False)
     else:
-        out.print(render(page, verbose=verbose))
+        from mjfim.output.terminal import TerminalPage
+
+        out.print(TerminalPage(page, verbose))
 
 
 # ---- files

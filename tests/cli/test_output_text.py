@@ -12,7 +12,8 @@ import pytest
 
 from mjfim.cli.common import replace_unencodable_characters
 from mjfim.cli.progress import errors, out
-from mjfim.output.page import Row, Table, render
+from mjfim.output.page import Row, Table
+from mjfim.output.terminal import TerminalPage
 from tests.support.cli import PROCESS, loads, misused, run, write_experiment
 from tests.support.pages import page_with
 from tests.support.paths import ROOT
@@ -39,7 +40,7 @@ def test_brackets_in_tables(capsys: pytest.CaptureFixture[str]) -> None:
     table = Table(
         title="title [/a]", columns=("heading [b]",), rows=(Row((NAME,)),), note="note [/c]"
     )
-    out.print(render(page_with(table)))
+    out.print(TerminalPage(page_with(table)))
     printed = capsys.readouterr().out
     shown = ("title [/a]", "heading [b]", NAME, "note [/c]")
     assert [text for text in shown if text not in printed] == []

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from mjfim.output.page import Level, Page, Part, Section, Text, Verdict, render
+from mjfim.output.page import Level, Page, Part, Section, Text, Verdict
+from mjfim.output.terminal import TerminalPage
 
 
 def printed(page: Page, width: int = 200, *, verbose: bool = False) -> str:
     """The text in a terminal without colours."""
     console = Console(width=width, no_color=True)
     with console.capture() as capture:
-        console.print(render(page, verbose=verbose))
+        console.print(TerminalPage(page, verbose))
     return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
 

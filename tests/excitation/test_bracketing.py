@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
+from mjfim.excitation.shortest_horizon import SampleGrid, smallest_feasible
 
 LAWS: dict[str, Callable[[int], float]] = {
     "square root": lambda n: (173 / n) ** 0.5,

@@ -1,0 +1,234 @@
+"""Pages on a terminal: a screen of text at most, or all tables and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from rich import box
+from rich import table as rich_table
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.padding import Padding
+from rich.text import Text as Styled
+
+from mjfim.output.page import (
+    Emphasis,
+    Level,
+    Listing,
+    Page,
+    Table,
+    Text,
+    capitalised,
+)
+
+# Largest number of lines of the short form, if its most important rows have the room.
+MAX_LINES = 20
+
+# Fewest rows of the first table, and of further tables and lists, that the short form shows.
+FEWEST_RESULTS, FEWEST = 10, 2
+
+# Space between two columns, and least width of a column of text [characters].
+GAP, FOLDED_WIDTH = 2, 12
+
+# Parts that a terminal shows.
+Shown = Table | Text | Listing
+
+# Rich style of every emphasis.
+STYLES = {
+    Emphasis.NORMAL: "",
+    Emphasis.STRONG: "bold",
+    Emphasis.WEAK: "dim",
+    Emphasis.WARNING: "yellow",
+    Emphasis.DERIVED: "cyan",
+}
+
+
+@dataclass(frozen=True)
+class TerminalPage:
+    """A page as a Rich console prints it.
+
+    Attributes:
+        page: The page.
+        verbose: True for all tables and sentences, False for a screen of text at most.
+    """
+
+    page: Page
+    verbose: bool = False
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Lay out the page for the width of the terminal which shows it."""
+        verdict = capitalised(self.page.verdict.text)
+        if verdict:
+            is_good = self.page.verdict.level is Level.GOOD
+            yield _styled(verdict, "bold" if is_good else "bold yellow")
+        parts: list[Shown] = [
+            *(Text(f"warning: {warning}", Emphasis.WARNING) for warning in self.page.warnings),
+            *(part for part in self.page.parts if self.verbose or not part.detail),
+            *(Text(f"Next: {step}") for step in self.page.next_steps[:1]),
+        ]
+        width, hidden = options.max_width, 0
+        if not self.verbose:
+            parts, hidden = _shortened(parts, width, MAX_LINES - _height(Text(verdict), width))
+        for part in parts:
+            if self.verbose and not isinstance(part, Text):
+                yield Styled()
+            yield from _rendered(part, width, verbose=self.verbose)
+        if hidden:
+            rows = "1 row or sentence" if hidden == 1 else f"{hidden} rows and sentences"
+            yield _styled(f"Not shown here: {rows}; --verbose shows everything", "dim")
+
+
+def _styled(text: str, style: str) -> Styled:
+    """A text of one style, which is folded and never cut."""
+    return Styled(text, style=style, overflow="fold")
+
+
+# ---- short form
+
+
+def _shortened(parts: Sequence[Shown], width: int, lines: int) -> tuple[list[Shown], int]:
+    """Leave out explanations, and then rows, until the parts have few enough lines."""
+    shown = list(parts)
+    for part in parts:
+        is_explanation = isinstance(part, Text) and part.emphasis is Emphasis.WEAK
+        if is_explanation and sum(_height(each, width) for each in shown) > lines:
+            shown.remove(part)
+    results = next((i for i, part in enumerate(shown) if isinstance(part, Table)), -1)
+    hidden = 0
+    while sum(_height(part, width) for part in shown) > lines - bool(hidden):
+        spare = [
+            _count(part) - (FEWEST_RESULTS if i == results else FEWEST)
+            for i, part in enumerate(shown)
+        ]
+        highest = max(range(len(shown)), key=spare.__getitem__, default=0)
+        if not spare or spare[highest] <= 0:
+            break
+        shown[highest] = _without_last(shown[highest])
+        hidden += 1
+    return shown, len(parts) - len(shown) + hidden
+
+
+def _count(part: Shown) -> int:
+    """Number of rows or items of a part."""
+    if isinstance(part, Text):
+        return 1
+    return len(part.rows if isinstance(part, Table) else part.items)
+
+
+def _height(part: Shown, width: int) -> int:
+    """Number of lines of a part; a long sentence may take one more."""
+    if isinstance(part, Table):
+        return (
+            2 + bool(part.title) + len(part.rows) + (_lines(part.note, width) if part.note else 0)
+        )
+    if isinstance(part, Text):
+        return _lines(part.text, width)
+    return bool(part.title) + sum(_lines(item, width - GAP) for item in part.items)
+
+
+def _lines(text: str, width: int) -> int:
+    """Number of lines of a text."""
+    return sum(-(-max(cell_len(line), 1) // width) for line in text.split("\n"))
+
+
+def _without_last(part: Shown) -> Shown:
+    """A part without its last row that does not stand out."""
+    if isinstance(part, Table):
+        plain = [row for row in part.rows if row.emphasis in (Emphasis.NORMAL, Emphasis.WEAK)]
+        last = (plain or part.rows)[-1]
+        return replace(part, rows=tuple(row for row in part.rows if row is not last))
+    return replace(part, items=part.items[:-1]) if isinstance(part, Listing) else part
+
+
+# ---- parts
+
+
+def _rendered(
+    part: Shown, width: int, *, verbose: bool
+) -> Iterator[Styled | Padding | rich_table.Table]:
+    """A part as what Rich prints."""
+    if isinstance(part, Text):
+        yield _styled(part.text, STYLES[part.emphasis])
+        return
+    if part.title:
+        yield _styled(part.title, "bold")
+    if isinstance(part, Listing):
+        bullet = "" if part.code else "• "
+        for item in part.items:
+            text = _styled(f"{bullet}{item}", STYLES[part.emphasis])
+            yield Padding(text, (0, 0, 0, GAP), expand=False)
+        return
+    shown = _columns(part, width, verbose=verbose)
+    widths = _widths(part, shown, width)
+    if widths is None:
+        yield from _paragraphs(part, shown)
+    else:
+        yield _grid(part, shown, widths)
+    if part.note:
+        yield _styled(part.note, "dim")
+
+
+def _columns(table: Table, width: int, *, verbose: bool) -> list[int]:
+    """The numbers of the columns for which there is room."""
+    shown = list(range(len(table.columns)))
+    if verbose:
+        return shown
+    for heading in reversed(table.spare):
+        if heading not in table.columns:
+            continue
+        names = max((cell_len(row.cells[0]) for row in table.rows), default=0)
+        widths = _widths(table, shown, width)
+        if widths is not None and widths[0] >= names:
+            break
+        shown.remove(table.columns.index(heading))
+    return shown
+
+
+def _widths(table: Table, shown: Sequence[int], available: int) -> list[int] | None:
+    """The width of each column, so that no number is folded; None if the table is too wide."""
+    least, natural = [], []
+    for k in shown:
+        heading = table.columns[k]
+        cells = max((cell_len(row.cells[k]) for row in table.rows), default=0)
+        words = max(map(cell_len, heading.split()), default=0)
+        natural.append(max(cells, cell_len(heading)))
+        is_folded = table.is_left(k)
+        least.append(max(words, min(cells, FOLDED_WIDTH) if is_folded else cells))
+    room = available - GAP * (len(shown) - 1) - sum(least)
+    if room < 0:
+        return None
+    # Text receives its full width first, so that headings are folded before names are.
+    for i in sorted(range(len(shown)), key=lambda i: not table.is_left(shown[i])):
+        added = min(natural[i] - least[i], room)
+        least[i] += added
+        room -= added
+    return least
+
+
+def _grid(table: Table, shown: Sequence[int], widths: Sequence[int]) -> rich_table.Table:
+    """A table whose columns have these widths."""
+    grid = rich_table.Table(
+        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, GAP - 1, 0, 0)
+    )
+    for k, width in zip(shown, widths, strict=True):
+        grid.add_column(
+            Styled(table.columns[k], style="dim"),
+            justify="left" if table.is_left(k) else "right",
+            vertical="top",
+            overflow="fold",
+            width=width,
+        )
+    for row in table.rows:
+        style = STYLES[row.emphasis]
+        grid.add_row(*(Styled(row.cells[k], style=style) for k in shown))
+    return grid
+
+
+def _paragraphs(table: Table, shown: Sequence[int]) -> Iterator[Styled | Padding]:
+    """Each row as a paragraph: its name, and below it the other cells with their headings."""
+    for row in table.rows:
+        style = STYLES[row.emphasis]
+        cells = [f"{table.columns[k]} {row.cells[k]}" for k in shown[1:] if row.cells[k]]
+        yield _styled(row.cells[0], style)
+        yield Padding(_styled(", ".join(cells), style), (0, 0, 0, GAP), expand=False)
