@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 from rich.cells import cell_len
 
-from mjfim.output.page import MAX_LINES, Emphasis, Listing, Row, Table, Text
+from mjfim.output.page import Emphasis, Listing, Row, Table, Text
 from mjfim.output.pages import page_of
+from mjfim.output.terminal import MAX_LINES
 from tests.support import results
 from tests.support.pages import page_with, printed
 
