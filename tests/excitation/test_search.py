@@ -77,6 +77,7 @@ def test_a_start_outside_the_limits_is_scaled_and_improved(tmp_path: Path) -> No
     assert verify(task, design.trajectory).is_feasible
 
 
+@pytest.mark.slow
 def test_limits_that_nothing_keeps_end_as_infeasible(tmp_path: Path) -> None:
     """The smallest force drives the cart out of its range."""
     limits = {"control": {"force": [4.0, 5.0]}, "position": {"slide": [0.05, 0.15]}}

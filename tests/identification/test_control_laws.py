@@ -540,6 +540,7 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
     assert found.absent == ("kp",)
 
 
+@pytest.mark.slow
 def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Path) -> None:
     experiment = arm_with_torques(
         tmp_path, {"shoulder": SHOULDER, "elbow": ELBOW}, TORQUE1 + TORQUE2

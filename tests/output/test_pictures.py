@@ -391,6 +391,7 @@ def test_a_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
     assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
 
 
+@pytest.mark.slow
 def test_pictures_need_no_matplotlib_and_figures_no_pyplot() -> None:
     code = (
         "import sys\n"

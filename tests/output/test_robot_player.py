@@ -213,6 +213,7 @@ def test_nothing_is_sent_far_from_the_start(player: ModuleType, tmp_path: Path) 
         played(player, robot, tmp_path / "recording.csv")
 
 
+@pytest.mark.slow
 def test_the_player_runs_as_a_program(script: Path, tmp_path: Path) -> None:
     """Without a robot it says what the design needs; with one it plays and says what it did."""
     python = (sys.executable, str(script))

@@ -261,6 +261,7 @@ def test_a_study_is_loaded_as_it_was(task: DesignTask, design: Design, tmp_path:
     round_trip(monte_carlo(task.experiment, curves, trials=3), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_comparison_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
     """The control of each method is part of the record."""
     methods = ["chirp", "steps"]

@@ -171,6 +171,7 @@ def test_only_applicable_methods_are_run() -> None:
         chosen_methods(hard, ["chrip"])
 
 
+@pytest.mark.slow
 def test_a_request_to_stop_keeps_finished_methods_and_the_best_of_the_last() -> None:
     token = StopToken()
 
@@ -315,6 +316,7 @@ def worse(design: Callable[..., Design]) -> Callable[..., Design]:
     return rigged
 
 
+@pytest.mark.slow
 def test_a_design_that_is_worse_is_reported_as_beaten(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
