@@ -137,14 +137,15 @@ def _with_draws(result: Estimate, system: System, count: int, seed: int) -> tupl
     """Draw robots from the uncertainty of an estimate.
 
     Returns:
-        The estimate, with the robots where that is possible, and otherwise the reason.
+        The estimate, with the robots if they could be drawn. Beside it, the end of a warning that
+        says why they were not drawn; empty if they were.
     """
     import numpy as np
 
     from mjfim.identification.assessment.parameter_draws import draw_parameters_system
     from mjfim.parallel.budget import run_optional
 
-    # Many bodies and robots take long, and Ctrl-C must not lose the fit.
+    # Drawing takes long for many bodies or robots, and Ctrl-C must not lose the fit.
     found: list[ParameterDraws] = []
     rng = np.random.default_rng(seed)
     try:

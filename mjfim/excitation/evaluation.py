@@ -1,4 +1,8 @@
-"""Evaluation of a trajectory for its information and its cost, and the warnings about a design."""
+"""Evaluation of controls and designs.
+
+A trajectory is evaluated for its information and its cost. What the initial control shows decides
+whether a design can begin. The evaluation of a finished design gives its warnings and its record.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +48,9 @@ from mjfim.records.trajectory import Trajectory
 
 # Growth of a disturbance along a trajectory without feedback above which the user is warned.
 UNSTABLE_GROWTH = 1e3
+
+
+# ---- points
 
 
 def point_at_stated_rate(stage: DescentLevel, control: Array) -> DesignPoint | None:
@@ -99,6 +106,9 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
     )
 
 
+# ---- growth of disturbances
+
+
 def growth_along(task: DesignTask, trajectory: Trajectory) -> float:
     """Largest open-loop amplification of a small deviation along a trajectory."""
     A = task.plant.derivatives.jacobians(task.theta, trajectory)[0]
@@ -106,7 +116,7 @@ def growth_along(task: DesignTask, trajectory: Trajectory) -> float:
 
 
 def growth_warning(growth: float) -> str | None:
-    """Warning about strong growth of small disturbances; None where it is not strong."""
+    """Warning about strong growth of small disturbances; None where the growth is not strong."""
     if not growth > UNSTABLE_GROWTH:
         return None
 
@@ -115,6 +125,9 @@ def growth_warning(growth: float) -> str | None:
         "is played open loop; the predicted σ assumes that there is no disturbance. Play it "
         "with the gains of design.npz, or raise cost.control"
     )
+
+
+# ---- a given control
 
 
 def evaluate(
@@ -181,6 +194,9 @@ def _evaluate_control(task: DesignTask, control: Array) -> Evaluation:
     identifiability = task.identifiability_test.along(point.trajectory, point.sensitivity)
     stage = DescentLevel(task, identifiability.basis)
     return evaluate_point(stage, stage.problem.reevaluated(point))
+
+
+# ---- warnings about a design
 
 
 def design_warnings(
@@ -270,6 +286,9 @@ def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
     yield from probable_degrees(experiment, task.system.source)
 
 
+# ---- whether a design can begin
+
+
 def identifiability_along(task: DesignTask, begin: DesignPoint) -> Identifiability:
     """Find the combinations of parameters that can be identified.
 
@@ -318,8 +337,8 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     """Require that every parameter has an effect, and that the initial control excites it.
 
     The initial control has to excite every combination of parameters that a random control
-    excites. Members of a declared inertia may have no effect; the design then works on the
-    combinations that have one.
+    excites. Single parameters of an inertia that `inertial` states may have no effect. The design
+    then works on the combinations that have one.
 
     Args:
         task: The task.
@@ -343,7 +362,7 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
             f"{'it' if len(silent) == 1 else 'them'}, or measure a quantity that shows the effect"
         )
 
-    # A criterion for combinations that cannot be identified.
+    # A criterion that asks for combinations that cannot be identified.
     if task.contrast is not None:
         information = replace(task.information, basis=identifiability.basis)
         if not information.is_estimable(task.contrast).all():
@@ -355,8 +374,8 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     if not along_all.basis.shape[1]:
         raise UnidentifiableError("no parameter has an effect on the measured outputs")
 
-    # Combinations that random controls excite, but not the initial one. A search over all releases
-    # does not need it.
+    # Combinations that random controls excite, but the initial one does not. A search over all
+    # releases does not begin at the initial one.
     if task.release is not None:
         return
     if identifiability.along_trajectory.count > along_all.count:
@@ -369,7 +388,7 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
 
 
 def _unexcited_group(group: ParameterGroup) -> str:
-    """Name of a group that has an effect, but not along the initial control."""
+    """Name of a group of parameters that the initial control does not excite."""
     return group.short if group.combinations else group.short_names
 
 
@@ -377,6 +396,9 @@ def _subject(names: Sequence[str]) -> str:
     """Beginning of a sentence about some parameters."""
     quoted = listed([f"parameters.{name}" for name in names])
     return f"{quoted} {'changes' if len(names) == 1 else 'change'}"
+
+
+# ---- the record of a design
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -427,7 +449,14 @@ class DesignReport:
         steps: int,
         interrupted: bool,
     ) -> Design:
-        """The design of the best run, with its warnings."""
+        """The record of the design, with its warnings.
+
+        Args:
+            best: How the search ended for the candidate that gave the design.
+            seconds: Time of the search [s].
+            steps: Engine steps of the search.
+            interrupted: Whether the search was stopped on request.
+        """
         task = self.stage.task
         initial = evaluate_point(self.stage, self.initial)
         final = evaluate_point(self.stage, self.final)
@@ -479,7 +508,7 @@ class DesignReport:
         found: Verification,
         warnings: tuple[str, ...],
     ) -> Design:
-        """The record of the design."""
+        """The record, from all its parts."""
         task = self.stage.task
         information = self.stage.problem.information
         parameters = task.parameters

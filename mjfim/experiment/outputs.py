@@ -1,6 +1,7 @@
 """The measured outputs of an experiment and their noise.
 
-They follow from its tables `noise` and `correlated`, the state and the sensors of the model.
+They follow from the tables `noise` and `correlated` of the experiment file, and from the state and
+the sensors of the model.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def resolve_outputs(
         measured.update(rows)
 
     for block in experiment.correlated:
-        rows = _correlated_rows(block, columns, covariance, strides)
+        rows = _correlated_columns(block, columns, covariance, strides)
         covariance[np.ix_(rows, rows)] = _checked_covariance(
             "correlated.covariance", block.covariance, len(rows)
         )
@@ -111,10 +112,10 @@ def _place(component: StateComponent | SensorComponent) -> dict[str, Any]:
     return {"sensor": component.address}
 
 
-def _correlated_rows(
+def _correlated_columns(
     block: Correlated, columns: list[str], covariance: Array, strides: np.ndarray
 ) -> list[int]:
-    """Columns of a block of the table `correlated`, which must be free of other correlations."""
+    """Numbers of the columns of one table `correlated`, which must have no other correlations."""
     for name in block.outputs:
         if name not in columns:
             raise ExperimentError(
@@ -145,8 +146,8 @@ def columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
 
     # Where a sensor has the name of a key of the state, the key means the state.
     columns_of_sensor: dict[str, list[str]] = {}
-    for number in coordinates.sensors:
-        columns_of_sensor.setdefault(number.sensor, []).append(number.name)
+    for component in coordinates.sensors:
+        columns_of_sensor.setdefault(component.sensor, []).append(component.name)
     return found | {k: columns for k, columns in columns_of_sensor.items() if k not in found}
 
 
@@ -156,7 +157,7 @@ def _noise_of_mjcf(coordinates: ModelCoordinates, *, required: bool) -> dict[str
     They are used if the experiment states no noise. Raises ExperimentError if `required` and the
     MJCF states none either.
     """
-    stated = {number.sensor: number.sigma for number in coordinates.sensors if number.sigma > 0}
+    stated = {each.sensor: each.sigma for each in coordinates.sensors if each.sigma > 0}
     if required and not stated:
         valid = listed(["state", *coordinates.measurable])
         raise ExperimentError(

@@ -21,7 +21,7 @@ from mjfim.model.targets import InertiaField, OutputBiasField, OutputDelayField
 from mjfim.model.variants import MocapPlacement
 from mjfim.plant.outputs import Outputs
 
-# Prefix of the names of parameters that are nuisance deviations of the initial state.
+# Beginning of the name of a nuisance parameter that changes the initial state.
 INITIAL_STATE_PREFIX = "initial "
 
 # Standard deviation of the logarithm of a pseudo-inertia relative to that of the model, where none
@@ -84,6 +84,7 @@ def _single_parameter(
     """A parameter with targets or a function. period: sample period of the experiment [s]."""
     guess, unit, magnitude = spec.guess, spec.unit, 0.0
     try:
+        # The first target gives the unit and the natural size, and the guess where none is stated.
         targets = tuple(_target(stated, source, outputs.names) for stated in spec.all_targets)
         for target in targets[:1]:
             if guess is None:
@@ -127,7 +128,7 @@ def _single_parameter(
 
 
 def _magnitude(target: Target, model: Any, outputs: Outputs, period: float) -> float:
-    """Size with which a change of a target is compared [unit of the target].
+    """Natural size of a target, with which its changes are compared [unit of the target].
 
     The size of a bias is the standard deviation of the noise, that of a delay the sample period.
     """
@@ -142,7 +143,7 @@ def _magnitude(target: Target, model: Any, outputs: Outputs, period: float) -> f
 def _require_inside(
     name: str, spec: ParameterSpec, guess: float, bounds: tuple[float, float]
 ) -> None:
-    """Refuse a guess or a true value outside the bounds, which physics may have set."""
+    """Refuse a guess or a true value outside the bounds, stated ones or those of physics."""
     for key, value in (("guess", guess), ("true", spec.true)):
         if value is None or bounds[0] <= value <= bounds[1]:
             continue
@@ -174,7 +175,7 @@ def _target(stated: TargetSpec, source: ModelSource, outputs: Sequence[str]) -> 
 def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]:
     """The ten coordinates of a body's inertia.
 
-    The stated prior is relative to the natural magnitude of each coordinate.
+    The stated prior is relative to the natural size of each coordinate.
     """
     key = f"parameters.{name}.inertial"
     kind = spec.coordinates or "logcholesky"
@@ -243,7 +244,7 @@ def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[in
 def _nuisance(
     stated: Nuisance, source: ModelSource, outputs: Sequence[str]
 ) -> Iterator[tuple[str, ParameterSpec]]:
-    """Names and tables of the parameters for which the table `nuisance` is short."""
+    """Names and tables of the parameters that the table `nuisance` stands for."""
     coordinates = source.coordinates
     paths = {c.name: c.path for c in coordinates.deviations if c.path}
     units = {c.name: c.unit for c in coordinates.deviations}
@@ -272,7 +273,7 @@ def _nuisance(
 
 
 def _deviation(path: str, prior: Any, unit: str, *, per_recording: bool) -> ParameterSpec:
-    """A nuisance parameter whose guess is zero."""
+    """A nuisance parameter, which is zero in the model and may have any sign."""
     return ParameterSpec(
         target=path,
         guess=0.0,
@@ -285,7 +286,7 @@ def _deviation(path: str, prior: Any, unit: str, *, per_recording: bool) -> Para
 
 
 def _priors_by_name(key: str, stated: Any, names: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """(name, prior) of one value that holds for all names, or of a table by name."""
+    """Yield (name, prior) from one value for all names, or from a table by name."""
     if stated is None:
         return
     table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)

@@ -1,7 +1,7 @@
 """Units of the numbers of an experiment: those that are stated, and angles that look like degrees.
 
-Numbers in the file are in the units of the model, or have a unit of their own ("90 deg"), which is
-compared here with the unit of what the number states.
+Numbers in the file are in the units of the model, or have a unit of their own ("90 deg"). Such a
+unit is compared here with the unit that the model gives to the number.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from mjfim.model.paths import unit_of
 from mjfim.model.units import ANGLE, control_unit, per_second, sensor_unit
 from mjfim.recordings.quantities import Quantity, Unit, wrong_unit
 
-# Angles beyond this number of turns look like degrees if they are round in degrees.
+# Angles beyond TURNS turns look like degrees if they are multiples of ROUND_DEGREES.
 TURNS = 2.0
 ROUND_DEGREES = 5.0
 
-# Angles beyond one turn look like degrees if only so they are inside the range of their joint.
+# One turn and one degree [rad]. Angles beyond one turn look like degrees, too, if they are outside
+# the range of their joint or control as radians, and inside as degrees.
 TURN = 2.0 * np.pi
 DEGREE = TURN / 360.0
 
-# Keys that lead to a number of an experiment, indices in lists among them.
+# Keys that lead to a number of an experiment, and indices where a key holds a list.
 Keys = tuple[Any, ...]
 Range = tuple[float, float]
 
@@ -87,7 +88,7 @@ def _numbers(value: Any, keys: Keys = ()) -> Iterator[tuple[Keys, float]]:
 
 
 def _place(keys: Keys) -> str:
-    """A number in messages, such as `initial.qpos[1]`; both bounds of a range have one name."""
+    """Name of a number in messages, such as `initial.qpos[1]`; a range has one name."""
     if isinstance(keys[-1], int) and keys[0] != "initial":
         keys = keys[:-1]
     parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
@@ -106,7 +107,7 @@ def _looks_like_degrees(number: float, ranges: Sequence[Range] | None) -> bool:
 
 
 class _Units:
-    """Units in the model of the numbers of an experiment."""
+    """Units that the model gives to the numbers of an experiment."""
 
     def __init__(self, experiment: Experiment, source: ModelSource) -> None:
         self.experiment = experiment
@@ -119,7 +120,8 @@ class _Units:
         """
         for length in (2, 3):
             if (units := self.tables.get(keys[:length])) is not None:
-                # Of the element that a table names, or of all; a wrong name is refused later.
+                # A number for all elements, or for the one that a table names. Wrong names are
+                # refused elsewhere.
                 names = keys[length:]
                 if not names:
                     return tuple(units.values())
@@ -216,8 +218,9 @@ class _Units:
         model, coordinates = self.source.model, self.source.coordinates
         # The noise of an orientation is an angle, although its quaternion has no unit.
         units = {c.name: c.unit if c.sigma_factor == 1.0 else ANGLE for c in coordinates.state}
-        for number in coordinates.sensors:
-            units[number.name] = sensor_unit(model, identifier(model, "sensor", number.sensor))
+        for component in coordinates.sensors:
+            sensor = identifier(model, "sensor", component.sensor)
+            units[component.name] = sensor_unit(model, sensor)
         return units
 
 
@@ -226,7 +229,8 @@ def _parameter_unit(spec: ParameterSpec, source: ModelSource) -> str:
     targets = spec.all_targets
     if targets and abs(targets[0].scale) == 1.0:
         return _unit_of_path(source, targets[0].path)
-    # The parameter has a unit of its own; only numbers in SI units fit to what was converted.
+    # The parameter has a unit of its own. Numbers with a unit are converted to SI units when the
+    # file is read, so that they fit a parameter in SI units only.
     try:
         is_si = Unit.parse(spec.unit).factor == 1.0
     except ValueError:

@@ -1,8 +1,10 @@
 """The system that an experiment is about: model, parameters, outputs, noise, time grid and plant.
 
 A system has no horizon, no cost and no control; these belong to the tasks in `excitation.task` and
-`identification.task`. Every name in the experiment is checked here against the model. A system
-makes synthetic recordings, and worker processes make it again from an order.
+`identification.task`. Every name in the experiment is checked here against the model.
+
+A system makes synthetic recordings. Worker processes make a system again from its order. Pictures
+and records take the labels of its joints, controls, parameters and outputs.
 """
 
 from __future__ import annotations
@@ -183,7 +185,10 @@ class System:
         grid = self.stated_grid.with_variant(variant)
 
         def plant(speeds: tuple[float, ...], smooth: Plant | None) -> Plant:
-            """A plant whose dry friction is viscous below these speeds."""
+            """A plant whose dry friction is viscous below these speeds.
+
+            smooth: Plant that computes its derivatives; None where it computes them itself.
+            """
             relaxed = relaxation
             if speeds:
                 relaxed = replace(relaxation or Relaxation(), smoothing_speeds=speeds)
@@ -235,13 +240,13 @@ class System:
         )
 
     def released_as(self, state: Array) -> System:
-        """This system, which begins in a state where a design chooses the release.
+        """This system, released in the first state of a trajectory.
 
         Args:
             state: (ns,) first state of a trajectory, at the theta of the design.
 
         Returns:
-            This system itself where the experiment fixes the initial state.
+            The released system; this system itself where the experiment fixes the initial state.
         """
         if not self.experiment.initial.free:
             return self
@@ -398,7 +403,7 @@ class System:
 
     @cached_property
     def _whole_model(self) -> PlantModel:
-        """The user's model with sensors and constraints on."""
+        """A copy of the user's model in which sensors and constraints are never switched off."""
         return self._plant_model(sensors=True, friction=True)
 
     def model_at(self, theta: Array, *, at_keyframe: bool = True) -> Any:
@@ -420,8 +425,8 @@ class System:
     def model_with_stated_solver(self, theta: Array) -> Any:
         """The user's model with parameters and with the solver settings of the MJCF.
 
-        Other models solve for constraint forces to a private tolerance and without a warm start,
-        and with a quicker solver where that finds the same forces.
+        Other models of this class solve for constraint forces with a small tolerance and without a
+        warm start. Where a quicker solver finds the same forces, they use it.
 
         Args:
             theta: (p,) parameter values.
@@ -451,7 +456,7 @@ class System:
 def _require_supported(source: ModelSource) -> None:
     """Raise ModelError for a model that mjfim cannot use.
 
-    It has a state that mjfim cannot read, or a timestep that is not positive.
+    Such a model has a timestep that is not positive, or a state that mjfim cannot read.
     """
     model = source.model
     timestep = model.opt.timestep
@@ -495,13 +500,13 @@ def simulate(
     """Simulate a recording at the `true` parameter values.
 
     The trajectory's control is applied open loop, and noise is added to the measured samples. The
-    motion begins at the initial state of the experiment, or where a design chooses the release, at
-    that of the trajectory.
+    motion begins at the initial state of the experiment. Where a design chooses the release, it
+    begins at the first state of the trajectory.
 
     Args:
         experiment: The experiment.
-        trajectory: The trajectory whose control is applied; or (N, nu) controls, with control laws
-            what they read of a log.
+        trajectory: The trajectory whose control is applied, or (N, nu) controls. With control laws,
+            these are the columns of a log that the laws read.
         seed: Seed of the noise, or a generator of random numbers.
         threads: Threads for the engine; default: one per core.
 
@@ -509,6 +514,7 @@ def simulate(
         The recording; outputs that are not measured at a sample are NaN.
 
     Raises:
+        ExperimentError: Something is wrong in the experiment, or the controls have a wrong shape.
         SimulationDivergedError: The simulation diverges under this control.
     """
     system = System.resolve(experiment, threads=threads)
@@ -556,7 +562,7 @@ def simulate_system(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SystemOrder:
-    """Everything that determines a system on the user's model. It can be pickled.
+    """What a worker process needs to make a system again. It can be pickled.
 
     Attributes:
         experiment: The experiment, with its files.
@@ -574,7 +580,7 @@ class SystemOrder:
 
     @classmethod
     def of(cls, system: System, threads: int) -> SystemOrder:
-        """Describe a system.
+        """Make the order of a system.
 
         Args:
             system: A system on the plant that the experiment states, or with other substeps.

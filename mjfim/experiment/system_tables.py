@@ -1,6 +1,7 @@
 """Tables of the experiment file about the system.
 
-They state the initial state, the unknown parameters and the measurement noise.
+They state the control laws, the initial state and control, the physical terms, the unknown
+parameters, the noise of the measurements and the nuisances. `task_tables` has the other tables.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from mjfim.recordings.section import (
 # A time that may be zero.
 Delay = Annotated[NonNegative, WithUnit("s")]
 
+# Rows of a matrix.
 Matrix = tuple[tuple[Finite, ...], ...]
 
 # Kinds of physical terms, those of `mjfim.model.terms.library`.
@@ -49,6 +51,7 @@ TermKind = Literal[
 # Largest number of harmonics of a multisine.
 MAX_HARMONICS = 10_000
 
+# Standard deviation of a nuisance before the experiment; True where nothing is known about it.
 PriorOrUnknown = PositiveWithUnit | Literal[True]
 
 
@@ -56,9 +59,9 @@ class ControllerSpec(Section):
     """Law with which the driver of an actuator computes its control from a log and from the joint.
 
     The law is evaluated at its own rate, and its control is held in between. The control is
-    `kp (reference - position) + kd (reference velocity - velocity) + integral + feed-forward`,
-    clipped to its range, in the unit of the actuator, which is called u here. Unknown numbers are
-    parameters, with the target `controller/<actuator>:kp` for example.
+    `kp (reference - position) + kd (reference velocity - velocity) + integral + feed-forward`. It
+    is clipped to its range and has the unit of the actuator, which is called u here. Unknown
+    numbers are parameters, with the target `controller/<actuator>:kp` for example.
     """
 
     kind: Literal["torque", "voltage", "current"] | None = Field(

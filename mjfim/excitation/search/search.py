@@ -3,8 +3,8 @@
 Candidates climb a ladder of rungs, from levels that are quick to the stated one, and a share of
 them goes on from each rung. Moves take a candidate and a time and yield a better one: a descent on
 a rung, scaling into the limits, and random changes. A candidate counts when it was seen on the
-stated plant; the best one so far is the result at any moment, the start included. On an executor
-each move is one task, which may be lost without harm to the others.
+stated plant; the best one so far is the result at any moment, the start included. On an executor,
+descents run side by side. Each is one task or several, which may be lost without harm to others.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from mjfim.records.design import (
 )
 from mjfim.records.events import DesignEvent
 
-# One in this number of candidates goes on from a rung to the next one.
+# On each rung, one of this number of candidates goes on to the next rung.
 HALVING_RATE = 4
 
 # Share of the time that is left, and of the iterations, for a rung below the stated one: with
@@ -66,44 +66,53 @@ LAST_WEIGHTS: dict[int, tuple[float, ...]] = {
     3: (0.03, 3e-4, 1e-4),
 }
 
-# Barrier on the stated level after several coarse ones. With the optimum so close, only the barrier
-# keeps the cost above it.
+# Barrier on the stated level after several coarse ones. So close to the optimum, the barrier alone
+# keeps the cost above the lowest one.
 SHARP_BARRIER = Barrier(
     first=1e-3, last=1e-5, relaxation=0.1, tolerance=1e-6, follows_curvature=True
 )
 
-# Barrier weights with which a single coarse level ends: with several candidates, and with few where
-# it differs by its timestep only; its minima are then close to those of the stated level.
+# Barrier weights with which a single coarse level ends. The second one is for few candidates on a
+# level that differs from the stated one by its timestep only. The minima of both levels are close
+# then.
 FIRST_LAST_WEIGHT = 0.01
 CLOSE_LAST_WEIGHT = 1e-3
 
-# The same, and its share of the time, where that allows few evaluations only on the stated level.
+# Barrier weight and share of the time of a single coarse level, where there is time for only few
+# evaluations on the stated level.
 BRIEF_LAST_WEIGHT = 0.03
 BRIEF_SHARE = 0.75
 
-# Number of evaluations for which there has to be time before a descent, and of iterations for which
-# a candidate should have time on the first rung.
+# Number of evaluations for which there has to be time before a descent.
 FEWEST_EVALUATIONS = 20.0
+
+# Number of iterations for which each candidate should have time on the first rung.
 ITERATIONS_OF_A_START = 50
 
-# Time of the iterations on a further rung below which it is not begun, in evaluations.
+# Number of iterations for which there has to be time before a further rung. The time of one
+# evaluation counts as that of an iteration.
 FEWEST_ITERATIONS = 6.0
 
-# Number of iterations that a stage of the barrier takes at least, where there is time for few.
+# Number of iterations for which there has to be time in each stage of the barrier, where time is
+# short.
 ITERATIONS_OF_A_STAGE = 5.0
 
-# Shares of the time for random changes: where derivatives may mislead before a descent, where the
-# start is far outside the limits, between two descents, and at the end. The rest is for the report.
+# Shares of the time for random changes before a descent: where derivatives may mislead, and where
+# the start is far outside the limits.
 PROBE_SHARE = 0.1
 OUTSIDE_SHARE = 0.4
+
+# Shares of the time for random changes between two descents, and at the end. The rest is for the
+# report.
 RANDOM_SHARE = 0.5
 CLOSING_SHARE = 0.95
 
-# Factor by which a control is enlarged where there is time for few evaluations only.
+# Factor by which a control is enlarged in each step, where there is no time for a descent.
 ENLARGING = 1.25
 
-# Time of a move on a worker, and the same in evaluations; the longer one counts. Between two moves
-# the iterates are shown, and a request to stop costs one move at most where workers do not see it.
+# Longest time of a move on a worker [s], and in evaluations; the longer one counts. Between two
+# moves the iterates are shown. Where workers do not see a request to stop, it takes one move at
+# most.
 MOVE_SECONDS = 8.0
 MOVE_EVALUATIONS = 60.0
 
@@ -119,9 +128,10 @@ class Search:
         stage: The stated level on the unmodified plant.
         first: The initial control, evaluated on it.
         budget: Ends the search.
-        executor: Workers of the moves; None for this process.
+        executor: Workers that carry out the descents; None for this process.
         evaluation_seconds: Time of one evaluation [s].
         keeps_curves: Candidates remain sums of their curves on all rungs.
+        remote_steps: Engine steps of the workers.
     """
 
     stage: DescentLevel
@@ -144,17 +154,17 @@ class Search:
 
     @cached_property
     def inside(self) -> InsideSearch:
-        """Search without derivatives within the limits."""
+        """Search without derivatives, for controls that keep the limits."""
         return InsideSearch(self.grounds.cost, self.stage.task.experiment.descent.seed)
 
     @cached_property
     def scaled(self) -> InsideControl | None:
-        """The initial control as large as the limits allow; None where no share keeps them."""
+        """The initial control, scaled into the limits; None where no share of it keeps them."""
         return self.inside.scaled(self.stage.task.control, self.budget)
 
     @property
     def scaled_start(self) -> ScaledStart | None:
-        """The scaled initial control as an entry of the design; None where it keeps the limits."""
+        """The scaled control, for the record; None if the initial control keeps the limits."""
         if not self.grounds.is_limited or self.keeps_limits(self.first) or self.scaled is None:
             return None
         return self.scaled.record
@@ -174,7 +184,8 @@ class Search:
         """Yield every iterate; return the candidates that were begun.
 
         Args:
-            candidates: Controls from which the search begins; the first one is begun always.
+            candidates: Controls from which the search begins. The first one is always begun, the
+                others as time allows.
         """
         if not self.grounds.is_limited and not self.keeps_curves:
             return (yield from self._moved(candidates, self._free_rungs, is_last=True))
@@ -189,7 +200,7 @@ class Search:
             free = [each for each in waiting if each.curves is None and each.repeats == 1]
             climbed = yield from self._moved(free, self._free_rungs, is_last=True)
             found = {each.name: each for each in climbed}
-            done = [self._seen(each) for each in climbed if not each.has_left]
+            done = [self._judged(each) for each in climbed if not each.has_left]
             left = {each.name for each in done}
             waiting = [
                 replace(found.get(each.name, each), has_left=False)
@@ -204,7 +215,7 @@ class Search:
             done += yield from self._run_inside(waiting)
         return done
 
-    # ---- without derivatives
+    # ---- before a descent
 
     def _enlarged(self, first: Candidate) -> Candidate:
         """The first candidate, enlarged while it keeps all limits and its cost falls."""
@@ -222,10 +233,10 @@ class Search:
     def _prepared(
         self, first: Candidate, *, is_rough: bool
     ) -> Generator[DesignEvent, None, Candidate]:
-        """The first candidate with the best control inside that is found before a descent.
+        """The first candidate with a control within the limits, where one is found.
 
-        Where the start is far outside the limits, and where derivatives may mislead, random
-        controls are tried.
+        The control is scaled into the limits. Where the start is far outside them, and where
+        derivatives may mislead, random controls are tried as well.
         """
         best = self._inside_of(first)
         if best is None:
@@ -243,7 +254,7 @@ class Search:
         return replace(first, control=best.begin) if is_outside else first
 
     def _inside_of(self, candidate: Candidate) -> InsideControl | None:
-        """The best control inside that scaling finds: of a candidate, or of the initial control."""
+        """The better of a candidate and the initial control, both scaled into the limits."""
         centre = self.grounds.stated.task.centre
         found = [self.scaled]
         if candidate.control is not self.stage.task.control:
@@ -251,7 +262,7 @@ class Search:
             found.append(self.inside.largest(centre, deviation, self.budget))
         return min((each for each in found if each), key=lambda each: each.cost, default=None)
 
-    # ---- within limits
+    # ---- descents within the limits
 
     def _run_inside(
         self, candidates: list[Candidate]
@@ -274,8 +285,8 @@ class Search:
     ) -> Generator[DesignEvent, None, Candidate]:
         """Descend once more where nothing keeps the limits, from controls strictly inside.
 
-        These are what holds the start, and the control that the candidate has found; where they are
-        outside, the barrier alone steers them inside first.
+        These are the constant controls that nearly hold the initial state, and the one that the
+        candidate has found. Those that are outside are first moved inside by the barrier alone.
         """
         task = self.grounds.stated.task
         holding = [np.tile(centre, (task.samples, 1)) for centre in reversed(task.centres)]
@@ -316,7 +327,7 @@ class Search:
         return list(results.values())
 
     def _has_time_for(self, batch: list[Candidate], rung: Rung) -> bool:
-        """Whether some iterations of a rung fit into the time; without a result it is tried."""
+        """Whether there is time for some iterations of a rung; True if nothing was found yet."""
         if not any(each.best is not None for each in batch):
             return True
         level = self.grounds.ground(rung.variant, batch[0]).level
@@ -342,6 +353,8 @@ class Search:
         last = barrier.first / MU_FACTOR ** (stages - 1)
         short = replace(barrier, last=max(last, barrier.last), relaxation=Barrier.relaxation)
         return replace(rung, barrier=short)
+
+    # ---- random changes
 
     def _helped_by_chance(
         self, done: list[Candidate], ladder: tuple[Rung, ...]
@@ -410,13 +423,13 @@ class Search:
         self._cost_by_chance = candidate.cost
         return candidate, inside
 
-    def _seen(self, candidate: Candidate) -> Candidate:
-        """A candidate of a descent without a barrier, seen within the limits."""
+    def _judged(self, candidate: Candidate) -> Candidate:
+        """A candidate of a descent without a barrier, judged on the stated plant."""
         climb = Climb(self.grounds, self._move(candidate, (), self.budget.seconds_left, True))
         status = candidate.status
         return replace(climb.judged(self.grounds.stated.task.system.variant), status=status)
 
-    # ---- rungs
+    # ---- rungs, and what they depend on
 
     @cached_property
     def _free_rungs(self) -> tuple[Rung, ...]:
@@ -497,7 +510,10 @@ class Search:
         return self.stage.task.experiment.descent.max_iterations
 
     def _is_rough(self, control: Array) -> bool:
-        """Check whether derivatives may mislead along the initial control."""
+        """Check whether derivatives may mislead along a control.
+
+        This is known of the initial control only; for others the answer is False.
+        """
         task = self.stage.task
         if control is not task.control or self.first.trajectory is None:
             return False
@@ -517,12 +533,12 @@ class Search:
         )
         return found is not None
 
-    # ---- moves, here or on workers
+    # ---- descents, here or on workers
 
     def _move(
         self, candidate: Candidate, rungs: tuple[Rung, ...], seconds: float, is_last: bool
     ) -> Move:
-        """An order for a candidate."""
+        """A move for a candidate. seconds: its time [s]."""
         left = max(self._max_iterations - max(candidate.iterations - 1, 0), 1)
         share = rungs[0].share if rungs else 1.0
         return Move(
@@ -538,7 +554,7 @@ class Search:
     def _moved(
         self, candidates: Sequence[Candidate], rungs: tuple[Rung, ...], *, is_last: bool
     ) -> Generator[DesignEvent, None, list[Candidate]]:
-        """Let candidates climb some rungs; those without time are left out."""
+        """Let candidates climb some rungs; those for which there is no time are left out."""
         share = rungs[0].share if len(rungs) == 1 else 1.0
         if self.executor is not None and (len(candidates) > 1 or self.grounds.is_limited):
             return (yield from self._moved_on_workers(candidates, rungs, share, is_last))
@@ -548,7 +564,8 @@ class Search:
         for candidate in candidates:
             if moved and self.budget.exhausted is not None:
                 break
-            # The last ones of a rung get at least half of their share, where others took longer.
+            # On a single rung, the candidates that wait share the time that is left of it. Without
+            # a barrier, each of them may take all time.
             seconds = end - self.budget.seconds_used
             if len(rungs) == 1:
                 seconds /= len(candidates) - len(moved)
@@ -608,7 +625,7 @@ class Search:
         return [self._ended(each, rungs[-1], is_last) for each in ended]
 
     def _ended(self, found: Candidate, rung: Rung, is_last: bool) -> Candidate:
-        """A candidate after its last move, compared on the stated plant."""
+        """A candidate after its last move, judged on the stated plant."""
         if rung.barrier is not None and not (found.is_judged or found.has_left):
             move = self._move(found, (rung,), 0.0, is_last)
             judged = Climb(self.grounds, move).judged(rung.variant)
@@ -643,18 +660,18 @@ def candidate_of(start: InitialControl) -> Candidate:
 
 
 def _rungs_left(candidate: Candidate, rungs: tuple[Rung, ...]) -> tuple[Rung, ...]:
-    """The rungs that a candidate has not left behind."""
+    """The rungs that a candidate still has to climb: the last one if it has found a control."""
     return rungs if candidate.best is None else rungs[-1:]
 
 
 def _is_unfinished(candidate: Candidate) -> bool:
-    """Whether the time of a move was over before its descent."""
+    """Whether the time of a move ended before its descent did."""
     is_over = candidate.is_judged or candidate.has_left or candidate.is_held_up
     return candidate.status is None and not is_over
 
 
 def _named_stop(candidate: Candidate, budget: Budget) -> Candidate:
-    """A candidate whose status says that the search was stopped, where its descent had no end."""
+    """A candidate whose status says that a request has stopped its descent, where that is so."""
     if budget.stop.requested and candidate.status is None:
         return replace(candidate, status=Status.INTERRUPTED)
     return candidate

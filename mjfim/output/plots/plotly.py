@@ -1,4 +1,7 @@
-"""Pictures for Plotly: the traces and the layout of each panel, small enough for one file."""
+"""Pictures for Plotly: the traces and the layout of each panel.
+
+A page holds all its pictures in one file. Curves are therefore thinned, and numbers are packed.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,13 @@ from mjfim.arrays import Array
 from mjfim.output.panels import Axis, Cells, Mark, Panel, Picture
 from mjfim.output.words import shorten
 
-# Values that JSON can hold, for the plotting library.
+# An object for Plotly, of values that JSON can hold.
 Plotly = dict[str, Any]
 
-# Share of the range of values below which single precision is exact enough for display.
+# Largest rounding with which numbers are stored in single precision, as a share of their range.
 DISPLAY_PRECISION = 1e-5
 
-# Names of dashes and of symbols.
+# Plotly's names of the dashes and symbols of marks.
 DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
 SYMBOLS = {
     "o": "circle",
@@ -46,13 +49,13 @@ SHAPES = {
     "hspan": "band",
 }
 
-# Points of a figure over CSS pixels, pixels of an inch, and least height of a plot [CSS pixels].
+# CSS pixels of a point, of an inch, and of the lowest plot.
 PIXELS, INCH, LEAST_HEIGHT = 1.3, 100, 170
 
-# Width of a letter beside rows [CSS pixels], and characters of names beside rows.
+# Width of a letter beside rows [CSS pixels], and largest number of letters of the name of a tick.
 LETTER, NAME_WIDTH = 6.5, 26
 
-# Decades of a logarithmic axis below which values between the powers of ten have labels, too.
+# On a logarithmic axis of fewer decades, values between the powers of ten have labels, too.
 SHORT_LOG_AXIS = 2.5
 
 
@@ -67,7 +70,7 @@ class Key:
 
 @dataclass(frozen=True, kw_only=True)
 class Plot:
-    """One plot: its words, and what the script of the page reads."""
+    """One plot: its words and its size, and the data that the script of the page reads."""
 
     title: str
     remark: str
@@ -94,7 +97,7 @@ def group_of(picture: Picture, limit: int) -> Group:
         picture: The picture.
         limit: Largest number of points of a curve.
     """
-    # Only the lowest panel of a column names the axis that all of it share.
+    # Only the lowest panel of a column names the axis that all panels of the column share.
     shared = {panel.place[1]: panel.x.label for panel in picture.panels if panel.x.label}
     keys = [
         Key(name=mark.label, role=mark.role, shape=SHAPES.get(mark.kind, "line"))
@@ -131,7 +134,7 @@ def group_of(picture: Picture, limit: int) -> Group:
 
 
 def _traces(mark: Mark, limit: int) -> list[Plotly]:
-    """The traces of a mark; straight lines and strips are shapes of the layout."""
+    """The traces of a mark; none for straight lines and strips, see `_shapes`."""
     colour = f"role:{mark.role}"
     named = {"name": escape(mark.label), "legendgroup": mark.label, "opacity": mark.opacity}
     other = np.zeros(0) if mark.other is None else mark.other
@@ -187,7 +190,7 @@ def _traces(mark: Mark, limit: int) -> list[Plotly]:
 
 
 def _points(mark: Mark, colour: str, limit: int) -> Plotly:
-    """A curve, held values, or dots; of many points, the peaks stay."""
+    """The trace of a curve, of held values or of dots, with at most about `limit` points."""
     y = np.append(mark.y, mark.y[-1:]) if mark.kind == "steps" else mark.y
     kept = thinned(y, limit)
     drawn: Plotly = {"type": "scatter", "x": packed(mark.x[kept]), "y": packed(y[kept])}
@@ -241,7 +244,7 @@ def _heatmap(cells: Cells) -> Plotly:
 
 def _layout(panel: Panel, label: str) -> Plotly:
     """Axes, straight lines and strips, and words beside the rows."""
-    # Cells without names of their rows have those of their columns.
+    # Where the rows of cells have no names, they are named like the columns.
     rows = panel.y
     if panel.cells is not None and not rows.names:
         rows = replace(panel.x, limits=(len(panel.cells.values) - 0.5, -0.5))
@@ -287,7 +290,7 @@ def _axis(axis: Axis, label: str) -> Plotly:
 
 
 def _shapes(mark: Mark) -> list[Plotly]:
-    """A straight line or a strip through the whole panel."""
+    """The shape of a straight line or of a strip through the whole panel; none for other marks."""
     if mark.kind not in ("vline", "hline", "vspan", "hspan"):
         return []
     upright = mark.kind[0] == "v"
@@ -317,7 +320,7 @@ def _words_beside(panel: Panel) -> list[Plotly]:
 
 
 def _letters(heading: str, texts: Sequence[str]) -> int:
-    """Number of letters of the widest of some words, with a space."""
+    """Number of letters of a column of words, with a gap."""
     return 2 + max(map(len, (heading, *texts)))
 
 
@@ -325,7 +328,7 @@ def _letters(heading: str, texts: Sequence[str]) -> int:
 
 
 def packed(values: Array) -> dict[str, str]:
-    """Return numbers as the library reads them from text, in single precision if possible."""
+    """Return numbers as base64 text, which Plotly reads, in single precision if possible."""
     array = np.asarray(values, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         single = array.astype(np.float32)
@@ -339,7 +342,7 @@ def packed(values: Array) -> dict[str, str]:
 
 
 def thinned(values: Array, limit: int) -> np.ndarray:
-    """Return which points of a curve are drawn, so that the peaks of all intervals stay."""
+    """Return the indices of the points that are drawn: the peaks of equal intervals of a curve."""
     count = len(values)
     if count <= limit:
         return np.arange(count)
