@@ -302,7 +302,7 @@ def _shapes(mark: Mark) -> list[Plotly]:
     colour = f"role:{mark.role}"
     if mark.kind.endswith("span"):
         return [{"type": "rect", **place, "fillcolor": colour, "line": {"width": 0}}]
-    line = {"color": colour, "width": mark.width, "dash": DASHES[mark.dash]}
+    line = {"color": colour, "width": PIXELS * mark.width, "dash": DASHES[mark.dash]}
     return [{"type": "line", **place, "line": line}]
 
 
