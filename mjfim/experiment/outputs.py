@@ -146,8 +146,8 @@ def columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
 
     # Where a sensor has the name of a key of the state, the key means the state.
     columns_of_sensor: dict[str, list[str]] = {}
-    for component in coordinates.sensors:
-        columns_of_sensor.setdefault(component.sensor, []).append(component.name)
+    for number in coordinates.sensors:
+        columns_of_sensor.setdefault(number.sensor, []).append(number.name)
     return found | {k: columns for k, columns in columns_of_sensor.items() if k not in found}
 
 

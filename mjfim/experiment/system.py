@@ -1,7 +1,7 @@
 """The system that an experiment is about: model, parameters, outputs, noise, time grid and plant.
 
 A system has no horizon, no cost and no control; these belong to the tasks in `excitation.task` and
-`identification.task`. Every name in the experiment is checked here against the model.
+`identification.search`. Every name in the experiment is checked here against the model.
 
 A system makes synthetic recordings. Worker processes make a system again from its order. Pictures
 and records take the labels of its joints, controls, parameters and outputs.

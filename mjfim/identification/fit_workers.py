@@ -86,7 +86,7 @@ def _made(
         for name in () if folder is None else ARRAYS:
             loaded = np.load(f"{folder}/{name}.npy", mmap_mode=MAP_MODE, allow_pickle=False)
             arrays[name] = loaded.view(np.ndarray)
-        found.append(replace(recording, **arrays))
+        found.append(replace(recording, **arrays) if arrays else recording)
     made = _systems.get(system.digest, lambda: system.value.system())
     return _with_parts(problem, made, tuple(found))
 

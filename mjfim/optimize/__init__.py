@@ -11,7 +11,6 @@ Modules:
     condensed_least_squares: Least squares with private unknowns of many segments, eliminated
         segment by segment, and robust losses.
     levenberg_marquardt: Bounded Levenberg-Marquardt on condensed least squares.
-    bracketing: Search for the smallest feasible number of samples.
 """
 
 import lazy_loader

@@ -1,4 +1,3 @@
-from .bracketing import SampleGrid, smallest_feasible
 from .condensed_least_squares import Condensed, RobustLoss
 from .cost_models import Bounds, relaxed_log_barrier
 from .directions import LBFGS, MetricDescent
@@ -12,10 +11,8 @@ __all__ = [
     "Condensed",
     "MetricDescent",
     "RobustLoss",
-    "SampleGrid",
     "StructuredBFGS",
     "minimise",
     "regulator",
     "relaxed_log_barrier",
-    "smallest_feasible",
 ]

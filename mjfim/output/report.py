@@ -253,8 +253,9 @@ def write_report(folder: Path, made: ShownRecord | None = None, media: Media | N
     facts = [_origin(folder, record) for record in records]
     stated = [_stated(folder, record, "experiment") for record in records]
     places = [os.path.normpath(folder / path) if path else None for path in stated]
+    design = folder if (folder / "design.npz").is_file() else None
     pages = [
-        page_of(record, experiment=place, design=folder)
+        page_of(record, experiment=place, design=design)
         for record, place in zip(records, places, strict=True)
     ]
     html = report_of(records, names, facts, media or media_in(file), pages)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.model.parameters import ParameterSet
 from mjfim.output.page import number
 from mjfim.records.campaign import Campaign
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.studies import MonteCarloStudy
 from mjfim.records.trajectory import Labels
+
+if TYPE_CHECKING:
+    from mjfim.model.parameters import ParameterSet
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

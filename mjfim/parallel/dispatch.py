@@ -84,8 +84,9 @@ class _Dispatch(Generic[Order, T]):
         self._workers = workers
         self._function = function
         self._budget = budget
-        self._orders = list(orders)
-        self._waiting = deque(range(len(self._orders)))
+        # Orders that are not carried out yet, by their numbers; they may be large.
+        self._orders = dict(enumerate(orders))
+        self._waiting = deque(self._orders)
         self._losses = [0] * len(self._orders)
         # Values that the worker of an order lacked, by the number of the order.
         self._values: dict[int, dict[str, SentValue]] = defaultdict(dict)
@@ -173,6 +174,7 @@ class _Dispatch(Generic[Order, T]):
             found, absent = future.result()
             if found:
                 del self._values[index]
+                del self._orders[index]
                 return Outcome(index=index, found=found)
             self._values[index].update({digest: owned_value(digest) for digest in absent})
         self._waiting.appendleft(index)

@@ -219,6 +219,15 @@ def test_long_moves_on_workers_are_cut_and_go_on(
     assert verify(task, design.trajectory).is_feasible
 
 
+def test_a_stop_before_a_worker_answers_leaves_the_start(tmp_path: Path) -> None:
+    token = StopToken()
+    token.request()
+    task = cart_inside(tmp_path)
+    with ThreadPoolExecutor(1) as executor:
+        design = design_task(task, executor=executor, budget=Budget(stop=token))
+    assert design.final.cost <= design.initial.cost
+
+
 def test_starts_without_time_are_named(tmp_path: Path) -> None:
     descent = {"starts": 5, "seconds": 0.01, "max_iterations": 10**6}
     design = design_task(cart_inside(tmp_path, limits={}, cost={"control": 1e-3}, descent=descent))

@@ -276,7 +276,7 @@ class Search:
             size = max(HALVING_RATE, workers)
             done += yield from self._climbed(waiting[:size], ladder)
             waiting = waiting[size:]
-        if all(each.best is None for each in done):
+        if done and self.grounds.is_limited and all(each.best is None for each in done):
             done[0] = yield from self._begun_inside(done[0], ladder[-1])
         return (yield from self._helped_by_chance(done, ladder))
 

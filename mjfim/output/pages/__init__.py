@@ -46,5 +46,6 @@ def page_of(
     steps = page.next_steps
     for word, place in (("EXPERIMENT", experiment), ("DESIGN_FOLDER", design)):
         if place is not None:
-            steps = tuple(step.replace(word, shlex.quote(str(place))) for step in steps)
+            quoted = f" {shlex.quote(str(place))} "
+            steps = tuple(step.replace(f" {word} ", quoted) for step in steps)
     return replace(page, next_steps=steps)
