@@ -249,15 +249,15 @@ def write_report(folder: Path, made: ShownRecord | None = None, media: Media | N
             if made is None:
                 raise
     file = folder / REPORT
-    names = [_name(folder, record) for record in records]
-    facts = [_origin(folder, record) for record in records]
-    stated = [_stated(folder, record, "experiment") for record in records]
-    places = [os.path.normpath(folder / path) if path else None for path in stated]
     design = folder if (folder / "design.npz").is_file() else None
-    pages = [
-        page_of(record, experiment=place, design=design)
-        for record, place in zip(records, places, strict=True)
-    ]
+    names, facts, pages = [], [], []
+    for record in records:
+        stated = _stated(folder, record)
+        names.append(_name(folder, record, stated))
+        facts.append(_origin(record, stated))
+        experiment = stated.get("experiment")
+        place = None if experiment is None else os.path.normpath(folder / experiment)
+        pages.append(page_of(record, experiment=place, design=design))
     html = report_of(records, names, facts, media or media_in(file), pages)
     with replacing(file) as temporary:
         temporary.write_text(html, encoding="utf-8", newline="\n")
@@ -369,34 +369,34 @@ def media_in(file: Path) -> Media:
 # ---- what a result is named after
 
 
-def _stated(folder: Path, record: ShownRecord, key: str) -> str:
-    """The path of a file that the JSON file of a result names; empty where it does not."""
+def _stated(folder: Path, record: ShownRecord) -> dict[str, str]:
+    """The paths of the experiment and of the model that the JSON file of a result names."""
     try:
-        stated = read_json(folder / f"{record.file_stem}.json").get(key)
+        saved = read_json(folder / f"{record.file_stem}.json")
     except RecordingError:
-        return ""
+        return {}
+    paths = {key: saved.get(key) for key in ("experiment", "model")}
     # The file may have been written on another system.
-    if not isinstance(stated, str):
-        return ""
-    return PureWindowsPath(stated).as_posix()
-
-
-def _origin(folder: Path, record: ShownRecord) -> dict[str, str]:
-    """The experiment, the model and the recordings of a result, as far as they are known."""
-    found = {
-        key: PurePosixPath(_stated(folder, record, key)).name for key in ("experiment", "model")
+    return {
+        key: PureWindowsPath(path).as_posix()
+        for key, path in paths.items()
+        if path and isinstance(path, str)
     }
+
+
+def _origin(record: ShownRecord, stated: Mapping[str, str]) -> dict[str, str]:
+    """The experiment, the model and the recordings of a result, as far as they are known."""
+    found = {key: PurePosixPath(path).name for key, path in stated.items()}
     if isinstance(record, Estimate):
         names = [PurePath(recording.name).name for recording in record.recordings]
         found["recordings"] = first_ones(names, longest=MAX_RECORDINGS_TEXT)
     return {key: name for key, name in found.items() if name}
 
 
-def _name(folder: Path, record: ShownRecord) -> str:
+def _name(folder: Path, record: ShownRecord, stated: Mapping[str, str]) -> str:
     """What a result is named after: the experiment, else the recordings or the folder."""
-    experiment = _stated(folder, record, "experiment")
-    if experiment:
-        return PurePath(experiment).stem
+    if "experiment" in stated:
+        return PurePosixPath(stated["experiment"]).stem
     if isinstance(record, Estimate):
         return first_ones([PurePath(recording.name).name for recording in record.recordings])
     if isinstance(record, Comparison):

@@ -370,6 +370,7 @@ class Climb:
         )
         if begin is None:
             return
+        self.candidate = replace(self.candidate, begins_inside=False)
         weights, direction = barrier.weights, ground.direction()
         point = ground.problem(barrier, weights[0], {}).point(begin)
         tightening: dict[str, float] = {}
