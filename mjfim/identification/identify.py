@@ -24,6 +24,7 @@ from mjfim.identification.fit_problem import FitProblem, have_same_initial_state
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import (
+    MISSED_ROUGH_SHARE,
     FitSearch,
     FitTask,
     Method,
@@ -183,6 +184,7 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
     problem, held_out = _problems(stated, workers)
     search, dynamics, instead = begin_fit(search, problem)
     task = search.task
+    repeats = task.settings.segment_length is None and task.method != "newton"
 
     # Combinations of parameters that no recording determines are held at their start values.
     begin_stage("testing what the recordings determine")
@@ -200,7 +202,7 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
             searched, begin = problem.of_segments(first), of_subset(begin, first)
             status = f", from {len(first)} of {len(problem.segments)} segments"
             subset = np.arange(len(first))
-    weighted, solution = search.solve(searched, begin)
+    weighted, solution = search.solve(searched, begin, is_first=repeats)
     fit = FitResult(
         task=stated,
         problem=weighted,
@@ -216,13 +218,13 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
 
     # A result that does not explain the data may be a local minimum: fits over short segments give
     # other starts, the second time from many starts where most of the motion is unexplained.
-    if task.settings.segment_length is None and task.method != "newton":
+    if repeats:
         for is_spread in (False, True):
             is_poor = bool(fit.quality.unexplained) if is_spread else is_doubtful(fit)
             if search.interrupted or not is_poor:
                 break
             fit = _restarted(search, problem, fit, is_spread=is_spread)
-    fit = _with_solution(fit, *search.over_roughness(fit.problem, fit.solution))
+    fit = _with_solution(fit, *search.converged(fit.problem, fit.solution))
 
     # Where the model does not explain whole recordings, the length of the segments matters.
     chooses_length = task.settings.segments is None and task.method != "newton"
@@ -257,9 +259,8 @@ def _fitted_from(
     cost_to_beat: float = np.inf,
 ) -> FitResult | None:
     """A fit with the solution over a problem from other unknowns; None where it diverges."""
-    placed = search.with_initial_states(problem, begin)
     try:
-        found = search.solve(problem, placed, phase, cost_to_beat=cost_to_beat)
+        found = search.solve(problem, begin, phase, cost_to_beat=cost_to_beat)
         return _with_solution(fit, *found)
     except SimulationDivergedError:
         return None
@@ -285,11 +286,18 @@ def _restarted(
     fit = replace(fit, inverse_dynamics=fit.inverse_dynamics or dynamics)
     again = None
     if start is not None:
+        compared = problem.with_noise(fit.problem.noise)
+        start = search.better_start(compared, start, fit.solution.unknowns)
+    if start is not None:
         again = _fitted_from(search, problem, start, "again all data", fit, before)
 
     # Costs can be compared only with the same noise. Of two equal fits, that which has converged.
     if again is not None:
         cost = fit.problem.cost(again.solution.unknowns)
+        if before > cost > (1.0 - MISSED_ROUGH_SHARE) * before:
+            fit = _with_solution(fit, *search.converged(fit.problem, fit.solution))
+            before = fit.solution.cost
+            restart = replace(restart, cost_before=before, cost=before)
         converges = again.solution.success and not fit.solution.success
         if before - cost > SAME_COST or (converges and before - cost > -SAME_COST):
             first = restart if fit.restart is None else fit.restart
@@ -311,7 +319,8 @@ def _over_chosen_length(search: FitSearch, problem: FitProblem, fit: FitResult) 
     cut = cut.pinned(task.start, fit.null_space)
     chosen = replace(search, task=task)
     words = f"segments of {length:.2g} s"
-    found = _fitted_from(chosen, cut, cut.begin(theta), words, fit)
+    begin = chosen.with_initial_states(cut, cut.begin(theta))
+    found = _fitted_from(chosen, cut, begin, words, fit)
     if found is None:
         return replace(fit, horizons=replace(study, why_not_used=DIVERGED))
     return replace(
@@ -351,7 +360,7 @@ def refit_task(
     nearby = replace(search, begins_near=True)
     found = nearby.solve(problem, begin, "near a similar fit", is_rough=is_rough)
     if not is_rough:
-        found = nearby.over_roughness(*found)
+        found = nearby.converged(*found)
     return FitResult(
         task=task,
         problem=found[0],

@@ -51,7 +51,7 @@ MAX_SAMPLES = 200_000
 SEARCH = SearchSettings(
     max_iterations=8, tolerance=1e-2, relinearise_at_end=False, rough_share=1e-4
 )
-
+INITIAL_STATES = replace(SEARCH, rough_share=1e-3)
 
 # Share of the predicted decrease of the cost that a step to the fit without a part may miss. The
 # errors of predictions hardly change with what is left of it.
@@ -181,7 +181,7 @@ def with_initial_states(
 
     known = problem.masked(_masks_for_initial_states(problem, masks))
     begin = replace(at, private=private)
-    found = minimise(known.with_shared_held(), begin, SEARCH, budget)
+    found = minimise(known.with_shared_held(), begin, INITIAL_STATES, budget)
     return problem, at if found is None else found.unknowns
 
 

@@ -14,6 +14,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError, listed, unknown
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
+from mjfim.identification.assessment.residual_tests import RELEVANT_SIZE_RATIO
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
 from mjfim.identification.segments import spread_over_data
@@ -219,12 +220,17 @@ FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
 SAMPLES_OF_MUCH_DATA = SAMPLES_FOR_ONE_SIDED
 
 # Length of a step [standard deviations] at which the search over the first data ends, and decrease
-# of the cost, as a share of it, that its last step may bring.
+# of the cost, as a share of it, that its last step may bring. Closer to the minimum, few data are
+# fitted at the expense of the others.
 FIRST_TOLERANCE = 0.1
-FIRST_ROUGH_SHARE = 1e-3
+FIRST_ROUGH_SHARE = 1e-2
 
 # That share where the stated noise is only the first guess.
 ROUGH_SHARE = 0.1
+
+# That share where much data are clearly missed, also if the cost falls by twice this share, so that
+# searches from other starts follow.
+MISSED_ROUGH_SHARE = 0.02
 
 # That share in a fit that is only compared with others by its predictions.
 COMPARED_ROUGH_SHARE = 1e-4
@@ -342,6 +348,7 @@ class FitSearch:
         phase: str = "all data",
         *,
         is_rough: bool = False,
+        is_first: bool = False,
         cost_to_beat: float = np.inf,
     ) -> tuple[FitProblem, Solution]:
         """Search over all data.
@@ -351,6 +358,8 @@ class FitSearch:
             begin: Unknowns at the begin.
             phase: Name of the search in events.
             is_rough: Whether the fit is only compared with others, so that few digits are enough.
+            is_first: Whether searches from other starts follow where the data are missed. With much
+                data, it then ends near its minimum, and `converged` goes on.
             cost_to_beat: Cost of another fit with the stated noise. A search without a chance to
                 cost less ends early.
 
@@ -370,6 +379,10 @@ class FitSearch:
             )
         if self.task.noise_is_stated:
             settings = replace(settings, cost_to_beat=cost_to_beat)
+            if is_first and not settings.relinearise_at_end:
+                dof = problem.value_count - problem.unknown_count
+                least = 0.5 * dof * RELEVANT_SIZE_RATIO**2 / (1.0 - 2.0 * MISSED_ROUGH_SHARE)
+                settings = replace(settings, rough_share=MISSED_ROUGH_SHARE, rough_above=least)
             return problem, self._found(problem, begin, settings, phase)
 
         # The stated noise is only the first guess: its minimum is left as soon as it is near. The
@@ -446,12 +459,46 @@ class FitSearch:
         whole = replace(best, private=private)
         if self.interrupted:
             return whole
-        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
-        candidates = [
-            self.with_initial_states(first_parts, each, INITIAL_STATE_ITERATIONS)
-            for each in (whole, begin)
-        ]
+        candidates = [self._with_begun_states(problem, each) for each in (whole, begin)]
         return min(candidates, key=problem.cost)
+
+    def better_start(
+        self, problem: FitProblem, begin: UnknownValues, beaten: UnknownValues
+    ) -> UnknownValues | None:
+        """Improve another start on a subset of the data, before the search over all of them.
+
+        Args:
+            problem: The problem of all data, with the noise of both starts.
+            begin: Unknowns at the start.
+            beaten: The unknowns that are to cost more.
+
+        Returns:
+            The improved start; None where it costs more on the subset, or diverges there.
+        """
+        subset = first_subset(problem)
+        if len(subset) == len(problem.segments):
+            return self.with_initial_states(problem, begin)
+        part = problem.of_segments(subset)
+        placed = self.with_initial_states(part, of_subset(begin, subset))
+        cost_to_beat = part.cost(of_subset(beaten, subset))
+        settings = replace(
+            self._settings(part),
+            tolerance=FIRST_TOLERANCE,
+            relinearise_at_end=False,
+            rough_share=FIRST_ROUGH_SHARE,
+            cost_to_beat=cost_to_beat,
+        )
+        found = self.minimise(part, placed, settings, "again part of the data")
+        if found is None or found.cost >= cost_to_beat:
+            return None
+        at = found.unknowns
+        begin = replace(begin, theta=at.theta, per_recording=at.per_recording)
+        return self._with_begun_states(problem, begin)
+
+    def _with_begun_states(self, problem: FitProblem, begin: UnknownValues) -> UnknownValues:
+        """Unknowns with initial states improved by the first part of each segment."""
+        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
+        return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
 
     def with_initial_states(
         self,
@@ -466,10 +513,8 @@ class FitSearch:
         found = self.minimise(problem.with_shared_held(), begin, settings, "initial states")
         return begin if found is None else found.unknowns
 
-    def over_roughness(
-        self, problem: FitProblem, solution: Solution
-    ) -> tuple[FitProblem, Solution]:
-        """Continue a search that ended because no step lowered the cost.
+    def converged(self, problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
+        """Continue a search that ended near its minimum, or because no step lowered the cost.
 
         Contacts and dry friction make residuals rough, over which longer differences reach.
 
@@ -477,6 +522,10 @@ class FitSearch:
             The problem of the last search and its solution; the given ones where the search had
             converged, or where longer differences lead nowhere.
         """
+        if solution.rough and not self.interrupted:
+            settings = replace(self._settings(problem), begins_near=True)
+            found = self.minimise(problem, solution.unknowns, settings, "all data")
+            solution = solution if found is None else _after(solution, found)
         for factor in LONGER_DIFFERENCES:
             if not solution.stuck or self.task.method == "newton" or self.interrupted:
                 break

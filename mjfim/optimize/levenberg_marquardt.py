@@ -329,6 +329,7 @@ class SearchSettings:
             linearisation: the search ends when the next step is expected to be below the tolerance.
         rough_share: Predicted decrease of the cost, as a share of the cost, below which a step is
             the last one. It serves searches that need not converge; 0 for the others.
+        rough_above: Cost above which alone `rough_share` ends the search.
         curved_rows: The common rows at the end of a step from given unknowns, where they are not
             linear along a step (`step_over_curved_rows`); None where they are.
         begins_near: Whether the search begins near the minimum, with hardly any damping. Damping
@@ -350,6 +351,7 @@ class SearchSettings:
     damped: bool = True
     relinearise_at_end: bool = True
     rough_share: float = 0.0
+    rough_above: float = 0.0
     curved_rows: Callable[[UnknownValues, Array], Array | None] | None = None
     begins_near: bool = False
     in_true_deviations: bool = False
@@ -498,7 +500,7 @@ class _Search:
 
         converged = self._converged(trial, predicted)
         futile = self._is_futile(trial, predicted)
-        near = trial.fraction == 1.0 and self._is_near(predicted)
+        near = trial.fraction == 1.0 and self._is_near(trial, predicted)
         if self.settings.lengthens and not (converged or futile or near):
             trial = self._lengthened(trial)
         slow = self._is_slow(trial)
@@ -695,12 +697,13 @@ class _Search:
         short = SHORT_STEP * self.unit * self.unknowns_length
         return complete and length < short and next_length < self._tolerance
 
-    def _is_near(self, predicted: Step) -> bool:
+    def _is_near(self, trial: _Trial, predicted: Step) -> bool:
         """Whether a search that need not converge has come near the minimum.
 
         The minimum of the linearised cost was not much lower than the cost.
         """
-        return predicted.predicted_decrease < self.settings.rough_share * self.cost
+        is_small = predicted.predicted_decrease < self.settings.rough_share * self.cost
+        return is_small and trial.cost > self.settings.rough_above
 
     def _is_slow(self, trial: _Trial) -> bool:
         """Count consecutive iterations of little use; True after too many of them."""

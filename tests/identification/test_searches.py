@@ -12,6 +12,7 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
+from mjfim.identification import search as search_module
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch, FitTask, first_subset
@@ -117,7 +118,7 @@ def stuck_at(theta: float) -> Solution:
 @pytest.mark.parametrize("begin", [0.7, 1.3])
 def test_longer_differences_lead_over_waves_to_the_minimum(begin: float) -> None:
     stuck = stuck_at(begin)
-    problem, found = search().over_roughness(Rough(), stuck)
+    problem, found = search().converged(Rough(), stuck)
     assert found.success and found.cost < 1e-3 * stuck.cost
     assert problem.step > Rough().step
     assert abs(found.unknowns.theta[0] - 1.0) < 1e-3
@@ -146,11 +147,31 @@ def test_longer_differences_are_two_sided_also_with_much_data(
     assert longer.step == pytest.approx(100.0 * problem.difference_step)
 
 
+def test_a_search_that_ended_near_its_minimum_converges() -> None:
+    near = replace(stuck_at(0.7), stuck=False, rough=True, success=True)
+    found = search().converged(Rough(), near)[1]
+    assert not found.rough and found.cost < 1e-3 * near.cost
+
+
+def test_much_data_that_are_missed_end_the_first_search_near_its_minimum(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Half of the residuals belong to another minimum, so that no parameter explains the data."""
+    problem: Any = NoisyParts(segments=(1.0, 3.0) * 50)
+    monkeypatch.setattr(search_module, "SAMPLES_OF_MUCH_DATA", 0)
+    begin = begin_of(7.0)
+    assert not search().solve(problem, begin)[1].rough
+    assert search().solve(problem, begin, is_first=True)[1].rough
+
+    explained = replace(problem, segments=(2.0,) * 100)
+    assert not search().solve(explained, begin, is_first=True)[1].rough
+
+
 def test_other_ends_of_a_search_stay() -> None:
     rough, stuck = Rough(), stuck_at(0.7)
     ended = replace(stuck, stuck=False)
-    assert search().over_roughness(rough, ended) == (rough, ended)
-    assert search("newton").over_roughness(rough, stuck) == (rough, stuck)
+    assert search().converged(rough, ended) == (rough, ended)
+    assert search("newton").converged(rough, stuck) == (rough, stuck)
 
 
 def of_segments(samples: int, count: int) -> Any:
@@ -253,6 +274,15 @@ def test_the_search_over_all_data_begins_where_all_data_cost_less(
     found = search(starts=1, noise_is_stated=True).best_start(problem, begin_of(1.1))
     assert found.theta[0] == pytest.approx(expected, abs=0.1)
     assert np.isfinite(problem.cost(found))
+
+
+@pytest.mark.parametrize(("beaten", "expected"), [(2.0, 3.0), (3.0, None), (2.99, 3.0)])
+def test_another_start_is_improved_on_a_part_where_it_beats_the_first_one(
+    beaten: float, expected: float | None
+) -> None:
+    problem: Any = parts(3.0, 2.9)
+    found = search().better_start(problem, begin_of(1.1), begin_of(beaten))
+    assert (None if found is None else round(float(found.theta[0]), 3)) == expected
 
 
 def test_a_search_that_ends_next_to_divergence_is_kept_where_the_noise_is_estimated() -> None:

@@ -475,6 +475,10 @@ def test_a_rough_search_ends_where_a_step_hardly_lowers_the_cost() -> None:
     assert rough.cost == p.cost(rough.unknowns)
     assert exact.cost <= rough.cost < 1.1 * exact.cost
 
+    # Where it costs too little for that, the search goes on.
+    settings = SearchSettings(rough_share=0.1, rough_above=2.0 * rough.cost)
+    assert solved(p, start, settings).cost == pytest.approx(exact.cost)
+
 
 def curve(t: Array, y: Array) -> Rows:
     """Residuals of an exponential curve at times t."""
