@@ -471,6 +471,11 @@ DERIVED = {
         ("site/t:pos[2]", 0.4),
         '<spatial name="band" stiffness="50" damping="1" springlength="',
     ),
+    "inertia of geoms": (
+        ("<default>\n", '<compiler inertiafromgeom="true"/><default>\n'),
+        ("body/a:mass", 2.0),
+        '<compiler inertiafromgeom="auto"/>',
+    ),
     "total mass": (
         ("<default>\n", '<compiler settotalmass="7"/><default>\n'),
         ("body/a:mass", 2.0),

@@ -479,9 +479,9 @@ class Climb:
         """
         found, begun, cost = self.candidate, self._begin, self._grounds.cost
         last, level_cost = found, self._level_cost
-        # A small violation of the last control ends after scaling, or on the next rung.
-        has_time = self._move.budget.exhausted is None
-        if has_time and self._latest is not None and self._latest[1] < level_cost:
+        # A small violation of the last control ends after scaling, which takes a few simulations.
+        is_stopped = self._budget.stop.requested
+        if not is_stopped and self._latest is not None and self._latest[1] < level_cost:
             last, level_cost = replace(found, control=self._latest[0]), self._latest[1]
         control = without_jumps(cost, last.over_horizon, variant.sample_factor)
         curves = found.curves if self._move.keeps_curves else None
@@ -499,18 +499,20 @@ class Climb:
 
         centre = self._grounds.stated.task.centre
         search = InsideSearch(cost, 0)
+        controls = [control] if last is found else [control, found.over_horizon]
         for each in (
             with_corrected_end(cost, control, self._budget),
-            search.largest(centre, control - centre, self._budget),
+            *(search.largest(centre, each - centre, self._budget) for each in controls),
         ):
             if each is not None:
                 following = following.improved(each.control, each.point)
-        if last is not found:
-            point_inside = cost.inside(found.over_horizon)
-            if point_inside is not None:
-                following = following.improved(found.over_horizon, point_inside)
+        size = cost.level.problem.size(point)
+        is_outside = self._level_cost - level_cost > LARGEST_ERROR * size
+        if is_outside and following.best is not None and not self._move.is_last:
+            # Where the rung ends outside the limits, the next one begins inside.
+            return replace(following, control=following.best, rank=following.cost)
         error = point.cost - level_cost
-        if error <= LARGEST_ERROR * cost.level.problem.size(point):
+        if error <= LARGEST_ERROR * size:
             return replace(following, rank=min(level_cost, following.cost))
         if begun.cost < point.cost:
             blunt = begun.first_weight

@@ -399,7 +399,14 @@ def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) 
         _extend_keyframes(xml, source)
 
     xml.attach(urdfs)
-    is_changed = _state_others(xml, system.parameters, theta) or urdfs
+    is_changed = _state_others(xml, system.parameters, theta) or bool(urdfs)
+    bodies = range(wanted.nbody)
+    if any(differ_in_inertia(source.model, wanted, body, TOLERANCE) for body in bodies):
+        # Inertias that are stated have to count.
+        for compiler in xml.root.iter("compiler"):
+            if compiler.get("inertiafromgeom") == "true":
+                compiler.set("inertiafromgeom", "auto")
+                is_changed = True
     compiled = xml.compiled() if is_changed else (source.spec, source.model)
     state_differences(xml, compiled, wanted)
     return xml
