@@ -30,8 +30,9 @@ ORDER = (
     "replay",
 )
 
-# Each module registers its verb.
-for name in ORDER:
+# Each module registers its verb. One verb needs no module of the others.
+given = sys.argv[1:2]
+for name in given if given and given[0] in ORDER else ORDER:
     importlib.import_module(f"mjfim.cli.{name.replace('-', '_')}")
 
 
