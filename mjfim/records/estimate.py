@@ -134,9 +134,9 @@ class HorizonStudy(Record):
         ratios = self.relative_errors
         text = (
             "The model does not explain the recordings, so the length of the segments matters: "
-            f"{self.name_of(self.chosen)} were chosen, the longest ones whose predictions of "
-            f"left-out data over times of {first:.2g} to {last:.2g} s are not clearly worse than "
-            f"the best (error over the smallest one for each time: {ratios[self.chosen]:.3g}"
+            f"{self.name_of(self.chosen)} were chosen. They are the longest ones whose predictions "
+            f"of left-out data are not clearly worse than the best, over times of {first:.2g} to "
+            f"{last:.2g} s (error over the smallest one for each time: {ratios[self.chosen]:.3g}"
         )
         others = [i for i in range(len(self.lengths)) if i != self.chosen]
         listed = [f"{ratios[i]:.3g} with {self.name_of(i)}" for i in others]

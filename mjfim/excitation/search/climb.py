@@ -292,10 +292,10 @@ class Climb:
         self._begin = replace(move.candidate, is_judged=False, status=None)
         self.candidate = self._begin
         self._steps_before = grounds.steps - move.candidate.steps
-        # Cost of the best control on its own level, and the last control with its cost there, which
+        # Cost of the best control on its own level, and the last control with its point there. It
         # need not keep the limits.
         self._level_cost = np.inf
-        self._latest: tuple[Array, float] | None = None
+        self._latest: tuple[Array, DesignPoint] | None = None
         self._are_short: deque[bool] = deque(maxlen=SHORT_WINDOW)
 
     def run(self) -> Generator[DesignEvent, None, Candidate]:
@@ -410,7 +410,7 @@ class Climb:
         is_stated = ground.task.system.variant.sample_factor == 1
         if step.mu:
             if step.point is not None:
-                self._latest = step.control, step.point.cost
+                self._latest = step.control, step.point
             if cost <= self._level_cost:
                 self._level_cost, found = cost, replace(found, control=step.control)
         elif step.is_inside:
@@ -478,11 +478,7 @@ class Climb:
             variant: Plant of the rung.
         """
         found, begun, cost = self.candidate, self._begin, self._grounds.cost
-        last, level_cost = found, self._level_cost
-        # A small violation of the last control ends after scaling, which takes a few simulations.
-        is_stopped = self._budget.stop.requested
-        if not is_stopped and self._latest is not None and self._latest[1] < level_cost:
-            last, level_cost = replace(found, control=self._latest[0]), self._latest[1]
+        last, level_cost, is_far_lower = self._last()
         control = without_jumps(cost, last.over_horizon, variant.sample_factor)
         curves = found.curves if self._move.keeps_curves else None
         following = replace(
@@ -499,25 +495,40 @@ class Climb:
 
         centre = self._grounds.stated.task.centre
         search = InsideSearch(cost, 0)
-        controls = [control] if last is found else [control, found.over_horizon]
         for each in (
             with_corrected_end(cost, control, self._budget),
-            *(search.largest(centre, each - centre, self._budget) for each in controls),
+            search.largest(centre, control - centre, self._budget),
         ):
             if each is not None:
                 following = following.improved(each.control, each.point)
-        size = cost.level.problem.size(point)
-        is_outside = self._level_cost - level_cost > LARGEST_ERROR * size
-        if is_outside and following.best is not None and not self._move.is_last:
+        if last is not found and (inside := cost.inside(found.over_horizon)) is not None:
+            following = following.improved(found.over_horizon, inside)
+        if is_far_lower and following.best is not None and not self._move.is_last:
             # Where the rung ends outside the limits, the next one begins inside.
             return replace(following, control=following.best, rank=following.cost)
         error = point.cost - level_cost
-        if error <= LARGEST_ERROR * size:
+        if error <= LARGEST_ERROR * cost.level.problem.size(point):
             return replace(following, rank=min(level_cost, following.cost))
         if begun.cost < point.cost:
             blunt = begun.first_weight
             following = replace(following, control=begun.over_horizon, first_weight=blunt)
         return replace(following, rank=min(point.cost, following.cost))
+
+    def _last(self) -> tuple[Candidate, float, bool]:
+        """The candidate with its last control if that costs less on its level, and its cost there.
+
+        A small violation ends after scaling, or on the next rung. When the time is over, only a
+        control that costs far less is worth the simulations. The third value tells whether it does.
+        """
+        found, lowest, latest = self.candidate, self._level_cost, self._latest
+        if latest is None or self._move.budget.stop.requested or latest[1].cost >= lowest:
+            return found, lowest, False
+        control, point = latest
+        size = self._grounds.cost.level.problem.size(point)
+        is_far_lower = lowest - point.cost > LARGEST_ERROR * size
+        if not is_far_lower and self._move.budget.exhausted is not None:
+            return found, lowest, False
+        return replace(found, control=control), point.cost, is_far_lower
 
 
 def tightened(before: Mapping[str, float], margins: Mapping[str, float]) -> dict[str, float]:

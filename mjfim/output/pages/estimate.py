@@ -54,8 +54,8 @@ FITTED_NOTE = (
 # The meaning of the standard deviations.
 ABOUT_STD = (
     "The formal σ is the true accuracy only if the model and the noise are right. The honest σ is "
-    "a quarter of the width of the 95 % interval, which allows for residuals that are not white "
-    "noise and for recordings that disagree, but not for the bias of a wrong model."
+    "a quarter of the width of the 95 % interval. It allows for residuals that are not white noise "
+    "and for recordings that disagree. It does not allow for the bias of a wrong model."
 )
 
 
