@@ -292,10 +292,10 @@ class Climb:
         self._begin = replace(move.candidate, is_judged=False, status=None)
         self.candidate = self._begin
         self._steps_before = grounds.steps - move.candidate.steps
-        # Cost of the best control on its own level, and the last control with its point there. It
-        # need not keep the limits.
+        # Cost of the best control on its own level. The last control, with its cost there and the
+        # size of this cost, need not keep the limits.
         self._level_cost = np.inf
-        self._latest: tuple[Array, DesignPoint] | None = None
+        self._latest: tuple[Array, float, float] | None = None
         self._are_short: deque[bool] = deque(maxlen=SHORT_WINDOW)
 
     def run(self) -> Generator[DesignEvent, None, Candidate]:
@@ -410,7 +410,8 @@ class Climb:
         is_stated = ground.task.system.variant.sample_factor == 1
         if step.mu:
             if step.point is not None:
-                self._latest = step.control, step.point
+                size = ground.level.problem.size(step.point)
+                self._latest = step.control, step.point.cost, size
             if cost <= self._level_cost:
                 self._level_cost, found = cost, replace(found, control=step.control)
         elif step.is_inside:
@@ -521,14 +522,13 @@ class Climb:
         control that costs far less is worth the simulations. The third value tells whether it does.
         """
         found, lowest, latest = self.candidate, self._level_cost, self._latest
-        if latest is None or self._move.budget.stop.requested or latest[1].cost >= lowest:
+        if latest is None or self._move.budget.stop.requested or latest[1] >= lowest:
             return found, lowest, False
-        control, point = latest
-        size = self._grounds.cost.level.problem.size(point)
-        is_far_lower = lowest - point.cost > LARGEST_ERROR * size
+        control, level_cost, size = latest
+        is_far_lower = lowest - level_cost > LARGEST_ERROR * size
         if not is_far_lower and self._move.budget.exhausted is not None:
             return found, lowest, False
-        return replace(found, control=control), point.cost, is_far_lower
+        return replace(found, control=control), level_cost, is_far_lower
 
 
 def tightened(before: Mapping[str, float], margins: Mapping[str, float]) -> dict[str, float]:
