@@ -30,15 +30,21 @@ ORDER = (
     "replay",
 )
 
-# Each module registers its verb. One verb needs no module of the others.
-given = sys.argv[1:2]
-for name in given if given and given[0] in ORDER else ORDER:
-    importlib.import_module(f"mjfim.cli.{name.replace('-', '_')}")
+
+def load_verbs() -> None:
+    """Import the module of the given verb, which registers it; without one, those of all verbs."""
+    given = sys.argv[1:2]
+    for name in given if given and given[0] in ORDER else ORDER:
+        importlib.import_module(f"mjfim.cli.{name.replace('-', '_')}")
+
+
+load_verbs()
 
 
 def main() -> NoReturn:
     """Run the command line, the entry point of `mjfim`."""
     replace_unencodable_characters()
     permit_processes()
+    load_verbs()
     app(prog_name="mjfim")
     sys.exit(0)
