@@ -379,7 +379,7 @@ class FitSearch:
             )
         if self.task.noise_is_stated:
             settings = replace(settings, cost_to_beat=cost_to_beat)
-            if is_first and not settings.relinearise_at_end:
+            if is_first and self._is_much(problem):
                 dof = problem.value_count - problem.unknown_count
                 least = 0.5 * dof * RELEVANT_SIZE_RATIO**2 / (1.0 - 2.0 * MISSED_ROUGH_SHARE)
                 settings = replace(settings, rough_share=MISSED_ROUGH_SHARE, rough_above=least)
@@ -441,12 +441,7 @@ class FitSearch:
         rough_share = 0.0
         if starts == 1:
             rough_share = FIRST_ROUGH_SHARE if self.task.noise_is_stated else ROUGH_SHARE
-        settings = replace(
-            self._settings(part),
-            tolerance=FIRST_TOLERANCE,
-            relinearise_at_end=False,
-            rough_share=rough_share,
-        )
+        settings = self._settings_of_part(part, rough_share)
         found = [self._found(part, placed, settings, "part of the data")]
         found += self._from_random_starts(part)
         best = min(found, key=lambda solution: solution.cost).unknowns
@@ -481,13 +476,8 @@ class FitSearch:
         part = problem.of_segments(subset)
         placed = self.with_initial_states(part, of_subset(begin, subset))
         cost_to_beat = part.cost(of_subset(beaten, subset))
-        settings = replace(
-            self._settings(part),
-            tolerance=FIRST_TOLERANCE,
-            relinearise_at_end=False,
-            rough_share=FIRST_ROUGH_SHARE,
-            cost_to_beat=cost_to_beat,
-        )
+        settings = self._settings_of_part(part, FIRST_ROUGH_SHARE)
+        settings = replace(settings, cost_to_beat=cost_to_beat)
         found = self.minimise(part, placed, settings, "again part of the data")
         if found is None or found.cost >= cost_to_beat:
             return None
@@ -562,8 +552,7 @@ class FitSearch:
         if self.task.method == "newton":
             return NEWTON
         is_linear = self.task.settings.loss == "linear"
-        samples = problem.sample_count * 2 * len(self.task.system.parameters)
-        is_much = samples >= SAMPLES_OF_MUCH_DATA
+        is_much = self._is_much(problem)
         return SearchSettings(
             max_iterations=self.task.settings.max_iterations,
             tolerance=FINAL_TOLERANCE_OF_MUCH_DATA if is_much else FINAL_TOLERANCE,
@@ -572,6 +561,20 @@ class FitSearch:
             begins_near=self.begins_near,
             in_true_deviations=True,
             lengthens=not is_linear,
+        )
+
+    def _is_much(self, problem: FitProblem) -> bool:
+        """Whether one linearisation of a problem takes long."""
+        samples = problem.sample_count * 2 * len(self.task.system.parameters)
+        return samples >= SAMPLES_OF_MUCH_DATA
+
+    def _settings_of_part(self, part: FitProblem, rough_share: float) -> SearchSettings:
+        """Settings of a search over a part of the data, before the search over all of them."""
+        return replace(
+            self._settings(part),
+            tolerance=FIRST_TOLERANCE,
+            relinearise_at_end=False,
+            rough_share=rough_share,
         )
 
     def _from_random_starts(self, problem: FitProblem) -> list[Solution]:

@@ -400,8 +400,7 @@ def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) 
 
     xml.attach(urdfs)
     is_changed = _state_others(xml, system.parameters, theta) or bool(urdfs)
-    bodies = range(wanted.nbody)
-    if any(differ_in_inertia(source.model, wanted, body, TOLERANCE) for body in bodies):
+    if not _same_inertias(source.model, wanted, TOLERANCE):
         # Inertias that are stated have to count.
         for compiler in xml.root.iter("compiler"):
             if compiler.get("inertiafromgeom") == "true":
@@ -451,12 +450,14 @@ def _differences(a: Any, b: Any, tolerance: float) -> list[str]:
     pairs = {name: (getattr(a, name), getattr(b, name)) for name in names}
     pairs |= {n: (getattr(a.opt, n), getattr(b.opt, n)) for n in MODEL_ARRAYS["option"]}
     found = [name for name, (x, y) in pairs.items() if not _is_equal(x, y, tolerance)]
+    return found if _same_inertias(a, b, tolerance) else [*found, "body_inertia"]
 
-    # Principal axes may be named in any order.
-    is_same = a.nbody == b.nbody and not any(
+
+def _same_inertias(a: Any, b: Any, tolerance: float) -> bool:
+    """Whether all bodies of two models have the same inertias, with axes named in any order."""
+    return a.nbody == b.nbody and not any(
         differ_in_inertia(a, b, i, tolerance) for i in range(a.nbody)
     )
-    return found if is_same else [*found, "body_inertia"]
 
 
 def _is_equal(x: Any, y: Any, tolerance: float) -> bool:
