@@ -294,7 +294,7 @@ def _restarted(
     # Costs can be compared only with the same noise. Of two equal fits, that which has converged.
     if again is not None:
         cost = fit.problem.cost(again.solution.unknowns)
-        if before > cost > (1.0 - MISSED_ROUGH_SHARE) * before:
+        if fit.solution.rough and before > cost > (1.0 - MISSED_ROUGH_SHARE) * before:
             fit = _with_solution(fit, *search.converged(fit.problem, fit.solution))
             before = fit.solution.cost
             restart = replace(restart, cost_before=before, cost=before)
