@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mjfim.errors import MjfimError
     from mjfim.excitation.design import design, design_jointly
     from mjfim.excitation.evaluation import evaluate
+    from mjfim.excitation.rehearsal import rehearse
     from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
     from mjfim.experiment.schema import Experiment
     from mjfim.experiment.system import simulate
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from mjfim.records.design import Design
     from mjfim.records.estimate import Estimate
     from mjfim.records.estimate_parts import InverseDynamicsFit
+    from mjfim.records.rehearsal import Rehearsal
     from mjfim.records.robots import RobotComparison
     from mjfim.records.studies import Comparison, MonteCarloStudy
     from mjfim.records.trajectory import Recording, Trajectory
@@ -44,7 +46,6 @@ if TYPE_CHECKING:
     from mjfim.studies.monte_carlo import monte_carlo
     from mjfim.studies.payload import identify_payload
     from mjfim.studies.robot_comparison import compare_estimates
-    from mjfim.studies.robustness import assess_robustness
     from mjfim.studies.selected_models import selected_experiment
     from mjfim.studies.selection import select_terms
 
@@ -62,12 +63,12 @@ __all__ = [
     "MonteCarloStudy",
     "Pool",
     "Recording",
+    "Rehearsal",
     "RobotComparison",
     "ShortestExperiment",
     "StopToken",
     "Trajectory",
     "Workers",
-    "assess_robustness",
     "check",
     "compare",
     "compare_estimates",
@@ -83,6 +84,7 @@ __all__ = [
     "live",
     "monte_carlo",
     "predict",
+    "rehearse",
     "run_campaign",
     "save_video",
     "select_terms",
@@ -100,6 +102,8 @@ MODULES = {
     "design": "mjfim.excitation.design",
     "evaluate": "mjfim.excitation.evaluation",
     "design_jointly": "mjfim.excitation.design",
+    "rehearse": "mjfim.excitation.rehearsal",
+    "Rehearsal": "mjfim.records.rehearsal",
     "ShortestExperiment": "mjfim.excitation.shortest_horizon",
     "shortest_experiment": "mjfim.excitation.shortest_horizon",
     "Experiment": "mjfim.experiment.schema",
@@ -131,7 +135,6 @@ MODULES = {
     "monte_carlo": "mjfim.studies.monte_carlo",
     "identify_payload": "mjfim.studies.payload",
     "compare_estimates": "mjfim.studies.robot_comparison",
-    "assess_robustness": "mjfim.studies.robustness",
     "select_terms": "mjfim.studies.selection",
     "selected_experiment": "mjfim.studies.selected_models",
 }

@@ -24,10 +24,11 @@ MAX_STARTS = 10_000
 MAX_ITERATIONS = 1_000_000
 MAX_REPLICATES = 100_000
 MAX_SAMPLES = 10_000
+MAX_ROBOTS = 100_000
 
-# Largest relative error of a guess, and largest ratio of the noise to the stated one. Robots beyond
-# them have nothing in common with the model, and their numbers overflow in the end.
-MAX_WRONG, MAX_NOISE = 10.0, 1e6
+# Largest relative error of a guess. Robots beyond it have nothing in common with the model, and
+# their numbers overflow in the end.
+MAX_WRONG = 10.0
 
 
 class MjfimError(Exception):

@@ -205,10 +205,10 @@ def robots(models: Path, data: Path) -> tuple[Robot, ...]:
         words=("{experiment}", "-o", "{out}/compare", "--seconds", "5"),
         folder="compare",
     )
-    robustness = Step(
-        verb="robustness",
-        words=("{experiment}", "{out}/design", "-o", "{out}/robustness", "--runs", "40"),
-        folder="robustness",
+    rehearse = Step(
+        verb="rehearse",
+        words=("{out}/design", "-o", "{out}/rehearse", "--robots", "300"),
+        folder="rehearse",
     )
     campaign = Step(
         verb="campaign",
@@ -222,14 +222,14 @@ def robots(models: Path, data: Path) -> tuple[Robot, ...]:
             title="Cart-pendulum",
             text="The study of the paper: mass, length and damping of a pendulum on a cart.",
             experiment=own / "cart_pendulum.toml",
-            steps=_design_steps(montecarlo, compare, robustness, campaign),
+            steps=_design_steps(montecarlo, compare, rehearse, campaign),
         ),
         Robot(
             name="servo-arm",
             title="Servo arm",
             text="Two joints with position servos, and limits of position, velocity and force.",
             experiment=own / "servo_arm.toml",
-            steps=_design_steps(montecarlo, robustness),
+            steps=_design_steps(montecarlo, rehearse),
         ),
         Robot(
             name="quadrotor",

@@ -4,9 +4,9 @@
 
 For each model, in a folder of its own and without an edit: `mjfim init`, `check`, `design`,
 `simulate` of a robot whose parameters differ from those of the model, and `identify` from that
-recording, which begins with the values of the model. The claim of `design` that all limits hold is
-judged by plain MuJoCo at every engine step. The result is a table in Markdown (stdout) and
-newcomer.json.
+recording, which begins with the values of the model. The claims of `design` are judged by plain
+MuJoCo at every engine step: that all limits hold on the model, and what its rehearsal says of
+robots whose parameters differ. The result is a table in Markdown (stdout) and newcomer.json.
 """
 
 from __future__ import annotations
@@ -28,10 +28,18 @@ import mujoco
 import numpy as np
 import tomlkit
 
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
 from scripts.verbs import call_verb
 
 # Difference between the parameters of the simulated robot and those of the model, relative to them.
 DIFFERENCE = 0.05
+
+# Number of robots that play a design in plain MuJoCo, and largest relative error of a parameter.
+ROBOTS, WRONG = 300, 0.2
+
+# Share of the robots that may leave a limit in a motion that is safe.
+MAX_BROKEN = 0.05
 
 # Longest time of one verb; none should come near to it [s].
 PATIENCE = 600.0
@@ -59,6 +67,10 @@ class Walk:
         feasible_start: Whether the initial control keeps all limits.
         claimed: Whether `design` says that all limits hold.
         violations: What plain MuJoCo finds beyond its limit in the design.
+        safe: Whether the rehearsal of `design` calls the motion safe.
+        kept: Share of the robots of the rehearsal that keep all limits.
+        kept_in_mujoco: The same share of robots in plain MuJoCo.
+        approximate: Parameters whose standard deviation is stated by finite steps.
         inside: Number of true parameters inside their 95 % intervals.
         parameters: Number of parameters.
         misfit: Whether `identify` found a misfit.
@@ -73,6 +85,10 @@ class Walk:
     feasible_start: bool | None = None
     claimed: bool | None = None
     violations: list[str] = field(default_factory=list)
+    safe: bool | None = None
+    kept: float | None = None
+    kept_in_mujoco: float | None = None
+    approximate: int | None = None
     inside: int | None = None
     parameters: int | None = None
     misfit: bool | None = None
@@ -86,7 +102,15 @@ class Walk:
             self._gain(),
             "—" if self.inside is None else f"{self.inside} of {self.parameters}",
             self._limits(),
+            self._rehearsal(),
         ]
+
+    def _rehearsal(self) -> str:
+        """Verdict of the rehearsal, and the robots that keep all limits in both loops."""
+        if self.safe is None or self.kept is None or self.kept_in_mujoco is None:
+            return "—"
+        shares = f"{100 * self.kept:.0f} % / {100 * self.kept_in_mujoco:.0f} %"
+        return f"{'safe' if self.safe else 'not safe'} ({shares})"
 
     def _cell(self, verb: str) -> str:
         """Exit code and duration of a verb."""
@@ -120,6 +144,7 @@ HEADER = (
     "λ_min gain",
     "within 95 %",
     "limits held",
+    "rehearsal (robots that keep limits: said / MuJoCo)",
 )
 
 
@@ -216,6 +241,25 @@ def _judge_design(found: Walk, folder: Path) -> None:
     with np.load(folder / "design" / "design.npz") as arrays:
         trajectory = {name: arrays[name] for name in ("t", "qpos", "qvel", "act", "ctrl")}
     found.violations = violations(model, trajectory, stated.get("limits", {}))
+
+    rehearsal = design["rehearsal"]
+    if rehearsal is None:
+        return
+    found.safe = bool(rehearsal["safe"])
+    found.kept = rehearsal["all_limits_kept"] / max(rehearsal["robots"], 1)
+    pairs = zip(rehearsal["steps"]["predicted"], rehearsal["steps"]["std"], strict=True)
+    ratios = [std / predicted for predicted, std in pairs if predicted and std]
+    found.approximate = sum(not 1 / 1.4 <= ratio <= 1 / 0.7 for ratio in ratios)
+    broken = 0
+    rng = np.random.default_rng(37)
+    system = System.resolve(Experiment.from_file(folder / EXPERIMENT), threads=1)
+    p = system.parameters
+    for _ in range(ROBOTS):
+        error = WRONG * rng.uniform(-1.0, 1.0, len(p)) * p.sizes(system.theta)
+        theta = np.clip(system.theta + np.where(p.changes_model, error, 0.0), p.lower, p.upper)
+        robot = system.model_at(theta)
+        broken += bool(violations(robot, trajectory, stated.get("limits", {})))
+    found.kept_in_mujoco = 1.0 - broken / ROBOTS
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -384,7 +428,10 @@ def main() -> int:
 def _is_done(found: Walk) -> bool:
     """Whether the walk went to its end, and no claim was wrong."""
     ended = [found.codes.get(verb) in (0, 1) for verb in VERBS]
-    return all(ended) and not (found.claimed and found.violations)
+    is_right = not (found.claimed and found.violations)
+    if found.safe and found.kept_in_mujoco is not None:
+        is_right = is_right and found.kept_in_mujoco > 1.0 - 2.0 * MAX_BROKEN
+    return all(ended) and is_right
 
 
 if __name__ == "__main__":

@@ -20,17 +20,16 @@ from mjfim.identification.assessment.report import _warnings_of_bounds, _warning
 from mjfim.identification.search import _start
 from mjfim.identification.starts import divergence_at_start
 from mjfim.output.campaign_folder import accuracy_sentence
-from mjfim.output.pages.studies import MAX_MISSED_LIMITS, _limit_sentences
 from mjfim.records.campaign import missed_targets
 from mjfim.records.check import (
     Combination,
     ConfoundedPair,
     ParameterGroup,
-    Roughness,
     SelfTest,
     groups_in_words,
     verdict_of_check,
 )
+from mjfim.records.rehearsal import FiniteSteps
 
 # Longest message [characters].
 LONGEST_MESSAGE = 600
@@ -112,9 +111,11 @@ def test_the_verdict_of_a_check_is_short() -> None:
         "confounded": pairs,
         "refused": (),
         "violations": (),
-        "self_test": SelfTest(roughness=None, recursion=0.0, slope=0.0),
+        "self_test": SelfTest(recursion=0.0, slope=0.0),
         "source": "the initial control",
         "missing": (),
+        "steps": None,
+        "rehearsal": None,
     }
     for rows in (known, known[:1]):
         check: Any = SimpleNamespace(rows=rows, **findings)
@@ -123,31 +124,18 @@ def test_the_verdict_of_a_check_is_short() -> None:
         assert sum(" more" in sentence for sentence in sentences) == 3
 
 
-def test_a_robustness_study_has_a_sentence_for_the_limits_that_are_missed_most() -> None:
-    limits = [SimpleNamespace(kind="position", name=name, scale=2.0) for name in NAMES]
-    result = SimpleNamespace(
-        all_kept=0,
-        runs=3,
-        limits=limits,
-        kept=np.zeros((3, 300), dtype=bool),
-        margins=np.tile(-np.arange(300.0), (3, 1)),
-    )
-    first, *worst, others = _limit_sentences(result)
-    assert first == "0 of 3 robots keep all limits at every engine step"
-    assert len(worst) == MAX_MISSED_LIMITS
-    assert worst[-1] == "position of inertia_of_link_299 is exceeded by up to 598"
-    assert others.startswith(f"{300 - MAX_MISSED_LIMITS} more limits are exceeded or reached")
-
-    result.limits, result.margins = limits[:8], result.margins[:, :8]
-    result.kept = result.kept[:, :8]
-    assert len(list(_limit_sentences(result))) == 9
-
-
-def test_the_causes_of_a_rough_motion_are_short() -> None:
+def test_the_causes_of_an_approximation_are_short() -> None:
     causes = tuple(f"limit of {name}" for name in NAMES)
-    rough = Roughness(error=1.0, parameter="mass", sample=3, time=0.3, causes=causes)
-    require_short(str(rough))
-    assert rough.summary()["causes"] == list(causes)
+    steps = FiniteSteps(
+        names=NAMES,
+        predicted=np.ones(300),
+        std=np.full(300, 3.0),
+        length=np.ones(1),
+        ratio=np.ones(1),
+        causes=causes,
+    )
+    require_short(str(steps))
+    assert steps.summary()["causes"] == list(causes)
 
 
 def test_missed_targets_are_short_with_the_worst_first() -> None:

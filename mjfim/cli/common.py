@@ -34,7 +34,7 @@ from mjfim.errors import (
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
 from mjfim.output.manifest import write_optional
-from mjfim.output.page import REPORT, Page, PictureFormat
+from mjfim.output.page import REPORT, Level, Page, PictureFormat
 from mjfim.output.video import require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
@@ -293,6 +293,8 @@ class Run:
 
         values = {**summary_with_origin(result, system, self.output), **further}
         page = page_of(result, experiment=system.experiment.source, design=design)
+        if page.verdict.level is Level.BAD:
+            verdict = verdict or page.verdict.text
         self.print(values, page, verdict)
         self.write(result, system, further, remark)
 

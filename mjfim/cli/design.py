@@ -96,9 +96,8 @@ def design(
         # The files describe the shortest horizon, not the stated one.
         system = System.resolve(found.experiment, threads=run.threads)
         further["shortest"] = found.summary()
-    verdict = "" if result.success else "; ".join([result.outcome, *result.warnings])
     motion = f"\nto see the motion: mjfim replay {run.output}"
-    run.finish(result, system, design=run.output, further=further, verdict=verdict, remark=motion)
+    run.finish(result, system, design=run.output, further=further, remark=motion)
     if found is not None:
         found.save(run.output)
         say(f"{found}" if found.reached else f"mjfim: {found}")

@@ -21,6 +21,7 @@ from mjfim.excitation.limits.verification import (
     verify,
 )
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.rehearsal import rehearse_task
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -28,12 +29,11 @@ from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import labels_of_system
 from mjfim.information.criteria import shared
 from mjfim.information.identifiability import PROBES, Identifiability
-from mjfim.information.smoothness import roughness
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.check import GROUPS_TEXT, ParameterGroup, Roughness, groups_in_words
+from mjfim.records.check import GROUPS_TEXT, ParameterGroup, groups_in_words
 from mjfim.records.design import (
     Design,
     Evaluation,
@@ -44,6 +44,7 @@ from mjfim.records.design import (
     improvement_per_iteration,
     without_motions,
 )
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Trajectory
 
 # Growth of a disturbance along a trajectory without feedback above which the user is warned.
@@ -204,7 +205,6 @@ def design_warnings(
     found: Verification,
     task: DesignTask,
     clamped: tuple[str, ...],
-    rough: Roughness | None,
 ) -> Iterator[str]:
     """Make the warnings that a user has to know before running a design.
 
@@ -213,13 +213,10 @@ def design_warnings(
         found: Its limits at every engine step of the unmodified model.
         task: The task of the design.
         clamped: Names of the actuators that reach their forcerange along it.
-        rough: Place along it where derivatives do not exist, or None.
 
     Yields:
         Warnings, each a sentence.
     """
-    if rough is not None:
-        yield str(rough)
     if clamped:
         yield (
             f"forcerange clamps {listed(clamped)} along the design: its derivatives do not hold "
@@ -466,25 +463,13 @@ class DesignReport:
         model = task.system.model_at(task.theta)
         clamped = saturated_actuators(model, final.trajectory)
 
-        # Check that derivatives exist along the design; after Ctrl-C this would take too long.
-        rough = None
-        if not interrupted:
-            rough = roughness(
-                task.plant,
-                task.system.noise,
-                model,
-                task.theta,
-                final.trajectory,
-                self.final.sensitivity,
-            )
-
+        # After Ctrl-C a rehearsal would take too long.
+        rehearsal = None if interrupted else rehearse_task(self.played or task, final)
         status = Status.INTERRUPTED if interrupted else best.status
-        if status.ended_as_planned and (rough is not None or clamped):
-            status = Status.ROUGH
         if task.is_limited and not found.is_feasible and not interrupted:
             status = Status.INFEASIBLE
 
-        warnings = (*design_warnings(final, found, task, clamped, rough), *self.remarks)
+        warnings = (*design_warnings(final, found, task, clamped), *self.remarks)
         return self._record(
             best=best,
             seconds=seconds,
@@ -494,6 +479,7 @@ class DesignReport:
             final=final,
             found=found,
             warnings=warnings,
+            rehearsal=rehearsal,
         )
 
     def _record(
@@ -507,6 +493,7 @@ class DesignReport:
         final: Evaluation,
         found: Verification,
         warnings: tuple[str, ...],
+        rehearsal: Rehearsal | None,
     ) -> Design:
         """The record, from all its parts."""
         task = self.stage.task
@@ -547,4 +534,5 @@ class DesignReport:
             sizes=parameters.sizes(task.theta),
             motions=motions,
             improvement=improvement_per_iteration(history, self.stage.problem.size(self.final)),
+            rehearsal=rehearsal,
         )

@@ -23,7 +23,15 @@ from mjfim.experiment.system_tables import (
     ParameterSpec,
     TermSpec,
 )
-from mjfim.experiment.task_tables import Boundary, Cost, Descent, FitSpec, Limits, Robust
+from mjfim.experiment.task_tables import (
+    Boundary,
+    Cost,
+    Descent,
+    FitSpec,
+    Limits,
+    RehearsalSpec,
+    Robust,
+)
 from mjfim.model.model_files import PackedFiles
 from mjfim.recordings.section import (
     Hertz,
@@ -137,6 +145,9 @@ class Experiment(Section):
     limits: Limits = Field(default=Limits(), description="Hard limits of a design.")
     boundary: Boundary = Field(
         default=Boundary(), description="States in which a design begins and ends."
+    )
+    rehearsal: RehearsalSpec = Field(
+        default=RehearsalSpec(), description="Robots on which a design is rehearsed."
     )
     recording: RecordingSpec = Field(
         default=RecordingSpec(),

@@ -9,7 +9,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from mjfim.errors import MAX_ITERATIONS, MAX_REPLICATES, MAX_SAMPLES, MAX_STARTS
+from mjfim.errors import (
+    MAX_ITERATIONS,
+    MAX_REPLICATES,
+    MAX_ROBOTS,
+    MAX_SAMPLES,
+    MAX_STARTS,
+    MAX_WRONG,
+)
 from mjfim.recordings.section import (
     Boolean,
     Finite,
@@ -380,6 +387,47 @@ class Boundary(Section):
                 'keyframe needs end = "rest": it is the state in which such a design ends'
             )
         return self
+
+
+class RehearsalSpec(Section):
+    """Simulated robots on which a design is rehearsed before a person plays it."""
+
+    robots: Integer = Field(
+        default=60,
+        ge=0,
+        le=MAX_ROBOTS,
+        description="Number of robots. 0: the design is played on the model alone.",
+    )
+    wrong: NonNegative = Field(
+        default=0.2,
+        le=MAX_WRONG,
+        description=(
+            "Largest error of a parameter without a prior, relative to its size. Errors stay "
+            "within the bounds. Parameters with a prior are drawn from it."
+        ),
+    )
+    feedback: Boolean = Field(
+        default=False,
+        description=(
+            "true: the controller adds the gains times the measured deviation, with the noise of "
+            "the measurements."
+        ),
+    )
+    latency: Annotated[Finite, Field(ge=0)] | None = Field(
+        default=None,
+        description=(
+            "Delay of the control under feedback [s], rounded up to timesteps. Default: 0.005."
+        ),
+    )
+    floor: FiniteWithUnit | Literal["none"] | None = Field(
+        default=None,
+        description=(
+            "Height in the world below which no part of the robot may come [m]. Default: the floor "
+            "of the model, else the lower end of a base that does not move, 0 for a free body, or "
+            'the lowest point of the start if that is lower. "none": there is no floor.'
+        ),
+    )
+    seed: Integer = Field(default=0, ge=0, description="Seed of the robots.")
 
 
 class FitSpec(Section):

@@ -6,6 +6,7 @@ Modules:
     null_space: Combinations of parameters without effect, and the groups that they form.
     identifiability: Null spaces along the trajectory of an experiment and along random ones.
     smoothness: Detection of points at which derivatives do not exist.
+    finite_steps: Standard deviations by steps of finite length.
 """
 
 import lazy_loader

@@ -5,18 +5,13 @@ Such points are contacts, dry friction, joint limits and clamped actuators.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import listed
 from mjfim.information.null_space import LEAST_EFFECT, LEAST_RELATIVE_EFFECT
 from mjfim.model.parameters import ParameterSet
-from mjfim.plant.active_constraints import active_constraints
 from mjfim.plant.outputs import Noise
 from mjfim.plant.plant import SENSITIVITY_STEP, Plant
-from mjfim.records.check import Roughness
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # Ratio of the second difference step to the first one; the second step changes a parameter by
@@ -43,9 +38,6 @@ DISAGREEMENT_TOLERANCE = 1e-2
 # of the parameter's largest derivative.
 NEGLIGIBLE_OUTPUT = 1e-3
 
-# Number of samples before the first disagreement that are searched for its causes, too.
-SAMPLES_BEFORE = 2
-
 
 def disagreement(fine: Array, coarse: Array) -> Array:
     """Relative disagreement of two derivatives of the outputs.
@@ -63,75 +55,50 @@ def disagreement(fine: Array, coarse: Array) -> Array:
     return np.asarray(relative.max(axis=1))
 
 
-def roughness(
+def is_rough(
     plant: Plant,
     noise: Noise,
-    model: Any,
     theta: Array,
     trajectory: Trajectory,
     fine: Sensitivity | None = None,
-) -> Roughness | None:
-    """Find the worst disagreement of two difference steps along a trajectory.
+) -> bool:
+    """Whether two difference steps disagree along a trajectory.
 
     Args:
         plant: The plant.
         noise: Noise of the measured outputs.
-        model: The user's model (MjModel) at theta, in which the causes are searched.
         theta: (p,) parameter values.
         trajectory: The trajectory.
         fine: Its sensitivity with the shorter step, if it is known.
-
-    Returns:
-        The worst disagreement and its causes; None if it is below `DISAGREEMENT_TOLERANCE`.
     """
-    names, derivatives = plant.parameters.names, plant.derivatives
+    derivatives = plant.derivatives
     # Ratio of the second to the first difference step of each parameter.
     factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / derivatives.parameter_scale
     factors = np.maximum(factors, LEAST_STEP_FACTOR)
     coarse = derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
     if fine is None:
         fine = derivatives.sensitivity(theta, trajectory)
-
     # A trajectory that diverges after a small change of the parameters has no derivative at all.
     if fine is None or coarse is None:
-        return Roughness(
-            error=np.inf,
-            parameter=listed(names),
-            sample=0,
-            time=0.0,
-            causes=_causes(plant, model, theta, trajectory, range(trajectory.samples)),
-        )
+        return True
 
     G = noise.whiten(fine.G)
     visible = np.flatnonzero(visible_columns(plant.parameters, G))
-    if not len(visible):
-        return None
-
     error = disagreement(G, noise.whiten(coarse.G))[:, visible]
-    worst = int(np.argmax(error.max(axis=0)))
-    if not error[:, worst].max() > DISAGREEMENT_TOLERANCE:
-        return None
+    if not error.max(initial=0.0) > DISAGREEMENT_TOLERANCE:
+        return False
 
     # If a derivative exists, the error of central differences decreases by a factor of nine with a
     # third of the step. The trajectory is then smooth, only strongly curved.
     medium = np.maximum(factors / MEDIUM_STEP_DIVISOR, LEAST_MEDIUM_FACTOR)
     between = derivatives.sensitivity(theta, trajectory, medium * SENSITIVITY_STEP)
-    if between is not None:
-        smaller = disagreement(G, noise.whiten(between.G))[:, visible]
-        # Dry friction may switch between the shorter steps as well, however little they disagree.
-        tolerated = 0.0 if np.any(model.dof_frictionloss) else DISAGREEMENT_TOLERANCE
-        if only_curved(smaller.max(axis=0), error.max(axis=0), tolerated):
-            return None
-
-    first = int(np.argmax(error[:, worst] > DISAGREEMENT_TOLERANCE))
-    nearby = range(max(first - SAMPLES_BEFORE, 0), min(first + 1, trajectory.samples))
-    return Roughness(
-        error=float(error[:, worst].max()),
-        parameter=names[visible[worst]],
-        sample=first,
-        time=float(trajectory.t[first]),
-        causes=_causes(plant, model, theta, trajectory, nearby),
-    )
+    if between is None:
+        return True
+    smaller = disagreement(G, noise.whiten(between.G))[:, visible]
+    # Dry friction may switch between the shorter steps as well, however little they disagree.
+    has_friction = bool(np.any(plant.model(theta).dof_frictionloss))
+    tolerated = 0.0 if has_friction else DISAGREEMENT_TOLERANCE
+    return not only_curved(smaller.max(axis=0), error.max(axis=0), tolerated)
 
 
 def only_curved(medium: Array, longer: Array, tolerated: float) -> bool:
@@ -159,16 +126,3 @@ def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
     length = np.linalg.norm(G, axis=(0, 1)) * parameters.magnitude
     strongest = length.max(initial=0.0)
     return np.asarray((length > LEAST_EFFECT) & (length > LEAST_RELATIVE_EFFECT * strongest))
-
-
-def _causes(
-    plant: Plant, model: Any, theta: Array, trajectory: Trajectory, samples: range
-) -> tuple[str, ...]:
-    """Names of the constraints and limits of control laws that act at some samples."""
-    if plant.laws is None:
-        return active_constraints(model, trajectory, samples)
-
-    played, is_clipped = plant.applied(theta, trajectory)
-    clipped = np.flatnonzero(is_clipped[list(samples)].any(axis=0)).tolist()
-    laws = [f"limit of the law of {plant.laws.laws[i].actuator}" for i in clipped]
-    return (*active_constraints(model, played, samples), *laws)

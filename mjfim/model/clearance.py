@@ -151,7 +151,7 @@ class PairDistances:
             points[:, i] = positions[:, first]
             if self.exact[p]:
                 downwards = -np.einsum("nij,ni->nj", frame, normal)
-                local = _farthest_points(int(kind[first]), size[first], downwards)
+                local = farthest_points(int(kind[first]), size[first], downwards)
                 points[:, i] += np.einsum("nij,nj->ni", frame, local)
 
             height = points[:, i] - positions[:, second]
@@ -259,7 +259,7 @@ class PairDistances:
         return normals / np.where(length > 0.0, length, 1.0)
 
 
-def _farthest_points(kind: int, size: Array, direction: Array) -> Array:
+def farthest_points(kind: int, size: Array, direction: Array) -> Array:
     """Points of a primitive that lie farthest along given directions.
 
     Args:

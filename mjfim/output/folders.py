@@ -159,10 +159,10 @@ DESIGN_FILES = (
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
-# Files that `mjfim check`, `mjfim compare-robots` and `mjfim robustness` may write.
-CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png")
+# Files that `mjfim check`, `mjfim compare-robots` and `mjfim rehearse` may write.
+CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png", "rehearsal.png")
 ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png")
-ROBUSTNESS_FILES = ("playback.json", "playback.npz", REPORT, "playback.png")
+REHEARSAL_FILES = ("rehearsal.json", "rehearsal.npz", REPORT, "rehearsal.png")
 
 
 def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:

@@ -38,8 +38,9 @@ from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
-from mjfim.records.studies import Comparison, MonteCarloStudy, Robustness
+from mjfim.records.studies import Comparison, MonteCarloStudy
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -168,7 +169,7 @@ KINDS: tuple[type[ShownRecord], ...] = (
     Comparison,
     RobotComparison,
     MonteCarloStudy,
-    Robustness,
+    Rehearsal,
     Check,
 )
 

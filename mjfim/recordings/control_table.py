@@ -1,4 +1,4 @@
-"""Readers of a control from a CSV table, and of a design.csv, which is played on a robot."""
+"""Reader of a control from a CSV table, also from a design.csv."""
 
 from __future__ import annotations
 
@@ -10,22 +10,15 @@ import numpy as np
 from mjfim import recordings
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, listed, unknown
-from mjfim.model.coordinates import gain_names, state_names
-from mjfim.recordings.channels import Channels
-from mjfim.records.trajectory import Playback
 
 # Prefixes of the columns that a design.csv has besides the time and the controls.
 DESIGN_PREFIXES = ("qpos:", "qvel:", "act:", "gain:", "note:")
 
-# Tolerance of rounded time stamps, as a fraction of the sample period; per row of a design.csv as a
-# fraction of a timestep.
+# Tolerance of rounded time stamps, as a fraction of the sample period.
 STAMP_TOLERANCE = 1e-6
 
 # Tolerance of the first and last time of a table [s].
 TIME_TOLERANCE = 1e-9
-
-# Smallest number of rows of a playback.
-MIN_ROWS = 3
 
 
 def read_control(
@@ -93,58 +86,6 @@ def _check_columns(
     for column in columns:
         if column not in known and not column.startswith(DESIGN_PREFIXES):
             raise RecordingError(f"{path}: {unknown('column', column, ['t', *names])}")
-
-
-def read_playback(path: Path, channels: Channels) -> Playback:
-    """Read a design.csv at the rate at which it was written.
-
-    Args:
-        path: The file.
-        channels: The signals of the experiment to which the design belongs.
-
-    Returns:
-        States, controls and gains of every row.
-
-    Raises:
-        RecordingError: A column or a number is missing, or the times are not equally spaced.
-    """
-    table = recordings.read_table(path)
-    states = state_names(channels.model)
-    controls = channels.control_columns
-    gains = gain_names(channels.model, channels.controls)
-    for name in ("t", *states, *controls, *gains):
-        if name not in table:
-            raise RecordingError(
-                f"{path}: column {name!r} is missing; the file is not a design.csv of this model"
-            )
-
-    # The last row is the final state, which has neither control nor gain.
-    t = _grid(path, table["t"], float(channels.model.opt.timestep))
-    state = _finite(path, table, states, len(t))
-    ctrl = _finite(path, table, controls, len(t) - 1)
-    gain = _finite(path, table, gains, len(t) - 1)
-
-    # Gains have one column for each deviation of the state; without controls there are none.
-    nx = 2 * channels.model.nv + channels.model.na
-    return Playback(t=t, state=state, ctrl=ctrl, gain=gain.reshape(len(ctrl), len(controls), nx))
-
-
-def _grid(path: Path, t: Array, timestep: float) -> Array:
-    """(M+1,) times of the rows without rounding [s]; the period is a whole number of timesteps."""
-    if len(t) < MIN_ROWS:
-        raise RecordingError(
-            f"{path}: too few rows ({len(t)}); a playback needs at least {MIN_ROWS}"
-        )
-    period = (t[-1] - t[0]) / (len(t) - 1)
-    steps = round(period / timestep)
-    grid = np.arange(len(t)) * (steps * timestep)
-    # The comparison is negated so that NaN is refused, too.
-    if steps < 1 or not np.abs(t - grid).max() <= STAMP_TOLERANCE * timestep * len(t):
-        raise RecordingError(
-            f"{path}: column 't' must begin at 0 and increase by equal periods, each a whole "
-            f"number of timesteps ({timestep:g} s)"
-        )
-    return np.asarray(grid)
 
 
 def _finite(path: Path, table: Mapping[str, Array], names: Sequence[str], rows: int) -> Array:

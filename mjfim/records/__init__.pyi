@@ -2,7 +2,8 @@ from .campaign import Campaign, CampaignStatus
 from .check import Check
 from .design import Design, Status
 from .estimate import Estimate
-from .studies import Comparison, MethodOutcome, MonteCarloStudy, RobotConditions, Robustness
+from .rehearsal import FiniteSteps, Rehearsal
+from .studies import Comparison, MethodOutcome, MonteCarloStudy
 from .trajectory import Recording, Trajectory
 
 __all__ = [
@@ -12,11 +13,11 @@ __all__ = [
     "Comparison",
     "Design",
     "Estimate",
+    "FiniteSteps",
     "MethodOutcome",
     "MonteCarloStudy",
     "Recording",
-    "RobotConditions",
-    "Robustness",
+    "Rehearsal",
     "Status",
     "Trajectory",
 ]

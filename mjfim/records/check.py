@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from mjfim.arrays import Array
 from mjfim.errors import first_ones, shortened
 from mjfim.records.base import Record, ShownRecord, record
 from mjfim.records.design import CombinationAccuracy, LimitViolation
+from mjfim.records.rehearsal import FiniteSteps, Rehearsal
 
 # A coefficient that differs from 1 by less than this number is not written.
 UNIT_COEFFICIENT_TOLERANCE = 1e-6
@@ -240,53 +241,6 @@ class ConfoundedPair(Record):
 
 
 @record
-class Roughness(Record):
-    """Disagreement of dy/dtheta between two difference steps, because the motion is not smooth.
-
-    Attributes:
-        error: Largest relative disagreement.
-        parameter: Name of the parameter with this disagreement.
-        sample: First sample with a disagreement.
-        time: Time of this sample [s].
-        causes: Contacts, dry friction or active limits at this sample, in words.
-    """
-
-    error: float
-    parameter: str
-    sample: int
-    time: float
-    causes: tuple[str, ...]
-
-    def __str__(self) -> str:
-        """Return a sentence of size, place and cause; short forms keep the part with the cause."""
-        # Two digits, and no power of ten for some hundred percent.
-        size = "an unlimited amount"
-        if np.isfinite(self.error):
-            size = f"{float(f'{100.0 * self.error:.2g}'):g} %"
-
-        where, remark = f"with {first_ones(_grouped(self.causes))}", ""
-        if not self.causes:
-            where = "though no contact, friction or limit acts"
-            remark = "; the motion may be chaotic, or depend too strongly on this parameter"
-
-        return (
-            f"not smooth at t = {self.time:.4g} s, {where}: derivatives with two different "
-            f"difference steps disagree by {size} for {self.parameter}, first at sample "
-            f"{self.sample}{remark}; σ and the design are unreliable, because they depend on these "
-            "derivatives"
-        )
-
-
-def _grouped(causes: Iterable[str]) -> list[str]:
-    """Return causes such as `dry friction of Jaw`, each kind once with all of its names."""
-    names: dict[str, list[str]] = {}
-    for cause in causes:
-        kind, of, name = cause.partition(" of ")
-        names.setdefault(kind + of, []).append(name)
-    return [kind + first_ones(found) for kind, found in names.items()]
-
-
-@record
 class SelfTest(Record):
     """Test of the derivatives along a trajectory.
 
@@ -294,17 +248,16 @@ class SelfTest(Record):
     is infinite.
 
     Attributes:
-        roughness: Disagreement between two difference steps if it is too large, otherwise None.
         recursion: Difference between psi by rollouts and psi by `psi_{k+1} = A psi + E`.
         slope: Difference between DJ . zeta and finite differences of J(P(xi + gamma zeta)).
-        likely_cause: Likely cause, in words, if `recursion` or `slope` is too large; else empty.
+        acting: What acts first along the trajectory, in words, if an error is too large:
+            contacts, dry friction or limits, where derivatives differ from differences.
         finished: False where the test was stopped; errors that were not computed are NaN.
     """
 
-    roughness: Roughness | None
     recursion: float
     slope: float
-    likely_cause: str = ""
+    acting: tuple[str, ...] = ()
     finished: bool = True
 
     in_json = (
@@ -312,20 +265,14 @@ class SelfTest(Record):
         "finished",
         "recursion",
         "slope",
-        "likely_cause",
-        "roughness",
+        "acting",
     )
-    json_names = {"likely_cause": "suspect", "roughness": "rough"}
 
     @property
     def passed(self) -> bool:
-        """True if all derivatives agree."""
-        return (
-            self.finished
-            and self.roughness is None
-            and not self.recursion > RECURSION_TOLERANCE
-            and not self.slope > SLOPE_TOLERANCE
-        )
+        """True if all derivatives agree, or contacts, friction or limits say why they do not."""
+        has_agreed = not self.recursion > RECURSION_TOLERANCE and not self.slope > SLOPE_TOLERANCE
+        return self.finished and (has_agreed or bool(self.acting))
 
 
 @record
@@ -346,6 +293,8 @@ class Check(ShownRecord):
         not_separable: Groups of parameters that no experiment with these outputs can separate.
         not_excited: Groups of parameters that another control would separate.
         self_test: Test of the derivatives.
+        steps: Standard deviations by finite steps along one motion; None where they were not made.
+        rehearsal: What a given motion does to robots; None for a start and for recordings.
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
             are equal.
@@ -367,6 +316,8 @@ class Check(ShownRecord):
     not_excited: tuple[ParameterGroup, ...]
     self_test: SelfTest
     verdict: tuple[str, ...]
+    steps: FiniteSteps | None = None
+    rehearsal: Rehearsal | None = None
     combined: tuple[CombinationAccuracy, ...] = ()
     missing: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
@@ -391,6 +342,8 @@ class Check(ShownRecord):
         "not_separable",
         "not_excited",
         "self_test",
+        "steps",
+        "rehearsal",
     )
     json_names = {
         "rows": "parameters",
@@ -422,6 +375,7 @@ class Check(ShownRecord):
         stated = [row for row in self.rows if row.stated and not row.nuisance]
         reached = all(row.repetitions == 1 for row in stated)
         passed = self.self_test.passed and not self.missing and not self.refused
+        passed = passed and (self.rehearsal is None or self.rehearsal.is_safe)
         return passed and separable and not self.not_excited and reached
 
     def summary(self) -> dict[str, Any]:
@@ -475,14 +429,14 @@ def verdict_of_check(check: Check) -> Iterator[str]:
 def _about_derivatives(check: Check) -> Iterator[str]:
     """Reason why the numbers of the check cannot be trusted, where the self-test failed."""
     tested = check.self_test
-    if tested.roughness is not None:
-        yield f"{tested.roughness}"
-    elif tested.finished and not tested.passed:
+    if tested.finished and not tested.passed:
         yield (
             f"the derivatives do not agree (psi recursion {tested.recursion:.1e}, slope "
-            f"{tested.slope:.1e}); {tested.likely_cause}. Shorten horizon or timestep, or "
-            "smooth what switches, before you trust these numbers"
+            f"{tested.slope:.1e}); the motion may be too unstable, or a component switches (muscle "
+            "activation). Shorten horizon or timestep before you trust these numbers"
         )
+    if check.steps is not None and str(check.steps):
+        yield str(check.steps)
 
 
 def _unknown_groups(check: Check) -> list[ParameterGroup]:

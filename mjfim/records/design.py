@@ -10,6 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
 
 # Largest number of iterates of one search whose motions are kept, and number of samples of each.
@@ -162,10 +163,6 @@ class Status(NamedEnum):
         "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
     )
     RELEASE_FOUND = "converged: no release nearby tells more, the best of a search over all ranges"
-    ROUGH = (
-        "ended where derivatives are unreliable (contact, dry friction or saturated actuators): "
-        "the numbers are only approximate, see warnings"
-    )
     STALLED = (
         "stalled: no step along the descent direction lowers the cost any more, "
         "within the accuracy of the finite differences"
@@ -189,11 +186,6 @@ class Status(NamedEnum):
     def success(self) -> bool:
         """True if the result is a (local) optimum to the requested tolerance."""
         return self in (Status.CONVERGED, Status.SMOOTHED, Status.RELEASE_FOUND)
-
-    @property
-    def ended_as_planned(self) -> bool:
-        """True if the optimisation converged, found no better one, or used up its budget."""
-        return self.success or self in (Status.MAX_ITERATIONS, Status.BEST_SEEN)
 
 
 @record
@@ -451,6 +443,8 @@ class Design(ShownRecord):
         motions: Thinned motions of at most `MAX_MOTIONS` iterates; None if none was kept.
         improvement: Share by which each of the last iterations lowered the cost; for D-optimality
             relative to one nat per parameter. NaN where it is unknown.
+        rehearsal: What the design does to the model and to simulated robots; None where it was
+            interrupted before.
     """
 
     status: Status
@@ -478,6 +472,7 @@ class Design(ShownRecord):
     sizes: Array = no_array()
     motions: IterateMotions | None = None
     improvement: float = float("nan")
+    rehearsal: Rehearsal | None = None
 
     file_stem = "design"
     made_by = "`mjfim design EXPERIMENT -o DIR`"
@@ -503,6 +498,7 @@ class Design(ShownRecord):
         "combinations",
         "prior",
         "data",
+        "rehearsal",
     )
     json_names = {"outcome": "message"}
 
@@ -534,16 +530,28 @@ class Design(ShownRecord):
 
     @property
     def sound(self) -> bool:
-        """True if the trajectory can be used as it is.
+        """True if a person would play the trajectory on a robot.
 
-        The optimisation converged, or it used up its budget and found a trajectory other than the
-        initial one. The trajectory keeps all limits, and derivatives exist along it.
+        The optimisation converged, or it found a trajectory other than the initial one. The
+        trajectory keeps all limits, and the rehearsal found no danger to robots that differ from
+        the model.
         """
+        is_safe = self.rehearsal is None or self.rehearsal.is_safe
+        is_useful = self.status.success or not self.is_start
+        is_finished = self.status is not Status.INTERRUPTED
+        return is_finished and self.within_limits and is_safe and is_useful
+
+    @property
+    def is_start(self) -> bool:
+        """True if no trajectory was found that is better than the initial one."""
         final, initial = self.final.trajectory, self.initial.trajectory
         same_control = np.array_equal(final.ctrl, initial.ctrl)
-        has_moved = not same_control or not np.array_equal(final.state[0], initial.state[0])
-        is_useful = self.status.success or has_moved
-        return self.status.ended_as_planned and self.within_limits and is_useful
+        return same_control and np.array_equal(final.state[0], initial.state[0])
+
+    @property
+    def stated_std(self) -> Array:
+        """(p,) standard deviations to state: by finite steps where derivatives are wrong."""
+        return self.final.std if self.rehearsal is None else self.rehearsal.steps.stated
 
     @property
     def separable(self) -> bool:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError, first_ones
+from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError
 from mjfim.excitation.evaluation import (
     growth_along,
     growth_warning,
@@ -26,6 +26,7 @@ from mjfim.excitation.evaluation import (
 from mjfim.excitation.initial_controls import initial_controls_of
 from mjfim.excitation.limits.verification import all_violations_of, require_feasible_start
 from mjfim.excitation.objective import DesignPoint, DesignProblem
+from mjfim.excitation.rehearsal import rehearsed
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.levels import regulator_for, require_coarse_factor
 from mjfim.excitation.task import (
@@ -44,9 +45,10 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.search import refuse_same_data
 from mjfim.identification.segments import recorded_release
 from mjfim.information.criteria import shared
+from mjfim.information.finite_steps import finite_steps
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
-from mjfim.information.smoothness import roughness, visible_columns
+from mjfim.information.smoothness import visible_columns
 from mjfim.optimize.directions import LBFGS
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
@@ -85,7 +87,7 @@ def self_test(
         task: Task whose model is tested.
         problem: Cost whose slope is tested.
         point: Trajectory with the cost there, computed with central differences.
-        stop: Asked before each of the three tests; true leaves out the rest of them.
+        stop: Asked before each of the two tests; true leaves out the rest of them.
 
     Raises:
         SimulationDivergedError: The trajectory diverges when the parameters change a little.
@@ -105,41 +107,25 @@ def self_test(
             return np.inf
 
     tests: dict[str, tuple[str, Callable[[], Any]]] = {
-        "roughness": (
-            "two step sizes",
-            lambda: roughness(
-                task.plant, task.system.noise, model, task.theta, trajectory, sensitivity
-            ),
-        ),
         "recursion": ("recursion", lambda: recursion_error(task, trajectory, sensitivity)),
         "slope": ("slope", slope),
     }
-    tested = SelfTest(roughness=None, recursion=np.nan, slope=np.nan, finished=False)
+    tested = SelfTest(recursion=np.nan, slope=np.nan, finished=False)
     for number, (key, (name, error)) in enumerate(tests.items()):
         if stop():
             return tested
         # A state does not show what control laws remember: there is no recursion and no slope.
-        is_possible = task.plant.laws is None or key == "roughness"
+        is_possible = task.plant.laws is None
         begin_stage(f"testing the derivatives: {name}", number, len(tests))
         found: dict[str, Any] = {key: error() if is_possible else 0.0}
         tested = replace(tested, **found)
     tested = replace(tested, finished=True)
 
-    # The result of the roughness test names its cause. The likely cause of any other failure is the
-    # first constraint that acts.
-    if tested.passed or tested.roughness is not None:
+    # Where contacts, dry friction or limits act, derivatives differ from differences.
+    if tested.passed:
         return tested
     active = first_active_constraint(model, trajectory)
-    if active is None:
-        cause = "the motion may be too unstable, or a component switches (muscle activation)"
-        return replace(tested, likely_cause=cause)
-
-    sample, causes = active
-    cause = (
-        f"constraints are active from sample {sample} (t = {trajectory.t[sample]:.4g} s): "
-        f"{first_ones(causes)}"
-    )
-    return replace(tested, likely_cause=cause)
+    return tested if active is None else replace(tested, acting=active[1])
 
 
 def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensitivity) -> float:
@@ -355,6 +341,7 @@ def check_task(
             source=source,
             duration=float(curve.t[-1]),
             is_start=trajectory is None,
+            is_played=trajectory is not None,
         )
 
 
@@ -489,6 +476,7 @@ def _checked(
     source: str,
     duration: float,
     is_start: bool,
+    is_played: bool = False,
 ) -> Check:
     """The record for the user; what a request to stop leaves out is named in it.
 
@@ -502,6 +490,7 @@ def _checked(
         source: What is checked, in words.
         duration: Duration of the data [s].
         is_start: Whether it is the initial control, at which a design begins.
+        is_played: Whether it is a motion that a robot is to play.
     """
     missing = []
 
@@ -535,6 +524,29 @@ def _checked(
     std = np.full(len(task.parameters), np.inf)
     std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
 
+    # Along one motion, standard deviations are checked by finite steps.
+    steps = None
+    if not stop.requested and point.trajectory is not None and point.information is not None:
+        along = information.std(point.information)
+        steps = finite_steps(
+            task.plant,
+            task.system.noise,
+            task.theta,
+            point.trajectory,
+            information=point.information,
+            prior=task.information.prior,
+            predicted=along,
+        )
+        odd = ~steps.confirmed
+        std[odd] *= steps.std[odd] / along[odd]
+
+    # A motion that a robot is to play is rehearsed without feedback.
+    rehearsal = None
+    if is_played and steps is not None and point.trajectory is not None:
+        played = point.trajectory
+        gain = np.zeros((played.samples, len(task.controls), task.space.nx))
+        rehearsal = rehearsed(task, played, gain, steps)
+
     # Eigenvalues of the criterion, without combinations that no experiment can identify.
     criterion = replace(task.information, basis=found.basis)
     eigenvalues = criterion.evaluate(data + criterion.prior).eigenvalues
@@ -563,6 +575,8 @@ def _checked(
         not_separable=found.groups_along_all,
         not_excited=not_excited,
         self_test=tested,
+        steps=steps,
+        rehearsal=rehearsal,
         verdict=(),
         combined=() if not_excited else found.combinations(information, values, total, total),
         missing=tuple(missing),

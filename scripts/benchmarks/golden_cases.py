@@ -107,8 +107,8 @@ CASES: dict[str, str] = {
     " ; simulate cart_pendulum_guess+parameters.c.true=1.5 -o b.csv"
     " ; identify cart_pendulum_guess.toml a.csv -o a ; identify cart_pendulum_guess.toml b.csv -o b"
     " ; compare-robots a b -o o",
-    "robustness": "design cart_pendulum+descent.max_iterations=10 -o a"
-    " ; robustness cart_pendulum.toml a -o o --runs 10 --executor local:1",
+    "rehearse": "design cart_pendulum+descent.max_iterations=10 -o a"
+    " ; rehearse a --experiment cart_pendulum.toml -o o --robots 10",
     "monte carlo": "design cart_pendulum+descent.max_iterations=10 -o a"
     " ; montecarlo cart_pendulum.toml a -o o --trials 20",
     "campaign": "campaign cart_pendulum_guess+descent.max_iterations=20 -o o --rounds 2"

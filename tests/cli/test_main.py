@@ -135,7 +135,7 @@ def test_version() -> None:
     [
         ("check", "study.toml", "--threads", "1000000"),
         ("design", "study.toml", "-o", "out", "--starts", "1000000000"),
-        ("robustness", "study.toml", "made", "-o", "x", "--runs", "1000000000"),
+        ("rehearse", "made", "-o", "x", "--robots", "1000000000"),
     ],
     ids=["threads", "starts", "runs"],
 )

@@ -273,7 +273,7 @@ def test_every_verb_follows_the_designed_release(tmp_path: Path) -> None:
         ("identify", file, log, "-o", tmp_path / "fit"),
         ("check", file, "--design", out),
         ("montecarlo", file, out, "-o", tmp_path / "study", "--trials", "4"),
-        ("robustness", file, out, "-o", tmp_path / "robots", "--runs", "1"),
+        ("rehearse", out, "-o", tmp_path / "robots", "--robots", "1"),
         ("replay", out, "--save", tmp_path / "replay.rrd"),
     ):
         result = run(*arguments)

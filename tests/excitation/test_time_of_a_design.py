@@ -104,6 +104,8 @@ def test_a_design_uses_its_time_and_not_much_more(
 ) -> None:
     """Beyond its time, it ends the iteration and verifies the result."""
     task = make(tmp_path, {**ENDLESS, "seconds": seconds})
+    # The rehearsal comes after the time of the search.
+    task = task.restated(task.experiment.replace(rehearsal={"robots": 0}))
     begun = clock()
     design = design_task(task)
     used = clock() - begun
@@ -157,7 +159,7 @@ def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_frict
         costs.append(design.final.cost)
         assert design.within_limits
         assert all(row.mu == 0.0 for row in design.history)
-        assert design.status in (Status.MAX_ITERATIONS, Status.ROUGH)
+        assert design.status is Status.MAX_ITERATIONS
 
         # All random controls are counted. Beyond its time, the design ends the last of them, whose
         # growth and report take as long as some evaluations.

@@ -68,9 +68,7 @@ CALLS = {
             *("--methods", "chirp,steps"),
         )
     ),
-    "robustness": Call(
-        words=("robustness", "study.toml", "made", *FOLDER, "--runs", "3"), has_workers=True
-    ),
+    "rehearse": Call(words=("rehearse", "made", *FOLDER, "--robots", "3")),
     "campaign": Call(
         words=("campaign", "guess.toml", *FOLDER, "--wanted", "0.0055", "--seed", "5"),
         again=("--resume",),

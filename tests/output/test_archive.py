@@ -81,6 +81,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
     """Names and shapes of all arrays, for the designed and the initial trajectory."""
     with np.load(folder / "design.npz", allow_pickle=False) as data:
         shapes = {key: data[key].shape for key in data.files}
+        robots = {key: shapes.pop(key) for key in data.files if key.startswith("rehearsal.")}
         motions = {key for key in data.files if key.startswith("motions.")}
         kinds = {data[key].dtype for key in {*data.files} - motions - {"record"}}
         kinds_of_motions = {data[key].dtype for key in motions}
@@ -108,6 +109,8 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         **{"theta": (P,), "sizes": (P,), "prior": (P, P), "data": (P, P)},
         "record": (),
     }
+    assert robots["rehearsal.theta"] == (61, P) and robots["rehearsal.steps.std"] == (P,)
+    assert robots["rehearsal.speed"] == (61, NV)
     assert kinds == {np.dtype("float64")}
     assert kinds_of_motions == {np.dtype("float64")}
     assert np.array_equal(psi, design.initial.sensitivity)

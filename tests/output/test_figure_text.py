@@ -28,18 +28,17 @@ from mjfim.records.estimate import (
     Whiteness,
 )
 from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
+from mjfim.records.rehearsal import Rehearsal, RehearsedLimit
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
-    AssessedLimit,
     Comparison,
     MethodOutcome,
     MonteCarloStudy,
-    RobotConditions,
-    Robustness,
 )
 from mjfim.records.terms import Decision, Selection, SelectionStep
 from mjfim.records.trajectory import Labels
+from tests.support import results
 from tests.support.figure_text import misplaced_texts
 from tests.support.made_records import (
     make_comparison,
@@ -190,7 +189,7 @@ def check(size: Size) -> Check:
         confounded=(),
         not_separable=(),
         not_excited=(),
-        self_test=SelfTest(roughness=None, recursion=0.0, slope=0.0),
+        self_test=SelfTest(recursion=0.0, slope=0.0),
         verdict=(
             f"{count} parameters miss their wanted sigma; the worst is {rows[-1].name}. Stop",
         ),
@@ -228,34 +227,24 @@ def comparison(size: Size) -> Comparison:
 
 
 @cache
-def robustness(size: Size) -> Robustness:
-    """A study of twelve robots."""
+def rehearsal(size: Size) -> Rehearsal:
+    """A rehearsal of twelve robots, some of which leave limits."""
     labels = size.labels
-    count, runs = size.parameters, 12
     rng = np.random.default_rng(0)
-    limits = tuple(
-        AssessedLimit(
-            kind="control_rate", name=label.partition(" ")[0], lower=-1.0, upper=1.0, scale=1.0
-        )
-        for label in labels.positions
-    )
-    return Robustness(
-        conditions=RobotConditions(),
-        names=labels.parameters,
-        units=labels.parameter_units,
-        limits=limits,
-        wrong=np.full(count, 0.2),
-        z=rng.normal(size=(runs, count)),
-        error=0.01 * rng.normal(size=(runs, count)),
-        std=np.full((runs, count), 0.01),
-        predicted=np.full(count, 0.01),
-        joint=(runs, runs),
-        margins=rng.uniform(-0.1, 0.5, (runs, size.joints)),
-        planned=np.full(size.joints, 0.2),
-        fit=1.0,
-        misfits=0,
-        restarted=0,
-        troubles={},
+    joints = tuple(label.partition(" ")[0] for label in labels.positions)
+    speed = rng.uniform(1.0, 9.0, (13, len(joints)))
+    return results.rehearsal(
+        limits=tuple(
+            RehearsedLimit(kind="control_rate", name=name, lower=-1.0, upper=1.0, scale=1.0)
+            for name in joints
+        ),
+        margins=rng.uniform(-0.1, 0.5, (13, len(joints))),
+        joints=joints,
+        units=("rad/s",) * len(joints),
+        speed=speed,
+        acceleration=10.0 * speed,
+        end_speed=0.1 * speed,
+        unlimited=joints[::2],
     )
 
 
@@ -435,7 +424,7 @@ RECORDS: dict[str, Callable[[Size], ShownRecord]] = {
     "check": check,
     "comparison": comparison,
     "robots": robots,
-    "robustness": robustness,
+    "rehearsal": rehearsal,
     "study": study,
     "campaign": campaign,
 }

@@ -19,7 +19,7 @@ from mjfim.output.rerun.documents import as_markdown
 from mjfim.output.words import improvement, relative
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import CampaignStatus
-from mjfim.records.design import CombinationAccuracy, Status
+from mjfim.records.design import CombinationAccuracy
 from mjfim.records.terms import (
     AlternativeTerm,
     Decision,
@@ -58,6 +58,7 @@ def test_a_record_without_page_is_refused() -> None:
 # ---- verdicts and next steps
 
 
+BROKEN: dict[str, Any] = {"margins": np.vstack([[0.1, 0.1], np.full((20, 2), [-0.5, 0.1])])}
 LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
 
 
@@ -66,7 +67,6 @@ LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
     [
         ("design", {}, Level.GOOD, "Ready to play: one experiment"),
         ("design", {"limits": {"position": -0.1}}, Level.BAD, "violates limits (position)"),
-        ("design", {"status": Status.INFEASIBLE}, Level.BAD, "not ready"),
         ("design", LENGTH_UNKNOWN, Level.DOUBTFUL, "length, damping: σ is 1000 % of its size for"),
         ("identify", {}, Level.GOOD, "explains the recordings"),
         ("identify", {"misfit": True, "chi2": 800.0}, Level.DOUBTFUL, "2.01 times the noise"),
@@ -76,7 +76,12 @@ LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
         ("check", {"refused": ("too long",), "verdict": ("a b",)}, Level.DOUBTFUL, "A b."),
         ("compare", {}, Level.GOOD, "The design is the best"),
         ("montecarlo", {}, Level.GOOD, "scatter as predicted"),
-        ("robustness", {}, Level.DOUBTFUL, "of 20 robots keep all limits"),
+        ("rehearse", {}, Level.GOOD, "20 of 20 robots whose parameters are up to 20 % off keep"),
+        ("rehearse", BROKEN, Level.BAD, "20 leave the limit on position of hinge, by up to"),
+        ("rehearse", {"lowest": np.full(21, -0.2)}, Level.BAD, "20 pass through the floor"),
+        ("design", {"rehearsal": results.rehearsal(**BROKEN)}, Level.BAD, "Do not play"),
+        ("design", {"rehearsal": None}, Level.DOUBTFUL, "not rehearsed"),
+        ("design", {"final": results.evaluation(0.01, 50)}, Level.DOUBTFUL, "less than its start"),
         ("campaign", {}, Level.GOOD, "Reached"),
         ("campaign", {"status": CampaignStatus.INFEASIBLE}, Level.BAD, "No design keeps"),
         ("campaign", {"status": CampaignStatus.WAITING, "rounds": ()}, Level.GOOD, "waits"),
@@ -92,7 +97,7 @@ def test_the_verdict(verb: str, changes: dict[str, Any], level: Level, words: st
     ("verb", "changes", "words"),
     [
         ("design", {}, "mjfim export"),
-        ("design", {"status": Status.ROUGH}, "away from contacts"),
+        ("design", {"rehearsal": results.rehearsal(**BROKEN)}, "position = { hinge = ["),
         ("design", {"limits": {"position": -0.1}}, "Widen the limit"),
         ("identify", {"missing_terms": (results.missing_term(),)}, "joint/hinge:frictionloss"),
         ("campaign", {"status": CampaignStatus.WAITING}, "--recordings FILE"),

@@ -23,7 +23,8 @@ from mjfim.output.plots.pictures import Pictures
 from mjfim.output.report import STYLES, template
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import Design
-from mjfim.records.studies import RobotConditions, Robustness
+from mjfim.records.rehearsal import Rehearsal
+from tests.support import results
 from tests.support.pages import page_with
 from tests.support.paths import MODELS
 
@@ -69,26 +70,9 @@ def comparison(experiment: mjfim.Experiment) -> mjfim.Comparison:
 
 
 @pytest.fixture
-def robustness() -> Robustness:
-    """Four robots of a model with one parameter, without limits."""
-    return Robustness(
-        conditions=RobotConditions(),
-        names=("m",),
-        units=("kg",),
-        limits=(),
-        wrong=np.array([0.2]),
-        z=np.array([[0.5], [-1.0], [1.5], [0.1]]),
-        error=np.full((4, 1), 0.01),
-        std=np.full((4, 1), 0.01),
-        predicted=np.array([0.01]),
-        joint=(4, 4),
-        margins=np.zeros((4, 0)),
-        planned=np.zeros(0),
-        fit=1.0,
-        misfits=0,
-        restarted=0,
-        troubles={},
-    )
+def rehearsal() -> Rehearsal:
+    """Robots of a model with limits."""
+    return results.rehearsal()
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +87,7 @@ def campaign(experiment: mjfim.Experiment) -> mjfim.Campaign:
     return mjfim.run_campaign(wanted, measure, rounds=1)
 
 
-RESULTS = ["check", "design", "estimate", "comparison", "study", "robustness", "campaign"]
+RESULTS = ["check", "design", "estimate", "comparison", "study", "rehearsal", "campaign"]
 
 
 @pytest.fixture(params=RESULTS)
@@ -234,23 +218,23 @@ def test_a_fit_keeps_its_iterates_its_segments_and_the_nominal_model(
     ],
 )
 def test_plot_writes_the_format_that_the_file_names(
-    robustness: Robustness, ending: str, start: bytes, tmp_path: Path
+    rehearsal: Rehearsal, ending: str, start: bytes, tmp_path: Path
 ) -> None:
     file = tmp_path / f"picture.{ending}"
-    robustness.plot(file=file)
+    rehearsal.plot(file=file)
     first = file.read_bytes()
     assert first.startswith(start)
 
     # A file holds no time and no random names.
-    robustness.plot(file=file)
+    rehearsal.plot(file=file)
     assert file.read_bytes() == first
 
 
 def test_an_unknown_format_is_an_error_that_lists_the_formats(
-    robustness: Robustness, tmp_path: Path
+    rehearsal: Rehearsal, tmp_path: Path
 ) -> None:
     with pytest.raises(MjfimError, match=r"picture.bmp.*valid: .png, .svg, .pdf"):
-        robustness.plot(file=tmp_path / "picture.bmp")
+        rehearsal.plot(file=tmp_path / "picture.bmp")
 
 
 def test_pictures_of_an_earlier_run_in_another_format_are_removed(tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def test_every_colour_has_a_value_in_both_themes(verb: str) -> None:
 @pytest.mark.parametrize("verb", results.MAKERS)
 def test_names_of_others_are_escaped(verb: str) -> None:
     """A name with a script stays a text, in the page and in the data of the plots."""
-    names = {"name": HOSTILE} if verb in ("design", "identify", "robustness") else {}
+    names = {"name": HOSTILE} if verb in ("design", "identify", "rehearse") else {}
     record = results.MAKERS[verb](parameters=(HOSTILE, "<img src=x>", "a & b"), **names)
     html = report_of([record], [HOSTILE])
     assert HOSTILE not in html

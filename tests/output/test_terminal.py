@@ -29,7 +29,7 @@ def letters(text: str) -> str:
 @widths
 @pytest.mark.parametrize("verbose", [False, True])
 def test_nothing_is_cut(verb: str, width: int, verbose: bool) -> None:
-    names = {"name": LONG[0]} if verb in ("design", "identify", "robustness") else {}
+    names = {"name": LONG[0]} if verb in ("design", "identify", "rehearse") else {}
     page = page_of(results.MAKERS[verb](parameters=LONG, **names))
     text = printed(page, width, verbose=verbose)
     assert max(map(cell_len, text.splitlines())) <= width

@@ -32,7 +32,8 @@ from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate, PredictionErrors
-from mjfim.records.studies import Comparison, MonteCarloStudy, Robustness
+from mjfim.records.rehearsal import Rehearsal
+from mjfim.records.studies import Comparison, MonteCarloStudy
 from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies.check import check_task
 from mjfim.studies.monte_carlo import monte_carlo
@@ -48,7 +49,7 @@ SAVED: tuple[type[SavedRecord], ...] = (
     MonteCarloStudy,
     PredictionErrors,
     Recording,
-    Robustness,
+    Rehearsal,
     Trajectory,
 )
 

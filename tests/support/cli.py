@@ -32,6 +32,7 @@ DESIGN = {
     "sensitivity_phase.png",
     "convergence.png",
     "standard_deviations.png",
+    "rehearsal.png",
 }
 
 # Files that `mjfim identify` writes.
@@ -100,7 +101,7 @@ def write_experiment(home: Path, **lines: str) -> Path:
             raise ValueError(f"{key} does not stand exactly once in the experiment file")
 
     path = home / "study.toml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(f"rehearsal.robots = 4\n{text}", encoding="utf-8")
     return path
 
 

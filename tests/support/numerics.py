@@ -138,7 +138,14 @@ def make_task(model: str | Path, folder: Path, **tables: Any) -> DesignTask:
         path.write_text(model, encoding="utf-8")
 
     chirp = {"kind": "chirp", "amplitude": 1.0, "frequency": 0.7, "frequency_end": 2.0}
-    values = {"rate": 100.0, "horizon": 0.5, "initial": {"control": chirp}, **tables}
+    few = {"robots": 4}
+    values = {
+        "rate": 100.0,
+        "horizon": 0.5,
+        "initial": {"control": chirp},
+        "rehearsal": few,
+        **tables,
+    }
     if "control" in values:
         values["initial"] = {**values["initial"], "control": values.pop("control")}
 

@@ -22,16 +22,14 @@ from mjfim.records.estimate import (
     PredictionErrors,
     Whiteness,
 )
+from mjfim.records.rehearsal import FiniteSteps, Rehearsal, RehearsedLimit
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
-    AssessedLimit,
     Comparison,
     MethodOutcome,
     MethodResult,
     MonteCarloStudy,
-    RobotConditions,
-    Robustness,
     TrialStatistics,
 )
 from mjfim.records.terms import Term, TermNumber
@@ -136,6 +134,7 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
             ),
         ),
         "labels": labels(name),
+        "rehearsal": rehearsal(name, steps=finite_steps(predicted=final.std)),
     }
     return Design(**{**fields, **changes})  # type: ignore[arg-type]
 
@@ -264,7 +263,7 @@ def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
         "confounded": (ConfoundedPair(first=parameters[0], second=parameters[1], correlation=0.8),),
         "not_separable": (),
         "not_excited": (),
-        "self_test": SelfTest(roughness=None, recursion=1e-8, slope=1e-6),
+        "self_test": SelfTest(recursion=1e-8, slope=1e-6),
         "verdict": ("every identifiable parameter reaches its wanted sigma",),
     }
     return Check(**{**fields, **changes})  # type: ignore[arg-type]
@@ -341,32 +340,54 @@ def study(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> MonteC
     return MonteCarloStudy(**{**fields, **changes})  # type: ignore[arg-type]
 
 
-def robustness(name: str = "hinge", parameters: tuple[str, ...] = PARAMETERS) -> Robustness:
-    """Twenty robots, some of which exceed a limit."""
-    random = np.random.default_rng(0)
-    z = random.normal(size=(20, 3))
-    limits = tuple(
-        AssessedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0)
-        for kind in ("position", "velocity")
-    )
-    return Robustness(
-        conditions=RobotConditions(),
+def finite_steps(
+    parameters: tuple[str, ...] = PARAMETERS, predicted: np.ndarray = 0.01 * THETA
+) -> FiniteSteps:
+    """Standard deviations that finite steps confirm."""
+    return FiniteSteps(
         names=parameters,
-        units=UNITS,
-        limits=limits,
-        wrong=0.2 * THETA,
-        z=z,
-        error=0.01 * z * THETA,
-        std=np.tile(0.01 * THETA, (20, 1)),
-        predicted=0.01 * THETA,
-        joint=(19, 19),
-        margins=np.array([0.1, 0.4]) + 0.1 * random.normal(size=(20, 2)),
-        planned=np.array([0.1, 0.4]),
-        fit=1.0,
-        misfits=0,
-        restarted=0,
-        troubles={},
+        predicted=predicted,
+        std=predicted,
+        length=np.full(3, 2.0),
+        ratio=np.ones(3),
     )
+
+
+def rehearsal(
+    name: str = "hinge", parameters: tuple[str, ...] = PARAMETERS, **changes: object
+) -> Rehearsal:
+    """Twenty robots that keep all limits, or some of which exceed one for small margins."""
+    random = np.random.default_rng(0)
+    rows = np.ones((21, 1))
+    fields: dict[str, object] = {
+        "parameters": parameters,
+        "wrong": 0.2,
+        "feedback": False,
+        "latency": 0.0,
+        "theta": THETA * (1.0 + 0.2 * random.uniform(-1.0, 1.0, (21, 3))),
+        "limits": tuple(
+            RehearsedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0, unit=unit)
+            for kind, unit in (("position", "rad"), ("velocity", "rad/s"))
+        ),
+        "margins": np.array([0.4, 0.5]) + 0.1 * random.uniform(-1.0, 1.0, (21, 2)),
+        "joints": ("slide", name),
+        "units": ("m/s", "rad/s"),
+        "speed": rows * np.array([0.5, 0.6]),
+        "acceleration": rows * np.array([5.0, 6.0]),
+        "end_speed": rows * np.array([0.001, 0.002]),
+        "unlimited": ("slide",),
+        "lowest": 0.2 * rows[:, 0],
+        "floor": 0.0,
+        "has_floor": True,
+        "depth": 0.01,
+        "end_height": 0.3 * rows[:, 0],
+        "nearest": 0.1 * rows[:, 0],
+        "in_contact": 0.0 * rows[:, 0],
+        "at_stop": 0.0 * rows[:, 0],
+        "unbraked": {},
+        "steps": finite_steps(parameters),
+    }
+    return Rehearsal(**{**fields, **changes})  # type: ignore[arg-type]
 
 
 def campaign(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Campaign:
@@ -420,6 +441,6 @@ MAKERS = {
     "check": check,
     "compare": comparison,
     "montecarlo": study,
-    "robustness": robustness,
+    "rehearse": rehearsal,
     "campaign": campaign,
 }

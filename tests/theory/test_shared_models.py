@@ -14,7 +14,6 @@ import pytest
 import mjfim
 from mjfim.errors import ModelError
 from mjfim.model.loading import compile_spec, load_spec
-from mjfim.records.design import Status
 from tests.support.numerics import shared_model
 from tests.support.paths import SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
@@ -84,26 +83,16 @@ def test_a_design_has_ten_times_the_information_of_the_chirp(name: str) -> None:
     assert gain >= GAIN, f"{gain:.3g}, {design.status.value}"
     assert all(margin >= 0.0 for margin in design.limits.values()), design.limits
     assert not any("clamps" in sentence for sentence in design.warnings), design.warnings
-    if design.status is Status.ROUGH:  # joints with dry friction: said, with its sample
-        assert name == "so_arm100"
-        assert any(
-            "not smooth" in sentence and "dry friction" in sentence for sentence in design.warnings
-        )
-    else:
-        assert design.status.success
+    assert design.status.success or name == "so_arm100"  # which has joints with dry friction
+    assert design.rehearsal is not None
 
 
 @pytest.mark.parametrize("name", EXPERIMENT_NAMES)
-def test_check_passes_or_names_the_rough_sample(name: str) -> None:
+def test_check_passes(name: str) -> None:
     found = mjfim.check(experiment(name))
     assert not found.not_separable
     assert not found.not_excited
     assert all(np.isfinite(row.std) for row in found.rows)
     assert found.verdict
-    if not found.self_test.passed:
-        rough = found.self_test.roughness
-        assert rough is not None, found.self_test
-        assert rough.sample > 0
-        assert any(
-            "friction" in cause or "contact" in cause or "limit" in cause for cause in rough.causes
-        )
+    assert found.self_test.passed, found.self_test
+    assert found.steps is not None

@@ -34,7 +34,7 @@ from mjfim.excitation.search.inside import InsideControl, InsideSearch, is_progr
 from mjfim.excitation.search.levels import DescentLevel, coarse_level, coarser_levels, easier_level
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import for_workers
-from mjfim.information.smoothness import roughness
+from mjfim.information.smoothness import is_rough
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
@@ -523,15 +523,13 @@ class Search:
         model = task.system.model_at(task.theta)
         if nothing_acts_along(model, self.first.trajectory, task.system.grid.substeps):
             return False
-        found = roughness(
+        return is_rough(
             task.plant,
             task.system.noise,
-            model,
             task.theta,
             self.first.trajectory,
             self.first.sensitivity,
         )
-        return found is not None
 
     # ---- descents, here or on workers
 

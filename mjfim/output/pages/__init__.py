@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import replace
 from importlib import import_module
@@ -21,7 +22,7 @@ PAGES = {
     "InverseDynamicsFit": ("studies", "equation_page"),
     "MonteCarloStudy": ("studies", "study_page"),
     "RobotComparison": ("studies", "robots_page"),
-    "Robustness": ("studies", "robustness_page"),
+    "Rehearsal": ("design", "rehearsal_page"),
 }
 
 
@@ -46,6 +47,12 @@ def page_of(
     steps = page.next_steps
     for word, place in (("EXPERIMENT", experiment), ("DESIGN_FOLDER", design)):
         if place is not None:
-            quoted = f" {shlex.quote(str(place))} "
-            steps = tuple(step.replace(f" {word} ", quoted) for step in steps)
+            # A file in the folder is one word of the shell, too.
+            pattern = rf"(?<= )({word})(/[\w.]+)?(?=[ `])"
+            steps = tuple(_with_path(step, pattern, str(place)) for step in steps)
     return replace(page, next_steps=steps)
+
+
+def _with_path(step: str, pattern: str, path: str) -> str:
+    """Put a path in the place of a word, with the quotation marks that a shell needs."""
+    return re.sub(pattern, lambda found: shlex.quote(path + (found[2] or "")), step)

@@ -25,6 +25,7 @@ from mjfim.output.page import (
     number,
     numbers,
     tabulated,
+    warned,
 )
 from mjfim.output.words import (
     BEST_CASE,
@@ -35,7 +36,8 @@ from mjfim.output.words import (
     size_sentence,
 )
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup
-from mjfim.records.design import Design, ScaledStart, Status
+from mjfim.records.design import Design, ScaledStart
+from mjfim.records.rehearsal import Rehearsal, RehearsedLimit
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
@@ -45,6 +47,9 @@ MAX_VIOLATIONS = 4
 
 # Numbers of the eigenvalues that a table shows where there are more than these, largest first.
 SHOWN_EIGENVALUES = (0, 1, 2, -2, -1)
+
+# Longest text of the dangers of a motion in its verdict [characters].
+MAX_FAULTS_TEXT = 320
 
 # Digits as subscripts.
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
@@ -65,6 +70,8 @@ def design_page(design: Design) -> Page:
     ]
     if design.limits:
         sections.insert(2, Section("Limits", [Plot("limits"), _limit_table(design)]))
+    if design.rehearsal is not None:
+        sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
     before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
     return Page(
         kind="Design of an experiment",
@@ -94,34 +101,111 @@ def _verdict(design: Design) -> Verdict:
     if violated:
         text = f"Do not play this motion: it violates limits ({first_ones(violated)})."
         return Verdict(text, Level.BAD)
-    if not design.sound:
-        return Verdict(f"The design is not ready: {design.outcome}.", Level.BAD)
-    kept = "It keeps all limits" if design.limits else "No limits were stated"
+    rehearsal = design.rehearsal
+    if rehearsal is None:
+        text = f"The design was {design.outcome}. It was not rehearsed on robots."
+        return Verdict(text, Level.DOUBTFUL)
+    if not rehearsal.is_safe:
+        return _danger(rehearsal)
+    seen = " ".join(_observed(rehearsal))
+    if design.is_start and not design.status.success:
+        return Verdict(f"The design is no better than its start. {seen}", Level.DOUBTFUL)
     if not design.separable:
         text = (
-            f"The design is made for combinations of parameters, because no control separates all "
-            f"of them. {kept}."
+            "The design is made for combinations of parameters, because no control separates all "
+            f"of them. {seen}"
         )
         return Verdict(text, Level.DOUBTFUL)
     reservation = _reservation(design)
     if reservation:
-        text = f"This motion can be played, but {reservation}. {kept}."
-        return Verdict(text, Level.DOUBTFUL)
-    return Verdict(f"Ready to play: {_accuracy(design)}. {kept}.", Level.GOOD)
+        return Verdict(f"This motion can be played, but {reservation}. {seen}", Level.DOUBTFUL)
+    return Verdict(f"Ready to play: {_accuracy(design)}. {seen}", Level.GOOD)
+
+
+def _danger(rehearsal: Rehearsal) -> Verdict:
+    """Say what happens to robots that must not happen, the worst first."""
+    faults = first_ones(list(_faults(rehearsal)), "; ", MAX_FAULTS_TEXT)
+    return Verdict(f"Do not play this motion. Of {_robots(rehearsal)}, {faults}.", Level.BAD)
+
+
+def _robots(rehearsal: Rehearsal) -> str:
+    """The robots of a rehearsal in words."""
+    return f"{rehearsal.robots} robots whose parameters are up to {100 * rehearsal.wrong:g} % off"
+
+
+def _faults(rehearsal: Rehearsal) -> Iterator[str]:
+    if rehearsal.diverged:
+        yield f"{rehearsal.diverged} diverge in the simulation"
+    if rehearsal.passes_floor.any():
+        floor = "the floor" if rehearsal.has_floor else "the plane under the robot"
+        deepest = -float(np.nanmin(rehearsal.lowest))
+        yield f"{rehearsal.below_floor} pass through {floor}, by up to {deepest:.3g} m"
+    worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
+    broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
+    for i in sorted(broken.tolist(), key=lambda i: float(rehearsal.kept[:, i].sum())):
+        limit, count = rehearsal.limits[i], int((~rehearsal.kept[1:, i]).sum())
+        excess = -float(np.nanmin(worst[:, i])) * limit.scale
+        manner = f"by up to {excess:.3g} {limit.unit}".rstrip() if excess > 0.0 else "to its clamp"
+        yield f"{count} leave the limit on {_kind(limit)} of {limit.name}, {manner}"
+    for name, count in rehearsal.unbraked.items():
+        yield f"{count} end too fast to be braked before the limit of {name}"
+
+
+def _kind(limit: RehearsedLimit) -> str:
+    """The kind of a limit in words."""
+    return limit.kind.replace("_", " ")
+
+
+def _observed(rehearsal: Rehearsal) -> Iterator[str]:
+    """Say how sure σ is, what robots do in a motion that is safe, and what nothing limits."""
+    if str(rehearsal.steps):
+        yield as_sentence(str(rehearsal.steps))
+    if not rehearsal.limits:
+        yield "No limits were stated."
+    elif rehearsal.robots:
+        yield f"{rehearsal.all_kept} of {_robots(rehearsal)} keep all limits."
+    else:
+        yield "It keeps all limits."
+    peaks = np.nanmax(rehearsal.speed, axis=0)
+    free = [i for i, name in enumerate(rehearsal.joints) if name in rehearsal.unlimited]
+    free = [i for i in free if peaks[i] > 0.0]
+    if free:
+        fastest: dict[str, int] = {}
+        for i in sorted(free, key=lambda i: -float(peaks[i])):
+            fastest.setdefault(rehearsal.units[i], i)
+        shown = [f"{peaks[i]:.2g} {unit} ({rehearsal.joints[i]})" for unit, i in fastest.items()]
+        joints = "1 joint" if len(free) == 1 else f"{len(free)} joints"
+        yield f"Nothing limits the speed of {joints}: it is up to {' and '.join(shown)}."
+    if not rehearsal.at_rest:
+        shares = rehearsal.end_speed[0] / np.where(peaks > 0.0, peaks, np.inf)
+        i = int(np.argmax(shares))
+        speed = f"{rehearsal.end_speed[0, i]:.2g} {rehearsal.units[i]}"
+        yield f"It ends in motion: {rehearsal.joints[i]} at {speed}."
+    else:
+        yield "It ends at rest."
 
 
 def _undetermined(design: Design) -> list[int]:
     """Numbers of the wanted parameters whose standard deviation exceeds their size."""
-    std, sizes = design.final.std, design.sizes
+    std, sizes = design.stated_std, design.sizes
     return [j for j in design.wanted if not np.isfinite(std[j]) or 0.0 < sizes[j] < std[j]]
 
 
 def _reservation(design: Design) -> str:
-    """Say which parameters a design does not determine; empty where it determines all of them."""
+    """Say what a design does not tell; empty where it determines all and tells more than its start.
+
+    A start outside the limits may tell more.
+    """
     found = _undetermined(design)
+    if not found and _tells_less(design):
+        before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+        return (
+            f"it tells less than its start (λ_min {before:.3g} → {after:.3g}), because the cost "
+            "weighs the control or the tracking more than the information"
+        )
     if not found:
         return ""
-    std, sizes = design.final.std, design.sizes
+    std, sizes = design.stated_std, design.sizes
     worst = max(found, key=lambda j: float(std[j] / sizes[j]) if np.isfinite(std[j]) else np.inf)
     text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
     if not np.isfinite(std[worst]):
@@ -131,16 +215,22 @@ def _reservation(design: Design) -> str:
     return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
 
 
+def _tells_less(design: Design) -> bool:
+    """Whether a start inside the limits has more information."""
+    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    return not design.initial_violations and RELEVANT_RATIO * after < before
+
+
 def _accuracy(design: Design) -> str:
     """The accuracy of the parameter that a design determines worst, in words."""
-    shares = design.final.std / np.where(design.sizes > 0.0, design.sizes, np.nan)
+    shares = design.stated_std / np.where(design.sizes > 0.0, design.sizes, np.nan)
     wanted = [j for j in design.wanted if np.isfinite(shares[j])]
     sentence = f"one experiment of {_seconds(design):.3g} s determines every parameter"
     if not wanted:
         return sentence
     worst = max(wanted, key=lambda j: float(shares[j]))
     name = design.parameters[worst]
-    before, after = float(design.initial.std[worst]), float(design.final.std[worst])
+    before, after = float(design.initial.std[worst]), float(design.stated_std[worst])
     sentence += f" with a σ of {relative(after, float(design.sizes[worst]))} or less"
     if not np.isfinite(before):
         return f"{sentence}; the initial motion does not determine {name}"
@@ -154,16 +244,15 @@ def _next_steps(design: Design) -> Iterator[str]:
     if not design.within_limits:
         yield "Widen the limit that is violated, or begin with an initial control that is smaller."
         return
+    if design.rehearsal is not None and not design.rehearsal.is_safe:
+        yield from _cures(design.rehearsal)
+        yield "Design again: `mjfim design EXPERIMENT -o FOLDER`."
+        return
     if not design.separable:
         groups = first_ones(design.combinations, "; ")
         yield (
             f"Remove or fix one parameter of each group, give it a prior, or measure another "
             f"output: {groups}."
-        )
-    if design.status is Status.ROUGH:
-        yield (
-            "Keep the motion away from contacts, dry friction and saturated actuators: begin with "
-            "an initial control of smaller amplitude, or state narrower limits."
         )
     undetermined = _undetermined(design) if design.separable else []
     if undetermined:
@@ -172,11 +261,120 @@ def _next_steps(design: Design) -> Iterator[str]:
             f"Determine {names} with a longer or larger motion, by measuring another output, or "
             "state what is known with `prior`."
         )
-    if not design.status.success and design.status is not Status.ROUGH:
+    if _tells_less(design):
+        yield "Lower `cost.control` and `cost.tracking` for a design that tells more."
+    if design.is_start and not design.status.success:
         yield "Allow more time or iterations in the table `[descent]` for a better design."
     if design.sound:
-        yield "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o FILE`."
+        yield (
+            "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o "
+            "DESIGN_FOLDER/player.py`."
+        )
         yield "Record it, then estimate: `mjfim identify EXPERIMENT RECORDING -o FOLDER`."
+
+
+def _cures(rehearsal: Rehearsal) -> Iterator[str]:
+    """Lines of the experiment file that keep such robots safe."""
+    if rehearsal.passes_floor.any():
+        yield (
+            "Keep the robot above the floor: state ranges of `position` in `[limits]` for what "
+            "moves down, or `clearance` to a floor in the model."
+        )
+    reserve = rehearsal.reserve
+    for i in np.flatnonzero(~rehearsal.kept.all(axis=0)).tolist():
+        limit = rehearsal.limits[i]
+        move = float(np.ceil(100.0 * reserve[i]) / 100.0) * limit.scale
+        if not 0.0 < move < limit.scale or limit.kind == "clearance":
+            continue
+        low, high = limit.lower + move, limit.upper - move
+        yield (
+            f"Design with a reserve for such robots: `[limits] {limit.kind} = {{ "
+            f"{limit.name} = [{low:.4g}, {high:.4g}] }}`."
+        )
+    if rehearsal.unbraked:
+        yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
+
+
+def rehearsal_page(rehearsal: Rehearsal) -> Page:
+    """Describe what a design does to robots that differ from the model."""
+    verdict = _danger(rehearsal)
+    steps: tuple[str, ...] = (
+        *_cures(rehearsal),
+        "Design again: `mjfim design EXPERIMENT -o FOLDER`.",
+    )
+    if rehearsal.is_safe:
+        verdict = Verdict(f"Safe to play. {' '.join(_observed(rehearsal))}", Level.GOOD)
+        steps = (
+            "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o "
+            "DESIGN_FOLDER/player.py`.",
+        )
+    control = "with feedback" if rehearsal.feedback else "open loop"
+    return Page(
+        kind="Rehearsal of a design",
+        verdict=verdict,
+        next_steps=steps,
+        facts={
+            "robots": str(rehearsal.robots),
+            "error of the parameters": f"{100.0 * rehearsal.wrong:g} %",
+            "control": control,
+        },
+        sections=[Section("Rehearsal", list(_rehearsal_parts(rehearsal)))],
+    )
+
+
+def _rehearsal_parts(rehearsal: Rehearsal) -> Iterator[Part]:
+    yield Plot("rehearsal")
+    if rehearsal.limits:
+        yield _margin_table(rehearsal)
+    yield tabulated(
+        "Largest speeds and accelerations of the model and of all robots",
+        {
+            "joint": list(map(named, rehearsal.joints, rehearsal.units)),
+            "speed": numbers(rehearsal.speed[0]),
+            "of robots": numbers(np.nanmax(rehearsal.speed, axis=0)),
+            "at the end": numbers(np.nanmax(rehearsal.end_speed, axis=0)),
+            "acceleration": numbers(np.nanmax(rehearsal.acceleration, axis=0)),
+            "limited": [
+                "no" if name in rehearsal.unlimited else "yes" for name in rehearsal.joints
+            ],
+        },
+        spare=("acceleration", "limited"),
+        detail=True,
+    )
+    yield Text(_surroundings(rehearsal), detail=True)
+
+
+def _surroundings(rehearsal: Rehearsal) -> str:
+    """Heights, distances, contacts and stops of all robots in a sentence."""
+    parts = []
+    place = "the floor" if rehearsal.has_floor else "the plane under the robot"
+    place = place if np.isfinite(rehearsal.floor) else "the origin of the world"
+    parts.append(f"lowest point {np.nanmin(rehearsal.lowest):.3g} m above {place}")
+    if np.isfinite(rehearsal.nearest).any():
+        parts.append(f"smallest distance {np.nanmin(rehearsal.nearest):.3g} m")
+    for share, name in ((rehearsal.in_contact, "in contact"), (rehearsal.at_stop, "at a stop")):
+        parts.append(f"{name} for up to {100.0 * np.nanmax(share):.2g} % of the time")
+    return f"All robots: {', '.join(parts)}."
+
+
+def _margin_table(rehearsal: Rehearsal) -> Table:
+    """Tabulate the limits, the least kept first."""
+    worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
+    least = np.nanmin(worst, axis=0)
+    order = np.argsort(least, kind="stable").tolist()
+    limits = [rehearsal.limits[i] for i in order]
+    scales = np.array([limit.scale for limit in limits])
+    kept = rehearsal.kept[1:, order].sum(axis=0).tolist()
+    return tabulated(
+        f"Margins of the limits on {rehearsal.robots} robots; negative: exceeded",
+        {
+            "limit": [named(f"{_kind(each)} of {each.name}", each.unit) for each in limits],
+            "model": numbers(rehearsal.margins[0, order] * scales),
+            "worst robot": numbers(least[order] * scales),
+            "robots that keep it": [f"{count} of {rehearsal.robots}" for count in kept],
+        },
+        warned([count < rehearsal.robots for count in kept]),
+    )
 
 
 # ---- sentences
@@ -184,7 +382,7 @@ def _next_steps(design: Design) -> Iterator[str]:
 
 def _accuracy_parts(design: Design) -> Iterator[Part]:
     if design.outcome.lower() not in _verdict(design).text.lower():
-        yield Text(capitalised(design.outcome))
+        yield Text(capitalised(design.outcome), detail=design.sound)
     yield _accuracy_table(design)
     yield Plot("standard_deviations")
     broken = [str(violation) for violation in design.initial_violations]
@@ -244,7 +442,7 @@ def _accuracy_table(design: Design) -> Table:
     values = [*design.theta[wanted], *(each.value for each in combined)]
     sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
     before = [*design.initial.std[wanted], *(each.std_initial for each in combined)]
-    after = [*design.final.std[wanted], *(each.std_final for each in combined)]
+    after = [*design.stated_std[wanted], *(each.std_final for each in combined)]
     return tabulated(
         "Predicted standard deviation σ of each parameter after one experiment",
         {
@@ -313,6 +511,8 @@ MAX_LISTED_EIGENVALUES = 8
 def check_page(check: Check) -> Page:
     """Describe predicted standard deviations, and inseparable parameters."""
     sections = [Section("Accuracy", list(_check_parts(check)))]
+    if check.rehearsal is not None:
+        sections.append(Section("Rehearsal", list(_rehearsal_parts(check.rehearsal))))
     if check.violations:
         title = "The motion of the initial control violates limits; a design looks for one inside:"
         items = tuple(str(violation) for violation in check.violations)
@@ -333,6 +533,8 @@ def check_page(check: Check) -> Page:
 
 
 def _check_verdict(check: Check) -> Verdict:
+    if check.rehearsal is not None and not check.rehearsal.is_safe:
+        return _danger(check.rehearsal)
     if check.ok:
         shares = {row.name: row.relative for row in check.rows if not row.nuisance}
         worst = max(shares, key=lambda name: shares[name])
@@ -348,6 +550,8 @@ def _check_verdict(check: Check) -> Verdict:
 def _check_next(check: Check) -> Iterator[str]:
     if check.refused or check.missing:
         return
+    if check.rehearsal is not None and not check.rehearsal.is_safe:
+        yield from _cures(check.rehearsal)
     if check.not_separable:
         yield (
             "Remove or fix one parameter of each group that is identifiable only in combination, "
@@ -427,8 +631,8 @@ def _about_self_test(check: Check) -> str:
     test = check.self_test
     if not test.finished:
         return "derivative self-test not finished, because the check was interrupted"
-    agreement = "agree" if test.roughness is None else "disagree"
+    acting = f"; {first_ones(test.acting)} acts" if test.acting else ""
     return (
         f"derivative self-test {'passed' if test.passed else 'FAILED'}: relative error of psi "
-        f"{test.recursion:.1e}, of the slope {test.slope:.1e}; two step sizes {agreement}"
+        f"{test.recursion:.1e}, of the slope {test.slope:.1e}{acting}"
     )

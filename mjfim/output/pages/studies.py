@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import PurePath
 
 import numpy as np
-import scipy
 
 from mjfim.errors import first_ones
 from mjfim.output.page import (
@@ -37,13 +36,10 @@ from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.robots import RobotComparison, p_text
 from mjfim.records.studies import (
-    CONFIDENCE,
     DESIGN,
-    REQUIRED_COVERAGE,
     Comparison,
     MethodResult,
     MonteCarloStudy,
-    Robustness,
     TrialStatistics,
 )
 
@@ -117,143 +113,6 @@ def _campaign_table(campaign: Campaign, parameters: CampaignParameters) -> Table
         errors = (values - parameters.true[chosen]) / std
         columns["error"] = [f"{error:+.1f} σ" for error in errors]
     return tabulated("Estimates", columns, warned(~(std <= wanted)))
-
-
-# ---- a design on robots that differ from the model
-
-
-def robustness_page(result: Robustness) -> Page:
-    """Describe estimates and margins of a design on robots that differ from the model."""
-    conditions = result.conditions
-    covered = (
-        "the 95 % intervals hold the true values often enough"
-        if result.covered
-        else "the 95 % intervals hold the true values too rarely"
-    )
-    text = f"{result.all_kept} of {result.runs} robots keep all limits, and {covered}."
-    conclusions = tuple(as_sentence(sentence) for sentence in robustness_sentences(result))
-    steps: tuple[str, ...] = ()
-    if result.reserve():
-        steps = conclusions[-1:]
-    elif result.ok:
-        steps = ("Play the design on the robot: `mjfim export DESIGN_FOLDER --to player -o FILE`.",)
-    limits: list[Part] = [_limit_table(result)] if result.limits else []
-    return Page(
-        kind="A design on robots that differ from the model",
-        verdict=Verdict(text, Level.GOOD if result.ok else Level.DOUBTFUL),
-        next_steps=steps,
-        facts={
-            "robots": str(result.runs),
-            "error of the parameters": f"{100 * conditions.wrong:g} %",
-            "delay of the control": f"{1e3 * conditions.latency:g} ms",
-            "control": "with feedback" if conditions.feedback else "open loop",
-            "noise / stated noise": f"{conditions.loudness:g}",
-        },
-        sections=[
-            Section(
-                "Robots",
-                [
-                    Listing("Conclusions", conclusions),
-                    _unknown_table(result),
-                    *limits,
-                    Plot("playback"),
-                ],
-            )
-        ],
-    )
-
-
-def robustness_sentences(result: Robustness) -> Iterator[str]:
-    """Yield the conclusions of a robustness study; the advice is the last one."""
-    n = result.runs
-    low, high = (int(k) for k in scipy.stats.binom.interval(0.99, n, CONFIDENCE))
-    inside = result.inside[result.identified]
-    stated, every = result.joint
-    yield (
-        f"95 % intervals hold the true value in {inside.min(initial=n)} to {inside.max(initial=0)} "
-        f"of {n} runs (expected by chance: {low} to {high})"
-    )
-    yield (
-        f"joint 95 % regions hold the true values of the experiment's parameters in {stated}, and "
-        f"of all unknowns in {every} of {n} runs"
-    )
-    yield (
-        f"fits: mean chi2 / dof {result.fit:.3f}, {result.misfits} misfits, {result.restarted} "
-        "repeated from other initial guesses"
-    )
-    for sentence, count in result.troubles.items():
-        yield f"{count} of {n} runs: {sentence}"
-    yield from _limit_sentences(result)
-    reserve = result.reserve()
-    if reserve:
-        needed = " ".join(f"{kind}={share:g}" for kind, share in reserve.items())
-        yield (
-            "such robots keep the limits if the design stays away from them by these shares of "
-            f"half of each range: {needed} (state limits that are tighter by it, and design again)"
-        )
-
-
-def _limit_sentences(result: Robustness) -> Iterator[str]:
-    """Yield how many robots keep all limits, and a sentence for each limit that some do not."""
-    yield f"{result.all_kept} of {result.runs} robots keep all limits at every engine step"
-    worst = result.margins.min(axis=0)
-    missed = np.flatnonzero(~result.kept.all(axis=0)).tolist()
-    worst_first = sorted(missed, key=lambda i: float(worst[i]))
-    for i in sorted(worst_first[:MAX_MISSED_LIMITS]):
-        limit = result.limits[i]
-        excess = -worst[i] * limit.scale
-        manner = f"exceeded by up to {excess:.3g}" if excess > 0.0 else "reached and clamped"
-        yield f"{limit.kind} of {limit.name} is {manner}"
-    others = len(worst_first) - MAX_MISSED_LIMITS
-    if others > 0:
-        yield (
-            f"{others} more limits are exceeded or reached, each by a smaller share of its range; "
-            "see limits in playback.json"
-        )
-
-
-def _unknown_table(result: Robustness) -> Table:
-    """Tabulate nominal, predicted and observed errors by unknown."""
-    alone = np.isfinite(result.formal)
-    inside = [
-        str(int(count)) if is_alone else "in combination only"
-        for count, is_alone in zip(result.inside, alone, strict=True)
-    ]
-    return tabulated(
-        f"Accuracy of {result.runs} robots, each identified from the nominal values",
-        {
-            "unknown": list(map(named, result.names, result.units)),
-            "nominal error": numbers(result.wrong, infinite="-"),
-            "σ predicted": numbers(result.predicted, infinite="-"),
-            "σ formal": numbers(result.formal, infinite="-"),
-            "rms error": numbers(result.observed, infinite="-"),
-            f"in 95 % interval, of {result.runs}": inside,
-        },
-        warned(alone & (result.inside < REQUIRED_COVERAGE * result.runs)),
-        spare=("nominal error", "σ formal"),
-    )
-
-
-def _limit_table(result: Robustness) -> Table:
-    """Tabulate the tightest limit of every kind."""
-    worst = result.margins.min(axis=0)
-    rows = []
-    for kind in dict.fromkeys(limit.kind for limit in result.limits):
-        members = [i for i, limit in enumerate(result.limits) if limit.kind == kind]
-        tightest = min(members, key=lambda i: float(worst[i]))
-        kept = int(result.kept[:, members].all(axis=1).sum())
-        shares = (result.planned[tightest], worst[tightest], result.lost[members].max())
-        cells = (
-            f"{kind} of {result.limits[tightest].name}",
-            *(f"{100 * share:.1f} %" for share in shares),
-            f"{kept} of {result.runs}",
-        )
-        rows.append(Row(cells, Emphasis.NORMAL if kept == result.runs else Emphasis.WARNING))
-    return Table(
-        title="Margins of the limits, in percent of half of each range; negative: exceeded",
-        columns=("tightest limit", "planned", "worst robot", "largest loss", "robots that keep it"),
-        rows=tuple(rows),
-    )
 
 
 # ---- two robots

@@ -32,8 +32,9 @@ from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import InverseDynamicsFit
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
-from mjfim.records.studies import Comparison, MonteCarloStudy, Robustness
+from mjfim.records.studies import Comparison, MonteCarloStudy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,6 +50,7 @@ DESIGN_PICTURES = (
     "convergence",
     "standard_deviations",
     "limits",
+    "rehearsal",
 )
 ESTIMATE_PICTURES = (
     "parameters",
@@ -145,6 +147,8 @@ def _(design: Design) -> Pictures:
     }
     if design.usage:
         pictures["limits"] = partial(of_design.limits, design, labels)
+    if design.rehearsal is not None:
+        pictures["rehearsal"] = partial(studies.rehearsal, design.rehearsal)
     return pictures
 
 
@@ -222,6 +226,8 @@ def _(study: MonteCarloStudy) -> Pictures:
 def _(check: Check) -> Pictures:
     """The pictures of a check."""
     pictures: Pictures = {"check": partial(studies.check, check)}
+    if check.rehearsal is not None:
+        pictures["rehearsal"] = partial(studies.rehearsal, check.rehearsal)
     if estimate_studies.has_pairs(np.array([row.std for row in check.rows if not row.nuisance])):
         pictures["pairs"] = partial(studies.check_pairs, check)
     return pictures
@@ -240,9 +246,9 @@ def _(comparison: RobotComparison) -> Pictures:
 
 
 @pictures_of.register
-def _(result: Robustness) -> Pictures:
-    """The picture of a robustness study."""
-    return {"playback": partial(studies.playback, result)}
+def _(result: Rehearsal) -> Pictures:
+    """The picture of a rehearsal."""
+    return {"rehearsal": partial(studies.rehearsal, result)}
 
 
 @pictures_of.register

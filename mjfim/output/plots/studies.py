@@ -15,7 +15,6 @@ from mjfim.output.page import (
     IDENTIFIED,
     INITIAL,
     MEASURED,
-    NOMINAL,
     OTHER,
     TRAJECTORY_TERMS,
 )
@@ -55,15 +54,13 @@ from mjfim.output.words import (
 )
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
-    CONFIDENCE,
     DESIGN,
-    REQUIRED_COVERAGE,
     Comparison,
     MethodResult,
     MonteCarloStudy,
-    Robustness,
     TrialStatistics,
 )
 from mjfim.records.trajectory import Labels, with_unit
@@ -600,137 +597,82 @@ def robots(comparison: RobotComparison) -> Picture:
     return Picture(title=title, panels=[panel], note=note, heights=[0.7 + row * len(order)])
 
 
-# ---- robots that differ from the model
+# ---- rehearsals
 
 
-def playback(result: Robustness) -> Picture:
-    """Show the margins of every limit, the errors, the coverage, and errors of nominal values."""
-    has_limits = bool(result.limits)
-    column = int(has_limits)
-    panels = [_margins(result)] if has_limits else []
-    panels += [
-        _errors(result, column),
-        _coverage(result, column),
-        _before_and_after(result, column),
-    ]
-    conditions = result.conditions
-    control = "with the gains K(t)" if conditions.feedback else "open loop"
+def rehearsal(result: Rehearsal) -> Picture:
+    """Show the margin of every limit and the largest speed of every joint, for all robots."""
+    panels = [_margins(result)] if result.limits else []
+    panels.append(_speeds(result, len(panels)))
+    control = "with the gains K(t)" if result.feedback else "open loop"
     title = (
-        f"{result.runs} robots, every parameter {100 * conditions.wrong:g} % off, commands "
-        f"{1e3 * conditions.latency:g} ms late, {control}"
+        f"{result.robots} robots, parameters up to {100 * result.wrong:g} % off, {control}: "
+        f"{'safe to play' if result.is_safe else 'do not play'}"
     )
-    place = "Left: dots are robots. Right, from above:" if has_limits else "From above:"
-    note = (
-        f"{place} errors over the formal σ (shaded: 95 % range; red: outside); robots whose 95 % "
-        "interval holds the true value (dashed: required, shaded: expected); errors in percent of "
-        "the error of the nominal value."
-    )
-    if not has_limits:
+    note = "Dots are robots, bars the model."
+    if not result.limits:
         note += " The experiment states no limits."
-    height = max(5.4, 1.0 + 0.22 * len(result.limits))
+    height = max(2.6, 1.0 + 0.24 * max(len(result.limits), len(result.joints)))
     return Picture(
         title=title,
         panels=panels,
         note=note,
-        heights=[0.4 * height, 0.25 * height, 0.35 * height],
-        widths=[1.0, 1.3] if has_limits else [1.0],
+        heights=[height],
+        widths=[1.3, 1.0] if result.limits else [1.0],
     )
 
 
-def _margins(result: Robustness) -> Panel:
-    """Return a row per limit: margin of the design, and of every robot."""
-    percent = 100.0 * np.maximum(result.margins, LEAST_MARGIN)
+def _margins(result: Rehearsal) -> Panel:
+    """Return a row per limit: margin of the model, and of every robot."""
+    margins = np.where(np.isfinite(result.margins), result.margins, LEAST_MARGIN)
+    percent = 100.0 * np.maximum(margins, LEAST_MARGIN)
     low = min(-5.0, float(percent.min(initial=0.0)) - 5.0)
-    high = max(100.0, 100.0 * float(result.planned.max(initial=0.0)) + 5.0)
+    high = max(100.0, float(percent[0].max(initial=0.0)) + 5.0)
     marks = [vspan(low, 0.0, DESIGNED.word, opacity=0.1)]
-    # The robots of a row are spread at random over its height, so that all dots are visible.
-    rng = np.random.default_rng(0)
     for i in range(len(result.limits)):
         role, label = MEASURED.word, "robots, all keep the limit"
         if not result.kept[:, i].all():
             role, label = DESIGNED.word, "robots, some exceed the limit"
-        rows = i + rng.uniform(-0.22, 0.22, result.runs)
-        look = {"size": 3.5, "opacity": 0.5, "label": label}
-        marks.append(dots(percent[:, i], rows, role, **look))
-    look = {"symbol": "|", "size": 14.0, "width": 1.6, "label": "planned"}
-    rows = np.arange(float(len(result.limits)))
-    marks.append(dots(100.0 * result.planned, rows, "text", **look))
+        marks += _row(percent[:, i], i, role, label)
     names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in result.limits]
     return Panel(
-        title=f"{result.all_kept} of {result.runs} robots keep all limits",
+        title=f"{result.all_kept} of {result.robots} robots keep all limits",
         marks=marks,
         x=Axis(label="margin over half of the range [%]", limits=(low, high)),
         y=row_axis(names),
-        is_tall=True,
     )
 
 
-def _errors(result: Robustness, column: int) -> Panel:
-    """Return the errors of all estimates in standard deviations."""
-    rng = np.random.default_rng(0)
-    z = np.clip(result.z, -LARGEST_ERROR, LARGEST_ERROR)
-    x = np.arange(z.shape[1]) + rng.uniform(-0.28, 0.28, z.shape)
-    inside = np.abs(z) <= NORMAL_95
-    reach = LARGEST_ERROR + 0.2
+def _speeds(result: Rehearsal, column: int) -> Panel:
+    """Return a row per joint: largest speed of the model, and of every robot."""
+    speeds = np.where(np.isfinite(result.speed), result.speed, np.nan)
+    most = np.nanmax(speeds, axis=0)
+    share = 100.0 * speeds / np.where(most > 0.0, most, 1.0)
+    marks = []
+    for i, name in enumerate(result.joints):
+        role = DESIGNED.word if name in result.unlimited else MEASURED.word
+        label = "robots, nothing limits the speed" if name in result.unlimited else "robots"
+        marks += _row(share[:, i], i, role, label)
+    texts = [f"{peak:.2g} {unit}" for peak, unit in zip(most, result.units, strict=True)]
     return Panel(
-        title="errors of the estimates",
-        marks=[
-            hspan(-NORMAL_95, NORMAL_95, opacity=0.8),
-            hline(0.0, "muted", width=0.8),
-            dots(x[inside], z[inside], IDENTIFIED.word, size=3.5, opacity=0.6),
-            dots(x[~inside], z[~inside], DESIGNED.word, size=3.5),
-        ],
-        x=Axis(ticks=[], limits=(-0.5, z.shape[1] - 0.5)),
-        y=Axis(label="(estimate − truth) / σ", limits=(-reach, reach)),
+        title="largest speed of each joint",
+        marks=marks,
+        x=Axis(label="share of the largest one [%]", limits=(0.0, 105.0)),
+        y=row_axis(list(result.joints)),
+        beside=[("", "text", texts)],
         place=(0, column),
     )
 
 
-def _coverage(result: Robustness, column: int) -> Panel:
-    """Return how often the interval of each unknown holds the true value."""
-    from scipy.stats import binom  # slow, and only this picture needs it
-
-    n = max(result.runs, 1)
-    share = 100.0 * result.inside / n
-    x = np.arange(float(len(share)))
-    low, high = (100.0 * k / n for k in binom.interval(CONFIDENCE, n, CONFIDENCE))
-    marks = [
-        hspan(low, high, opacity=0.8),
-        hline(100.0 * REQUIRED_COVERAGE, DESIGNED.word, dash="--"),
-        dots(x, share, IDENTIFIED.word, size=5.0),
+def _row(values: Array, row: int, role: str, label: str) -> list[Mark]:
+    """Return dots for the robots, spread over the height of a row, and a bar for the model."""
+    rng = np.random.default_rng(0)
+    rows = row + rng.uniform(-0.22, 0.22, len(values) - 1)
+    look = {"symbol": "|", "size": 14.0, "width": 1.6, "label": "model"}
+    return [
+        dots(values[1:], rows, role, size=3.5, opacity=0.5, label=label),
+        dots(values[:1], np.array([float(row)]), "text", **look),
     ]
-    if len(share) <= MAX_HIGH_ROWS:
-        marks.append(words(x, share, [f"{value:.0f}" for value in share], "text"))
-    return Panel(
-        title="robots whose 95 % interval holds the true value",
-        marks=marks,
-        x=Axis(ticks=[], limits=(-0.5, len(share) - 0.5)),
-        y=Axis(
-            label="coverage [%]", limits=(min(85.0, float(share.min(initial=100.0)) - 3.0), 103.0)
-        ),
-        place=(1, column),
-    )
-
-
-def _before_and_after(result: Robustness, column: int) -> Panel:
-    """Return nominal, predicted and observed errors of each unknown."""
-    count = len(result.names)
-    x = np.arange(float(count))
-    percent = np.where(result.wrong > 0.0, result.wrong, np.nan) / 100.0
-    predicted, observed = result.predicted / percent, result.observed / percent
-    low = 0.6 * float(np.nanmin([predicted, observed], initial=100.0))
-    look = {"symbol": "_", "size": 18.0, "width": 1.8, "label": "σ predicted by the design"}
-    return Panel(
-        title="rms error and σ, over the error of the nominal value",
-        marks=[
-            dots(x, np.full(count, 100.0), NOMINAL.word, label=NOMINAL.word),
-            dots(x, predicted, "text", **look),
-            dots(x, observed, IDENTIFIED.word, label="estimates"),
-        ],
-        x=Axis(ticks=range(count), names=result.names, limits=(-0.5, count - 0.5)),
-        y=Axis(label="error [%]", log=True, limits=(low, 400.0)),
-        place=(2, column),
-    )
 
 
 # ---- campaigns

@@ -1,0 +1,643 @@
+"""Rehearsal of a design: what its control does to the model and to robots that differ from it.
+
+Each robot plays the exported control in plain MuJoCo. It stands at its own equilibrium before it
+begins. Limits are checked at every engine step, and what nothing limits is measured.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from typing import Any
+
+import mujoco
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.information.finite_steps import finite_steps
+from mjfim.model.clearance import (
+    PLANE,
+    PRIMITIVES,
+    GeomDistances,
+    farthest_points,
+    find_geom_pairs,
+)
+from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.elements import model_length
+from mjfim.model.parameter_writer import ParameterWriter
+from mjfim.model.units import ANGLE, LENGTH, joint_unit, per_second
+from mjfim.parallel import one_blas_thread
+from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.outputs import outputs_by_state
+from mjfim.records.design import Design, Evaluation
+from mjfim.records.rehearsal import FiniteSteps, Rehearsal, RehearsedLimit
+from mjfim.records.trajectory import Trajectory
+
+# Largest number of attempts to draw a robot whose bodies are physical.
+MAX_DRAWS = 500
+
+# Factor by which the errors of the parameters are reduced after as many unphysical draws as there
+# are parameters.
+DRAW_SHRINKAGE = 0.9
+
+# Largest acceleration of a robot that counts as standing still, relative to the size of each
+# coordinate over the square of the horizon.
+MAX_REST_MOVE = 1e-4
+
+# Largest number of steps of the search for an equilibrium.
+MAX_REST_STEPS = 15
+
+# Delay of the control under feedback where none is stated [s]; it is rounded up to timesteps.
+LATENCY = 5e-3
+
+# Number of instants of each robot at which heights, distances and contacts are measured.
+INSTANTS = 64
+
+# Relative difference of two sample periods up to which they are equal.
+SAME_PERIOD = 1e-6
+
+# Largest number of values of the states that are simulated at once.
+MAX_VALUES = 1 << 22
+
+# Height below the floor that counts as passing through it, over the length of the model. Soft
+# contacts give way by less.
+PASSED_SHARE = 0.02
+
+# Cosine of the largest angle between a floor and the horizontal plane.
+LEVEL_FLOOR = 0.99
+
+# A joint that moves more slowly at the end than this share of its peak needs no brake.
+SLOW_SHARE = 0.02
+
+
+def rehearse(experiment: Experiment, design: Design, *, threads: int | None = None) -> Rehearsal:
+    """Play a design on simulated robots, and check its standard deviations by finite steps.
+
+    The table `[rehearsal]` states the robots. Their parameters are drawn from the priors. Those
+    without a prior are drawn within the stated share of their size and their bounds.
+
+    Args:
+        experiment: The experiment of the design.
+        design: The design.
+        threads: Threads for simulations; default: one per core.
+
+    Returns:
+        Margins, speeds, heights and contacts of all robots, and the standard deviations.
+
+    Raises:
+        ExperimentError: The experiment is faulty, or no physical robot can be drawn.
+        RecordingError: The design does not fit the experiment.
+    """
+    task = DesignTask.resolve(experiment, threads=threads)
+    planned = design.trajectory
+    found = (planned.qpos.shape[1], planned.qvel.shape[1], planned.ctrl.shape[1])
+    wanted = (task.space.nq, task.space.nv, len(task.controls))
+    if found != wanted or abs(planned.dt - task.dt) > SAME_PERIOD * task.dt:
+        raise RecordingError(
+            f"the design has (nq, nv, nu) = {found} at {1.0 / planned.dt:g} Hz, but the experiment "
+            f"{wanted} at {1.0 / task.dt:g} Hz; give the experiment of the design"
+        )
+    return rehearse_task(task.released_as(planned.state[0]), design.final)
+
+
+def rehearse_task(task: DesignTask, final: Evaluation) -> Rehearsal:
+    """Rehearse the trajectory of an evaluation in a resolved task. See `rehearse`."""
+    steps = finite_steps(
+        task.plant,
+        task.system.noise,
+        task.theta,
+        final.trajectory,
+        information=final.information,
+        prior=task.prior,
+        predicted=final.std,
+    )
+    return rehearsed(task, final.trajectory, final.gain, steps)
+
+
+@one_blas_thread()
+def rehearsed(
+    task: DesignTask, trajectory: Trajectory, gain: Array, steps: FiniteSteps
+) -> Rehearsal:
+    """Play a trajectory on robots.
+
+    Args:
+        task: The task, released as the trajectory is.
+        trajectory: The trajectory, an open-loop simulation of the model.
+        gain: (N, nu, nx) gains, which matter under feedback only.
+        steps: Its standard deviations by finite steps.
+    """
+    spec = task.experiment.rehearsal
+    stage = _Stage(task, trajectory, gain)
+    rng = np.random.default_rng(spec.seed)
+    theta = np.array([task.theta, *(_drawn(task, rng) for _ in range(spec.robots))])
+
+    # The model comes first, because its motion is the plan of the feedback.
+    most = max(MAX_VALUES // stage.numbers, 1)
+    blocks = [theta[:1], *(theta[i : i + most] for i in range(1, len(theta), most))]
+    parts = [part for block in blocks for part in stage.play(block, rng)]
+    measured = {
+        each.name: np.array([getattr(part, each.name) for part in parts])
+        for each in fields(_Played)
+        if each.name != "unbraked"
+    }
+    return Rehearsal(
+        parameters=task.parameters.names,
+        wrong=spec.wrong,
+        feedback=spec.feedback,
+        latency=stage.late_steps * stage.timestep,
+        theta=theta,
+        limits=stage.rehearsed_limits(),
+        joints=tuple(group.name for group in stage.groups),
+        units=tuple(group.unit for group in stage.groups),
+        unlimited=tuple(group.name for group in stage.groups if not group.is_limited),
+        floor=stage.floor,
+        has_floor=stage.has_floor,
+        depth=stage.depth,
+        unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
+        steps=steps,
+        **measured,
+    )
+
+
+def _drawn(task: DesignTask, rng: np.random.Generator) -> Array:
+    """Draw the (p,) parameters of a robot whose bodies are physical [theta-unit].
+
+    Errors are reduced where the bodies would be unphysical.
+    """
+    p, spec = task.parameters, task.experiment.rehearsal
+    prior = np.array([q.prior or 0.0 for q in p.parameters])
+    reach = np.where(p.changes_model, spec.wrong * p.sizes(task.theta), 0.0)
+    for attempt in range(MAX_DRAWS):
+        by_prior = p.guess + prior * rng.standard_normal(len(p))
+        within = task.theta + reach * rng.uniform(-1.0, 1.0, len(p))
+        drawn = np.where(prior > 0.0, by_prior, within)
+        error = DRAW_SHRINKAGE ** (attempt // len(p)) * (drawn - task.theta)
+        theta = np.clip(task.theta + error, p.lower, p.upper)
+        if not ParameterWriter(p).unphysical_bodies(task.plant.source, theta):
+            return np.asarray(theta)
+    raise ExperimentError(
+        f"{task.experiment.source}: rehearsal.wrong: errors of {spec.wrong:.0%} in the parameters "
+        "lead to unphysical bodies; state a smaller error"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SpeedGroup:
+    """A joint whose speed is measured: the norm of the velocities of some degrees of freedom."""
+
+    name: str
+    dofs: tuple[int, ...]
+    unit: str
+    is_limited: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Played:
+    """What one robot does; see `Rehearsal`."""
+
+    margins: Array
+    speed: Array
+    acceleration: Array
+    end_speed: Array
+    lowest: float = np.nan
+    end_height: float = np.nan
+    nearest: float = np.nan
+    in_contact: float = np.nan
+    at_stop: float = np.nan
+    unbraked: tuple[str, ...] = ()
+
+
+class _Stage:
+    """A design, and what measures the robots that play it.
+
+    Attributes:
+        task: The task, released as the design is.
+        ctrl: (M, nu) controls at the M rows of the controller [unit of the actuator].
+        gain: (M, nu, nx) gains.
+        steps_per_row: Number of engine steps per row.
+        timestep: Timestep of the engine [s].
+        late_steps: Number of engine steps by which the control is late; 0 without feedback, where
+            a delay would only shift the motion.
+        constraints: Constraints of the task.
+        limits: The l limits that are checked.
+        groups: Joints whose speeds are measured.
+        plan: (M+1, ns) states of the model at the rows; None before it was played.
+    """
+
+    def __init__(self, task: DesignTask, trajectory: Trajectory, gain: Array) -> None:
+        self.task, spec = task, task.experiment.rehearsal
+        self.timestep = float(task.system.model.opt.timestep)
+        grid = task.system.stated_grid
+        self.steps_per_row = grid.playback_steps
+        rows = task.system.grid.substeps // self.steps_per_row
+        self.ctrl = np.repeat(trajectory.ctrl, rows, axis=0)
+        self.gain = np.repeat(gain, rows, axis=0)
+        self.feedback = spec.feedback and bool(task.controls)
+        stated = LATENCY if spec.latency is None else spec.latency
+        self.late_steps = int(np.ceil(stated / self.timestep - 1e-6)) if self.feedback else 0
+        self.plan: Array | None = None
+
+        self.constraints = constraint_set_of(task, every=True)
+        self.limits = (
+            *(each for kind in SUBSTEP_KINDS for each in task.limits if each.kind == kind),
+            *(each for each in task.limits if each.kind not in SUBSTEP_KINDS),
+        )
+        self._observations = self.constraints.observations.of_single_steps()
+        model = task.system.model_at(task.theta)
+        self._simulator = BatchSimulator(model, threads=task.plant.simulator.threads)
+        self.rest = self._rest_control()
+        space = task.space
+        self.sensed = np.full(space.nq + space.nv + space.na, -1)
+        for entry, output in outputs_by_state(task.system.model, task.system.outputs).items():
+            self.sensed[entry] = output
+        if self.feedback and (self.sensed < 0).all():
+            raise ExperimentError(
+                f"{task.experiment.source}: rehearsal.feedback: the gains need a measured position "
+                "or velocity of a joint, and the experiment measures none"
+            )
+
+        self.groups = tuple(_speed_groups(task))
+        gravity = np.array(model.opt.gravity)
+        strength = float(np.linalg.norm(gravity))
+        self._up = -gravity / strength if strength > 0.0 else np.array([0.0, 0.0, 1.0])
+        self._moving = np.flatnonzero(model.body_weldid > 0)
+        shapes = np.isin(model.geom_type, (*PRIMITIVES, int(mujoco.mjtGeom.mjGEOM_MESH)))
+        moves = model.body_weldid[model.geom_bodyid] > 0
+        self._geoms = np.flatnonzero(shapes & moves)
+        self._base = np.flatnonzero(shapes & ~moves & (model.geom_bodyid > 0))
+        self.depth = PASSED_SHARE * float(model_length(model))
+        self.floor, self.has_floor = self._floor_of(model, trajectory.state[0])
+        ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
+        self._distances: GeomDistances | None = None
+        with suppress(ExperimentError):
+            pairs = find_geom_pairs(model, ignored)
+            self._distances = GeomDistances(model, pairs, max(self.depth, 1.0))
+
+    @property
+    def numbers(self) -> int:
+        """Number of values that the simulation of one robot returns."""
+        steps = len(self.ctrl) * self.steps_per_row + self.late_steps
+        return steps * (self.task.space.nq + self.task.space.nv + 2 * len(self.limits) + 1)
+
+    def rehearsed_limits(self) -> tuple[RehearsedLimit, ...]:
+        """The limits in the order of the margins."""
+        found = [
+            RehearsedLimit(
+                kind=limit.kind,
+                name=limit.name,
+                lower=limit.lower,
+                upper=limit.upper,
+                scale=limit.scale,
+                unit=limit.unit,
+            )
+            for limit in self.limits
+        ]
+        nearest = self.constraints.clearance
+        if nearest is not None:
+            found.append(
+                RehearsedLimit(
+                    kind="clearance",
+                    name="nearest pair",
+                    lower=nearest.least,
+                    upper=np.inf,
+                    scale=nearest.scale,
+                    unit=LENGTH,
+                )
+            )
+        return tuple(found)
+
+    def play(self, theta: Array, rng: np.random.Generator) -> Iterator[_Played]:
+        """Play the design on robots with the parameters (m, p), and measure each of them."""
+        task = self.task
+        models = [task.system.model_at(row) for row in theta]
+        starts = np.array([self._start(*each) for each in zip(models, theta, strict=True)])
+        sent = np.broadcast_to(self._clipped(self.ctrl), (len(theta), *self.ctrl.shape))
+        if self.feedback and self.plan is not None:
+            noise = [task.system.noise.sample(len(self.ctrl) + 1, rng) for _ in models]
+            sent = np.array(
+                [self._fed_back(*each) for each in zip(models, starts, noise, strict=True)]
+            )
+        held = np.repeat(sent, self.steps_per_row, axis=1)
+        before = np.array([self._before_start(start) for start in starts])
+        late = np.repeat(before[:, None], self.late_steps, axis=1)
+        applied = np.concatenate([late, held], axis=1)
+        out = self._simulator.rollout(models, starts, applied, self._observations)
+        if self.plan is None:
+            self.plan = out.states[0, self.late_steps :: self.steps_per_row]
+
+        for i, model in enumerate(models):
+            if not out.finite[i]:
+                unknown = np.full(len(self.groups), np.nan)
+                margins = np.full(len(self.rehearsed_limits()), -np.inf)
+                yield _Played(
+                    margins=margins, speed=unknown, acceleration=unknown, end_speed=unknown
+                )
+                continue
+            observed = None if out.observed is None else out.observed[i]
+            margins = self._margins(observed, sent[i], before[i], out.states[i])
+            yield self._measured(model, out.states[i], applied[i], margins)
+
+    # ---- what is measured
+
+    def _measured(self, model: Any, states: Array, applied: Array, margins: Array) -> _Played:
+        """Measure the motion of one robot, (n+1, ns) at every engine step."""
+        qpos, qvel, act = self.task.space.split(states)
+        change = np.diff(qvel, axis=0) / self.timestep
+
+        def largest(values: Array) -> Array:
+            """(j,) largest norms of each group over the rows of (n, nv) values."""
+            norms = [np.linalg.norm(values[:, group.dofs], axis=1) for group in self.groups]
+            return np.array([norm.max(initial=0.0) for norm in norms])
+
+        data = mujoco.MjData(model)
+        rows = evenly_spread_indices(len(states), INSTANTS)
+        lowest, touches, stops = [], 0, 0
+        for row in rows.tolist():
+            data.qpos[:], data.qvel[:], data.act[:] = qpos[row], qvel[row], act[row]
+            data.ctrl[:] = applied[min(row, len(applied) - 1)]
+            mujoco.mj_forward(model, data)
+            lowest.append(self._lowest(model, data, self._geoms))
+            touches += bool((data.contact.dist < 0.0).any())
+            stops += int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT) in data.efc_type
+        # Above the plane under a robot without a floor, the robot may come as low as it begins.
+        floor = self.floor if self.has_floor else min(self.floor, lowest[0])
+        heights = np.array(lowest) - (floor if np.isfinite(floor) else 0.0)
+        nearest = np.nan
+        if self._distances is not None:
+            nearest = self._distances.nearest(qpos[rows])[0]
+        end_speed = largest(qvel[-1:])
+        return _Played(
+            margins=margins,
+            speed=largest(qvel),
+            acceleration=largest(change),
+            end_speed=end_speed,
+            lowest=float(heights.min()),
+            end_height=float(heights[-1]),
+            nearest=nearest,
+            in_contact=touches / len(rows),
+            at_stop=stops / len(rows),
+            unbraked=tuple(self._unbraked(model, data, qvel)),
+        )
+
+    def _lowest(self, model: Any, data: Any, geoms: np.ndarray) -> float:
+        """Height of the lowest of some geoms and of the moving bodies [m]."""
+        lowest = float((data.xipos[self._moving] @ self._up).min(initial=np.inf))
+        frames = data.geom_xmat[geoms].reshape(-1, 3, 3)
+        along = np.einsum("gij,i->gj", frames, self._up)
+        boxes = model.geom_aabb[geoms]
+        centre = data.geom_xpos[geoms] @ self._up + (along * boxes[:, :3]).sum(axis=1)
+        reach = (np.abs(along) * boxes[:, 3:]).sum(axis=1)
+        # The boxes about the geoms are lower bounds; from the lowest one on, geoms are measured.
+        for i in np.argsort(centre - reach).tolist():
+            if centre[i] - reach[i] >= lowest:
+                break
+            geom = int(geoms[i])
+            kind, mesh = int(model.geom_type[geom]), int(model.geom_dataid[geom])
+            if kind in PRIMITIVES:
+                point = farthest_points(kind, model.geom_size[geom], -along[i : i + 1])
+            else:
+                first = int(model.mesh_vertadr[mesh])
+                point = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+            height = float(data.geom_xpos[geom] @ self._up) + float((point @ along[i]).min())
+            lowest = min(lowest, height)
+        return lowest
+
+    def _floor_of(self, model: Any, start: Array) -> tuple[float, bool]:
+        """Height of the floor [m], and whether the experiment or the model states it.
+
+        Without a floor it is the lower end of a base that does not move, or 0 for a free body, or
+        the lowest point of the start if that is lower. A robot without a base has no floor.
+        """
+        stated = self.task.experiment.rehearsal.floor
+        if stated is not None:
+            return (-np.inf, False) if stated == "none" else (float(stated), True)
+        data = mujoco.MjData(model)
+        data.qpos[:] = start[: model.nq]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        lowest = self._lowest(model, data, self._geoms)
+        is_fixed = model.body_weldid[model.geom_bodyid] == 0
+        normals = data.geom_xmat[:, 2::3] @ self._up
+        is_floor = (model.geom_type == PLANE) & is_fixed & (normals > LEVEL_FLOOR)
+        heights = data.geom_xpos[is_floor] @ self._up
+        below = heights[heights <= lowest + self.depth]
+        if len(below):
+            return float(below.max()), True
+        if len(self._base):
+            return min(self._lowest(model, data, self._base), lowest), False
+        is_free = bool((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+        return (min(0.0, lowest) if is_free else -np.inf), False
+
+    def _unbraked(self, model: Any, data: Any, qvel: Array) -> Iterator[str]:
+        """Joints that reach a limit after the end, however the controls brake them.
+
+        Args:
+            model: Model of the robot.
+            data: Its MjData at the end.
+            qvel: (n+1, nv) velocities at every engine step.
+        """
+        space, bounds = self.task.space, self.constraints.control.bounds
+        dof_of = dict(zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True))
+        is_bounded = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
+        for limit in self.limits:
+            if limit.kind != "position" or limit.count != 1 or limit.index not in dof_of:
+                continue
+            dof = dof_of[limit.index]
+            speed, place = float(qvel[-1, dof]), float(data.qpos[limit.index])
+            if abs(speed) <= SLOW_SHARE * np.abs(qvel[:, dof]).max():
+                continue
+            room = limit.upper - place if speed > 0.0 else place - limit.lower
+            if not np.isfinite(room) or not is_bounded.all():
+                continue
+            if speed**2 > 2.0 * self._brake(model, data, dof, speed) * max(room, 0.0):
+                yield limit.name
+
+    def _brake(self, model: Any, data: Any, dof: int, speed: float) -> float:
+        """Largest deceleration of a degree of freedom that the controls can reach, at least 0."""
+        bounds, sign = self.constraints.control.bounds, -np.sign(speed)
+        best = 0.5 * (bounds.lower + bounds.upper)
+
+        def deceleration(ctrl: Array) -> float:
+            """Deceleration under one control."""
+            data.ctrl[:] = ctrl
+            mujoco.mj_forward(model, data)
+            return float(sign * data.qacc[dof])
+
+        for k in range(len(best)):
+            chosen = np.arange(len(best)) == k
+            sides = [np.where(chosen, bound, best) for bound in (bounds.lower, bounds.upper)]
+            best = max(sides, key=deceleration)
+        return max(deceleration(best), 0.0)
+
+    def _margins(self, observed: Array | None, sent: Array, before: Array, states: Array) -> Array:
+        """(l,) smallest margins of all limits over half of their ranges.
+
+        Args:
+            observed: (n, rows, w) observations at every engine step, with further rows of forces.
+            sent: (M, nu) controls that were sent [unit of the actuator].
+            before: (nu,) control before the motion begins [unit of the actuator].
+            states: (n+1, ns) states at every engine step.
+        """
+        constraints = self.constraints
+        margins: list[float] = []
+        if observed is not None:
+            bounds = constraints.substeps.bounds
+            quantities = constraints.substeps.quantities(observed)
+            inside = bounds.margin(quantities).min(axis=(0, 1), initial=np.inf) / bounds.scale
+            margins = inside.tolist()
+
+        # Rates from row to row, with the change from the control before the motion, and the change
+        # to the control after its end.
+        after = None if constraints.rate is None else constraints.rate.control_after
+        after = sent[-1] if after is None or self.feedback else after
+        changes = np.diff(sent, axis=0, prepend=before[None], append=after[None])
+        rates = changes / (self.steps_per_row * self.timestep)
+        for limit in self.limits[len(margins) :]:
+            values = (sent if limit.kind == "control" else rates)[:, limit.index]
+            margin = np.minimum(values - limit.lower, limit.upper - values).min()
+            margins.append(float(margin) / limit.scale)
+        if constraints.clearance is not None:
+            nearest = constraints.clearance.distances.nearest(states[:, : self.task.space.nq])[0]
+            margins.append((nearest - constraints.clearance.least) / constraints.clearance.scale)
+        return np.array(margins)
+
+    # ---- the start
+
+    def _rest_control(self) -> Array | None:
+        """(nu,) control that holds the start; None where the motion begins without a rest."""
+        if not self.task.controls:
+            return None
+        try:
+            return self.task.initial_hold
+        except ExperimentError:
+            return None
+
+    def _start(self, model: Any, theta: Array) -> Array:
+        """(ns,) initial state of a robot: its equilibrium near the start, where it has one."""
+        stated = self.task.plant.initial_state(theta)
+        if self.rest is None:
+            return stated
+        found, moves = self._equilibrium(model, stated)
+        return found if moves <= MAX_REST_MOVE else stated
+
+    def _equilibrium(self, model: Any, stated: Array) -> tuple[Array, float]:
+        """An equilibrium near a state, and the largest acceleration that is left.
+
+        The acceleration is relative to the size of its coordinate over the square of the horizon.
+        """
+        space, sizes = self.task.space, self.task.plant.sizes
+        data = mujoco.MjData(model)
+        # Positions and activations may change by multiples of their sizes; velocities stay.
+        directions = np.delete(np.diag(sizes.state), np.arange(space.nv, 2 * space.nv), axis=0)
+        time = self.task.horizon
+        rates = np.concatenate([sizes.position / time**2, sizes.activation / time])
+
+        def relative_rates(move: Array) -> Array:
+            """Accelerations and rates of the activations after a move, relative to their sizes."""
+            state = space.plus(stated, move @ directions)
+            data.qpos[:], data.qvel[:], data.act[:] = space.split(state)
+            data.ctrl[:] = self._before_start(state)
+            mujoco.mj_forward(model, data)
+            return np.asarray(np.concatenate([data.qacc, data.act_dot]) / rates)
+
+        still = np.zeros(len(directions))
+        if np.abs(relative_rates(still)).max(initial=0.0) <= MAX_REST_MOVE:
+            return stated, 0.0
+        move = scipy.optimize.least_squares(
+            relative_rates, still, xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=MAX_REST_STEPS
+        ).x
+        moves = float(np.abs(relative_rates(move)).max(initial=0.0))
+        return space.plus(stated, move @ directions), moves
+
+    # ---- the controller, with or without feedback
+
+    def _before_start(self, state: Array) -> Array:
+        """(nu,) control before the motion in a state (ns,); with feedback the first gain acts."""
+        if self.rest is None:
+            return np.asarray(self.ctrl[0] if len(self.ctrl) else np.zeros(0))
+        if not self.feedback or self.plan is None:
+            return self.rest
+        return np.asarray(self.rest + self.gain[0] @ self._deviation(state, 0))
+
+    def _fed_back(self, model: Any, start: Array, noise: Array) -> Array:
+        """(M, nu) controls that the controller sends to a robot.
+
+        Args:
+            model: Model of the robot.
+            start: (ns,) its initial state.
+            noise: (M+1, ny) noise of the outputs that the controller reads [y-unit].
+        """
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.act[:] = self.task.space.split(start)
+        sent = np.zeros(self.ctrl.shape)
+        before = self._before_start(start)
+        read = np.flatnonzero(self.sensed >= 0)
+        for step in range(len(sent) * self.steps_per_row):
+            row, phase = divmod(step, self.steps_per_row)
+            if phase == 0:
+                state = np.concatenate([data.qpos, data.qvel, data.act])
+                state[read] += noise[row, self.sensed[read]]
+                move = self.gain[row] @ self._deviation(state, row)
+                sent[row] = self._clipped(self.ctrl[row] + move)
+            arrived = (step - self.late_steps) // self.steps_per_row
+            data.ctrl[:] = before if arrived < 0 else sent[arrived]
+            mujoco.mj_step(model, data)
+        return sent
+
+    def _clipped(self, control: Array) -> Array:
+        """Controls in the ranges to which the controller clips [unit of the actuator]."""
+        bounds = self.constraints.control.bounds
+        return np.asarray(np.clip(control, bounds.lower, bounds.upper))
+
+    def _deviation(self, state: Array, row: int) -> Array:
+        """(nx,) planned minus measured state; zero for entries that are not measured."""
+        assert self.plan is not None
+        planned = self.plan[row]
+        measured = np.where(self.sensed >= 0, state, planned)
+        for q, _ in self.task.space.quaternions:
+            measured[q : q + 4] /= np.linalg.norm(measured[q : q + 4])
+        return self.task.space.minus(planned, measured)
+
+
+def _speed_groups(task: DesignTask) -> Iterator[_SpeedGroup]:
+    """The joints of a model: a free joint has a speed and an angular speed."""
+    model = task.system.model
+    limited = {
+        kind: [limit.name for limit in task.limits if limit.kind == kind]
+        for kind in ("velocity", "angular_velocity")
+    }
+
+    def is_limited(name: str, *kinds: str) -> bool:
+        """Whether a limit of these kinds names the joint or one of its coordinates."""
+        found = [each for kind in kinds for each in limited[kind]]
+        return any(each == name or each.startswith(f"{name}.") for each in found)
+
+    for joint, name in enumerate(joint_names(model)):
+        first, count = int(model.jnt_dofadr[joint]), joint_dofs(model, joint)
+        if count == 6:
+            yield _SpeedGroup(
+                name=name,
+                dofs=tuple(range(first, first + 3)),
+                unit=per_second(LENGTH),
+                is_limited=is_limited(name, "velocity"),
+            )
+            yield _SpeedGroup(
+                name=f"{name} (rotation)",
+                dofs=tuple(range(first + 3, first + 6)),
+                unit=per_second(ANGLE),
+                is_limited=is_limited(name, "angular_velocity"),
+            )
+            continue
+        yield _SpeedGroup(
+            name=name,
+            dofs=tuple(range(first, first + count)),
+            unit=per_second(joint_unit(model, joint)),
+            is_limited=is_limited(name, "velocity", "angular_velocity"),
+        )

@@ -1,0 +1,303 @@
+"""Records of a rehearsal: a design on simulated robots, and standard deviations by finite steps.
+
+The first row of each array over robots is the model at the parameters of the design; the n robots
+follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import first_ones
+from mjfim.records.base import Record, ShownRecord, record
+
+# Ratios of the effect of a finite step to that of the derivatives that confirm a standard
+# deviation.
+CONFIRMED = (0.7, 1.4)
+
+# Share of the robots that may break a limit in a motion that is safe to play.
+MAX_BROKEN = 0.05
+
+# A joint rests at the end where its speed is below this share of its peak.
+REST_SHARE = 0.02
+
+# Kinds of limits that hold by a clamp of the simulation, which does not count as kept.
+CLAMPED_KINDS = ("force", "joint_force", "tendon_force")
+
+# Smallest reserve, over half of a range; smaller values are round-off.
+MIN_RESERVE = 1e-9
+
+
+@record
+class FiniteSteps(Record):
+    """Standard deviations that steps of finite length along their principal directions give.
+
+    Attributes:
+        names: Names of the p parameters.
+        predicted: (p,) standard deviations by derivatives; infinite for a parameter that is not
+            identifiable alone [theta-unit].
+        std: (p,) the same by finite steps [theta-unit].
+        length: (d,) half of the length of the step along each of the d principal directions, in
+            standard deviations of it; 2, or less where parameters would become impossible.
+        ratio: (d,) change of the whitened outputs over the step, relative to that of the
+            derivatives; NaN where the simulation diverges.
+        causes: Contacts, dry friction and active limits along the motion, in words.
+    """
+
+    names: tuple[str, ...]
+    predicted: Array
+    std: Array
+    length: Array
+    ratio: Array
+    causes: tuple[str, ...] = ()
+
+    @property
+    def confirmed(self) -> np.ndarray:
+        """(p,) True where the derivatives and the finite steps agree, or nothing is predicted."""
+        known = np.isfinite(self.predicted) & (self.predicted > 0.0)
+        change = np.where(known, self.std, 1.0) / np.where(known, self.predicted, 1.0)
+        low, high = CONFIRMED
+        return np.asarray((1.0 / high <= change) & (change <= 1.0 / low))
+
+    @property
+    def stated(self) -> Array:
+        """(p,) standard deviations to state: those of the finite steps where they differ."""
+        return np.where(self.confirmed, self.predicted, self.std)
+
+    def __str__(self) -> str:
+        """Say which standard deviations are approximate, and why; empty where none is."""
+        odd = np.flatnonzero(~self.confirmed).tolist()
+        if not odd:
+            return ""
+        if not np.isfinite(self.std[odd]).all():
+            lost = first_ones([self.names[j] for j in odd if not np.isfinite(self.std[j])])
+            return f"the simulation diverges at 2 σ from {lost}, so σ is a guess{self._reason}"
+        changes = [
+            f"{self.names[j]} {self.std[j]:.2g} in place of {self.predicted[j]:.2g}" for j in odd
+        ]
+        return f"σ is approximate, by finite steps ({first_ones(changes)}){self._reason}"
+
+    @property
+    def _reason(self) -> str:
+        """What makes the standard deviations approximate, where something acts."""
+        if not self.causes:
+            return "; the outputs depend on the parameters in a strongly curved way"
+        return f"; {first_ones(list(grouped(self.causes)))} makes it approximate"
+
+
+def grouped(causes: Iterable[str]) -> list[str]:
+    """Return causes such as `dry friction of Jaw`, each kind once with all of its names."""
+    names: dict[str, list[str]] = {}
+    for cause in causes:
+        kind, of, name = cause.partition(" of ")
+        names.setdefault(kind + of, []).append(name)
+    return [kind + first_ones(found) for kind, found in names.items()]
+
+
+@record
+class RehearsedLimit(Record):
+    """A limit whose margin is measured on every robot.
+
+    Attributes:
+        kind: Kind of the limit, such as `position`, `control_rate` or `clearance`.
+        name: Name of the joint or actuator; "nearest pair" for a clearance.
+        lower: Lower bound [unit of the quantity].
+        upper: Upper bound [unit of the quantity].
+        scale: Half of the range, by which margins are divided [unit of the quantity].
+        unit: Unit of the quantity; empty where it is unknown.
+    """
+
+    kind: str
+    name: str
+    lower: float
+    upper: float
+    scale: float
+    unit: str = ""
+
+
+@record
+class Rehearsal(ShownRecord):
+    """Result of `mjfim.rehearse`: a design on the model and on n simulated robots.
+
+    Attributes:
+        parameters: Names of the p parameters.
+        wrong: Relative error up to which parameters without a prior were drawn.
+        feedback: Whether the gains acted.
+        latency: Delay of the control under feedback [s].
+        theta: (n+1, p) parameters of the robots [theta-unit].
+        limits: The l limits.
+        margins: (n+1, l) smallest margin of each limit over half of its range, negative outside;
+            minus infinity for a simulation that diverges.
+        joints: Names of the j moving joints; a free joint counts twice, for its two speeds.
+        units: Units of their speeds.
+        speed: (n+1, j) largest speeds.
+        acceleration: (n+1, j) largest accelerations [unit of the speed per s].
+        end_speed: (n+1, j) speeds at the end.
+        unlimited: Names of those joints whose speed nothing limits.
+        lowest: (n+1,) smallest height of any geom or body that moves, above the floor, or in the
+            world where there is none [m].
+        floor: Height of the floor in the world, or of the plane under the robot; minus infinity
+            where there is neither [m].
+        has_floor: Whether the model or the experiment states the floor.
+        depth: Height below the floor that counts as passing through it [m].
+        end_height: (n+1,) height of the lowest geom or body at the end, likewise [m].
+        nearest: (n+1,) smallest distance of the robot to itself and to its surroundings [m]; NaN
+            where the model has none that can be measured.
+        in_contact: (n+1,) share of the time in which something touches.
+        at_stop: (n+1,) share of the time in which a joint is at its stop.
+        unbraked: Number of robots by the joint that cannot be braked at the end before it reaches a
+            limit.
+        steps: Standard deviations by finite steps.
+    """
+
+    parameters: tuple[str, ...]
+    wrong: float
+    feedback: bool
+    latency: float
+    theta: Array
+    limits: tuple[RehearsedLimit, ...]
+    margins: Array
+    joints: tuple[str, ...]
+    units: tuple[str, ...]
+    speed: Array
+    acceleration: Array
+    end_speed: Array
+    unlimited: tuple[str, ...]
+    lowest: Array
+    floor: float
+    has_floor: bool
+    depth: float
+    end_height: Array
+    nearest: Array
+    in_contact: Array
+    at_stop: Array
+    unbraked: dict[str, int]
+    steps: FiniteSteps
+
+    file_stem = "rehearsal"
+    made_by = "`mjfim rehearse DESIGN_FOLDER -o DIR`"
+    in_json = (
+        "is_safe",
+        "robots",
+        "wrong",
+        "feedback",
+        "latency",
+        "all_kept",
+        "below_floor",
+        "floor",
+        "unbraked",
+        "unlimited",
+        "steps",
+    )
+    json_names = {"is_safe": "safe", "all_kept": "all_limits_kept"}
+
+    @property
+    def robots(self) -> int:
+        """Number n of robots."""
+        return len(self.margins) - 1
+
+    @property
+    def kept(self) -> np.ndarray:
+        """(n+1, l) True if the model, or a robot, keeps a limit."""
+        is_clamped = [limit.kind in CLAMPED_KINDS for limit in self.limits]
+        return np.where(is_clamped, self.margins > 0.0, self.margins >= 0.0)
+
+    @property
+    def diverged(self) -> int:
+        """Number of robots whose simulation diverges."""
+        return int(np.isnan(self.end_height[1:]).sum())
+
+    @property
+    def all_kept(self) -> int:
+        """Number of robots that keep every limit."""
+        return int((self.kept.all(axis=1) & ~np.isnan(self.end_height))[1:].sum())
+
+    @property
+    def passes_floor(self) -> np.ndarray:
+        """(n+1,) True where a geom or body passes through the floor."""
+        return np.asarray(np.isfinite(self.floor) & (self.lowest < -self.depth))
+
+    @property
+    def below_floor(self) -> int:
+        """Number of robots of which a geom or body passes through the floor."""
+        return int(self.passes_floor[1:].sum())
+
+    @property
+    def is_safe(self) -> bool:
+        """True if a person would play the motion on a robot.
+
+        The model and at least 95 % of the robots keep all limits, stay above the floor, and can be
+        braked at the end before a limit.
+        """
+        allowed = MAX_BROKEN * self.robots
+        is_model_safe = bool(self.kept[0].all()) and not self.passes_floor[0]
+        broken = self.robots - self.all_kept
+        worst = max(self.unbraked.values(), default=0)
+        has_few = max(broken, self.below_floor, worst) < max(allowed, 1.0)
+        return is_model_safe and has_few
+
+    @property
+    def reserve(self) -> Array:
+        """(l,) distance by which the worst robot is closer to a limit than the model.
+
+        It is over half of the range of the limit.
+        """
+        finite = np.where(np.isfinite(self.margins), self.margins, np.nan)
+        worst = np.nanmin(finite, axis=0, initial=np.inf)
+        return np.asarray(np.maximum(np.where(np.isfinite(worst), finite[0] - worst, 0.0), 0.0))
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the model rests at the end."""
+        return bool((self.end_speed[0] <= REST_SHARE * self.speed[0]).all())
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        measured = ("lowest", "end_height", "nearest", "in_contact", "at_stop")
+        return {
+            **super().summary(),
+            "limits": [
+                {
+                    "kind": limit.kind,
+                    "name": limit.name,
+                    "range": [limit.lower, limit.upper],
+                    "unit": limit.unit,
+                    "planned": float(self.margins[0, i]) * limit.scale,
+                    "worst": float(self.margins[1:, i].min(initial=np.inf)) * limit.scale,
+                    "kept": int(self.kept[1:, i].sum()),
+                }
+                for i, limit in enumerate(self.limits)
+            ],
+            "joints": [
+                {
+                    "name": name,
+                    "unit": self.units[i],
+                    **{
+                        key: {"model": float(each[0, i]), "robots": worst_of(each[1:, i])}
+                        for key, each in (
+                            ("speed", self.speed),
+                            ("acceleration", self.acceleration),
+                            ("end_speed", self.end_speed),
+                        )
+                    },
+                }
+                for i, name in enumerate(self.joints)
+            ],
+            **{
+                key: {"model": float(each[0]), "robots": worst_of(each[1:], key)}
+                for key, each in ((name, getattr(self, name)) for name in measured)
+            },
+        }
+
+
+def worst_of(values: Array, key: str = "") -> float:
+    """The worst of the values of all robots: the smallest height or distance, else the largest."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return float("nan")
+    is_least = key in ("lowest", "end_height", "nearest")
+    return float(known.min() if is_least else known.max())

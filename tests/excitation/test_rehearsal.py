@@ -1,0 +1,335 @@
+"""A design on robots that differ from the model, against loops of plain MuJoCo."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.output.page import Level
+from mjfim.output.pages import page_of
+from mjfim.records.design import Design
+from mjfim.records.rehearsal import FiniteSteps
+from tests.support.cli import run
+
+CART = """
+<mujoco model="cart_pendulum">
+  <option timestep="0.005"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="cart">
+      <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+      <joint name="slide" type="slide" axis="1 0 0" damping="0.5" stiffness="4"/>
+      <body name="bob">
+        <joint name="hinge" type="hinge" axis="0 -1 0" damping="0.1" frictionloss="{friction}"/>
+        <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.8"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="force" joint="slide" ctrlrange="-10 10"/></actuator>
+</mujoco>
+"""
+
+TABLES = """
+model = "cart.xml"
+rate = 50.0
+playback_rate = 100.0
+horizon = 2.0
+initial.control = {{ kind = "chirp", amplitude = 5.0, frequency = 0.7, frequency_end = 3.0 }}
+parameters.mass = {{ target = "body/bob:mass" }}
+parameters.damping = {{ target = "joint/hinge:damping" }}
+parameters.spring = {{ target = "joint/slide:stiffness", prior = 0.3, bounds = [3.9, 9.0] }}
+noise.state = {noise}
+limits.velocity = {{ slide = {speed}, hinge = 9.0 }}
+limits.position = {{ slide = [-{reach}, {reach}] }}
+limits.enforce = false
+descent.max_iterations = 0
+rehearsal.robots = 40
+"""
+
+
+def played(folder: Path, *, friction: float = 0.0, **numbers: float) -> tuple[Any, Design]:
+    """The cart and a design of no iteration, which is its initial control."""
+    chosen = {"noise": 0.004, "speed": 4.0, "reach": 3.0, **numbers}
+    text = CART.format(friction=friction)
+    (folder / "cart.xml").write_text(text, encoding="utf-8")
+    (folder / "cart.toml").write_text(TABLES.format(**chosen), encoding="utf-8")
+    experiment = mjfim.Experiment.from_file(folder / "cart.toml")
+    return experiment, mjfim.design(experiment, threads=1, progress=False)
+
+
+def looped(theta: np.ndarray, ctrl: np.ndarray, friction: float = 0.0) -> np.ndarray:
+    """(n+1, 4) states of the cart under a control that is held for four engine steps."""
+    model = mujoco.MjModel.from_xml_string(CART.format(friction=friction))
+    model.body_mass[2], model.dof_damping[1], model.jnt_stiffness[0] = theta
+    data = mujoco.MjData(model)
+    states = [np.concatenate([data.qpos, data.qvel])]
+    for u in np.repeat(ctrl, 4, axis=0):
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data)
+        states.append(np.concatenate([data.qpos, data.qvel]))
+    return np.array(states)
+
+
+def test_robots_agree_with_a_plain_loop(tmp_path: Path) -> None:
+    """Margins, peaks, ends and heights of the model and of every robot."""
+    _, design = played(tmp_path)
+    found = design.rehearsal
+    assert found is not None and found.robots == 40
+    limits = [(limit.kind, limit.name) for limit in found.limits]
+    assert set(limits) == {
+        ("position", "slide"),
+        ("velocity", "slide"),
+        ("velocity", "hinge"),
+        ("control", "force"),
+    }
+    for i, theta in enumerate(found.theta):
+        states = looped(theta, design.trajectory.ctrl)
+        speeds = np.abs(states[:, 2:])
+        np.testing.assert_allclose(found.speed[i], speeds.max(axis=0), rtol=1e-9)
+        np.testing.assert_allclose(found.end_speed[i], speeds[-1], rtol=1e-9)
+        change = np.abs(np.diff(states[:, 2:], axis=0)).max(axis=0) / 0.005
+        np.testing.assert_allclose(found.acceleration[i], change, rtol=1e-9)
+        margins = {
+            ("position", "slide"): 1.0 - np.abs(states[1:, 0]).max() / 3.0,
+            ("velocity", "slide"): 1.0 - speeds[1:, 0].max() / 4.0,
+            ("velocity", "hinge"): 1.0 - speeds[1:, 1].max() / 9.0,
+            ("control", "force"): 1.0 - np.abs(design.trajectory.ctrl).max() / 10.0,
+        }
+        wanted = [margins[limit] for limit in limits]
+        np.testing.assert_allclose(found.margins[i], wanted, rtol=1e-9, atol=1e-12)
+        # The end of the rod has a radius of 2 cm. Nothing states a floor.
+        height = -0.5 * np.cos(states[-1, 1]) - 0.02
+        assert found.end_height[i] == pytest.approx(height, abs=1e-9)
+    assert not found.has_floor and not found.passes_floor.any()
+
+
+def test_robots_are_drawn_as_stated(tmp_path: Path) -> None:
+    """From the prior, within the bounds, and within the share of the size."""
+    experiment, design = played(tmp_path)
+    found = mjfim.rehearse(experiment.replace(rehearsal={"robots": 300, "wrong": 0.3}), design)
+    mass, damping, spring = found.theta[1:].T
+    for values, size in ((mass, 0.8), (damping, 0.1)):
+        share = values / size - 1.0
+        assert np.abs(share).max() <= 0.3 and share.min() < -0.27 and share.max() > 0.27
+    assert spring.min() == 3.9
+    free = spring[spring > 3.9] - 4.0
+    # A normal distribution that is cut off a third of its standard deviation below its mean.
+    assert np.isclose((spring == 3.9).mean(), 0.369, atol=0.08)
+    assert np.isclose(np.sqrt((free[free > 0.0] ** 2).mean()), 0.3, rtol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ({}, "keep all limits"),
+        ({"speed": 0.6}, "violates limits"),
+        ({"speed": None}, "leave the limit on velocity of slide"),
+    ],
+)
+def test_the_verdict_counts_robots(
+    numbers: dict[str, float | None], words: str, tmp_path: Path
+) -> None:
+    """A limit that the model keeps by a hair is broken by a half of the robots."""
+    _, first = played(tmp_path)
+    assert first.rehearsal is not None
+    exact = float(first.rehearsal.speed[0, 0]) * (1.0 + 1e-6)
+    chosen = {key: exact if value is None else value for key, value in numbers.items()}
+    experiment, design = played(tmp_path, **chosen)
+    page = page_of(design, experiment="cart.toml", design=tmp_path)
+    assert words in page.verdict.text
+    is_good = not numbers
+    assert (page.verdict.level is Level.BAD) is not is_good and design.rehearsal is not None
+    assert design.rehearsal.is_safe is is_good
+    if "leave" in words:
+        wide = mjfim.rehearse(experiment.replace(rehearsal={"robots": 300, "seed": 1}), design)
+        states = [looped(theta, design.trajectory.ctrl) for theta in wide.theta[1:]]
+        broken = sum(bool((np.abs(each[1:, 2]) > exact).any()) for each in states)
+        assert broken > 50 and 300 - broken == wide.all_kept
+        cure = next(step for step in page.next_steps if "velocity" in step)
+        assert "slide = [-" in cure and "DESIGN_FOLDER" not in " ".join(page.next_steps)
+
+
+FALLING = """
+<mujoco>
+  <worldbody>
+    {floor}
+    <body name="drone" pos="0 0 1">
+      <freejoint name="base"/>
+      <geom name="hull" type="box" size="0.1 0.1 0.05" mass="1" contype="0" conaffinity="0"/>
+      <site name="rotor"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="thrust" site="rotor" gear="0 0 1 0 0 0" ctrlrange="0 20"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("floor", ["", '<geom type="plane" size="1 1 1" pos="0 0 0.2"/>'])
+@pytest.mark.parametrize(("thrust", "is_safe"), [(9.0, False), (9.81, True)])
+def test_what_falls_below_the_floor_is_not_played(
+    floor: str, thrust: float, is_safe: bool, tmp_path: Path
+) -> None:
+    """With a floor in the model, and without one, where the ground is at zero."""
+    (tmp_path / "drone.xml").write_text(FALLING.format(floor=floor), encoding="utf-8")
+    experiment = mjfim.Experiment(
+        model="drone.xml",
+        directory=tmp_path,
+        rate=50.0,
+        horizon=2.0,
+        initial={
+            "control": {
+                "kind": "chirp",
+                "amplitude": 1e-6,
+                "frequency": 0.5,
+                "frequency_end": 1.0,
+                "offset": thrust,
+            }
+        },
+        parameters={"mass": {"target": "body/drone:mass"}},
+        noise={"qpos:base.z": 0.01},
+        descent={"max_iterations": 0},
+        rehearsal={"robots": 10, "wrong": 0.001},
+    )
+    design = mjfim.design(experiment, threads=1, progress=False)
+    found = design.rehearsal
+    assert found is not None and found.has_floor is bool(floor)
+    level = 0.2 if floor else 0.0
+    assert found.floor == pytest.approx(level, abs=1e-12)
+    fallen = 0.5 * (9.81 - thrust) * 2.0**2
+    assert found.lowest[0] == pytest.approx(0.95 - fallen - level, abs=0.02)
+    assert found.is_safe is is_safe
+    assert ("pass through" in page_of(design).verdict.text) is not is_safe
+    stated = experiment.replace(rehearsal={"floor": "none"})
+    assert mjfim.rehearse(stated, design).is_safe
+
+
+@pytest.mark.parametrize("room", [1e-4, 2.0])
+def test_an_end_that_no_control_can_brake_is_not_played(room: float, tmp_path: Path) -> None:
+    """Held at its strongest brake after the end, the cart of plain MuJoCo leaves the limit."""
+    _, first = played(tmp_path)
+    assert first.rehearsal is not None
+    states = [looped(theta, first.trajectory.ctrl) for theta in first.rehearsal.theta]
+    reach = float(max(np.abs(each[:, 0]).max() for each in states)) + room
+    _, design = played(tmp_path, reach=reach)
+    found = design.rehearsal
+    assert found is not None and found.all_kept == 40
+    left = 0
+    for theta, each in zip(found.theta[1:], states[1:], strict=True):
+        model = mujoco.MjModel.from_xml_string(CART.format(friction=0.0))
+        model.body_mass[2], model.dof_damping[1], model.jnt_stiffness[0] = theta
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = each[-1, :2], each[-1, 2:]
+        data.ctrl[:] = -10.0 * np.sign(data.qvel[0])
+        direction = np.sign(data.qvel[0])
+        while data.qvel[0] * direction > 0.0:
+            mujoco.mj_step(model, data)
+        left += bool(abs(data.qpos[0]) > reach)
+    # The deceleration of the first instant stands for the whole way.
+    assert abs(found.unbraked.get("slide", 0) - left) <= 2
+    assert found.is_safe is (left < 2)
+
+
+def test_feedback_keeps_robots_near_the_plan(tmp_path: Path) -> None:
+    """With little noise the robots follow the plan, late as stated."""
+    experiment, design = played(tmp_path, noise=1e-6)
+    spread = [
+        np.ptp(mjfim.rehearse(experiment.replace(rehearsal=table), design).end_speed[:, 1])
+        for table in ({}, {"feedback": True, "latency": 0.0})
+    ]
+    assert spread[1] < 0.7 * spread[0]
+    late = mjfim.rehearse(
+        experiment.replace(rehearsal={"feedback": True, "latency": 0.007, "robots": 2}), design
+    )
+    assert late.latency == pytest.approx(0.01, abs=1e-12)
+
+
+def whitened_change(design: Design, step: np.ndarray, noise: float, friction: float) -> float:
+    """Distance of the measured states at theta plus and minus a step, by plain loops."""
+    sides = [
+        looped(design.theta + sign * step, design.trajectory.ctrl, friction)[::4]
+        for sign in (1.0, -1.0)
+    ]
+    return float(np.linalg.norm((sides[0] - sides[1])[1:] / noise))
+
+
+@pytest.mark.parametrize(("friction", "noise"), [(0.0, 0.004), (0.0, 0.4), (0.3, 0.05)])
+def test_finite_steps_agree_with_plain_loops(friction: float, noise: float, tmp_path: Path) -> None:
+    """Along the principal axes of the covariance; for little noise the derivatives hold."""
+    _, design = played(tmp_path, friction=friction, noise=noise)
+    assert design.rehearsal is not None
+    steps, information = design.rehearsal.steps, design.final.information
+    prior = np.diag([0.0, 0.0, 0.3**-2])
+    size = np.sqrt(np.diag(information))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    weight = np.zeros(3)
+    for d, value in enumerate(values):
+        axis = vectors[:, d] / size
+        step = steps.length[d] * axis / np.sqrt(value)
+        of_data = axis @ (information - prior) @ axis
+        if not (design.theta - np.abs(step) > 0.0).all() or steps.length[d] < 2.0:
+            weight[d] = np.nan
+            continue
+        expected = 2.0 * steps.length[d] * np.sqrt(of_data / value)
+        ratio = whitened_change(design, step, noise, friction) / expected
+        assert steps.ratio[d] == pytest.approx(ratio, rel=3e-3)
+        weight[d] = axis @ prior @ axis + ratio**2 * of_data
+    if np.isfinite(weight).all():
+        std = np.sqrt(((vectors / size[:, None]) ** 2 / weight).sum(axis=1))
+        np.testing.assert_allclose(steps.std, std, rtol=1e-2)
+    if noise == 0.004:
+        np.testing.assert_allclose(steps.ratio, 1.0, atol=0.02)
+        assert str(steps) == "" and (steps.stated == steps.predicted).all()
+
+
+def test_a_standard_deviation_that_differs_is_stated_by_the_finite_step() -> None:
+    """The one of the finite step, with its cause; the confirmed ones stay."""
+    steps = FiniteSteps(
+        names=("mass", "friction"),
+        predicted=np.array([0.1, 0.05]),
+        std=np.array([0.11, 0.12]),
+        length=np.full(2, 2.0),
+        ratio=np.array([0.9, 0.4]),
+        causes=("dry friction of hinge",),
+    )
+    np.testing.assert_array_equal(steps.stated, [0.1, 0.12])
+    assert "friction 0.12 in place of 0.05" in str(steps)
+    assert "dry friction of hinge makes it approximate" in str(steps)
+
+
+def test_the_verb_plays_a_folder(tmp_path: Path) -> None:
+    """It finds the experiment by itself, and agrees with the rehearsal of the design."""
+    played(tmp_path)
+    made, out = tmp_path / "made", tmp_path / "out"
+    done = run("design", tmp_path / "cart.toml", "-o", made)
+    assert "keep all limits" in done.stdout
+    done = run("rehearse", made, "-o", out, "--robots", "7", "--seed", "3")
+    assert done.exit_code == 0 and "7 of 7 robots" in done.stdout
+    assert f"mjfim export {made} --to player" in " ".join(done.stdout.split())
+    told = json.loads((out / "rehearsal.json").read_text(encoding="utf-8"))
+    assert told["safe"] and told["robots"] == 7 and len(told["limits"]) == 4
+    assert (out / "rehearsal.png").stat().st_size > 10_000
+
+
+def test_misuse_is_one_sentence(tmp_path: Path) -> None:
+    experiment, design = played(tmp_path)
+    with pytest.raises(RecordingError, match="give the experiment of the design"):
+        mjfim.rehearse(experiment.replace(rate=100.0), design)
+    silent = experiment.replace(rehearsal={"feedback": True})
+    silent = silent.restated({**silent.model_dump(exclude_unset=True), "noise": {"x": 1.0}})
+    with pytest.raises(ExperimentError):
+        mjfim.rehearse(silent, design)
+
+
+def test_a_model_alone_is_enough(tmp_path: Path) -> None:
+    experiment, design = played(tmp_path)
+    alone = mjfim.rehearse(experiment.replace(rehearsal={"robots": 0}), design)
+    assert alone.robots == 0 and alone.is_safe
+    lost = replace(alone, margins=-alone.margins)
+    assert not lost.is_safe
