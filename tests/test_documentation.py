@@ -2,9 +2,10 @@
 
 A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it.
 Python blocks stand alone. Commands of one file run one after another in one folder that holds a
-copy of models/. Those of README.md are typed into a shell; other documents show the same verbs,
-which run in the test process, because a new process takes two seconds to import everything. A TOML
-block with the key `model` is an experiment beside models/; the TOML blocks after it extend it.
+copy of models/. The blocks of README.md run in new processes; those of other documents run in the
+test process, because a new process takes two seconds to import everything. They have smaller
+budgets than a reader's (`QUICKER`). A TOML block with the key `model` is an experiment beside
+models/; the TOML blocks after it extend it.
 """
 
 from __future__ import annotations
@@ -39,6 +40,17 @@ TYPED = ROOT / "README.md"
 # Experiment that TOML blocks extend in a file that states no complete experiment before them.
 DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
 
+# Budgets of the documents and of models/ that the tests replace by smaller ones.
+QUICKER = {
+    "--seconds 10 ": "--seconds 2 ",
+    "seconds=4.0": "seconds=1.0",
+    "--trials 200": "--trials 20",
+    "trials=100": "trials=20",
+    '"starts": 3': '"starts": 2',
+    '"max_iterations": 20': '"max_iterations": 5',
+    "tolerance = 1e-7": "tolerance = 1e-3",
+}
+
 # Signs that the shell would replace or obey in the words of a command.
 SHELL_SIGNS = re.compile(r"[|&;<>()$`*?\[{~!]")
 
@@ -50,6 +62,13 @@ def runnable(path: Path, language: str) -> list[CodeBlock]:
     """Return the blocks of one language of a file that are not marked as `not run`."""
     blocks = [block for block in code_blocks(path) if block.language == language]
     return [block for block in blocks if not block.skip_reason]
+
+
+def quicker(text: str) -> str:
+    """Return a text with smaller budgets."""
+    for stated, smaller in QUICKER.items():
+        text = text.replace(stated, smaller)
+    return text
 
 
 def commands(block: CodeBlock) -> list[tuple[str, int]]:
@@ -153,6 +172,8 @@ def checkout(tmp_path: Path) -> Path:
     """A folder with copies of models/ and scripts/, where results may be written."""
     for name in ("models", "scripts"):
         shutil.copytree(ROOT / name, tmp_path / name)
+    for path in tmp_path.glob("models/*.toml"):
+        path.write_text(quicker(path.read_text(encoding="utf-8")), encoding="utf-8")
     return tmp_path
 
 
@@ -163,7 +184,13 @@ def checkout(tmp_path: Path) -> Path:
     ids=lambda block: block.name,
 )
 def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
-    run([sys.executable, "-c", block.text], checkout)
+    """Those that start processes run in a new one, too."""
+    if block.path == TYPED or "__main__" in block.text:
+        run([sys.executable, "-c", quicker(block.text)], checkout)
+        return
+
+    with contextlib.chdir(checkout):
+        exec(compile(quicker(block.text), block.name, "exec"), {"__name__": "__main__"})
 
 
 @pytest.mark.slow
@@ -175,6 +202,7 @@ def test_shell_blocks_run(path: Path, checkout: Path) -> None:
     """Pictures are made; those of README.md alone are rendered, too."""
     for block in runnable(path, "sh"):
         for line, code in commands(block):
+            line = quicker(line)
             if path == TYPED:
                 run(["bash", "-c", line], checkout, code)
             else:
@@ -221,6 +249,11 @@ def test_named_code_exists(path: Path) -> None:
 
 
 # ---- the checks themselves, on small documents
+
+
+def test_every_budget_stands_somewhere() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in (*DOCUMENTS, *MODELS.glob("*.toml"))]
+    assert [stated for stated in QUICKER if not any(stated in text for text in texts)] == []
 
 
 def test_a_failing_block_is_noticed(tmp_path: Path) -> None:
