@@ -2,10 +2,9 @@
 
 A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it.
 Python blocks stand alone. Commands of one file run one after another in one folder that holds a
-copy of models/. The blocks of README.md run in new processes; those of other documents run in the
-test process, because a new process takes two seconds to import everything. They have smaller
-budgets than a reader's (`QUICKER`). A TOML block with the key `model` is an experiment beside
-models/; the TOML blocks after it extend it.
+copy of models/. They run in the test process, because a new process takes two seconds to import
+everything, and with smaller budgets than a reader's (`QUICKER`). A TOML block with the key `model`
+is an experiment beside models/; the TOML blocks after it extend it.
 """
 
 from __future__ import annotations
@@ -30,26 +29,13 @@ from mjfim.experiment import System
 from tests.support import cli
 from tests.support.markdown import CodeBlock, code_blocks, linked_files
 from tests.support.paths import MODELS, ROOT
+from tests.support.quicker import QUICKER, quicker, quicker_models
 
 # All documents of the repository.
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-# The document whose commands are typed into a shell.
-TYPED = ROOT / "README.md"
-
 # Experiment that TOML blocks extend in a file that states no complete experiment before them.
 DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
-
-# Budgets of the documents and of models/ that the tests replace by smaller ones.
-QUICKER = {
-    "--seconds 10 ": "--seconds 2 ",
-    "seconds=4.0": "seconds=1.0",
-    "--trials 200": "--trials 20",
-    "trials=100": "trials=20",
-    '"starts": 3': '"starts": 2',
-    '"max_iterations": 20': '"max_iterations": 5',
-    "tolerance = 1e-7": "tolerance = 1e-3",
-}
 
 # Signs that the shell would replace or obey in the words of a command.
 SHELL_SIGNS = re.compile(r"[|&;<>()$`*?\[{~!]")
@@ -62,13 +48,6 @@ def runnable(path: Path, language: str) -> list[CodeBlock]:
     """Return the blocks of one language of a file that are not marked as `not run`."""
     blocks = [block for block in code_blocks(path) if block.language == language]
     return [block for block in blocks if not block.skip_reason]
-
-
-def quicker(text: str) -> str:
-    """Return a text with smaller budgets."""
-    for stated, smaller in QUICKER.items():
-        text = text.replace(stated, smaller)
-    return text
 
 
 def commands(block: CodeBlock) -> list[tuple[str, int]]:
@@ -170,10 +149,8 @@ def run_line(line: str, folder: Path, code: int = 0) -> None:
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A folder with copies of models/ and scripts/, where results may be written."""
-    for name in ("models", "scripts"):
-        shutil.copytree(ROOT / name, tmp_path / name)
-    for path in tmp_path.glob("models/*.toml"):
-        path.write_text(quicker(path.read_text(encoding="utf-8")), encoding="utf-8")
+    shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
+    quicker_models(tmp_path / "models")
     return tmp_path
 
 
@@ -184,8 +161,8 @@ def checkout(tmp_path: Path) -> Path:
     ids=lambda block: block.name,
 )
 def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
-    """Those that start processes run in a new one, too."""
-    if block.path == TYPED or "__main__" in block.text:
+    """Those that start processes run in a new one."""
+    if "__main__" in block.text:
         run([sys.executable, "-c", quicker(block.text)], checkout)
         return
 
@@ -199,14 +176,10 @@ def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
     "path", [path for path in DOCUMENTS if runnable(path, "sh")], ids=lambda path: path.name
 )
 def test_shell_blocks_run(path: Path, checkout: Path) -> None:
-    """Pictures are made; those of README.md alone are rendered, too."""
+    """Pictures are made, and not rendered."""
     for block in runnable(path, "sh"):
         for line, code in commands(block):
-            line = quicker(line)
-            if path == TYPED:
-                run(["bash", "-c", line], checkout, code)
-            else:
-                run_line(line, checkout, code)
+            run_line(quicker(line), checkout, code)
 
 
 @pytest.mark.parametrize(
@@ -252,7 +225,8 @@ def test_named_code_exists(path: Path) -> None:
 
 
 def test_every_budget_stands_somewhere() -> None:
-    texts = [path.read_text(encoding="utf-8") for path in (*DOCUMENTS, *MODELS.glob("*.toml"))]
+    files = [*DOCUMENTS, *MODELS.glob("*.toml"), *(ROOT / "docs" / "notebooks").glob("*.ipynb")]
+    texts = [path.read_text(encoding="utf-8").replace('\\"', '"') for path in files]
     assert [stated for stated in QUICKER if not any(stated in text for text in texts)] == []
 
 

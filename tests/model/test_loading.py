@@ -28,9 +28,8 @@ ROUGH = {
     "dfki_simple_pendulum",
 }  # contact and dry friction
 
-# The examples whose pictures are rendered: a ball joint, a free joint, a closed loop, limits, and
-# an actuator with a state of its own.
-RENDERED = {"ball_pendulum", "quadrotor", "four_bar", "sliding_block", "filtered_drive"}
+# The examples whose pictures are rendered: a ball joint, and a free joint under limits.
+RENDERED = {"ball_pendulum", "quadrotor"}
 TOGETHER = {"double_pendulum", "ball_pendulum"}  # not every parameter can be told alone
 
 
