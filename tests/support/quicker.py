@@ -17,6 +17,9 @@ QUICKER = {
     '"starts": 3': '"starts": 2',
     '"max_iterations": 20': '"max_iterations": 5',
     '"max_iterations": 25': '"max_iterations": 5',
+    "np.arange(1000)": "np.arange(400)",
+    "horizon = 3.0": "horizon = 1.5",
+    "horizon = 4.0": "horizon = 2.0",
     "tolerance = 1e-7": "tolerance = 1e-3",
     "tolerance = 1e-2": "tolerance = 1e-1",
 }
@@ -32,5 +35,5 @@ def quicker(text: str) -> str:
 def quicker_models(folder: Path) -> None:
     """Copy models/ to a new folder, with smaller budgets."""
     shutil.copytree(MODELS, folder)
-    for path in folder.glob("*.toml"):
+    for path in folder.rglob("*.toml"):
         path.write_text(quicker(path.read_text(encoding="utf-8")), encoding="utf-8")
