@@ -174,7 +174,7 @@ def test_a_settled_selection_keeps_the_length_that_the_user_left_free(tmp_path: 
 
 @pytest.mark.slow
 def test_two_missing_terms_are_both_found(tmp_path: Path) -> None:
-    logs = recorded(tmp_path, 'frictionloss="0.3" stiffness="2"', count=3, horizon=4.0)
+    logs = recorded(tmp_path, 'frictionloss="0.3" stiffness="2"', count=3, horizon=3.0)
     found = mjfim.select_terms(stated(), logs)
     assert found.selection is not None
     paths = {term.path for term in found.selection.terms}
