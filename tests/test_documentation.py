@@ -2,9 +2,9 @@
 
 A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it.
 Python blocks stand alone. Commands of one file run one after another in one folder that holds a
-copy of models/. Those of README.md are typed into a shell; other documents show the same verbs,
-which run in the test process, because a new process takes two seconds to import everything. A TOML
-block with the key `model` is an experiment beside models/; the TOML blocks after it extend it.
+copy of models/. They run in the test process, because a new process takes two seconds to import
+everything, and with smaller budgets than a reader's (`QUICKER`). A TOML block with the key `model`
+is an experiment beside models/; the TOML blocks after it extend it.
 """
 
 from __future__ import annotations
@@ -29,12 +29,10 @@ from mjfim.experiment import System
 from tests.support import cli
 from tests.support.markdown import CodeBlock, code_blocks, linked_files
 from tests.support.paths import MODELS, ROOT
+from tests.support.quicker import QUICKER, quicker, quicker_models
 
 # All documents of the repository.
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-
-# The document whose commands are typed into a shell.
-TYPED = ROOT / "README.md"
 
 # Experiment that TOML blocks extend in a file that states no complete experiment before them.
 DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
@@ -151,8 +149,8 @@ def run_line(line: str, folder: Path, code: int = 0) -> None:
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A folder with copies of models/ and scripts/, where results may be written."""
-    for name in ("models", "scripts"):
-        shutil.copytree(ROOT / name, tmp_path / name)
+    shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
+    quicker_models(tmp_path / "models")
     return tmp_path
 
 
@@ -163,7 +161,13 @@ def checkout(tmp_path: Path) -> Path:
     ids=lambda block: block.name,
 )
 def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
-    run([sys.executable, "-c", block.text], checkout)
+    """Those that start processes run in a new one."""
+    if "__main__" in block.text:
+        run([sys.executable, "-c", quicker(block.text)], checkout)
+        return
+
+    with contextlib.chdir(checkout):
+        exec(compile(quicker(block.text), block.name, "exec"), {"__name__": "__main__"})
 
 
 @pytest.mark.slow
@@ -172,13 +176,10 @@ def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
     "path", [path for path in DOCUMENTS if runnable(path, "sh")], ids=lambda path: path.name
 )
 def test_shell_blocks_run(path: Path, checkout: Path) -> None:
-    """Pictures are made; those of README.md alone are rendered, too."""
+    """Pictures are made, and not rendered."""
     for block in runnable(path, "sh"):
         for line, code in commands(block):
-            if path == TYPED:
-                run(["bash", "-c", line], checkout, code)
-            else:
-                run_line(line, checkout, code)
+            run_line(quicker(line), checkout, code)
 
 
 @pytest.mark.parametrize(
@@ -221,6 +222,12 @@ def test_named_code_exists(path: Path) -> None:
 
 
 # ---- the checks themselves, on small documents
+
+
+def test_every_budget_stands_somewhere() -> None:
+    files = [*DOCUMENTS, *MODELS.glob("*.toml"), *(ROOT / "docs" / "notebooks").glob("*.ipynb")]
+    texts = [path.read_text(encoding="utf-8").replace('\\"', '"') for path in files]
+    assert [stated for stated in QUICKER if not any(stated in text for text in texts)] == []
 
 
 def test_a_failing_block_is_noticed(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.support.paths import ROOT
+from tests.support.quicker import quicker_models
 
 # All notebooks of the documentation.
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -23,8 +23,11 @@ EXECUTE = """
 import sys
 import nbformat
 from nbclient import NotebookClient
+from tests.support.quicker import quicker
 
 notebook = nbformat.read(sys.argv[1], as_version=4)
+for cell in notebook.cells:
+    cell.source = quicker(cell.source)
 NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
 nbformat.write(notebook, sys.argv[2])
 """
@@ -62,7 +65,7 @@ def test_notebooks_run(path: Path, tmp_path: Path) -> None:
     """Every cell runs, no cell warns, and tables and figures are shown."""
     folder = tmp_path / "docs" / "notebooks"
     folder.mkdir(parents=True)
-    shutil.copytree(ROOT / "models", tmp_path / "models")
+    quicker_models(tmp_path / "models")
     result = tmp_path / path.name
 
     done = subprocess.run(

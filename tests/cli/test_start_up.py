@@ -17,7 +17,7 @@ from typer.main import get_command
 
 from mjfim.cli.main import ORDER, app
 from mjfim.parallel import cores
-from tests.support.cli import MODELS, run
+from tests.support.cli import MODELS, run, write_experiment
 from tests.support.paths import ROOT
 
 # Packages that take long to import, and that no help and no message about misuse needs.
@@ -119,7 +119,7 @@ def test_a_wrong_key_is_said_before_the_engine_is_imported(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_a_design_imports_only_the_parts_of_scipy_that_it_needs(tmp_path: Path) -> None:
-    words = ["design", str(MODELS / "cart_pendulum.toml"), "-o", str(tmp_path / "out")]
+    words = ["design", str(write_experiment(tmp_path)), "-o", str(tmp_path / "out")]
     unused = ("scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.stats", "pandas")
     unused = (*unused, "mjfim.identification")
 
@@ -131,7 +131,7 @@ def test_a_design_imports_only_the_parts_of_scipy_that_it_needs(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_a_fit_imports_nothing_of_a_design(tmp_path: Path) -> None:
-    experiment, log = str(MODELS / "cart_pendulum.toml"), str(tmp_path / "log.csv")
+    experiment, log = str(write_experiment(tmp_path)), str(tmp_path / "log.csv")
     assert run("simulate", experiment, "-o", log).exit_code == 0
     lines = Path(log).read_text().splitlines(keepends=True)
     Path(log).write_text("".join(lines[:80]))

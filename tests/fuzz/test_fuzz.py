@@ -37,7 +37,7 @@ from tests.fuzz.workers import run_cases
 from tests.support.cli import write_experiment
 
 # Time of each kind in these tests [s]; no case begins later.
-SECONDS = {"problem": 15.0, "input": 15.0, "kill": 30.0, "mechanism": 15.0, "fault": 15.0}
+SECONDS = {"problem": 8.0, "input": 8.0, "kill": 12.0, "mechanism": 8.0, "fault": 8.0}
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ def system() -> System:
         base.replace(
             initial={"control": CONTROL},
             fit={"bootstrap": 0, "max_iterations": 15, "segments": "whole"},
-            horizon=3.0,
+            horizon=2.0,
         )
     )
 

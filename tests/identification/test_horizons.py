@@ -67,7 +67,7 @@ def test_nothing_is_compared_where_the_model_explains_the_recordings() -> None:
 
 @pytest.mark.slow
 def test_lengths_are_compared_where_the_model_lacks_a_term(tmp_path: Path) -> None:
-    logs = recorded(0.6, 3)
+    logs = recorded(0.6, 2)
     found = mjfim.identify(stated(), logs)
     assert found.misfit
     study = found.horizons
@@ -89,7 +89,7 @@ def test_lengths_are_compared_where_the_model_lacks_a_term(tmp_path: Path) -> No
     for segments, count in (("whole", 1), (1.0, 3)):
         again = mjfim.identify(stated(segments=segments), logs)
         assert again.horizons is None
-        assert [len(begins) for begins in again.segments] == [count] * 3
+        assert [len(begins) for begins in again.segments] == [count] * 2
 
     found.save(tmp_path)
     loaded = mjfim.Estimate.load(tmp_path).horizons

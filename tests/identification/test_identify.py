@@ -359,14 +359,11 @@ def test_an_interruption_before_the_last_search_ends_all_searches(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1.0, 3.0])
 def test_a_robust_fit_tests_the_size_of_its_residuals(
-    task: DesignTask, recording: Recording, scale: float
+    task: DesignTask, recording: Recording
 ) -> None:
-    """The stated noise is no misfit for any threshold of outliers; three times the noise is."""
-    robust = DesignTask.resolve(
-        task.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale})
-    )
+    """The stated noise is no misfit; three times the noise is."""
+    robust = DesignTask.resolve(task.experiment.replace(fit={"loss": "soft_l1", "loss_scale": 1.0}))
     right = identify_system(robust.system, [recording])
     assert right.chi2 / right.dof == pytest.approx(1.0, abs=0.15)
     assert not right.misfit

@@ -55,8 +55,8 @@ def rubbing_pendulum(folder: Path) -> Recording:
     [
         ('frictionloss="0.5"', "joint/slide:frictionloss", 0.5, 2.0),
         pytest.param('damping="0.6"', "joint/slide:damping", 0.6, 4.0, marks=pytest.mark.slow),
-        pytest.param('stiffness="2"', "joint/slide:stiffness", 2.0, 4.0, marks=pytest.mark.slow),
-        pytest.param('armature="0.5"', "joint/slide:armature", 0.5, 4.0, marks=pytest.mark.slow),
+        pytest.param('stiffness="2"', "joint/slide:stiffness", 2.0, 3.0, marks=pytest.mark.slow),
+        pytest.param('armature="0.5"', "joint/slide:armature", 0.5, 3.0, marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_a_complete_model_has_no_missing_terms() -> None:
     task = DesignTask.resolve(stated())
     found = [
         identify_system(task.system, [simulate_system(task.system, task.initial, seed)])
-        for seed in range(12)
+        for seed in range(5)
     ]
     assert not any(e.missing_terms or e.misfit for e in found)
 

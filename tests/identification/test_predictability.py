@@ -46,7 +46,7 @@ def test_rounding_errors_are_mentioned_where_they_change_the_motion() -> None:
 @pytest.mark.slow
 def test_a_chaotic_motion_is_fitted_with_the_recommended_segments(tmp_path: Path) -> None:
     """One simulation ends in a local minimum; the warning says with which segments it works."""
-    study = PLANTS["acrobot"](Setting(horizon=8.0))
+    study = PLANTS["acrobot"](Setting(horizon=6.0))
     (tmp_path / "plant.xml").write_text(study.xml, encoding="utf-8")
     tables = {"model": "plant.xml", "directory": tmp_path, "source": "chaos.toml", **study.tables}
     experiment = mjfim.Experiment(**tables)

@@ -185,36 +185,23 @@ class Setting:
 
 
 @pytest.mark.slow
-def test_equal_recordings_rarely_give_an_odd_one() -> None:
-    alarms, _, joint = Setting(K=4).rates(100)
-    assert alarms <= 0.04
+@pytest.mark.parametrize(
+    "setting",
+    [Setting(K=4), Setting(K=3, phi=0.9), Setting(K=5, phi=0.9, c=10), Setting(K=5, noisy=5.0)],
+    ids=str,
+)
+def test_rate_of_false_alarms(setting: Setting) -> None:
+    """The stated level is 1 %; 150 sets give more than 5 with a probability of 0.4 %."""
+    alarms, _, joint = setting.rates(150)
+    assert alarms <= 5 / 150
     assert joint <= 0.02
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "setting",
-    [
-        Setting(K=3),
-        Setting(K=3, phi=0.9),
-        Setting(K=8, phi=0.9),
-        Setting(K=5, c=10),
-        Setting(K=5, phi=0.9, c=10),
-        Setting(K=5, noisy=5.0),
-    ],
-    ids=str,
-)
-def test_rate_of_false_alarms(setting: Setting) -> None:
-    """The stated level is 1 %; 400 sets give 2.5 % with a probability of 1 % or less."""
-    alarms, _, _ = setting.rates(400)
-    assert alarms <= 0.025
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("K", "least"), [(3, 0.75), (4, 0.88), (8, 0.95)])
+@pytest.mark.parametrize(("K", "least"), [(3, 0.75), (8, 0.95)])
 def test_rate_of_true_alarms(K: int, least: float) -> None:
     """A difference of eight standard deviations of one recording."""
-    alarms, hits, _ = Setting(K=K, phi=0.3, odd=8.0).rates(200)
+    alarms, hits, _ = Setting(K=K, phi=0.3, odd=8.0).rates(100)
     assert hits >= least
     assert alarms - hits <= 0.02
 

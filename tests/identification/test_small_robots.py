@@ -68,12 +68,8 @@ STATED: dict[str, Any] = {
 SIZES = {
     "crane": Units(length=1e2, mass=1e6, time=1e1),
     "insect": Units(length=1e-1, mass=1e-3, time=0.3),
-    "long": Units(length=1e3),
-    "short": Units(length=1e-3),
-    "heavy": Units(mass=1e3),
-    "light": Units(mass=1e-3),
-    "slow": Units(time=1e3),
-    "quick": Units(time=1e-3),
+    "violent": Units(length=1e2, mass=1e3, time=1e-1),
+    "sluggish": Units(length=1e-2, mass=1e-3, time=1e1),
 }
 
 
@@ -132,4 +128,4 @@ def test_the_furuta_of_another_project_has_no_misfit() -> None:
     shared_model(EXPERIMENTS["furuta"]["model"])
     stated = {**EXPERIMENTS["furuta"], "fit": {"bootstrap": 0}}
     experiment = Experiment(**stated, directory=SHARED_MODELS, source="furuta")
-    assert_is_complete(fits(System.resolve(experiment), SEEDS))
+    assert_is_complete(fits(System.resolve(experiment), SEEDS[:2]))

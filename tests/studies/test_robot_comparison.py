@@ -313,32 +313,22 @@ def test_equal_robots_rarely_differ() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "setting",
-    [
-        Setting(K=1),
-        Setting(K=1, phi=0.9),
-        Setting(K=3),
-        Setting(K=3, phi=0.9, c=8),
-        Setting(K=3, tau=1.0),
-        Setting(K=4, tau=3.0),
-    ],
-    ids=str,
+    "setting", [Setting(K=1, phi=0.9), Setting(K=3, phi=0.9, c=8), Setting(K=4, tau=3.0)], ids=str
 )
 def test_rate_of_false_alarms(setting: Setting) -> None:
-    """The stated level is 5 %; 300 comparisons give 8.5 % with a probability of 1 %."""
+    """The stated level is 5 %; 100 comparisons give more than 10 with a probability of 1 %."""
     rng = np.random.default_rng(1)
-    alarms = sum(setting.compared(rng).differs for _ in range(300))
-    assert alarms / 300 <= 0.085
+    assert sum(setting.compared(rng).differs for _ in range(100)) <= 10
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", [Setting(K=1), Setting(K=4), Setting(K=4, phi=0.9)], ids=str)
+@pytest.mark.parametrize("setting", [Setting(K=1), Setting(K=4, phi=0.9)], ids=str)
 def test_rate_of_true_alarms(setting: Setting) -> None:
     """A shift as large as the difference that would be found with a probability of 80 %."""
     rng = np.random.default_rng(2)
+    found = setting.compared(rng)
     hits = 0
-    for _ in range(200):
-        shift = float(setting.compared(rng).detectable[0])
-        found = setting.compared(rng, shift)
+    for _ in range(100):
+        found = setting.compared(rng, float(found.detectable[0]))
         hits += 0 in found.changed
-    assert 0.68 <= hits / 200 <= 0.92
+    assert 66 <= hits <= 92

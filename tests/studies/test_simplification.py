@@ -143,7 +143,7 @@ def test_the_selected_model_is_fitted_to_held_out_recordings() -> None:
     stated = base.replace(horizon=2.0, initial={"control": control}, fit={"bootstrap": 0})
     friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.6, "scale": 1.0}}
     robot = stated.replace(parameters=friction)
-    *logs, kept = recorded(robot, 4)
+    *logs, kept = recorded(robot, 3)
     found = mjfim.select_terms(stated, logs, held_out=[kept])
     assert found.selection is not None
     refit = found.selection.refit

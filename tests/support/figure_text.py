@@ -16,9 +16,9 @@ def misplaced_texts(figure: Figure) -> list[str]:
     """Return a sentence for each text that overlaps another one or leaves the figure.
 
     Args:
-        figure: The figure; it is laid out and drawn.
+        figure: The figure; it is laid out.
     """
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     tolerance = TOLERANCE * figure.dpi / 72.0
     texts, boxes = _visible_texts(figure)
     if not texts:

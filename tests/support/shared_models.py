@@ -97,7 +97,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         },
         "noise": state_noise(("shoulder", "elbow")),
         "cost": {"criterion": "E", "control": 0.2},
-        "descent": {"tolerance": 1e-3},
+        "descent": {"tolerance": 1e-3, "max_iterations": 15},
     },
     # The motor allows a torque of 0.02 N m, and the cable of the arm two radians.
     "furuta": {
@@ -113,7 +113,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         },
         "noise": state_noise(("theta", "alpha")),
         "cost": {"criterion": "E", "control": 200.0, "tracking": {"theta": 6e-3}},
-        "descent": {"tolerance": 1e-2},
+        "descent": {"tolerance": 1e-2, "max_iterations": 15},
         "limits": {"control": {"motor": (-0.02, 0.02)}, "position": {"theta": (-2.0, 2.0)}},
     },
     # The jaw is open, because the pads of a closed jaw touch.
@@ -161,7 +161,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             "tracking": dict.fromkeys(SO_ARM, 5.0),
             "tracking_velocity": dict.fromkeys(SO_ARM, 20.0),
         },
-        "descent": {"tolerance": 1e-2, "max_iterations": 40},
+        "descent": {"tolerance": 1e-2, "max_iterations": 9},
     },
     # The controls of the six muscles swing about the equilibrium of half activation.
     "arm26": {
