@@ -31,9 +31,9 @@ from mjfim.recordings.section import ColumnSpec
 # Number of the first rows whose motion is looked at.
 MOST_ROWS = 4000
 
-# A parameter of which nothing is stated lies between its guess over this factor and its guess times
-# this factor, and within so many standard deviations of its prior.
-UNSTATED_FACTOR = 2.0
+# A parameter without bounds lies within this factor of its guess, as the starts of a fit do, and
+# within so many standard deviations of a prior.
+UNSTATED_FACTOR = 10.0
 PRIOR_SIGMAS = 3.0
 
 # Residuals over forces above which an equation shows a gross error, and above which it may be an
@@ -173,15 +173,13 @@ class _Search:
             raise RecordingError(f"{recording.name}: too short for the equation of motion")
 
         # Bounds on both sides are stated; a single one may be that of physics.
-        guess, weight = parameters.guess, parameters.prior_weight
+        guess, size = parameters.guess, parameters.magnitude
         bounds = np.array([parameters.lower, parameters.upper])
         about = np.sort([guess / UNSTATED_FACTOR, guess * UNSTATED_FACTOR], axis=0)
-        has_prior = weight > 0.0
-        spread = np.where(has_prior, PRIOR_SIGMAS / np.where(has_prior, weight, 1.0), 0.0)
-        spread += np.where(has_prior, 0.0, parameters.magnitude)
-        about = np.where(has_prior | (guess == 0.0), [guess - spread, guess + spread], about)
-        is_stated = np.isfinite(bounds).all(axis=0) & ~has_prior
-        lower, upper = np.where(is_stated, bounds, np.clip(about, *bounds))
+        about = np.where(guess == 0.0, [-size, size], about)
+        prior = PRIOR_SIGMAS / np.maximum(parameters.prior_weight, np.finfo(float).tiny)
+        about = np.clip(about, guess - prior, guess + prior)
+        lower, upper = np.where(np.isfinite(bounds).all(axis=0), bounds, np.clip(about, *bounds))
         return _Search(
             system=system,
             equations=equations,
