@@ -34,7 +34,13 @@ from mjfim.identification.search import (
     quick_subset,
     with_length,
 )
-from mjfim.identification.starts import SPREAD_STARTS, begin_fit, choose_length, start_from_segments
+from mjfim.identification.starts import (
+    SPREAD_STARTS,
+    begin_fit,
+    choose_length,
+    describe_extreme_value,
+    start_from_segments,
+)
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -192,8 +198,9 @@ def fit_task(
     stated = search.task
     problem, held_out = _problems(stated, workers)
     if checks_log and stated.method != "newton":
-        channels = stated.system.channels
-        if not any(any(contradiction_remarks(channels, each)) for each in stated.recordings):
+        channels, logs = stated.system.channels, stated.recordings
+        is_faulty = bool(describe_extreme_value(logs, channels.control_columns))
+        if not (is_faulty or any(any(contradiction_remarks(channels, each)) for each in logs)):
             begin_stage("looking for gross errors of the recordings")
             refuse_gross_error(problem.system, problem.recordings, stated.start)
     search, dynamics, instead = begin_fit(search, problem)

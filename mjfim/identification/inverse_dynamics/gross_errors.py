@@ -1,10 +1,11 @@
 """Gross errors of a log, found by the equation of motion along the measured motion.
 
-A control or a joint with another sign, unit or name, an encoder with another zero, and measured
-values that are late leave large residuals of the equation of motion, at any parameters that the
-experiment allows. One such error after the other is taken out of the log. It is named where the
-residuals become far smaller, and small beside the forces. Friction and constant forces, which the
-model may lack, are free in every fit, so that they are not taken for an error of the log.
+A control or a joint with another sign, unit or name and an encoder with another zero leave large
+residuals of the equation of motion, at any parameters that the experiment allows. One such error
+after the other is taken out of the log. It is named where the residuals become far smaller, and
+small beside the forces. Friction and constant forces, which the model may lack, are free in every
+fit, so that they are not taken for an error of the log. A delay is left to the tests after a fit,
+which tell it from a lag of the actuators.
 """
 
 from __future__ import annotations
@@ -115,7 +116,6 @@ class _Change:
         order: (n,) signals that have the names of these.
         factor: (n,) their factors.
         offset: (n,) constants that are added.
-        delay: (1,) time by which the joints are late [s].
         words: The error in words.
         unknown: Attribute with unknown numbers; empty for none.
         where: (k,) its entries.
@@ -125,7 +125,6 @@ class _Change:
     order: np.ndarray
     factor: Array
     offset: Array
-    delay: Array
     words: str
     unknown: str
     where: np.ndarray
@@ -196,9 +195,8 @@ class _Search:
             order=np.arange(count),
             factor=np.ones(count),
             offset=np.zeros(count),
-            delay=np.zeros(1),
-            words="measured values are late",
-            unknown="delay",
+            words="",
+            unknown="offset",
             where=np.arange(0),
             sizes=np.zeros(0),
         )
@@ -293,7 +291,6 @@ class _Search:
         motion = replace(
             motion,
             recording=replace(motion.recording, ctrl=ctrl),
-            lag=motion.lag - float(change.delay[0]),
             qpos=qpos,
             qvel=qvel,
             qacc=qacc,
@@ -330,8 +327,6 @@ class _Search:
         scaled = replace(none, words=words, unknown="factor", where=moving, sizes=sizes)
         found = search.fitted(scaled, is_quick=True)[2]
         yield replace(found, sizes=np.abs(found.factor[moving]))
-        dt = np.array([self.system.dt])
-        yield replace(none, where=np.arange(1), sizes=100.0 * dt)
         for k, joint in enumerate(joints, start=nu):
             size = np.ptp(each.motion.qpos[:, [joint.q]], axis=0)
             words = f"joint {joint.name} has another zero"
@@ -351,12 +346,6 @@ class _Search:
 
     def _cure(self, change: _Change) -> str:
         """What to write into the experiment file; empty for a trifle."""
-        if change.delay[0]:
-            return (
-                'State [parameters.delay] with target = "output:delay" and '
-                f"guess = {change.delay[0]:.3g}"
-            )
-
         columns = [[f"ctrl:{name}"] for name in actuator_names(self.system.model)]
         found = measured_states(self.system, self.equations.recorded[0].motion.recording)
         for joint in self.joints:
