@@ -63,6 +63,10 @@ class OutputError(MjfimError):
     """A result cannot be written where the user wants it without the loss of other files."""
 
 
+class WrongLogError(RecordingError):
+    """A log has a gross error, such as a control with the wrong sign; the message has the cure."""
+
+
 class UnidentifiableError(MjfimError):
     """A trajectory gives no information about a combination of parameters."""
 

@@ -30,6 +30,7 @@ from mjfim.errors import (
     RecordingError,
     UndrawnWarning,
     UnfinishedError,
+    WrongLogError,
 )
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
@@ -511,7 +512,7 @@ def _carry_out(call: Callable[[], None]) -> None:
 
 def _told(error: Exception) -> typer.Exit:
     """Print one message about an error, and return the end of the verb with its exit code."""
-    message, code = str(error), 2
+    message, code = str(error), 1 if isinstance(error, WrongLogError) else 2
     if isinstance(error, MemoryError):
         message = (
             f"there is not enough memory ({error or 'nothing is left'}); a shorter horizon, a "

@@ -22,6 +22,7 @@ from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.inverse_dynamics import refuse_gross_error
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import (
     MISSED_ROUGH_SHARE,
@@ -33,7 +34,13 @@ from mjfim.identification.search import (
     quick_subset,
     with_length,
 )
-from mjfim.identification.starts import SPREAD_STARTS, begin_fit, choose_length, start_from_segments
+from mjfim.identification.starts import (
+    SPREAD_STARTS,
+    begin_fit,
+    choose_length,
+    describe_extreme_value,
+    start_from_segments,
+)
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -48,6 +55,7 @@ from mjfim.optimize.levenberg_marquardt import (
 )
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.recordings.checks import contradiction_remarks
 from mjfim.records.estimate import Estimate, Restart
 from mjfim.records.events import FitEvent, begin_stage, shown_progress
 from mjfim.records.trajectory import Recording
@@ -107,6 +115,8 @@ def identify(
     Raises:
         ExperimentError: Something is wrong in the experiment or in the arguments.
         RecordingError: A recording cannot be used.
+        WrongLogError: A gross error of the recordings, such as a control with the wrong sign,
+            explains them; the message has the lines that cure it.
         SimulationDivergedError: The model diverges at the start.
     """
     with shown_progress("identifying", callback, progress) as show:
@@ -151,6 +161,7 @@ def identify_system(
     Raises:
         ExperimentError: Something is wrong in the arguments.
         RecordingError: A recording cannot be used.
+        WrongLogError: A gross error of the recordings explains them.
         SimulationDivergedError: The model diverges at the start.
     """
     task = FitTask.of(system, recordings, method=method, start=start, held_out=held_out)
@@ -169,19 +180,29 @@ def identify_system(
     )
 
 
-def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
+def fit_task(
+    search: FitSearch, workers: FitWorkers | None = None, *, checks_log: bool = True
+) -> FitResult:
     """Search for the parameters of a task from its start.
 
     Args:
         search: The searches of the identification.
         workers: Workers that do parts of the work; None for this process.
+        checks_log: Whether gross errors of the recordings are looked for first.
 
     Raises:
+        WrongLogError: A gross error of the recordings explains them.
         SimulationDivergedError: The simulation diverges at the start, and no other start is found.
         RecordingError: The recordings do not fit the experiment.
     """
     stated = search.task
     problem, held_out = _problems(stated, workers)
+    if checks_log and stated.method != "newton":
+        channels, logs = stated.system.channels, stated.recordings
+        is_faulty = bool(describe_extreme_value(logs, channels.control_columns))
+        if not (is_faulty or any(any(contradiction_remarks(channels, each)) for each in logs)):
+            begin_stage("looking for gross errors of the recordings")
+            refuse_gross_error(problem.system, problem.recordings, stated.start)
     search, dynamics, instead = begin_fit(search, problem)
     task = search.task
     repeats = task.settings.segment_length is None and task.method != "newton"

@@ -376,7 +376,7 @@ def plausibility_remarks(
     return (
         *_control_remarks(channels, recording.ctrl[:MAX_ROWS]),
         *_roughness_remarks(channels, recording, predicted),
-        *_contradiction_remarks(channels, recording),
+        *contradiction_remarks(channels, recording),
     )
 
 
@@ -435,7 +435,7 @@ def _roughness_remarks(
             )
 
 
-def _contradiction_remarks(channels: Channels, recording: Recording) -> Iterator[str]:
+def contradiction_remarks(channels: Channels, recording: Recording) -> Iterator[str]:
     """Remarks about joints whose position does not follow the integral of their velocity."""
     t = recording.t[:MAX_ROWS]
     columns = {name: recording.y[:MAX_ROWS, i] for i, name in enumerate(recording.outputs)}
@@ -460,7 +460,8 @@ def _contradiction_remarks(channels: Channels, recording: Recording) -> Iterator
         if size > 0.0 and difference > max(MAX_DISAGREEMENT * size, SIGNIFICANT_SIGMAS * expected):
             yield (
                 f"{position} and the integral of {velocity} differ by "
-                f"{100 * difference / size:.0f} % of the motion; one of them is wrong or delayed"
+                f"{100 * difference / size:.0f} % of the motion; one of them is wrong, delayed "
+                "or has the other sign"
             )
 
 

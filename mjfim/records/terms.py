@@ -145,6 +145,8 @@ class TermTestData(Record):
         untested: Terms in words that could not be tested, because the model cannot have them or the
             simulation diverges with them.
         impossible: Terms in words, each with the reason, that a model of this kind cannot have.
+        unseen: By parameter, the largest move by a term that the tests may miss, in standard
+            deviations of the parameter, and the term in words.
     """
 
     share: float
@@ -152,6 +154,7 @@ class TermTestData(Record):
     count: int
     untested: tuple[str, ...] = ()
     impossible: tuple[str, ...] = ()
+    unseen: tuple[tuple[str, tuple[float, str]], ...] = ()
 
     in_json = (
         "share",
@@ -160,6 +163,7 @@ class TermTestData(Record):
         "words",
         "untested",
         "impossible",
+        "unseen",
     )
     json_names = {"count": "of_recordings"}
 
@@ -190,6 +194,14 @@ class TermTestData(Record):
             f"Not tested, because the simulation with {pronoun} diverges or the model cannot have "
             f"{pronoun}: {first_ones(self.untested)}."
         )
+
+    @property
+    def unseen_sentence(self) -> str:
+        """Sentence about parameters that a missing term could move unseen; empty for none."""
+        if not self.unseen:
+            return ""
+        moves = [f"{name} by {sigmas:.0f} σ ({term})" for name, (sigmas, term) in self.unseen]
+        return f"A missing term that is too small for the tests could move {first_ones(moves)}."
 
     @property
     def impossible_sentence(self) -> str:

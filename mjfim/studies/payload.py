@@ -599,7 +599,7 @@ class PayloadTask:
         # The length of the segments may be chosen already; the comparison of lengths still holds.
         if fit.horizons is not None:
             task = with_length(task, fit.task.settings.segments or "whole")
-        found = fit_task(replace(search, task=replace(task, start=start)))
+        found = fit_task(replace(search, task=replace(task, start=start)), checks_log=False)
 
         # Nominal is the model at which the whole search began.
         task = replace(found.task, start=search.task.start)

@@ -232,7 +232,7 @@ class _Selector:
         begin_stage("fitting the selected model to the held-out recordings")
         task = FitTask.of(result.task.system, self.held_out, start=estimate.theta)
         try:
-            found = fit_task(self._search(task), self.workers)
+            found = fit_task(self._search(task), self.workers, checks_log=False)
         except SimulationDivergedError:
             return None
         interval = found.accuracy.interval
@@ -256,7 +256,7 @@ class _Selector:
         settings = final.settings
         begins_at_guess = settings.starts == 1 and settings.start != "inverse_dynamics"
         if settings.segment_length is None or not begins_at_guess or is_free:
-            return fit_task(self._search(final), self.workers)
+            return fit_task(self._search(final), self.workers, checks_log=False)
         return refit_task(self._search(final), result, self.workers, is_rough=False)
 
     def _at_final_fit(self, model: FittedModel, result: FitResult, is_free: bool) -> FittedModel:

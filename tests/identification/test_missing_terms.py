@@ -12,7 +12,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.assessment import term_tests
 from mjfim.identification.assessment.term_candidates import Candidate, Effect
-from mjfim.identification.assessment.term_tests import find_missing_terms
+from mjfim.identification.assessment.term_tests import TermTests, find_missing_terms
 from mjfim.identification.identify import identify_system
 from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
@@ -72,6 +72,40 @@ def test_the_missing_term_comes_first_and_in_about_its_size(
     assert first.sigmas > 5.0
     assert amount / 2.0 < first.main.value < 2.0 * amount
     assert any(path in sentence for sentence in found.warnings)
+
+
+@pytest.mark.slow
+def test_a_small_term_that_matters_is_found_in_much_data() -> None:
+    """A constant force of 6 standard deviations is less than 2e-3 of the squares of this log."""
+    task = DesignTask.resolve(stated(horizon=60.0))
+    system, true = task.system, task.system.parameters.true
+
+    def tested(force: float, seed: int) -> TermTests:
+        """Tests of a log in which a constant force acts that the control does not show."""
+        outputs, _ = system.plant.measure(true[None], task.initial.ctrl + force)
+        noise = system.noise.sample(len(outputs[0]), np.random.default_rng(seed))
+        recording = Recording(
+            t=system.dt * np.arange(len(noise)),
+            ctrl=task.initial.ctrl,
+            y=outputs[0] + noise,
+            outputs=system.outputs.names,
+        )
+        fit = FitTask.of(system, [recording])
+        problem = fit.problem()
+        return find_missing_terms(problem, fit.recordings, problem.begin(true))
+
+    def tilt(tests: TermTests) -> float:
+        """Its deviation from zero, in standard deviations; 0 where it is not significant."""
+        return max((t.sigmas for t in tests.terms if t.path == "option:gravity[0]"), default=0.0)
+
+    force = 0.01
+    large = tilt(tested(force, 0))
+    found = [tested(6.0 * force / large, seed) for seed in range(4)]
+    assert sum(tilt(tests) > 0.0 for tests in found) >= 3
+    assert max(term.share for tests in found for term in tests.terms) < 2.2e-3
+    assert tested(0.0, 0).terms == ()
+    assert found[0].data is not None
+    assert "could move" in found[0].data.unseen_sentence
 
 
 @pytest.mark.slow

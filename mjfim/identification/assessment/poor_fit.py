@@ -1,8 +1,4 @@
-"""Causes of a poor fit: signals with the wrong sign, and motions that no simulation follows.
-
-A control or an angle that counts in the other direction leaves residuals as large as the motion.
-Where a fit is so poor, it is repeated with one sign changed at a time. A sign looks flipped if the
-change makes the sum of squared residuals much smaller.
+"""Motions that no simulation follows, as the cause of a poor fit.
 
 Unstable and chaotic motions amplify a deviation exponentially. The residuals of one simulation over
 a long time then have many local minima, in which a fit ends. Shorter segments avoid that.
@@ -10,148 +6,15 @@ a long time then have many local minima, in which a fit ends. Shorter segments a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError, SimulationDivergedError
-from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.search import FitTask
 from mjfim.identification.segments import MIN_SAMPLES
-from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
-from mjfim.parallel.budget import Budget
-from mjfim.records.check import join_names
-from mjfim.records.trajectory import Recording
-
-# Sum of squared residuals per degree of freedom above which signs are looked at.
-POOR_FIT = 4.0
-
-# Factor by which a changed sign has to make the sum of squared residuals smaller. Where the noise
-# is known, a smaller factor is enough if the residuals that remain are about as large as the noise.
-MIN_IMPROVEMENT = 10.0
-MIN_IMPROVEMENT_TO_NOISE = 1.5
-EXPLAINED = 1.3
-
-# Signs whose sums of squares are within this factor explain the residuals equally well.
-TIE = 2.0
-
-# Beginnings of the names of inputs that have a sign.
-SIGNED_INPUTS = ("ctrl:", "reference:", "feedforward:")
-
-# Largest number of signs with which the fit is repeated, and iterations of such a fit.
-MAX_FITS = 4
-ITERATIONS = 15
-TOLERANCE = 1e-2
-
-
-def flipped_signs(result: FitResult, budget: Budget) -> tuple[str, ...]:
-    """Find the signs that look flipped after a very poor fit.
-
-    Args:
-        result: The fit.
-        budget: Budget with the stop token.
-
-    Returns:
-        The signals in words, each of which explains the residuals; empty where none does, where the
-        fit is not poor enough, and after a request to stop.
-    """
-    task, quality, noise = result.task, result.quality, result.problem.noise
-    is_poor = task.noise_is_stated and quality.chi2 > POOR_FIT * quality.dof
-    if not (is_poor or quality.unexplained):
-        return ()
-
-    # Largest sum of squared residuals with another sign that makes the stated sign doubtful.
-    problem, at = result.quick
-    squares = 2.0 * problem.cost(at)
-    enough = squares / MIN_IMPROVEMENT
-    if task.noise_is_stated:
-        of_noise = min(EXPLAINED * problem.value_count, squares / MIN_IMPROVEMENT_TO_NOISE)
-        enough = max(enough, of_noise)
-
-    problems = []
-    for words, controls, outputs in _signs(task):
-        recordings = tuple(_flipped(each, controls, outputs) for each in task.recordings)
-        try:
-            flipped = replace(task, recordings=recordings).problem()
-        except RecordingError:
-            continue
-        problem = flipped.with_noise(noise).pinned(task.start, result.null_space)
-        problem = problem.of_segments(result.subset)
-        cost = problem.cost(problem.begin(task.start))
-        problems.append((cost if np.isfinite(cost) else np.inf, words, problem))
-
-    # The fit is repeated with the signs that explain most at its start.
-    problems.sort(key=lambda entry: entry[0])
-    found = []
-    settings = SearchSettings(
-        max_iterations=ITERATIONS, tolerance=TOLERANCE, relinearise_at_end=False
-    )
-    for cost, words, problem in problems[:MAX_FITS]:
-        if budget.stop.requested:
-            return ()
-        if np.isfinite(cost):
-            solution = minimise(problem, problem.begin(task.start), settings, budget)
-            if solution is not None:
-                found.append((2.0 * solution.cost, words))
-
-    best = min((value for value, _ in found), default=np.inf)
-    if best > enough or budget.stop.requested:
-        return ()
-    return tuple(words for value, words in found if value <= TIE * best)
-
-
-def _flipped(recording: Recording, controls: Sequence[int], outputs: Sequence[str]) -> Recording:
-    """A recording with the other sign of some controls and outputs."""
-    ctrl, y = np.array(recording.ctrl), np.array(recording.y)
-    ctrl[:, list(controls)] *= -1.0
-    y[:, [recording.outputs.index(name) for name in outputs]] *= -1.0
-    return replace(recording, ctrl=ctrl, y=y)
-
-
-def sentence_about_signs(signs: Sequence[str]) -> str:
-    """Warning about signs that look flipped.
-
-    Args:
-        signs: The signals in words, at least one.
-    """
-    if len(signs) == 1:
-        return (
-            f"the sign of {signs[0]} looks flipped: with the other sign the model explains the "
-            "recordings. State scale = -1.0 for it in [recording.columns], or turn the axis or the "
-            "gear in the MJCF"
-        )
-    return (
-        f"one of these signs looks flipped: {join_names(signs)}; with the other sign of any of "
-        "them the model explains the recordings. State scale = -1.0 for it in [recording.columns], "
-        "or turn the axis or the gear in the MJCF"
-    )
-
-
-def _signs(task: FitTask) -> Iterator[tuple[str, Sequence[int], Sequence[str]]]:
-    """All signs that may be flipped, in words, with their controls and their measured outputs."""
-    system = task.system
-    for i, name in enumerate(system.inputs):
-        if name.startswith(SIGNED_INPUTS):
-            is_control = name.startswith("ctrl:")
-            yield f"control {name.removeprefix('ctrl:')}" if is_control else name, [i], []
-
-    measured = set.intersection(*(set(recording.outputs) for recording in task.recordings))
-    names = [name for name in system.outputs.names if name in measured]
-    sensors = {component.name for component in system.source.coordinates.sensors}
-    for joint in system.coordinates:
-        columns = (joint.position_column, joint.velocity_column)
-        own = [name for name in columns if name in names]
-        if len(own) == len(columns):
-            yield f"joint {joint.name}", [], own
-        for name in own:
-            yield name, [], [name]
-    for name in names:
-        if name in sensors:
-            yield f"sensor {name}", [], [name]
-
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 # Largest number of samples of a motion along which the amplification is computed.
 MAX_SAMPLES = 20_000

@@ -17,11 +17,7 @@ from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import with_honest_covariance
-from mjfim.identification.assessment.poor_fit import (
-    flipped_signs,
-    sentence_about_signs,
-    unpredictable_motion,
-)
+from mjfim.identification.assessment.poor_fit import unpredictable_motion
 from mjfim.identification.assessment.recording_comparison import compare_recordings
 from mjfim.identification.assessment.residual_tests import (
     is_smaller_than_noise,
@@ -182,11 +178,9 @@ def estimate_from(
     if (reasons or quality.unexplained or not solution.success) and not solution.interrupted:
         unpredictable = unpredictable_motion(problem, solution.unknowns)
     interrupted = budget.stop.requested
-    flipped = () if interrupted else flipped_signs(result, budget)
 
     # The most serious ones first.
     warnings = (
-        *([sentence_about_signs(flipped)] if flipped else []),
         *_warnings_of_search(result, unpredictable, interrupted=interrupted),
         *_warnings_of_misfit(result, reasons),
         *_warnings_of_recordings(result, comparison),

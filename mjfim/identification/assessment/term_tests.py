@@ -24,7 +24,11 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.system import System
-from mjfim.identification.assessment.term_candidates import Candidate, candidates_of
+from mjfim.identification.assessment.term_candidates import (
+    LINEARISATION_SIZE,
+    Candidate,
+    candidates_of,
+)
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import of_subset
 from mjfim.identification.segments import KnownActivations, Segment, spread_over_data
@@ -213,8 +217,15 @@ def _spread_segments(problem: FitProblem, max_samples: float) -> np.ndarray:
 # Probability, over all candidates, that one is reported although the model is complete.
 SIGNIFICANCE = 1e-3
 
-# Smallest share of the sum of squared residuals that a reported term explains.
+# A reported term explains at least this share of the sum of squared residuals, or moves a parameter
+# by this number of its standard deviations: a term that matters may hide in much data.
 MIN_EXPLAINED_SHARE = 2e-3
+LEAST_MOVE = 1.0
+
+# Power of a test with which the sizes of terms that it may miss are computed, and the smallest move
+# of a parameter by such a term that is said, in standard deviations.
+POWER = 0.95
+LEAST_SAID_MOVE = 2.0
 
 # Largest number of numbers that one linearisation tests; more of them are tested in groups.
 MAX_TESTED = 100
@@ -324,7 +335,7 @@ def find_missing_terms(
         squares=2.0 * part.cost(at),
         count=sum(len(group) for group in groups),
     )
-    found, untested = search.by_score(groups)
+    found, untested, moved = search.by_score(groups)
     screened = (search.screened(candidate) for candidate in candidates if candidate.screened)
     found += [term for term in screened if term is not None]
     return TermTests(
@@ -335,6 +346,7 @@ def find_missing_terms(
             count=len(problem.recordings),
             untested=tuple(dict.fromkeys(untested)),
             impossible=tuple(impossible),
+            unseen=tuple(sorted(moved.items(), key=lambda each: -each[1][0])),
         ),
     )
 
@@ -363,9 +375,8 @@ def _without_members(ordered: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def _by_significance(terms: Sequence[Term]) -> list[Term]:
-    """Terms that explain enough, most significant first; equal ones in their given order."""
-    left = [term for term in terms if term.share > MIN_EXPLAINED_SHARE]
-    ordered = []
+    """Terms, most significant first; equal ones in their given order."""
+    left, ordered = list(terms), []
     while left:
         least = (1.0 - EQUAL_SIGNIFICANCE) * max(term.sigmas for term in left)
         ordered += [term for term in left if term.sigmas >= least]
@@ -407,22 +418,27 @@ def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
 
 
 # Normal equations of the m tested numbers of some candidates after the parameters are eliminated:
-# (m, m) information and (m,) gradient, for columns of length 1, and (m,) lengths of the columns.
-Linearisation = tuple[Array, Array, Array]
+# (m, m) information and (m,) gradient, for columns of length 1, (m,) lengths of the columns, and
+# (q, m) moves of the common unknowns by each number, in their standard deviations.
+Linearisation = tuple[Array, Array, Array, Array]
 
 
-def _score_test(linearisation: Linearisation, columns: Sequence[int]) -> tuple[Array, float] | None:
+def _score_test(
+    linearisation: Linearisation, columns: Sequence[int]
+) -> tuple[Array, float, float] | None:
     """Score test of some columns; None where the parameters may stand for one of them.
 
     Returns:
-        Estimated changes of the numbers, and the reduction of the sum of squares.
+        Estimated changes of the numbers, the reduction of the sum of squares, and the largest move
+        of a parameter, in its standard deviations.
     """
     chosen = np.array(columns)
     information, score = linearisation[0][np.ix_(chosen, chosen)], linearisation[1][chosen]
     if not (np.diag(information) > MIN_REMAINING_SHARE).all():
         return None
     step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
-    return step / linearisation[2][chosen], float(-score @ step)
+    move = np.abs(linearisation[3][:, chosen] @ step).max(initial=0.0)
+    return step / linearisation[2][chosen], float(-score @ step), float(move)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -443,8 +459,18 @@ class _TermSearch:
     count: int
     squares: float
 
-    def by_score(self, groups: Sequence[Sequence[Candidate]]) -> tuple[list[Term], list[str]]:
+    @property
+    def threshold(self) -> float:
+        """Smallest deviation of a significant term from zero, in its standard deviations."""
+        return float(-scipy.special.ndtri(0.5 * SIGNIFICANCE / self.count))
+
+    def by_score(
+        self, groups: Sequence[Sequence[Candidate]]
+    ) -> tuple[list[Term], list[str], dict[str, tuple[float, str]]]:
         """Terms whose score tests are significant, and descriptions of those without a test.
+
+        By parameter, the largest move by a single number that the tests may miss is returned as
+        well, in standard deviations, with the term.
 
         Of variants of one term, the most significant one stands for it. Terms of one kind at
         several joints are tested together as well.
@@ -452,11 +478,13 @@ class _TermSearch:
         found: dict[str, Term] = {}
         of_joints: list[Term] = []
         untested: list[str] = []
+        unseen: dict[str, tuple[float, str]] = {}
         parts = (self._linearised(group) for group in groups)
         for candidates, linearisation in itertools.chain.from_iterable(parts):
             if linearisation is None:
                 untested += [candidate.description for candidate in candidates]
                 continue
+            self._add_unseen(unseen, linearisation, candidates)
             members: dict[str, int] = {}
             for index, candidate in enumerate(candidates):
                 term = self._term(linearisation, candidates, [index])
@@ -470,7 +498,27 @@ class _TermSearch:
             for kind, of_kind in kinds.items():
                 together = self._term(linearisation, candidates, of_kind) if kind else None
                 of_joints += [together] if together is not None and together.joints else []
-        return [*found.values(), *of_joints], untested
+        return [*found.values(), *of_joints], untested, unseen
+
+    def _add_unseen(
+        self,
+        unseen: dict[str, tuple[float, str]],
+        linearisation: Linearisation,
+        candidates: Sequence[Candidate],
+    ) -> None:
+        """Add the largest moves of parameters by numbers that the tests may miss."""
+        information, _, lengths, moves = linearisation
+        effects = [(number, each.description) for each in candidates for number in each.tested]
+        known = np.maximum(np.diag(information), MIN_REMAINING_SHARE)
+        # No term is larger than its natural size.
+        natural = np.array([number.size for number, _ in effects]) / LINEARISATION_SIZE * lengths
+        missed = (self.threshold + scipy.special.ndtri(POWER)) / np.sqrt(known)
+        sizes = np.abs(moves) * np.minimum(missed, natural)
+        names = self.problem.system.parameters.names
+        for j, row in zip(self.problem.parameter_of_column.tolist(), sizes, strict=True):
+            largest = float(row.max()), effects[int(row.argmax())][1]
+            if largest[0] > LEAST_SAID_MOVE:
+                unseen[names[j]] = max(unseen.get(names[j], largest), largest)
 
     def _linearised(
         self, candidates: Sequence[Candidate]
@@ -510,6 +558,10 @@ class _TermSearch:
 
         names = wider.parameters.names
         column_of = {names[j]: i for i, j in enumerate(wider.parameter_of_column.tolist())}
+        stated = [
+            column_of[self.problem.system.parameters.names[j]]
+            for j in self.problem.parameter_of_column.tolist()
+        ]
         tested = np.array(
             [
                 column_of[f"?{i}.{k}"]
@@ -528,7 +580,9 @@ class _TermSearch:
         inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
         response = inverse @ H[np.ix_(others, tested)]
         information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
-        return information, g[tested] - g[others] @ response, norms[tested]
+        places = np.searchsorted(others, stated)
+        moves = response[places] / np.sqrt(np.diag(inverse)[places])[:, None]
+        return information, g[tested] - g[others] @ response, norms[tested], moves
 
     def _term(
         self,
@@ -548,7 +602,7 @@ class _TermSearch:
             found = _score_test(linearisation, columns)
             if found is None:
                 return None
-            values, explained = found
+            values, explained, move = found
             changes = iter(values.tolist())
             numbers: list[TermNumber] = []
             possible = []
@@ -574,8 +628,9 @@ class _TermSearch:
             return None
 
         sigmas = equivalent_sigmas(explained, len(columns))
-        is_unlikely = sigmas > -scipy.special.ndtri(0.5 * SIGNIFICANCE / self.count)
-        if not (is_unlikely and MIN_EXPLAINED_SHARE < explained / self.squares < 1.0):
+        share = explained / self.squares
+        matters = share > MIN_EXPLAINED_SHARE or move > LEAST_MOVE
+        if not (sigmas > self.threshold and matters and share < 1.0):
             return None
         members = [candidates[i] for i in left]
         # Two drivers may act on the same joint.
@@ -589,7 +644,7 @@ class _TermSearch:
             numbers=tuple(numbers),
             tables={name: table for each in members for name, table in each.tables.items()},
             sigmas=sigmas,
-            share=explained / self.squares,
+            share=share,
             joints=() if is_single else joints,
             source=members[0].source,
         )
@@ -614,7 +669,8 @@ class _TermSearch:
             elif best > 0.0:
                 break
         reduction = self.squares - least
-        if not best or reduction < MIN_REDUCTION:
+        least = max(MIN_REDUCTION, MIN_EXPLAINED_SHARE * self.squares)
+        if not best or reduction < least:
             return None
         number = TermNumber(
             path=tested.path, value=best, unit=tested.unit, scale=best, is_size=True

@@ -5,5 +5,6 @@ from mjfim.identification.inverse_dynamics.fit import (
     inverse_dynamics,
     try_fit_equations,
 )
+from mjfim.identification.inverse_dynamics.gross_errors import refuse_gross_error
 
-__all__ = ["fit_equations", "inverse_dynamics", "try_fit_equations"]
+__all__ = ["fit_equations", "inverse_dynamics", "refuse_gross_error", "try_fit_equations"]

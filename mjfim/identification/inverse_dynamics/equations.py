@@ -119,6 +119,7 @@ class MotionEquations:
         forces: The measured forces.
         equations: The equations: of the degrees of freedom, and laws of measured forces.
         recorded: The equations along each recording.
+        assumes_friction: Whether dry friction may act that is not in the model.
     """
 
     system: System
@@ -127,6 +128,7 @@ class MotionEquations:
     forces: tuple[MeasuredForce, ...]
     equations: tuple[Equation, ...]
     recorded: tuple[RecordedEquations, ...] = ()
+    assumes_friction: bool = False
 
     @staticmethod
     def of(
@@ -136,6 +138,7 @@ class MotionEquations:
         *,
         forces: tuple[MeasuredForce, ...],
         laws: ControlLaws | None,
+        assumes_friction: bool = False,
     ) -> MotionEquations:
         """The equations along recordings, without contacts and limits.
 
@@ -145,6 +148,7 @@ class MotionEquations:
             theta: (p,) parameters at which windows are chosen.
             forces: The measured forces.
             laws: The control laws of the recordings; None without any.
+            assumes_friction: Whether dry friction may act that is not in the model.
         """
         durations = np.array([float(recording.t[-1]) for recording in recordings])
         shares = MOST_POINTS * durations / durations.sum()
@@ -160,6 +164,7 @@ class MotionEquations:
             friction_speeds=np.maximum(UNSURE_SIGMAS * sigma, SLOW_SHARE * fastest),
             forces=forces,
             equations=tuple(_equations(system, forces)),
+            assumes_friction=assumes_friction,
         )
         relaxed = system.with_variant(RELAXED, Relaxation(constraints=True))
         found = replace(stated, system=relaxed)
@@ -237,7 +242,7 @@ class MotionEquations:
     def has_friction(self) -> np.ndarray:
         """(nv,) True for degrees of freedom on which dry friction may act."""
         model: Any = self.system.model
-        found = np.asarray(model.dof_frictionloss > 0.0)
+        found = np.asarray((model.dof_frictionloss > 0.0) | self.assumes_friction)
         found[[bristle.dof for bristle in bristles_of(model)]] = True
         for parameter in self.system.parameters.parameters:
             for target in parameter.targets:

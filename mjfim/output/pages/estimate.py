@@ -270,6 +270,8 @@ def _missing_terms(estimate: Estimate) -> Iterator[Part]:
     """The terms that the model may lack."""
     tested = estimate.tested_data
     data = "" if tested is None or tested.is_complete else f" ({tested.amount})"
+    if tested is not None and tested.unseen:
+        yield Text(tested.unseen_sentence, Emphasis.WEAK, detail=True)
     if estimate.missing_terms:
         yield Listing(
             f"Terms that would explain a part of the residuals{data}",

@@ -1,0 +1,229 @@
+"""Gross errors of a log are named with their cure, before a fit; clean logs are fitted."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import WrongLogError
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System, simulate_system
+from mjfim.identification.aligned_recording import align
+from mjfim.identification.identify import identify_system
+from mjfim.identification.inverse_dynamics import refuse_gross_error
+from mjfim.output.archive import write_recording
+from mjfim.records.trajectory import Recording
+from tests.support.cli import run
+from tests.support.paths import MODELS
+
+MULTISINE = {"kind": "multisine", "amplitude": 6.0, "frequency": 0.3, "harmonics": 5}
+SHOULDER, ELBOW = ["qpos:shoulder", "qvel:shoulder"], ["qpos:elbow", "qvel:elbow"]
+
+
+def two_joint_arm(model: str = "two_joint_arm.xml", **changed: Any) -> mjfim.Experiment:
+    """The two-joint arm with motors, under a multisine."""
+    found = mjfim.Experiment.from_file(MODELS / "two_joint_arm.toml")
+    control = {"control": MULTISINE}
+    fit = {"segments": "whole", "bootstrap": 0}
+    changed = {"rate": 200.0, "horizon": 4.0, "initial": control, "fit": fit} | changed
+    return found.replace(model=model, **changed)
+
+
+def servo_arm() -> mjfim.Experiment:
+    """An arm with position servos whose friction is unknown."""
+    return mjfim.Experiment.from_file(MODELS / "servo_arm.toml").replace(fit={"bootstrap": 0})
+
+
+def logged(experiment: mjfim.Experiment, seed: int = 1) -> tuple[System, Recording]:
+    """The system, and a clean log of the true robot."""
+    system = System.resolve(experiment)
+    return system, simulate_system(system, DesignTask.of(system).initial, seed=seed)
+
+
+def refused(system: System, recording: Recording) -> str:
+    """What is said about a log; empty where it would be fitted."""
+    try:
+        refuse_gross_error(system, (align(system, recording),), system.parameters.guess)
+    except WrongLogError as error:
+        return str(error)
+    return ""
+
+
+def with_ctrl(recording: Recording, change: Any) -> Recording:
+    """The recording with other controls."""
+    return replace(recording, ctrl=change(recording.ctrl))
+
+
+def with_columns(recording: Recording, names: list[str], change: Any) -> Recording:
+    """The recording with other values of some outputs."""
+    y = np.array(recording.y)
+    for name in names:
+        y[:, recording.outputs.index(name)] = change(y[:, recording.outputs.index(name)])
+    return replace(recording, y=y)
+
+
+def cure_of(message: str) -> dict[str, Any]:
+    """The lines of `[recording.columns]` in a message, as a file would state them."""
+    lines = message.split("State in [recording.columns]: ")[1].replace("; ", "\n")
+    return tomllib.loads(lines)
+
+
+ERRORS: dict[str, tuple[Any, dict[str, dict[str, Any]]]] = {
+    "both controls flipped": (
+        lambda log: with_ctrl(log, lambda u: -u),
+        {"ctrl:shoulder": {"scale": -1.0}, "ctrl:elbow": {"scale": -1.0}},
+    ),
+    "one control flipped": (
+        lambda log: with_ctrl(log, lambda u: u * [-1.0, 1.0]),
+        {"ctrl:shoulder": {"scale": -1.0}},
+    ),
+    "currents in mA": (
+        lambda log: with_ctrl(log, lambda u: 770.0 * u),
+        {"ctrl:shoulder": {"scale": 1 / 770}, "ctrl:elbow": {"scale": 1 / 770}},
+    ),
+    "torques times 1.3": (
+        lambda log: with_ctrl(log, lambda u: 1.3 * u),
+        {"ctrl:shoulder": {"scale": 1 / 1.3}, "ctrl:elbow": {"scale": 1 / 1.3}},
+    ),
+    "controls swapped": (
+        lambda log: with_ctrl(log, lambda u: u[:, ::-1]),
+        {"ctrl:shoulder": {"column": "ctrl:elbow"}, "ctrl:elbow": {"column": "ctrl:shoulder"}},
+    ),
+    "joints swapped": (
+        lambda log: replace(log, y=log.y[:, [1, 0, 3, 2]]),
+        {a: {"column": b} for a, b in zip(SHOULDER + ELBOW, ELBOW + SHOULDER, strict=True)},
+    ),
+    "zero of an encoder": (
+        lambda log: with_columns(log, SHOULDER[:1], lambda q: q + 0.35),
+        {"qpos:shoulder": {"offset": -0.35}},
+    ),
+    "joint flipped": (
+        lambda log: with_columns(log, ELBOW, lambda q: -q),
+        {name: {"scale": -1.0} for name in ELBOW},
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[System, Recording]:
+    """The two-joint arm and a clean log of it."""
+    return logged(two_joint_arm())
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_an_error_is_named_with_the_lines_that_cure_it(
+    name: str, arm: tuple[System, Recording]
+) -> None:
+    system, recording = arm
+    make, cure = ERRORS[name]
+    found = cure_of(refused(system, make(recording)))
+    assert found.keys() == cure.keys()
+    for column, entries in cure.items():
+        for key, value in entries.items():
+            expected = value if isinstance(value, str) else pytest.approx(value, rel=0.03)
+            assert found[column][key] == expected
+
+
+def test_positions_alone_and_servos_are_enough(arm: tuple[System, Recording]) -> None:
+    system, recording = arm
+    positions = replace(recording, y=recording.y[:, :2], outputs=recording.outputs[:2])
+    flipped = refused(system, with_ctrl(positions, lambda u: -u))
+    assert cure_of(flipped).keys() == {"ctrl:shoulder", "ctrl:elbow"}
+
+    servos, commanded = logged(servo_arm())
+    assert refused(servos, commanded) == ""
+    flipped = refused(servos, with_ctrl(commanded, lambda u: u * [1.0, -1.0, 1.0, 1.0]))
+    assert cure_of(flipped)["ctrl:shoulder"]["scale"] == -1.0
+
+
+def test_the_fit_refuses_an_error_and_goes_on_with_its_cure(arm: tuple[System, Recording]) -> None:
+    system, recording = arm
+    wrong = with_ctrl(recording, lambda u: -u)
+    with pytest.raises(WrongLogError, match="scale = -1"):
+        identify_system(system, [wrong])
+    assert not identify_system(system, [recording]).misfit
+
+
+def test_the_command_line_ends_with_exit_code_1(
+    arm: tuple[System, Recording], tmp_path: Path
+) -> None:
+    system, recording = arm
+    experiment = tmp_path / "arm.toml"
+    text = (MODELS / "two_joint_arm.toml").read_text()
+    experiment.write_text(text.replace('"two', f'"{MODELS}/two', 1).replace("1000.0", "200.0"))
+    write_recording(tmp_path / "log.csv", with_ctrl(recording, lambda u: u[:, ::-1]), system)
+    result = run("identify", experiment, tmp_path / "log.csv", "-o", tmp_path / "fit")
+    assert result.exit_code == 1
+    assert "controls shoulder and elbow are swapped" in result.stderr
+
+
+def test_a_factor_is_named_only_where_masses_are_not_free(arm: tuple[System, Recording]) -> None:
+    """Bounds so wide that other masses explain the log leave nothing to name."""
+    free = {
+        f"free_{field}_{body}": {"target": f"body/{body}:{field}", "bounds": [0.0, 9.0]}
+        for body in ("upper", "fore")
+        for field in ("mass", "inertia[1]")
+    }
+    springs = {
+        f"spring_{joint}": {"target": f"joint/{joint}:stiffness", "bounds": [0.0, 20.0]}
+        for joint in ("shoulder", "elbow")
+    }
+    wide = two_joint_arm().model_copy()
+    tables = {name: each for name, each in wide.parameters.items() if name != "payload"}
+    system = System.resolve(
+        wide.model_copy(update={"parameters": tables}).replace(parameters=free | springs)
+    )
+    assert refused(system, with_ctrl(arm[1], lambda u: 1.3 * u)) == ""
+    assert "scale = -1" in refused(system, with_ctrl(arm[1], lambda u: -u))
+
+
+def test_other_misfits_have_no_name(arm: tuple[System, Recording]) -> None:
+    system, recording = arm
+    rng = np.random.default_rng(0)
+    assert refused(system, with_ctrl(recording, lambda u: 0.0 * u)) == ""
+    late = with_ctrl(recording, lambda u: np.concatenate([u[12:], u[-12:]]))
+    assert refused(system, late) == ""
+    assert refused(system, replace(recording, y=rng.normal(size=recording.y.shape))) == ""
+    assert refused(system, replace(recording, y=0.5 * recording.y)) == ""
+
+
+CLEAN = {
+    "arm": two_joint_arm,
+    "servos": servo_arm,
+    "cart": lambda: mjfim.Experiment.from_file(MODELS / "cart_pendulum_guess.toml"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CLEAN)
+def test_clean_logs_of_other_robots_have_no_error(name: str, tmp_path: Path) -> None:
+    """Parameters are up to 50 % wrong, and every other robot has friction that the model lacks."""
+    stated = CLEAN[name]()
+    system = System.resolve(stated)
+    trajectory, guess = DesignTask.of(system).initial, system.parameters.guess
+    sizes = {"arm": 0.4, "servos": 0.08, "cart": 0.5}
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        robot = stated
+        if seed % 2:
+            spec = mujoco.MjSpec.from_file(str(system.model_path))
+            for joint in spec.joints:
+                joint.frictionloss = sizes[name] * rng.uniform(0.5, 1.5)
+            spec.compile()
+            (tmp_path / "robot.xml").write_text(spec.to_xml())
+            robot = stated.replace(model=str(tmp_path / "robot.xml"))
+        true = np.clip(
+            guess * rng.uniform(0.5, 1.5, len(guess)),
+            system.parameters.lower,
+            system.parameters.upper,
+        )
+        tables = {key: {"true": float(x)} for key, x in zip(stated.parameters, true, strict=True)}
+        made = System.resolve(robot.replace(parameters=tables))
+        assert refused(system, simulate_system(made, trajectory, seed=seed)) == ""
