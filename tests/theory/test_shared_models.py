@@ -83,7 +83,6 @@ def test_a_design_has_ten_times_the_information_of_the_chirp(name: str) -> None:
     assert gain >= GAIN, f"{gain:.3g}, {design.status.value}"
     assert all(margin >= 0.0 for margin in design.limits.values()), design.limits
     assert not any("clamps" in sentence for sentence in design.warnings), design.warnings
-    assert design.status.success or design.status is Status.MAX_ITERATIONS
     assert design.rehearsal is not None
 
 
