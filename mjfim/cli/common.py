@@ -292,7 +292,8 @@ class Run:
         from mjfim.output.pages import page_of
 
         values = {**summary_with_origin(result, system, self.output), **further}
-        page = page_of(result, experiment=system.experiment.source, design=design)
+        source = system.experiment.source
+        page = page_of(result, experiment=source, design=design, output=self.output)
         self.print(values, page, verdict)
         self.write(result, system, further, remark)
 
