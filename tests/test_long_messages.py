@@ -95,7 +95,7 @@ def test_groups_of_parameters_are_short_in_messages_and_whole_in_files() -> None
 
 def test_the_verdict_of_a_check_is_short() -> None:
     row = SimpleNamespace(
-        nuisance=False, std=1.0, wanted=0.5, unit="kg", repetitions=4, seconds=8.0
+        nuisance=False, stated=True, std=1.0, wanted=0.5, unit="kg", repetitions=4, seconds=8.0
     )
     known = [SimpleNamespace(**{**vars(row), "name": name}) for name in NAMES]
     pairs = [

@@ -85,27 +85,28 @@ def test_a_quick_velocity_contradicts_its_position_only_where_it_is_wrong(
     assert any("the integral of qvel:fin differ" in remark for remark in found) == is_found
 
 
-def experiments() -> Iterator[mjfim.Experiment]:
-    """Experiments with encoders and velocities: shipped ones, and models of others."""
+def experiments() -> Iterator[tuple[mjfim.Experiment, int]]:
+    """Experiments with encoders and velocities, and their number of logs of a design."""
     for name in SHIPPED:
-        yield mjfim.Experiment.from_file(MODELS / f"{name}.toml").replace(noise={"state": 1e-3})
-    for tables in EXPERIMENTS.values():
-        yield mjfim.Experiment(**{**tables, "model": str(SHARED_MODELS / tables["model"])})
+        stated = mjfim.Experiment.from_file(MODELS / f"{name}.toml")
+        yield stated.replace(noise={"state": 1e-3}), 5
+    for name in EXPERIMENTS if SHARED_MODELS.is_dir() else ():
+        tables = EXPERIMENTS[name]
+        yield mjfim.Experiment(**{**tables, "model": str(SHARED_MODELS / tables["model"])}), 0
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not SHARED_MODELS.is_dir(), reason="the shared models are not there")
 def test_clean_logs_are_not_called_poor() -> None:
     """Of random smooth controls and of designs; at most one in a hundred is remarked on."""
     rng, count, alarms = np.random.default_rng(0), 0, []
-    for stated in experiments():
+    for stated, designed in experiments():
         system = System.resolve(stated, threads=1)
         horizon = stated.horizon
         assert horizon is not None
-        rows = round(horizon / system.dt)
-        controls = [smooth(system, rows, rng) for _ in range(7)]
-        quick = stated.replace(descent={"max_iterations": 3, "seconds": 4.0})
-        controls += [mjfim.design(quick).trajectory.ctrl] * 3
+        controls = [smooth(system, round(horizon / system.dt), rng) for _ in range(10 - designed)]
+        if designed:
+            quick = stated.replace(descent={"max_iterations": 1, "seconds": 2.0})
+            controls += [mjfim.design(quick).trajectory.ctrl] * designed
         for k, ctrl in enumerate(controls):
             try:
                 trajectory = system.plant.simulate(system.parameters.true, ctrl)
@@ -115,5 +116,5 @@ def test_clean_logs_are_not_called_poor() -> None:
             outputs, _ = system.plant.measure(system.parameters.true[None], ctrl)
             count += 1
             alarms += plausibility_remarks(system.channels, log, outputs[0])[:1]
-    assert count > 100
+    assert count >= 50
     assert len(alarms) <= 0.01 * count, alarms
