@@ -337,7 +337,7 @@ class RobotComparison(ShownRecord):
         The interval of the difference excludes zero, but not by enough for the number of tests, or
         the estimates differ much, which chance may explain.
         """
-        is_far = np.sign(self.interval[:, 0]) == np.sign(self.interval[:, 1])
+        is_far = np.prod(self.interval, axis=1) > 0.0
         is_far |= (self.is_single > 0.0) & (
             np.abs(self.difference) > LARGE * np.abs(self.values[0])
         )
