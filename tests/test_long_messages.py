@@ -16,7 +16,7 @@ from mjfim.excitation.evaluation import require_designable
 from mjfim.excitation.shortest_horizon import require_reachable
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.identification.assessment.report import _warnings_of_bounds, _warnings_of_search
+from mjfim.identification.assessment.report import _limits_of_search
 from mjfim.identification.search import _start
 from mjfim.identification.starts import divergence_at_start
 from mjfim.output.campaign_folder import accuracy_sentence
@@ -42,19 +42,15 @@ NAMES = tuple(f"inertia_of_link_{i}" for i in range(300))
 
 
 def test_warnings_about_many_parameters_list_the_first_ones_and_count_the_others() -> None:
-    (warning,) = _warnings_of_bounds(NAMES, outside=False)
-    assert len(warning) < LONGEST_MESSAGE
-    assert "inertia_of_link_0" in warning and " more" in warning
-
-
-def test_a_warning_about_many_outputs_lists_the_first_ones() -> None:
     result = SimpleNamespace(
         begun_instead="",
-        quality=SimpleNamespace(unexplained=NAMES),
-        accuracy=SimpleNamespace(groups=(), singular=False),
+        quality=SimpleNamespace(chi2=1.0, dof=1),
+        accuracy=SimpleNamespace(singular=False),
+        task=SimpleNamespace(noise_is_stated=False),
     )
-    (warning,) = _warnings_of_search(result, "", interrupted=False)
+    (warning,) = _limits_of_search(result, NAMES, (), interrupted=False)
     assert len(warning) < LONGEST_MESSAGE
+    assert "inertia_of_link_0" in warning and " more" in warning
 
 
 def test_a_start_of_wrong_length_lists_the_first_parameters() -> None:
@@ -98,7 +94,7 @@ def test_groups_of_parameters_are_short_in_messages_and_whole_in_files() -> None
 
 def test_the_verdict_of_a_check_is_short() -> None:
     row = SimpleNamespace(
-        nuisance=False, std=1.0, wanted=0.5, unit="kg", repetitions=4, seconds=8.0
+        nuisance=False, stated=True, std=1.0, wanted=0.5, unit="kg", repetitions=4, seconds=8.0
     )
     known = [SimpleNamespace(**{**vars(row), "name": name}) for name in NAMES]
     pairs = [

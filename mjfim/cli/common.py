@@ -293,7 +293,8 @@ class Run:
         from mjfim.output.pages import page_of
 
         values = {**summary_with_origin(result, system, self.output), **further}
-        page = page_of(result, experiment=system.experiment.source, design=design)
+        source = system.experiment.source
+        page = page_of(result, experiment=source, design=design, output=self.output)
         if page.verdict.level is Level.BAD:
             verdict = verdict or page.verdict.text
         self.print(values, page, verdict)

@@ -120,7 +120,7 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    page = page_of(result, experiment=stated.source)
+    page = page_of(result, experiment=stated.source, output=run.output)
     if run.verbose:
         section = log_section([log.summary for log in logs])
         page = replace(page, sections=[*page.sections, section])

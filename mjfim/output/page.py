@@ -216,7 +216,9 @@ class Page:
         kind: What kind of result it is.
         verdict: The result in one sentence.
         next_steps: What the reader can do next, the most useful step first.
+        causes: What is to be fixed first, each with its cure, the most probable cause first.
         warnings: What limits the result.
+        details: Remarks that a short form leaves out.
         facts: Short facts by their names.
         sections: Sections, the main results first.
     """
@@ -224,9 +226,16 @@ class Page:
     kind: str
     verdict: Verdict
     next_steps: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     sections: Sequence[Section] = ()
+
+    @property
+    def remarks(self) -> Mapping[str, tuple[str, ...]]:
+        """The sentences beside the result by their weight, the most serious ones first."""
+        return {"Fix first": self.causes, "Warning": self.warnings, "Detail": self.details}
 
     @property
     def every_part(self) -> Iterator[Part]:

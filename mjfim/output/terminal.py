@@ -22,6 +22,9 @@ from mjfim.output.page import (
     capitalised,
 )
 
+# Largest number of remarks of each weight that the short form shows.
+MOST = {"Fix first": 1, "Warning": 2, "Detail": 0}
+
 # Largest number of lines of the short form, if its most important rows have the room.
 MAX_LINES = 20
 
@@ -58,18 +61,24 @@ class TerminalPage:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Lay out the page for the width of the terminal which shows it."""
-        verdict = capitalised(self.page.verdict.text)
+        page = self.page
+        verdict = capitalised(page.verdict.text)
         if verdict:
-            is_good = self.page.verdict.level is Level.GOOD
+            is_good = page.verdict.level is Level.GOOD
             yield _styled(verdict, "bold" if is_good else "bold yellow")
-        parts: list[Shown] = [
-            *(Text(f"warning: {warning}", Emphasis.WARNING) for warning in self.page.warnings),
-            *(part for part in self.page.parts if self.verbose or not part.detail),
-            *(Text(f"Next: {step}") for step in self.page.next_steps[:1]),
-        ]
+        parts: list[Shown] = []
         width, hidden = options.max_width, 0
+        for weight, sentences in page.remarks.items():
+            kept = sentences if self.verbose else sentences[: MOST[weight]]
+            emphasis = Emphasis.WARNING if MOST[weight] else Emphasis.WEAK
+            parts += (Text(f"{weight}: {sentence}", emphasis) for sentence in kept)
+            hidden += len(sentences) - len(kept)
+        parts += (part for part in page.parts if self.verbose or not part.detail)
+        parts += (Text(f"Next: {step}") for step in page.next_steps[:1])
         if not self.verbose:
-            parts, hidden = _shortened(parts, width, MAX_LINES - _height(Text(verdict), width))
+            lines = MAX_LINES - _height(Text(verdict), width) - bool(hidden)
+            parts, left = _shortened(parts, width, lines)
+            hidden += left
         for part in parts:
             if self.verbose and not isinstance(part, Text):
                 yield Styled()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from mjfim.arrays import Array
 from mjfim.output.page import number
 from mjfim.records.campaign import Campaign
 from mjfim.records.design import Design
-from mjfim.records.estimate import Estimate
+from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.studies import MonteCarloStudy
 from mjfim.records.trajectory import Labels
 
@@ -277,18 +278,28 @@ BEST_CASE = (
 # Cell of a standard deviation that is infinite, because others absorb the parameter's effect.
 NOT_ALONE = "not alone"
 
+# Relative difference up to which two sizes are shown as one.
+SAME_SIZE = 1e-2
+
 # Largest number of digits of a share in percent.
 MAX_DIGITS = 6
 
 
-def relative(std: float, size: float) -> str:
-    """Write a standard deviation in percent of a size; "-" where there is none."""
+def relative(std: float, size: float, value: float | None = None) -> str:
+    """Write a standard deviation in percent of a size; "-" where there is none.
+
+    Args:
+        std: The standard deviation.
+        size: The size, in the same unit.
+        value: The value beside which it stands; the size is named where it is another number.
+    """
     if not size or not np.isfinite(std):
         return "-"
     percent = 100.0 * std / size
     # Shares from 99.5 % on are whole numbers, not powers of ten.
     places = len(f"{percent:.0f}") if percent < 10.0**MAX_DIGITS else MAX_DIGITS
-    return number(percent, max(places, 2), " %")
+    is_of_value = value is None or math.isclose(abs(value), size, rel_tol=SAME_SIZE)
+    return number(percent, max(places, 2), " %" if is_of_value else f" % of {number(size, 2)}")
 
 
 def size_sentence(values: Sequence[float] | Array, sizes: Sequence[float] | Array) -> str:
@@ -306,3 +317,10 @@ def improvement(before: float, after: float) -> str:
     if not (np.isfinite(before) and np.isfinite(after) and after > 0 and before > 0):
         return "-"
     return f"÷ {before / after:.1f}" if before >= after else f"× {after / before:.1f}"
+
+
+def predicted_data(predictions: Sequence[Prediction]) -> str:
+    """Say which data were predicted: those that no fit has seen, or each part by the others."""
+    if all(prediction.held_out for prediction in predictions):
+        return "recordings that were not fitted"
+    return "data by fits without them"

@@ -333,6 +333,9 @@ SHORTEST_COLUMN = 4 * MEDIAN_ROWS
 # and a fitted model does not explain this part.
 MAX_ROUGH_SHARE = 0.1
 
+# Correlation of the rough parts of two motions above which they are one motion.
+MIN_SAME_MOTION = 0.6
+
 # A deviation counts only if it exceeds this number of stated standard deviations of the noise.
 SIGNIFICANT_SIGMAS = 3.0
 
@@ -353,6 +356,9 @@ RANGE_TOLERANCE = 1e-6
 # A position and the integral of its velocity contradict each other if their displacements differ by
 # more than this fraction of the displacements' standard deviation.
 MAX_DISAGREEMENT = 0.1
+
+# Number of times by which a motion may be quicker than that of a model that may be wrong.
+MODEL_FACTOR = 2.0
 
 # Time over which displacements are compared [s].
 COMPARISON_TIME = 0.2
@@ -376,7 +382,7 @@ def plausibility_remarks(
     return (
         *_control_remarks(channels, recording.ctrl[:MAX_ROWS]),
         *_roughness_remarks(channels, recording, predicted),
-        *contradiction_remarks(channels, recording),
+        *contradiction_remarks(channels, recording, predicted),
     )
 
 
@@ -421,21 +427,29 @@ def _roughness_remarks(
         if not _moves(y):
             continue
 
-        share, explanation = _rough_share(y), "is too quick for a smooth motion"
-        if predicted is not None and name in channels.outputs:
+        rough, explanation = _rough_part(y), "is too quick for a smooth motion"
+        unexplained, least = float(np.var(rough)), MAX_ROUGH_SHARE * float(np.var(y))
+        if predicted is not None and name in channels.outputs and unexplained > least:
             motion = predicted[:MAX_ROWS, channels.outputs.index(name)][present]
-            unexplained = np.var(_rough_part(y) - _rough_part(motion)) / np.var(y)
-            share = min(share, float(unexplained))
-            explanation = "is not explained by the identified motion"
-        rough_std = np.sqrt(share * np.var(y))
-        if share > MAX_ROUGH_SHARE and rough_std > SIGNIFICANT_SIGMAS * sigma.get(name, 0.0):
+            quick, explanation = _rough_part(motion), "is not explained by the identified motion"
+            correlation = float(np.corrcoef(quick, rough)[0, 1]) if quick.any() else 0.0
+            unexplained *= 1.0 - correlation**2
+            # A model whose motion is another one shows at least how quick it is.
+            if correlation < MIN_SAME_MOTION:
+                power = float(np.var(rough) - MODEL_FACTOR * np.var(quick))
+                unexplained = min(unexplained, power)
+        noise = SIGNIFICANT_SIGMAS * sigma.get(name, 0.0)
+        if unexplained > max(least, noise**2):
+            share = unexplained / np.var(y)
             yield (
                 f"{name} is rough: {100 * share:.0f} % of its variance lies within {MEDIAN_ROWS} "
                 f"rows and {explanation}; noise, spikes or steps hide the motion of the robot"
             )
 
 
-def contradiction_remarks(channels: Channels, recording: Recording) -> Iterator[str]:
+def contradiction_remarks(
+    channels: Channels, recording: Recording, predicted: Array | None = None
+) -> Iterator[str]:
     """Remarks about joints whose position does not follow the integral of their velocity."""
     t = recording.t[:MAX_ROWS]
     columns = {name: recording.y[:MAX_ROWS, i] for i, name in enumerate(recording.outputs)}
@@ -450,14 +464,21 @@ def contradiction_remarks(channels: Channels, recording: Recording) -> Iterator[
 
         q, v = columns[position][both], columns[velocity][both]
         dq, dv, lag = displacements(t[both], q, v, COMPARISON_TIME, len(q) // 4)
-        size = float(np.std(dq))
+        size, difference = float(np.std(dq)), float(np.std(dq - dv))
         # Noise of a difference of positions, and of an integral of velocities.
         integral = np.sqrt(lag) * float(np.median(np.diff(t[both])))
-        expected = np.hypot(
+        expected = SIGNIFICANT_SIGMAS * np.hypot(
             np.sqrt(2.0) * sigma.get(position, 0.0), integral * sigma.get(velocity, 0.0)
         )
-        difference = float(np.std(dq - dv))
-        if size > 0.0 and difference > max(MAX_DISAGREEMENT * size, SIGNIFICANT_SIGMAS * expected):
+        # Where the motion is quick at the rate of the recording, those of a model differ, too.
+        if predicted is not None:
+            q, v = (
+                predicted[:MAX_ROWS, channels.outputs.index(name)][both]
+                for name in (position, velocity)
+            )
+            of_model = np.subtract(*displacements(t[both], q, v, COMPARISON_TIME, len(q) // 4)[:2])
+            expected += MODEL_FACTOR * float(np.std(of_model))
+        if size > 0.0 and difference > max(MAX_DISAGREEMENT * size, expected):
             yield (
                 f"{position} and the integral of {velocity} differ by "
                 f"{100 * difference / size:.0f} % of the motion; one of them is wrong, delayed "

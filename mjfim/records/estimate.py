@@ -403,7 +403,10 @@ class Estimate(ShownRecord):
         at_bound: Names of the parameters that ended at a bound.
         predicted: Outputs of the fitted model for each recording, (M, ny) [unit of the output].
         recordings: The fitted recordings.
-        warnings: Sentences for the user.
+        warnings: Sentences for the user, the most serious ones first.
+        causes: Those of them that say what to fix first, each with its cure.
+        details: Those of them that a short form leaves out.
+        nuisance: Names of the nuisance parameters.
         combinations: Groups of parameters that the recordings determine in combination only, in
             words.
         data: (p, p) information of the recordings without priors, in which nuisance parameters
@@ -483,6 +486,9 @@ class Estimate(ShownRecord):
     predicted: tuple[Array, ...]
     recordings: tuple[Recording, ...]
     warnings: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()
+    nuisance: tuple[str, ...] = ()
     combinations: tuple[str, ...] = ()
     data: Array = no_array(0, 0)
     std_sandwich: Array = no_array()
@@ -556,6 +562,9 @@ class Estimate(ShownRecord):
         "sloppy",
         "at_bound",
         "warnings",
+        "causes",
+        "details",
+        "nuisance",
         "prior",
         "data",
         "combinations",

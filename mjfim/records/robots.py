@@ -204,21 +204,28 @@ class RecordingComparison(Record):
             )
             sentences = ". ".join(str(odd) for odd in self.odd)
             return f"{sentences}.{few if len(self.recordings) <= FEW else ''}"
+        alone = ", without a single one that is odd" if "more than" in self.finding else ""
+        return f"The recordings {self.finding}{alone}."
+
+    @property
+    def separate(self) -> tuple[int, ...]:
+        """Indices of the parameters for which the 95 % intervals of two recordings do not meet."""
+        reach = NORMAL_95 * np.where(np.isfinite(self.values), self.std, np.inf)
+        values = np.nan_to_num(self.values)
+        is_apart = (values - reach).max(axis=0) > (values + reach).min(axis=0)
+        return tuple(np.flatnonzero(is_apart & (self.is_stated == 0.0)).tolist())
+
+    @property
+    def finding(self) -> str:
+        """What the recordings do together, as the end of a sentence."""
+        by_more = "by more than their noise explains"
+        if self.joint_p <= SIGNIFICANCE and not self.apart:
+            return f"differ in combinations of the parameters {by_more} ({p_text(self.joint_p)})"
+        found = self.apart or self.separate
+        names = join_names([self.parameters[j] for j in found]) if found else ""
         if self.apart:
-            names = join_names([self.parameters[j] for j in self.apart])
-            return (
-                f"The recordings differ in {names} by more than their noise explains, without a "
-                "single one that is odd."
-            )
-        if self.joint_p <= SIGNIFICANCE:
-            return (
-                "The recordings differ in combinations of the parameters by more than their noise "
-                f"explains ({p_text(self.joint_p)}), without a single one that is odd."
-            )
-        return (
-            "The recordings agree: what each of them suggests alone differs no more than its noise "
-            "explains."
-        )
+            return f"differ in {names} {by_more}"
+        return f"may differ in {names} (intervals apart)" if names else "agree within their noise"
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
@@ -235,6 +242,10 @@ class RecordingComparison(Record):
                 for odd in self.odd
             ],
         }
+
+
+# Difference over the value of the first robot that needs a word even where chance may explain it.
+LARGE = 0.25
 
 
 # Number of parameters that a sentence names.
@@ -320,6 +331,19 @@ class RobotComparison(ShownRecord):
         return tuple(j for j in self.order.tolist() if self.p[j] <= self.level)
 
     @property
+    def doubtful(self) -> tuple[int, ...]:
+        """Indices of the parameters that may differ, although this is not proven.
+
+        The interval of the difference excludes zero, but not by enough for the number of tests, or
+        the estimates differ much, which chance may explain.
+        """
+        is_far = np.prod(self.interval, axis=1) > 0.0
+        is_far |= (self.is_single > 0.0) & (
+            np.abs(self.difference) > LARGE * np.abs(self.values[0])
+        )
+        return tuple(j for j in self.order.tolist() if is_far[j] and self.p[j] > self.level)
+
+    @property
     def differs(self) -> bool:
         """Whether the robots differ, in single parameters or in all of them together."""
         return bool(self.changed) or self.joint_p <= self.level
@@ -373,6 +397,8 @@ class RobotComparison(ShownRecord):
                 f"There is a difference between {first} and {second}, but the data do not say in "
                 f"which single parameter ({p_text(self.joint_p)} for all parameters together)."
             )
+        if self.doubtful:
+            return f"The data do not prove a difference, but {self.sentence(self.doubtful[0])}."
         return f"The data show no difference between {first} and {second}. {self.sensitivity}"
 
     def summary(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ DESIGN = "design"
 
 
 # Relative difference of two costs J below which they count as equal.
-TIE_TOLERANCE = 1e-3
+TIE_TOLERANCE = 2e-2
 
 
 class MethodOutcome(NamedEnum):

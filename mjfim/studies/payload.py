@@ -421,7 +421,7 @@ class PayloadTask:
             fit, edge = fit_task(search), None
             if not self._determines_inertia(fit) and not token.requested:
                 fit, edge = self._with_assumed_inertia(known, fit, search)
-            estimate = estimate_from(fit, budget)
+            estimate = estimate_from(fit, budget, refuted=())
 
         system = fit.task.system
         payload = self._payload(estimate, known, edge)

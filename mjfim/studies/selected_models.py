@@ -136,7 +136,7 @@ def poorly_known(model: FittedModel) -> tuple[str, ...]:
     parameters = model.result.task.system.parameters
     own = {parameters.names[j] for j in np.flatnonzero(parameters.recording_specific)}
     excluded = added | own
-    return tuple(name for name, _ in model.result.accuracy.poorly_known if name not in excluded)
+    return tuple(name for name, _, _ in model.result.accuracy.poorly_known if name not in excluded)
 
 
 def different(

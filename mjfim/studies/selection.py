@@ -222,7 +222,7 @@ class _Selector:
         result = _reported(result, is_free)
         steps = (SelectionStep(decision=Decision.BEGUN, error=np.nan),)
         selection = Selection(terms=(), steps=steps, ending=ending)
-        estimate = estimate_from(result, self.budget)
+        estimate = estimate_from(result, self.budget, refuted=())
         return replace(estimate, selection=selection)
 
     def _refit_to_held_out(self, result: FitResult, estimate: Estimate) -> HeldOutRefit | None:

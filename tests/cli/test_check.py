@@ -18,7 +18,7 @@ def test_a_table_and_a_conclusion_are_printed_and_nothing_is_written(study: Path
     before = names(study.parent)
     result = run("check", study)
     assert result.exit_code == 0
-    for word in ("parameters miss the wanted", "relative σ", "repetitions", "best case"):
+    for word in ("of more than 5 % of their", "relative σ", "repetitions", "best case"):
         assert word in result.stdout
     assert f"mjfim design {study}" in "".join(result.stdout.split("\n"))
     assert "self-test" not in result.stdout

@@ -189,7 +189,7 @@ def test_reasons_in_sentences() -> None:
     """There is one sentence for each cause, and none for the stated noise."""
     assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
     assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (
-        "residuals are 2.00 x the stated noise",
+        "residuals are 2.00 times the stated noise",
     )
     assert misfit_reasons(4000.0, 1000, False, [seen()], ()) == (), (
         "where sigmas are estimated, size tells nothing"

@@ -106,9 +106,11 @@ def test_a_share_of_a_whole_vector_is_the_same_in_table_verdict_and_figure(desig
     std = design.final.std.tolist()
     shares = [relative(*pair) for pair in zip(std, of_vectors.sizes.tolist(), strict=True)]
 
-    for text in (in_terminal(of_vectors), texts_of(of_vectors.plot("standard_deviations"))):
+    figure, table = texts_of(of_vectors.plot("standard_deviations")), in_terminal(of_vectors)
+    for text in (figure, table):
         assert missing(shares, text) == []
-        assert "share of the magnitude of the whole" in " ".join(text.split())
+    assert "share of the magnitude of the whole" in " ".join(figure.split())
+    assert f"{shares[0]} of {number(of_vectors.sizes[0], 2)}" in table
 
 
 def test_the_accuracy_of_an_entry_of_a_vector_is_a_share_of_the_whole(estimate: Estimate) -> None:

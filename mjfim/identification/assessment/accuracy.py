@@ -13,7 +13,6 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import NORMAL_95, Array, scaled_to_unit_diagonal
-from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import between_covariance
 from mjfim.identification.assessment.residual_tests import FitQuality
 from mjfim.identification.assessment.robust_covariance import (
@@ -106,8 +105,11 @@ def prior_directions(
 # of the whole), above which a parameter is poorly known.
 POORLY_KNOWN_SHARE = 0.25
 
-# Half width of an interval over that size, above which the parameter is practically unknown.
-UNKNOWN_SHARE = 10.0
+# Half width of an interval over that size, from which on the recordings do not determine it.
+UNDETERMINED_SHARE = 0.5
+
+# Ratio of two standard deviations above which one of them counts as much larger.
+GROWN = 3.0
 
 # Correlation above which another parameter is named as confounded.
 CONFOUNDED_CORRELATION = 0.5
@@ -136,7 +138,8 @@ class Accuracy:
         singular: True where parameters outside these groups are not identifiable either.
         single_unidentifiable: True where one of the groups contains a parameter that was not
             declared as a member of a parameter group.
-        poorly_known: Names of parameters of interest that are poorly known, and a remark on each.
+        poorly_known: Parameters of interest that are poorly known: the name, a remark, and half the
+            width of the interval over the size of the value.
         data_information: (p, p) information of the recordings alone, without priors.
         robust: Robust uncertainty of the common unknowns; None where one of them is not determined.
         prior_directions: Combinations of inertias that the CAD prior determines, or None.
@@ -151,7 +154,7 @@ class Accuracy:
     groups: tuple[ParameterGroup, ...]
     singular: bool
     single_unidentifiable: bool
-    poorly_known: tuple[tuple[str, str], ...]
+    poorly_known: tuple[tuple[str, str, float], ...]
     data_information: Array
     robust: Uncertainty | None
     prior_directions: PriorDirections | None
@@ -242,7 +245,7 @@ def _accuracy_of(fit: FitResult) -> Accuracy:
         groups=groups,
         singular=not np.isfinite(std[~in_group]).all(),
         single_unidentifiable=bool((in_group & declared_alone).any()),
-        poorly_known=tuple(_poorly_known(system, theta, interval, formal)),
+        poorly_known=tuple(_poorly_known(fit, theta, interval, formal)),
         data_information=data,
         robust=robust,
         prior_directions=prior_directions(parameters, theta, data, std),
@@ -281,40 +284,66 @@ def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Ar
 
 
 def _poorly_known(
-    system: System, theta: Array, interval: Array, covariance: Array
-) -> Iterator[tuple[str, str]]:
-    """Names of the parameters of interest that are poorly known, each with a remark.
+    fit: FitResult, theta: Array, interval: Array, covariance: Array
+) -> Iterator[tuple[str, str, float]]:
+    """Parameters of interest that are poorly known, each with a remark and a share.
 
-    The remark says how accurate the estimate is, and which parameter it is confounded with.
-    Inertias with a CAD prior are left out: single ones of an arm are no result, and what the
-    recordings determine of them is said once for all (`prior_share`).
+    The remark says how accurate the estimate is, and why it is no better. The share is half the
+    width of the interval over the size of the value. Inertias with a CAD prior are left out: single
+    ones of an arm are no result, and what the recordings determine of them is said once for all
+    (`prior_share`).
     """
-    parameters = system.parameters
+    parameters = fit.problem.system.parameters
     variance = np.diag(covariance)
     is_known = np.isfinite(variance)
-    sizes = parameters.sizes(theta)
     std = np.sqrt(np.maximum(np.where(is_known, variance, 1.0), SMALLEST_VARIANCE))
+    sizes = np.maximum(parameters.sizes(theta), SMALLEST_RELATIVE_SIZE * parameters.magnitude)
+    half_widths = 0.5 * (interval[:, 1] - interval[:, 0])
+    shares = np.where(np.isfinite(half_widths), half_widths / sizes, 0.0)
+    chosen = np.setdiff1d(parameters.interest, CadPrior.of(parameters).columns)
+    chosen = chosen[shares[chosen] > POORLY_KNOWN_SHARE]
+    at_guess = std_at_start(fit) if (shares[chosen] >= UNDETERMINED_SHARE).any() else std
 
-    for j in np.setdiff1d(parameters.interest, CadPrior.of(parameters).columns):
-        half_width = 0.5 * float(interval[j, 1] - interval[j, 0])
-        smallest = SMALLEST_RELATIVE_SIZE * float(parameters.magnitude[j])
-        size = max(float(sizes[j]), smallest)
-        if not np.isfinite(half_width) or half_width <= POORLY_KNOWN_SHARE * size:
-            continue
-
-        remark = "may have any value in its interval"
-        if half_width < UNKNOWN_SHARE * size:
-            remark = f"is known to ±{100 * half_width / size:.0f} % only"
-
+    for j in chosen.tolist():
         # The name of the most correlated parameter helps to choose the next experiment.
         correlation = np.where(is_known, covariance[j], 0.0) / (std * std[j])
         correlation[j] = 0.0
         other = int(np.argmax(np.abs(correlation)))
+        confounded = ""
         if abs(correlation[other]) > CONFOUNDED_CORRELATION:
             name = parameters.names[other]
-            remark += f"; it is confounded with {name} (correlation {correlation[other]:+.2f})"
+            confounded = f"; it is confounded with {name} (correlation {correlation[other]:+.2f})"
+        remark = f"is known to ±{100 * shares[j]:.0f} % only{confounded}"
+        if shares[j] >= UNDETERMINED_SHARE:
+            low, high = interval[j]
+            span = f"{low:.3g} to {high:.3g} {parameters.parameters[j].unit}".rstrip()
+            why = "; its effect on these motions is smaller than the noise"
+            if std[j] > GROWN * at_guess[j]:
+                why = "; the motion depends on it much less at the estimate than at the guess"
+            elif max(abs(low), abs(high)) < abs(fit.task.start[j]):
+                why = "; it is smaller than the guess, and too small to be seen"
+            remark = (
+                f"is not determined by these logs: its interval is {span} (predicted σ "
+                f"{at_guess[j]:.2g} at the guess, {std[j]:.2g} at the estimate){confounded or why}"
+            )
+        yield parameters.names[j], remark, float(shares[j])
 
-        yield parameters.names[j], remark
+
+def std_at_start(fit: FitResult) -> Array:
+    """(p,) formal standard deviations that the recordings give at the start of a fit [theta-unit].
+
+    They are those of a quick part of the data, scaled to all of them; infinite where the model
+    diverges there.
+    """
+    problem, _ = fit.quick
+    condensed = problem.condense(problem.begin(fit.task.start))
+    std = np.full(len(fit.theta), np.inf)
+    if condensed is not None:
+        columns = problem.first_columns
+        found = standard_deviations(condensed.information())[columns]
+        share = problem.value_count / max(fit.problem.value_count, 1)
+        std[problem.parameter_of_column[columns]] = found * np.sqrt(share)
+    return std
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,7 +15,7 @@ from mjfim.errors import first_ones, listed
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification.aligned_recording import changes_within_samples
-from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.accuracy import UNDETERMINED_SHARE, FitResult
 from mjfim.identification.assessment.honest_covariance import with_honest_covariance
 from mjfim.identification.assessment.poor_fit import unpredictable_motion
 from mjfim.identification.assessment.recording_comparison import compare_recordings
@@ -112,8 +112,14 @@ IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
 BOUND_TOLERANCE = 1e-6
 
 
-# Largest number of poorly known parameters that have a warning each.
-MAX_SEPARATE_WARNINGS = 4
+# Longest list of remarks on poorly known parameters [characters].
+REMARKS_TEXT = 400
+
+# Share of the sum of squared residuals above which a missing term is the most probable cause.
+TELLING_SHARE = 0.1
+
+# Command that decides between terms; the page of the estimate has the files in place of the words.
+SELECT = "mjfim identify EXPERIMENT RECORDING --select -o FOLDER"
 
 # A recording is remarked on if at least this share of the changes of its control lies inside
 # engine steps of the model.
@@ -129,7 +135,7 @@ ROUNDING = 1e-6
 def estimate_from(
     result: FitResult,
     budget: Budget,
-    refuted: Collection[str] = (),
+    refuted: Collection[str] | None = None,
     tests: TermTests | None = None,
 ) -> Estimate:
     """Assess a fit and make the estimate.
@@ -142,7 +148,7 @@ def estimate_from(
         budget: Budget with the stop token.
         refuted: Keys of terms (`Term.key`) that are not missing, because a fit or the
             prediction of left-out data is no better with them. They are not named as missing terms,
-            and are no reason for a misfit.
+            and are no reason for a misfit. None where no term was tried.
         tests: Tests of terms that this model may lack, where they are known; None to make them.
 
     Returns:
@@ -162,7 +168,7 @@ def estimate_from(
         if not (budget.stop.requested or quality.unexplained):
             found = find_missing_terms(problem, task.recordings, solution.unknowns)
             tests = TermTests() if budget.stop.requested else found
-    tests = tests.without(refuted)
+    tests = tests.without(refuted or ())
     predictions = _predictions(result, budget)
     reasons = misfit_reasons(
         quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, tests.named
@@ -173,25 +179,34 @@ def estimate_from(
     at_bound, outside = _at_bounds(parameters, result.theta, task.settings.hold)
     comparison = compare_recordings(result)
 
-    # A good fit needs no advice.
-    unpredictable = ""
-    if (reasons or quality.unexplained or not solution.success) and not solution.interrupted:
-        unpredictable = unpredictable_motion(problem, solution.unknowns)
-    interrupted = budget.stop.requested
-
-    # The most serious ones first.
-    warnings = (
-        *_warnings_of_search(result, unpredictable, interrupted=interrupted),
-        *_warnings_of_misfit(result, reasons),
-        *_warnings_of_recordings(result, comparison),
-        *_warnings_of_bounds(at_bound, outside=outside),
-        *probable_degrees(system.experiment, system.source),
-        *_places_of_misfit(result, reasons, tests),
-        *_implausible_estimates(parameters, result.theta),
-        *_warnings_of_poorly_known(accuracy.poorly_known),
-        *_warnings_of_data(result),
-    )
     undetermined = accuracy.singular or accuracy.single_unidentifiable
+    success = solution.success and not (undetermined or outside)
+    interrupted = budget.stop.requested
+    groups = (
+        f"not identifiable separately: {group.short}; what the recordings do not determine was "
+        "held at the start. Remove or fix one of them, give it a prior, or record other motions"
+        for group in accuracy.groups
+    )
+    stated = (*probable_degrees(system.experiment, system.source), *groups)
+    causes: tuple[str, ...] = ()
+    if reasons or quality.unexplained or not success:
+        causes = (*_causes(result, tests, is_selected=refuted is not None), *stated)
+    if outside:
+        names = listed(at_bound)
+        newton = f"outside its bounds, which the method newton ignores: {names}; use least_squares"
+        causes = (newton, *causes)
+    worst_first = sorted(accuracy.poorly_known, key=lambda each: -each[2])
+    remarks = [f"{name} {remark}" for name, remark, _ in worst_first]
+    poor = [first_ones(remarks, "; ", REMARKS_TEXT)] if remarks else []
+    is_undetermined = bool(worst_first) and worst_first[0][2] >= UNDETERMINED_SHARE
+    known = (
+        *_limits_of_search(result, at_bound, reasons, interrupted=interrupted),
+        *(() if causes else stated),
+        *_contradictions(result, comparison),
+        *_implausible_estimates(parameters, result.theta),
+        *(poor if is_undetermined else ()),
+    )
+    details = (*_where_it_fails(result, reasons, tests), *(() if is_undetermined else poor))
     per_recording = zip(
         problem.per_recording, solution.unknowns.per_recording.T.tolist(), strict=True
     )
@@ -210,14 +225,17 @@ def estimate_from(
         chi2=quality.chi2,
         dof=quality.dof,
         status=solution.status,
-        success=solution.success and not (undetermined or outside),
+        success=success,
         misfit=bool(reasons),
         iterations=solution.iterations,
         residual_rms=quality.rms,
         at_bound=at_bound,
         predicted=quality.predicted,
         recordings=_as_aligned(problem, task.recordings),
-        warnings=warnings,
+        warnings=(*causes, *known, *details),
+        causes=causes,
+        details=details,
+        nuisance=tuple(p.name for p in parameters.parameters if p.nuisance),
         combinations=tuple(str(group) for group in accuracy.groups),
         data=accuracy.data_information,
         std_sandwich=accuracy.sandwich,
@@ -226,7 +244,7 @@ def estimate_from(
         sigma=dict(zip(system.outputs.names, problem.noise.sigma.tolist(), strict=True)),
         reasons=reasons,
         whiteness=quality.whiteness,
-        sloppy=tuple(name for name, _ in accuracy.poorly_known),
+        sloppy=tuple(name for name, _, _ in accuracy.poorly_known),
         missing_terms=tests.named,
         tested_data=tests.data,
         per_recording={parameters.names[j]: tuple(values) for j, values in per_recording},
@@ -319,36 +337,41 @@ def _as_aligned(problem: FitProblem, recordings: Sequence[Recording]) -> tuple[R
     )
 
 
-def _places_of_misfit(result: FitResult, reasons: Sequence[str], tests: TermTests) -> Iterator[str]:
-    """Where a misfit is, and where it may come from."""
+def _causes(result: FitResult, tests: TermTests, *, is_selected: bool) -> Iterator[str]:
+    """Probable causes of a poor fit, each with its cure, the most probable one first."""
+    quality = result.quality
+    problem, solution = result.problem, result.solution
+    if not solution.interrupted and (advice := unpredictable_motion(problem, solution.unknowns)):
+        yield advice
+    # A term that explains a good part of the residuals comes before what may not matter.
+    decide = "" if is_selected else f", or let `{SELECT}` decide"
+    terms = [(f"the model may lack {term}{decide}", term.share) for term in tests.named[:1]]
+    yield from (text for text, share in terms if share > TELLING_SHARE)
+    yield from _remarks_on_rate(result)
+    yield from (text for text, share in terms if share <= TELLING_SHARE)
+    yield from _remarks_on_data(result)
+    if quality.unexplained:
+        yield (
+            f"the fit explains little of the motion of {listed(quality.unexplained)}: probably "
+            "a local minimum. Shorter segments (fit.segments), more starts (fit.starts) or a "
+            "better guess may find a better one"
+        )
+
+
+def _where_it_fails(result: FitResult, reasons: Sequence[str], tests: TermTests) -> Iterator[str]:
+    """What a misfit is and where, and further terms that the model may lack."""
+    if reasons:
+        yield f"misfit: {'; '.join(reasons)}; the formal standard deviations are not the accuracy"
     if reasons and result.quality.worst_residual is not None:
         yield str(result.quality.worst_residual)
-    if reasons:
-        yield from _warnings_of_rate(result)
-    for term in tests.named:
+    for term in tests.named[bool(reasons) :]:
         yield f"the model may lack {term}"
-    if tests.data is not None and tests.data.untested:
-        yield f"terms that the model may lack: {tests.data.untested_sentence}"
-    if reasons and tests.data is not None and tests.data.impossible:
-        yield f"terms that the model may lack: {tests.data.impossible_sentence}"
+    if tests.data is not None:
+        found = (tests.data.untested_sentence, tests.data.impossible_sentence if reasons else "")
+        yield from (f"terms that the model may lack: {each}" for each in found if each)
 
 
-def _warnings_of_poorly_known(found: Sequence[tuple[str, str]]) -> Iterator[str]:
-    """Warnings about parameters that are poorly known: a sentence each, or one about many."""
-    if len(found) <= MAX_SEPARATE_WARNINGS:
-        for name, remark in found:
-            yield f"sloppy: {name} {remark}"
-        return
-
-    name, remark = found[0]
-    yield (
-        f"sloppy: {len(found)} parameters are poorly known: {listed([name for name, _ in found])}. "
-        f"For example, {name} {remark}. More varied motions, priors, or `--select`, which pools or "
-        "holds such parameters, may help"
-    )
-
-
-def _warnings_of_data(result: FitResult) -> Iterator[str]:
+def _remarks_on_data(result: FitResult) -> Iterator[str]:
     """Remarks about poor data, each with the recordings for which it holds."""
     channels = result.task.system.channels
     names: dict[str, list[str]] = {}
@@ -359,81 +382,53 @@ def _warnings_of_data(result: FitResult) -> Iterator[str]:
         yield f"poor data in {first_ones(recordings)}: {remark}"
 
 
-def _warnings_of_rate(result: FitResult) -> Iterator[str]:
-    """Warnings about recordings whose control changes inside the engine steps of the model."""
+def _remarks_on_rate(result: FitResult) -> Iterator[str]:
+    """Remarks on recordings whose control changes inside the engine steps of the model."""
     system = result.problem.system
     dt, held = system.dt, np.ones(len(system.inputs), dtype=bool)
     if system.laws is not None:
         held = system.laws.held
+    shares, period = {}, dt
     for recording in result.task.recordings:
         count = len(recording.t) - 1
         share = changes_within_samples(recording.t, recording.ctrl[:count, held], dt)
-        if share < MIN_SHARE_WITHIN_SAMPLES:
-            continue
-
+        if share >= MIN_SHARE_WITHIN_SAMPLES:
+            shares[Path(recording.name).name] = share
+            period = float(np.median(np.diff(recording.t)))
+    if shares:
         # The longest timestep of which the period of the log is a whole number.
-        period = float(np.median(np.diff(recording.t)))
         timestep = period / math.ceil(period / dt * (1.0 - ROUNDING))
         yield (
-            f"{100 * share:.0f} % of the changes of the control in {Path(recording.name).name} lie "
-            f"inside the engine steps of the model ({dt:g} s), which hold its mean: this alone can "
-            f"cause a misfit. State a timestep in the MJCF that divides the period of the log, for "
-            f'example timestep="{timestep:.4g}", and rate = '
+            f"{100 * max(shares.values()):.0f} % of the changes of the control in "
+            f"{first_ones([*shares])} lie inside the engine steps of the model ({dt:g} s), which "
+            "hold its mean: this alone can cause a misfit. State a timestep in the MJCF that "
+            f'divides the period of the log, for example timestep="{timestep:.4g}", and rate = '
             f"{1.0 / period:.4g} in the experiment file"
         )
 
 
-def _warnings_of_search(
-    result: FitResult, unpredictable: str, *, interrupted: bool
+def _limits_of_search(
+    result: FitResult, at_bound: Sequence[str], reasons: Sequence[str], *, interrupted: bool
 ) -> Iterator[str]:
-    """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
-    quality, accuracy = result.quality, result.accuracy
+    """Warnings about the start, the end, and what the recordings do not determine."""
     if result.begun_instead:
         yield (
             f"the model diverges at the start ({values_of_start(result.task)}): the search began "
             f"{result.begun_instead} instead"
         )
-
-    if unpredictable:
-        yield unpredictable
-
     if interrupted and not result.solution.interrupted:
         yield "interrupted after the search: there are no predictions of data that were not fitted"
-
-    if quality.unexplained:
-        yield (
-            f"the fit explains little of the motion of {listed(quality.unexplained)}: probably "
-            "a local minimum. Shorter segments (fit.segments), more starts (fit.starts) or a "
-            "better guess may find a better one"
-        )
-
-    for group in accuracy.groups:
-        yield (
-            f"not identifiable separately: {group.short}; what the recordings do not determine "
-            "was held at the start"
-        )
-
-    if accuracy.singular:
+    if result.accuracy.singular:
         yield "the recordings do not determine all parameters: the information is singular"
-
-
-def _warnings_of_misfit(result: FitResult, reasons: Sequence[str]) -> Iterator[str]:
-    """Warnings about residuals that differ from the stated noise."""
-    quality, noise_is_stated = result.quality, result.task.noise_is_stated
-    if reasons:
-        wrong = "The model or the noise is" if noise_is_stated else "The model is"
-        yield (
-            f"misfit: {'; '.join(reasons)}. {wrong} wrong, "
-            "and the formal standard deviations are not the accuracy"
-        )
-    elif noise_is_stated and is_smaller_than_noise(quality.chi2, quality.dof):
-        ratio = np.sqrt(quality.chi2 / quality.dof)
+    if at_bound:
+        yield f"at a bound: {listed(at_bound)}; formal standard deviations are not valid there"
+    chi2, dof = result.quality.chi2, result.quality.dof
+    if is_smaller_than_noise(chi2, dof) and result.task.noise_is_stated and not reasons:
+        ratio = np.sqrt(chi2 / dof)
         yield f"residuals are only {ratio:.2f} times the stated noise: the stated σ is too large"
 
 
-def _warnings_of_recordings(
-    result: FitResult, comparison: RecordingComparison | None
-) -> Iterator[str]:
+def _contradictions(result: FitResult, comparison: RecordingComparison | None) -> Iterator[str]:
     """Warnings about recordings that contradict each other."""
     for odd in () if comparison is None else comparison.odd:
         yield str(odd)
@@ -449,15 +444,6 @@ def _warnings_of_recordings(
         f"recordings disagree on {listed(apart)} by more than the scatter within each recording: "
         "something differs between them that is not in the model; the intervals allow for it"
     )
-
-
-def _warnings_of_bounds(at_bound: Sequence[str], *, outside: bool) -> Iterator[str]:
-    """Warnings about parameters at their bounds."""
-    names = listed(at_bound)
-    if outside:
-        yield f"outside its bounds, which the method newton ignores: {names}; use least_squares"
-    elif at_bound:
-        yield f"at a bound: {names}; formal standard deviations are not valid there"
 
 
 def _implausible_estimates(parameters: ParameterSet, theta: Array) -> Iterator[str]:

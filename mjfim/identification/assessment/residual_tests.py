@@ -163,7 +163,7 @@ def misfit_reasons(
     """
     reasons = []
     if noise_is_stated and is_larger_than_noise(chi2, dof):
-        reasons.append(f"residuals are {np.sqrt(chi2 / dof):.2f} x the stated noise")
+        reasons.append(f"residuals are {np.sqrt(chi2 / dof):.2f} times the stated noise")
 
     found = autocorrelated(tests)
     if found:

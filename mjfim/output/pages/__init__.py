@@ -27,14 +27,19 @@ PAGES = {
 
 
 def page_of(
-    record: ShownRecord, *, experiment: str | None = None, design: Path | None = None
+    record: ShownRecord,
+    *,
+    experiment: str | None = None,
+    design: Path | None = None,
+    output: Path | None = None,
 ) -> Page:
     """Return the page of a result.
 
     Args:
         record: The result.
-        experiment: Path of its experiment file, which the next steps name.
+        experiment: Path of its experiment file, which commands name.
         design: Folder or file of the design that it is or is about, likewise.
+        output: Its folder; the results of a command stand beside it, with the verb in their name.
 
     Raises:
         MjfimError: If there is no page for this kind of record.
@@ -44,15 +49,27 @@ def page_of(
         raise MjfimError(f"a {kind} cannot be shown as a page")
     module, function = PAGES[kind]
     page: Page = getattr(import_module(f"{__name__}.{module}"), function)(record)
-    steps = page.next_steps
-    for word, place in (("EXPERIMENT", experiment), ("DESIGN_FOLDER", design)):
-        if place is not None:
-            # A file in the folder is one word of the shell, too.
-            pattern = rf"(?<= )({word})(/[\w.]+)?(?=[ `])"
-            steps = tuple(_with_path(step, pattern, str(place)) for step in steps)
-    return replace(page, next_steps=steps)
+    places = {"EXPERIMENT": experiment, "DESIGN_FOLDER": design}
+
+    def with_places(sentence: str) -> str:
+        """A sentence with real paths in its commands."""
+        for word, place in places.items():
+            if place is not None:
+                # A file in the folder is one word of the shell, too.
+                pattern = rf"(?<= )({word})(/[\w.]+)?(?=[ `])"
+                sentence = _with_path(sentence, pattern, str(place))
+        if output is None:
+            return sentence
+        beside = shlex.quote(str(output)).replace("\\", r"\\")
+        return re.sub(r"mjfim (\w+)([^`]*) -o FOLDER", rf"mjfim \1\2 -o {beside}-\1", sentence)
+
+    return replace(
+        page,
+        next_steps=tuple(map(with_places, page.next_steps)),
+        causes=tuple(map(with_places, page.causes)),
+    )
 
 
-def _with_path(step: str, pattern: str, path: str) -> str:
+def _with_path(sentence: str, pattern: str, path: str) -> str:
     """Put a path in the place of a word, with the quotation marks that a shell needs."""
-    return re.sub(pattern, lambda found: shlex.quote(path + (found[2] or "")), step)
+    return re.sub(pattern, lambda found: shlex.quote(path + (found[2] or "")), sentence)

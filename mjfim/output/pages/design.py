@@ -33,7 +33,6 @@ from mjfim.output.words import (
     complete_labels,
     improvement,
     relative,
-    size_sentence,
 )
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup
 from mjfim.records.design import Design, ScaledStart
@@ -412,9 +411,6 @@ def _accuracy_parts(design: Design) -> Iterator[Part]:
             "Some parameters are not identifiable alone; the search maximises the information of "
             "combinations of them, see design.json"
         )
-    of_size = size_sentence(design.theta, design.sizes)
-    if of_size:
-        yield Text(of_size, Emphasis.WEAK)
     yield Text(BEST_CASE, Emphasis.WEAK)
 
 
@@ -451,7 +447,7 @@ def _accuracy_table(design: Design) -> Table:
             "σ initial": numbers(before, infinite=NOT_ALONE),
             "relative σ initial": list(map(relative, before, sizes)),
             "σ designed": numbers(after, infinite=NOT_ALONE),
-            "relative σ": list(map(relative, after, sizes)),
+            "relative σ": list(map(relative, after, sizes, values)),
             "change of σ": list(map(improvement, before, after)),
         },
         [Emphasis.NORMAL] * len(wanted) + [Emphasis.DERIVED] * len(combined),
@@ -538,9 +534,13 @@ def _check_verdict(check: Check) -> Verdict:
     if check.ok:
         shares = {row.name: row.relative for row in check.rows if not row.nuisance}
         worst = max(shares, key=lambda name: shares[name])
+        sigma = relative(shares[worst], 1.0)
+        if shares[worst] >= 1.0:
+            text = f"{check.source} does not determine {worst}: its σ is {sigma} of its size."
+            return Verdict(text, Level.DOUBTFUL)
         text = (
             f"All parameters can be identified with {check.source}; the least accurate is {worst} "
-            f"with a σ of {relative(shares[worst], 1.0)}."
+            f"with a σ of {sigma}."
         )
         return Verdict(text, Level.GOOD)
     first = check.verdict[0] if check.verdict else "the check found a fault"
@@ -577,9 +577,6 @@ def _check_parts(check: Check) -> Iterator[Part]:
     title = "Identifiable only in combination, with this control and with random ones"
     yield from _groups(title, check.not_separable, check)
     yield from _groups("Not excited by this control, but by another one", check.not_excited, check)
-    of_size = size_sentence([row.value for row in check.rows], [row.size for row in check.rows])
-    if of_size:
-        yield Text(of_size, Emphasis.WEAK)
     yield Text(BEST_CASE, Emphasis.WEAK)
     yield Text(_about_eigenvalues(check), detail=True)
     yield Text(_about_self_test(check), detail=True)
@@ -594,7 +591,7 @@ def _row(row: ParameterCheck) -> Row:
         name,
         value,
         number(row.std, infinite=NOT_ALONE),
-        relative(row.std, row.size),
+        relative(row.std, row.size, row.value),
         f"{row.wanted:.3g}{'' if row.stated else ' (5 %)'}",
         f"{row.repetitions:,}" if row.repetitions else "-",
         f"{row.seconds:,.0f} s" if row.repetitions else "-",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ import tomlkit
 
 from mjfim.arrays import NORMAL_95
 from mjfim.errors import first_ones, listed
-from mjfim.identification.assessment.accuracy import POORLY_KNOWN_SHARE
+from mjfim.identification.assessment.accuracy import POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
 from mjfim.output.page import (
     IDENTIFIED,
     NOMINAL,
@@ -33,7 +35,7 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.pages.studies import equation_parts
-from mjfim.output.words import NOT_ALONE, relative
+from mjfim.output.words import NOT_ALONE, predicted_data, relative
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
 from mjfim.records.terms import Decision, Selection, SelectionStep
@@ -73,13 +75,15 @@ def estimate_page(estimate: Estimate) -> Page:
         "Signals": [Plot("fit")] if estimate.recordings else [],
         "Residuals": [_residual_table(estimate), Plot("spectra")],
         "Search": [Plot("trace")] if len(estimate.trace) > 1 else [],
-        "Missing terms": list(_missing_terms(estimate)),
     }
+    causes, details = estimate.causes, estimate.details
     return Page(
         kind="Identification from recordings",
         verdict=_verdict(estimate),
         next_steps=tuple(_next_steps(estimate)),
-        warnings=estimate.warnings,
+        causes=tuple(cause.replace(" RECORDING ", f" {_files(estimate)} ") for cause in causes),
+        warnings=tuple(each for each in estimate.warnings if each not in (*causes, *details)),
+        details=details,
         facts={
             "recordings": str(len(estimate.recordings)),
             "χ²/dof": f"{estimate.chi2 / max(estimate.dof, 1):.3f}",
@@ -89,6 +93,12 @@ def estimate_page(estimate: Estimate) -> Page:
         },
         sections=[Section(title, found) for title, found in parts.items() if found],
     )
+
+
+def _files(estimate: Estimate) -> str:
+    """The fitted and the held-out recordings as arguments of a command."""
+    held_out = [("--held-out", each.name) for each in estimate.predictions if each.held_out]
+    return shlex.join([*(each.name for each in estimate.recordings), *chain(*held_out)])
 
 
 # ---- verdict
@@ -121,9 +131,10 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         terms = first_ones([term.description for term in estimate.selection.terms])
         model = f"With {terms} added, the model"
     if estimate.misfit:
+        size = f"the residuals are {ratio:.2f} times the noise"
         text = (
-            f"{model} does not explain the recordings: the residuals are {ratio:.2f} times the "
-            "noise or are no white noise, so the true errors may exceed the intervals."
+            f"{model} does not explain the recordings: {'; '.join(estimate.reasons) or size}. "
+            "The true errors may exceed the intervals."
         )
         return Verdict(text, Level.DOUBTFUL)
     text = f"{model} explains the recordings: the residuals are {ratio:.2f} times the noise"
@@ -136,13 +147,14 @@ def _worst_estimate(estimate: Estimate) -> str:
     sizes = estimate.sizes
     shares = half_widths / np.where(sizes > 0.0, sizes, np.nan)
     # A share of a value that may be zero says nothing.
-    known = np.isfinite(shares) & (shares < 1.0)
+    is_asked = ~np.isin(estimate.parameters, estimate.nuisance)
+    known = is_asked & (shares < UNDETERMINED_SHARE)
+    uncertain = [estimate.parameters[j] for j in np.flatnonzero(is_asked & ~known).tolist()]
     if not known.any():
         return ""
-    uncertain = [estimate.parameters[j] for j in np.flatnonzero(~known).tolist()]
     worst = int(np.argmax(np.where(known, shares, -np.inf)))
     share = relative(float(half_widths[worst]), float(sizes[worst]))
-    others = f" except {first_ones(uncertain)}, whose interval holds zero," if uncertain else ""
+    others = f" except {first_ones(uncertain)} (not determined)" if uncertain else ""
     return (
         f", and every parameter{others} is known to ± {share} or better (95 % interval, widest for "
         f"{estimate.parameters[worst]})"
@@ -150,15 +162,6 @@ def _worst_estimate(estimate: Estimate) -> str:
 
 
 def _next_steps(estimate: Estimate) -> Iterator[str]:
-    for term in estimate.missing_terms[:1]:
-        yield (
-            f"Add the term that explains most of the residuals, {term.description}: "
-            f"`{term.recipe}`."
-        )
-    if estimate.misfit and estimate.worst_residual is not None:
-        yield f"Look where the model fails: {estimate.worst_residual}."
-    if estimate.combinations:
-        yield "Remove or fix one parameter of each group, give it a prior, or record other motions."
     if estimate.sloppy:
         names = first_ones(estimate.sloppy)
         yield (
@@ -182,10 +185,6 @@ def _parameter_parts(estimate: Estimate) -> Iterator[Part]:
         yield Text(capitalised(estimate.status))
     yield _estimate_table(estimate)
     yield Plot("parameters")
-    noise = "consistent with noise"
-    if estimate.misfit:
-        noise = "not explained by noise: the formal σ underestimates the errors"
-    yield Text(f"Residuals {noise} (χ²/dof = {estimate.chi2 / estimate.dof:.3f})")
     if estimate.payload is not None:
         yield from (Text(sentence) for sentence in estimate.payload.sentences)
     for remark in (estimate.restart, estimate.prior_directions):
@@ -193,6 +192,8 @@ def _parameter_parts(estimate: Estimate) -> Iterator[Part]:
             yield Text(str(remark))
     if estimate.tested_data is not None and not estimate.tested_data.is_complete:
         yield Text(str(estimate.tested_data))
+    if estimate.tested_data is not None and estimate.tested_data.unseen:
+        yield Text(estimate.tested_data.unseen_sentence, Emphasis.WEAK, detail=True)
     yield Text(ABOUT_STD, Emphasis.WEAK)
     for law in estimate.controllers:
         yield Text(str(law))
@@ -266,20 +267,6 @@ def _residual_table(estimate: Estimate) -> Table:
     return tabulated("Fit of every output", columns, detail=True)
 
 
-def _missing_terms(estimate: Estimate) -> Iterator[Part]:
-    """The terms that the model may lack."""
-    tested = estimate.tested_data
-    data = "" if tested is None or tested.is_complete else f" ({tested.amount})"
-    if tested is not None and tested.unseen:
-        yield Text(tested.unseen_sentence, Emphasis.WEAK, detail=True)
-    if estimate.missing_terms:
-        yield Listing(
-            f"Terms that would explain a part of the residuals{data}",
-            tuple(str(term) for term in estimate.missing_terms),
-            detail=True,
-        )
-
-
 # ---- predictions
 
 
@@ -292,7 +279,7 @@ def _prediction_parts(predictions: Sequence[Prediction]) -> Sequence[Part]:
         prediction.name + ("" if prediction.held_out else FITTED_MARK) for prediction in predictions
     ]
     ratios = tabulated(
-        "Prediction of recordings that were not fitted: rms error, identified / nominal",
+        f"Prediction of {predicted_data(predictions)}: rms error, identified / nominal",
         {"recording": names, "ratio": numbers([each.ratio for each in predictions], 2)},
         warned(not prediction.ratio < 1.0 for prediction in predictions),
         note=note,
@@ -328,10 +315,11 @@ def _about(predictions: Sequence[Prediction]) -> str:
     """Say how much better than the nominal model the identified model predicts."""
     ratios = [prediction.ratio for prediction in predictions if np.isfinite(prediction.ratio)]
     if not ratios:
-        return "No prediction of data that were not fitted could be compared"
+        return f"No prediction of {predicted_data(predictions)} could be compared"
     low, high = f"{100.0 * min(ratios):.3g} %", f"{100.0 * max(ratios):.3g} %"
     share = low if low == high else f"{low} to {high}"
-    return f"Prediction of data that were not fitted: the error is {share} of the nominal model's"
+    data = predicted_data(predictions)
+    return f"Prediction of {data}: the error is {share} of the nominal model's"
 
 
 # What each decision is called in the table.
@@ -500,15 +488,8 @@ def recording_parts(estimate: Estimate) -> Sequence[Part]:
     differs = bool(comparison.odd or comparison.apart)
     emphasis = Emphasis.WARNING if differs else Emphasis.NORMAL
     in_short_form = differs and not comparison.odd
-    parts: list[Part] = [Text(str(comparison), emphasis, detail=not in_short_form)]
-    if differs and estimate.misfit:
-        text = (
-            "The model does not explain the recordings: its error acts differently along different "
-            "motions, and this alone can make recordings differ."
-        )
-        parts.append(Text(text, Emphasis.WEAK, detail=True))
-    tables = (_scatter_table(comparison), _value_table(comparison))
-    return (*parts, *tables, Plot("recordings"))
+    about = Text(str(comparison), emphasis, detail=not in_short_form)
+    return (about, _scatter_table(comparison), _value_table(comparison), Plot("recordings"))
 
 
 def _scatter_table(comparison: RecordingComparison) -> Table:

@@ -88,6 +88,8 @@ def campaign_page(campaign: Campaign, parameters: CampaignParameters | None = No
         facts["χ²/dof of the last fit"] = f"{last.chi2 / max(last.dof, 1):.3f}"
     step = AFTER_CAMPAIGN.get(campaign.status)
     level = CAMPAIGN_LEVELS.get(campaign.status, Level.DOUBTFUL)
+    if level is Level.GOOD and campaign.short:
+        level = Level.DOUBTFUL
     return Page(
         kind="Campaign of designs and recordings",
         verdict=Verdict(as_sentence(str(campaign)), level),
@@ -155,7 +157,8 @@ def _robots_verdict(comparison: RobotComparison) -> Verdict:
         return Verdict(text, Level.BAD)
     if not comparison.is_reliable:
         return Verdict(f"With reservations (see the warnings): {text}", Level.DOUBTFUL)
-    return Verdict(text, Level.DOUBTFUL if comparison.differs else Level.GOOD)
+    is_doubtful = comparison.differs or comparison.doubtful
+    return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD)
 
 
 def _steps_after_robots(comparison: RobotComparison) -> Iterator[str]:

@@ -34,6 +34,7 @@ from mjfim.output.words import (
     chi_squared_quantiles,
     format_number,
     format_with_uncertainty,
+    predicted_data,
     shorten,
     without_zeros,
 )
@@ -563,9 +564,9 @@ def predictions(estimate: Estimate, labels: Labels) -> Picture:
             f" Shown: {len(shown)} of {len(found)} recordings and "
             f"{min(len(measured), MAX_SPECTRA)} of {len(measured)} outputs."
         )
-    title = "Predictions of recordings that were not fitted"
+    title = f"Predictions of {predicted_data(shown)}"
     if len(shown) == 1:
-        title = f"Prediction of {_prediction_name(shown[0])}, which was not fitted"
+        title += f": {_prediction_name(shown[0])}"
     return Picture(title=title, panels=[panel], note=note, heights=[0.6 + 0.25 * len(names)])
 
 

@@ -207,12 +207,10 @@ def recordings(estimate: Estimate) -> Picture:
         for k, j in enumerate(shown)
     ]
     count = len(comparison.recordings)
-    title = f"{count} recordings that agree"
+    title = f"{count} recordings that {comparison.finding}"
     if odd:
         names = ", ".join(shorten(each.name) for each in comparison.odd)
         title = f"{names} {'is' if len(odd) == 1 else 'are'} odd among {count} recordings"
-    elif comparison.apart:
-        title = f"{count} recordings that differ by more than their noise"
     note = "Each value is one Gauss-Newton step away from the estimate of all recordings."
     if np.isfinite(comparison.prediction).any():
         note += " Another recording: 95 % interval of what it would suggest."

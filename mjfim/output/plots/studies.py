@@ -551,7 +551,7 @@ def robots(comparison: RobotComparison) -> Picture:
     marks = [vspan(-1.0, 1.0, opacity=0.6, label="would hardly be found"), vline(0.0)]
     for chosen, role, label in (
         (is_changed, DESIGNED.word, "differs"),
-        (~is_changed, IDENTIFIED.word, "no difference found"),
+        (~is_changed, IDENTIFIED.word, "no difference proven"),
     ):
         inside = chosen & (np.abs(centre) <= reach)
         marks += [
@@ -578,7 +578,7 @@ def robots(comparison: RobotComparison) -> Picture:
     if not comparison.is_reliable:
         note += " One of the estimates is not reliable, or does not fit its recordings."
 
-    title = f"{second} and {first}: no difference found"
+    title = f"{second} and {first}: no difference proven"
     if comparison.changed:
         names = [shorten(comparison.parameters[j], 26) for j in comparison.changed[:3]]
         more = len(comparison.changed) - len(names)

@@ -496,10 +496,13 @@ MARKS = re.compile(r"[\\|*`<>\[\]~]|(?<!\w)_|_(?!\w)")
 
 
 def as_markdown(page: Page, *further: str) -> str:
-    """Write a page: verdict, first part, warnings, then all other parts, and further sentences."""
-    parts = [_rendered(part) for part in page.parts]
-    if page.warnings:
-        parts[1:1] = ["**Warnings**", _list(page.warnings)]
+    """Write a page: verdict, remarks by their weight, all parts, and further sentences."""
+    remarks = (
+        f"**{weight}**\n\n{_list(sentences)}"
+        for weight, sentences in page.remarks.items()
+        if sentences
+    )
+    parts = [*remarks, *map(_rendered, page.parts)]
     texts = (f"### {escape(page.kind)}", f"**{escape(page.verdict.text)}**", *parts, *further)
     return "\n\n".join(text for text in texts if text)
 

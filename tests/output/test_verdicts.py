@@ -1,0 +1,206 @@
+"""Verdicts agree with the numbers of the same result, and the cause of a misfit stands below."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.output.page import Level
+from mjfim.output.pages import page_of
+from mjfim.output.plots.pictures import pictures_of
+from mjfim.output.words import relative
+from mjfim.records.campaign import CampaignStatus
+from mjfim.records.check import verdict_of_check
+from mjfim.records.studies import DESIGN
+from tests.support import results
+from tests.support.pages import printed
+from tests.support.results import THETA
+
+# Two recordings whose 95 % intervals of the length do not meet, and two of which they do.
+TWO = results.estimate().recording_comparison
+assert TWO is not None
+APART = np.array([[1.0, 1.5, 2.0], [1.0, 1.9, 2.0]])
+
+
+@pytest.mark.parametrize(
+    ("values", "p", "words"),
+    [
+        (np.array([[1.0, 1.5, 2.0], [1.0, 1.6, 2.0]]), 0.4, "agree within their noise"),
+        (APART, 0.01, "may differ in length (intervals apart)"),
+        (APART, 1e-5, "differ in length by more than their noise explains"),
+    ],
+)
+def test_recordings_agree_only_where_their_intervals_meet(
+    values: np.ndarray, p: float, words: str
+) -> None:
+    comparison = replace(
+        TWO,
+        recordings=("a.csv", "b.csv"),
+        parameters=results.PARAMETERS,
+        values=values,
+        std=np.full(values.shape, 0.05),
+        p=np.array([1.0, p, 1.0]),
+        joint_p=0.5,
+        odd=(),
+    )
+    is_disjoint = np.ptp(values[:, 1]) > 2.0 * 1.96 * 0.05
+    assert is_disjoint == bool(comparison.separate)
+    assert words in str(comparison)
+    picture = pictures_of(results.estimate(recording_comparison=comparison))["recordings"]()
+    assert words in picture.title
+
+
+@pytest.mark.parametrize(
+    ("second", "interval", "p", "level", "words"),
+    [
+        (1.0, (-0.02, 0.02), 1.0, Level.GOOD, "no difference between monday and friday. A change"),
+        (1.6, (0.034, 1.06), 0.08, Level.DOUBTFUL, "mass of friday is 60 % above"),
+        (1.48, (-0.1, 1.06), 0.3, Level.DOUBTFUL, "mass of friday is 48 % above"),
+        (1.6, (0.5, 0.7), 1e-9, Level.DOUBTFUL, "There is a difference"),
+    ],
+)
+def test_robots_are_equal_only_where_the_numbers_are(
+    second: float, interval: tuple[float, float], p: float, level: Level, words: str
+) -> None:
+    found = results.robots(
+        values=np.array([[1.0, 1.0, 1.0], [second, 1.0, 1.0]]),
+        interval=np.array([interval, (-0.02, 0.02), (-0.02, 0.02)]),
+        p=np.array([p, 1.0, 1.0]),
+        joint_p=max(p, 0.1) if p > 0.05 else p,
+    )
+    verdict = page_of(found).verdict
+    assert (verdict.level, words in verdict.text) == (level, True), verdict.text
+    low, high = found.interval[0]
+    excludes_zero = low > 0.0 or high < 0.0
+    assert not (excludes_zero and "no difference" in verdict.text)
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+def test_only_recordings_that_took_no_part_are_called_not_fitted(held_out: bool) -> None:
+    estimate = results.estimate()
+    predictions = tuple(replace(each, held_out=held_out) for each in estimate.predictions)
+    estimate = replace(estimate, predictions=predictions)
+    text = printed(page_of(estimate), verbose=True)
+    title = pictures_of(estimate)["predictions"]().title
+    assert ("not fitted" in title, "not fitted" in text) == (held_out, held_out)
+    assert ("part of the last fit" in text) is not held_out
+
+
+def test_a_share_of_a_whole_vector_names_the_size() -> None:
+    assert relative(0.0031, 0.039, 0.00048) == "7.9 % of 0.039"
+    assert relative(0.0031, 0.039, 0.039) == "7.9 %"
+
+
+def test_the_accuracy_in_the_verdict_is_of_a_parameter_that_was_asked_for() -> None:
+    std = np.array([0.01, 0.2, 0.01]) * THETA
+    asked, all_of_them = (
+        page_of(results.estimate(std=std, nuisance=nuisance)).verdict.text
+        for nuisance in (("length",), ())
+    )
+    assert "widest for length" in all_of_them
+    assert "length" not in asked and "± 2 %" in asked
+
+
+@pytest.mark.parametrize(
+    ("chi2", "reasons", "words"),
+    [
+        (30.0, ("residuals are autocorrelated: q (lag-1 correlation +0.22)",), "autocorrelated: q"),
+        (800.0, ("residuals are 2.01 times the stated noise",), "2.01 times the stated noise"),
+    ],
+)
+def test_a_misfit_says_only_what_is_wrong(
+    chi2: float, reasons: tuple[str, ...], words: str
+) -> None:
+    estimate = results.estimate(misfit=True, chi2=chi2, reasons=reasons)
+    verdict = page_of(estimate).verdict
+    assert verdict.level is Level.DOUBTFUL and words in verdict.text
+    assert " or are no " not in verdict.text
+    assert ("times the" in verdict.text) == (chi2 > estimate.dof)
+
+
+@pytest.mark.parametrize(
+    ("stated", "words", "others"),
+    [(True, "3 of 3 parameters miss the wanted σ", "5 %"), (False, "more than 5 %", "wanted")],
+)
+def test_an_accuracy_is_missed_only_where_one_was_wanted(
+    stated: bool, words: str, others: str
+) -> None:
+    check = results.check()
+    rows = tuple(
+        replace(row, relative=0.1, std=0.1 * row.size, stated=stated, repetitions=4)
+        for row in check.rows
+    )
+    found = replace(check, rows=rows)
+    text = "; ".join(verdict_of_check(found))
+    assert words in text and others not in text
+    page = page_of(replace(found, verdict=tuple(verdict_of_check(found))))
+    assert (page.verdict.level is Level.GOOD) is not stated
+
+
+def test_what_is_not_determined_has_no_green_box() -> None:
+    check = results.check()
+    rows = (replace(check.rows[0], relative=4.0, std=4.0 * check.rows[0].size), *check.rows[1:])
+    verdict = page_of(replace(check, rows=rows)).verdict
+    assert verdict.level is Level.DOUBTFUL and "does not determine mass" in verdict.text
+
+
+@pytest.mark.parametrize(
+    ("cost", "words"), [(1.002, "as good as"), (0.99, "as good as"), (1.1, "is the best")]
+)
+def test_equal_methods_are_called_equal(cost: float, words: str) -> None:
+    comparison = results.comparison()
+    rows = tuple(
+        row if row.method == DESIGN else replace(row, cost=cost) for row in comparison.rows
+    )
+    found = replace(comparison, rows=rows)
+    assert words in page_of(found).verdict.text
+    assert not found.beating
+
+
+def test_a_campaign_that_waits_with_a_missed_target_has_no_green_box() -> None:
+    waiting = {"status": CampaignStatus.WAITING}
+    for wanted, level in ((0.005, Level.DOUBTFUL), (0.015, Level.GOOD)):
+        page = page_of(results.campaign(wanted=wanted * THETA, **waiting))
+        assert page.verdict.level is level
+        assert ("wanted" in page.verdict.text) == (level is Level.DOUBTFUL)
+
+
+# ---- causes
+
+
+def cause(**changes: Any) -> Any:
+    """An estimate with a cause, ten warnings and a detail."""
+    first = (
+        "the model may lack dry friction, or let `mjfim identify EXPERIMENT RECORDING --select -o "
+        "FOLDER` decide"
+    )
+    causes, details = (first, "something else"), ("largest residuals in q",)
+    warnings = (*causes, *(f"warning number {k}" for k in range(10)), *details)
+    fields = {"misfit": True, "warnings": warnings, "causes": causes, "details": details}
+    return results.estimate(**{**fields, **changes})
+
+
+def test_the_cause_stands_under_the_verdict_with_the_command_that_cures_it(tmp_path: Any) -> None:
+    folder = tmp_path / "a run"
+    page = page_of(cause(), experiment="my arm.toml", output=folder)
+    lines = printed(page, 400).splitlines()
+    assert lines[0].startswith("The model does not explain")
+    assert lines[1].startswith("Fix first: the model may lack dry friction")
+    command = (
+        "`mjfim identify 'my arm.toml' logs/swing.csv --held-out logs/new.csv --select -o "
+        f"'{folder}'-identify`"
+    )
+    assert command in lines[1]
+
+
+def test_at_most_three_remarks_are_shown_before_verbose() -> None:
+    page = page_of(cause())
+    short, complete = (printed(page, 200, verbose=verbose) for verbose in (False, True))
+    weights = [line.split(":")[0] for line in short.splitlines()[1:4]]
+    assert weights == ["Fix first", "Warning", "Warning"]
+    assert short.count("Warning:") == 2 and "Not shown here" in short
+    assert complete.count("Warning:") == 10
+    assert complete.count("Fix first:") == 2 and "Detail: largest residuals in q" in complete

@@ -1,0 +1,120 @@
+"""Remarks about poor data: none about clean logs of quick motions, and all real faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy
+
+import mjfim
+from mjfim.errors import MjfimError
+from mjfim.experiment.system import System, simulate_system
+from mjfim.recordings.checks import plausibility_remarks
+from mjfim.records.trajectory import Recording
+from tests.support.paths import MODELS, SHARED_MODELS
+from tests.support.shared_models import EXPERIMENTS
+
+# A light fin in water follows its servo within one row of a log at 50 Hz.
+FIN = """
+<mujoco><option timestep="0.004" density="5000" gravity="0 0 0"/>
+<worldbody><body name="fin"><joint name="fin" axis="1 0 0" damping="2e-5" stiffness="1e-3"/>
+<geom type="ellipsoid" size=".015 .02 .001" pos=".01 0 0" density="2000"/></body></worldbody>
+<actuator><position name="fin" joint="fin" kp="3e-4"/></actuator></mujoco>
+"""
+SHIPPED = (
+    "cart_pendulum",
+    "double_pendulum",
+    "free_pendulum",
+    "four_bar",
+    "quadrotor",
+    "servo_arm",
+)
+
+
+def smooth(system: System, rows: int, rng: np.random.Generator) -> np.ndarray:
+    """A random control about the middle of its range, of a random quickness."""
+    model = system.model
+    low, high = model.actuator_ctrlrange.T
+    limited = model.actuator_ctrllimited.astype(bool)
+    middle = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
+    width = rng.uniform(0.02, 0.4) / system.dt
+    noise = scipy.ndimage.gaussian_filter1d(rng.normal(size=(rows, model.nu)), width, axis=0)
+    moved = middle + 0.15 * np.where(limited, high - low, 2.0) * noise / np.abs(noise).max(axis=0)
+    return np.where(limited, np.clip(moved, low, high), moved)
+
+
+def of_fin(folder: Path) -> tuple[System, Recording, np.ndarray]:
+    """The fin, a log of a stepped sine, and the outputs without noise."""
+    model = folder / "fin.xml"
+    model.write_text(FIN, encoding="utf-8")
+    stated = mjfim.Experiment(
+        model=str(model),
+        rate=50.0,
+        horizon=4.0,
+        parameters={"c": {"target": "joint/fin:damping"}},
+        noise={"state": 1e-3},
+    )
+    system = System.resolve(stated, threads=1)
+    ctrl = 0.3 * np.sin(2.0 * np.pi * np.arange(200) / 50.0)[:, None]
+    trajectory = system.plant.simulate(system.theta, ctrl)
+    outputs, _ = system.plant.measure(system.theta[None], ctrl)
+    return system, simulate_system(system, trajectory, seed=0), outputs[0]
+
+
+@pytest.mark.parametrize(
+    ("fault", "is_found"),
+    [
+        (lambda v: v, False),
+        (lambda v: 2.0 * v, True),
+        (lambda v: -v, True),
+        (lambda v: np.roll(v, 10), True),
+    ],
+)
+def test_a_quick_velocity_contradicts_its_position_only_where_it_is_wrong(
+    fault: Callable[[np.ndarray], np.ndarray], is_found: bool, tmp_path: Path
+) -> None:
+    system, log, outputs = of_fin(tmp_path)
+    y = np.array(log.y)
+    j = log.outputs.index("qvel:fin")
+    y[:, j] = fault(y[:, j])
+    found = plausibility_remarks(system.channels, replace(log, y=y), outputs)
+    assert any("the integral of qvel:fin differ" in remark for remark in found) == is_found
+
+
+def experiments() -> Iterator[tuple[mjfim.Experiment, int]]:
+    """Experiments with encoders and velocities, and their number of logs of a design."""
+    for name in SHIPPED:
+        stated = mjfim.Experiment.from_file(MODELS / f"{name}.toml")
+        yield stated.replace(noise={"state": 1e-3}), 5
+    for name in EXPERIMENTS if SHARED_MODELS.is_dir() else ():
+        tables = EXPERIMENTS[name]
+        yield mjfim.Experiment(**{**tables, "model": str(SHARED_MODELS / tables["model"])}), 0
+
+
+@pytest.mark.slow
+def test_clean_logs_are_not_called_poor() -> None:
+    """Of random smooth controls and of designs; at most one in a hundred is remarked on."""
+    rng, count, alarms = np.random.default_rng(0), 0, []
+    for stated, designed in experiments():
+        system = System.resolve(stated, threads=1)
+        horizon = stated.horizon
+        assert horizon is not None
+        controls = [smooth(system, round(horizon / system.dt), rng) for _ in range(10 - designed)]
+        if designed:
+            quick = stated.replace(descent={"max_iterations": 1, "seconds": 2.0})
+            controls += [mjfim.design(quick).trajectory.ctrl] * designed
+        for k, ctrl in enumerate(controls):
+            try:
+                trajectory = system.plant.simulate(system.parameters.true, ctrl)
+            except MjfimError:
+                continue  # an unstable motion is no log
+            log = simulate_system(system, trajectory, seed=k)
+            outputs, _ = system.plant.measure(system.parameters.true[None], ctrl)
+            count += 1
+            alarms += plausibility_remarks(system.channels, log, outputs[0])[:1]
+    assert count >= 50
+    assert len(alarms) <= 0.01 * count, alarms
