@@ -394,6 +394,7 @@ def _warnings_of_search(
 ) -> Iterator[str]:
     """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
     quality, accuracy = result.quality, result.accuracy
+    yield from result.task.elsewhere
     if result.begun_instead:
         yield (
             f"the model diverges at the start ({values_of_start(result.task)}): the search began "
