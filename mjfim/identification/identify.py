@@ -238,8 +238,8 @@ def is_doubtful(fit: FitResult) -> bool:
     quality, is_stated = fit.quality, fit.task.noise_is_stated
     if quality.unexplained or not (fit.solution.success or is_stated):
         return True
-    tests = quality.whiteness
-    return bool(misfit_reasons(quality.chi2, quality.dof, is_stated, tests, missing=()))
+    tests, worst = quality.whiteness, quality.worst_residual
+    return bool(misfit_reasons(quality.chi2, quality.dof, is_stated, tests, (), worst))
 
 
 def _with_solution(fit: FitResult, problem: FitProblem, solution: Solution) -> FitResult:

@@ -18,6 +18,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.residual_tests import are_white
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitTask
 from mjfim.identification.segments import MIN_SAMPLES
@@ -60,6 +61,7 @@ def flipped_signs(result: FitResult, budget: Budget) -> tuple[str, ...]:
     """
     task, quality, noise = result.task, result.quality, result.problem.noise
     is_poor = task.noise_is_stated and quality.chi2 > POOR_FIT * quality.dof
+    is_poor &= not are_white(quality.whiteness)
     if not (is_poor or quality.unexplained):
         return ()
 

@@ -24,6 +24,8 @@ from mjfim.identification.assessment.poor_fit import (
 )
 from mjfim.identification.assessment.recording_comparison import compare_recordings
 from mjfim.identification.assessment.residual_tests import (
+    are_white,
+    is_larger_than_noise,
     is_smaller_than_noise,
     misfit_reasons,
 )
@@ -36,6 +38,7 @@ from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
 from mjfim.parallel.budget import Budget
+from mjfim.plant.outputs import Noise
 from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
@@ -164,12 +167,23 @@ def estimate_from(
         begin_stage("looking for terms that the model lacks")
         tests = TermTests()
         if not (budget.stop.requested or quality.unexplained):
-            found = find_missing_terms(problem, task.recordings, solution.unknowns)
+            # Terms are compared with the noise that the residuals show.
+            tested, noise = problem, problem.noise
+            is_larger = is_larger_than_noise(quality.chi2, quality.dof)
+            if is_larger and are_white(quality.whiteness):
+                seen = quality.chi2 / quality.dof * noise.covariance
+                tested = problem.with_noise(Noise(covariance=seen, strides=noise.strides))
+            found = find_missing_terms(tested, task.recordings, solution.unknowns)
             tests = TermTests() if budget.stop.requested else found
     tests = tests.without(refuted)
     predictions = _predictions(result, budget)
     reasons = misfit_reasons(
-        quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, tests.named
+        quality.chi2,
+        quality.dof,
+        task.noise_is_stated,
+        quality.whiteness,
+        tests.named,
+        quality.worst_residual,
     )
 
     begin_stage("computing the intervals")
@@ -433,9 +447,12 @@ def _warnings_of_misfit(result: FitResult, reasons: Sequence[str]) -> Iterator[s
             f"misfit: {'; '.join(reasons)}. {wrong} wrong, "
             "and the formal standard deviations are not the accuracy"
         )
-    elif noise_is_stated and is_smaller_than_noise(quality.chi2, quality.dof):
-        ratio = np.sqrt(quality.chi2 / quality.dof)
+        return
+    ratio = np.sqrt(quality.chi2 / quality.dof)
+    if noise_is_stated and is_smaller_than_noise(quality.chi2, quality.dof):
         yield f"residuals are only {ratio:.2f} times the stated noise: the stated σ is too large"
+    if noise_is_stated and is_larger_than_noise(quality.chi2, quality.dof):
+        yield f"the noise is {ratio:.2f} times what you stated; the intervals use it"
 
 
 def _warnings_of_recordings(
