@@ -18,6 +18,7 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.poor_fit import touched_in
 from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
@@ -33,7 +34,13 @@ from mjfim.identification.search import (
     quick_subset,
     with_length,
 )
-from mjfim.identification.starts import SPREAD_STARTS, begin_fit, choose_length, start_from_segments
+from mjfim.identification.starts import (
+    SPREAD_STARTS,
+    begin_fit,
+    choose_length,
+    start_beyond_stops,
+    start_from_segments,
+)
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -60,6 +67,15 @@ SHARE_THAT_DETERMINES = 0.2
 # Difference of two costs that is not relevant. A step to the minimum that is 0.14 standard
 # deviations long lowers the cost by this much.
 SAME_COST = 1e-2
+
+# Largest number of times that a fit begins on the other side of a touch of a stop or a contact.
+MAX_TOUCH_ROUNDS = 4
+
+# Factor by which differences are shorter next to a jump of the residuals.
+SHORTER_DIFFERENCES = 0.01
+
+# How a search ends whose next step would lead over a jump of the residuals.
+AT_JUMP = "converged: next to a jump of the residuals, where a stop or a contact comes or goes"
 
 # Reason for an estimate over whole recordings, although segments predict left-out data better.
 DIVERGED = "the fit over this length diverged"
@@ -225,6 +241,22 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
                 break
             fit = _restarted(search, problem, fit, is_spread=is_spread)
     fit = _with_solution(fit, *search.converged(fit.problem, fit.solution))
+
+    # Where a joint stop or a contact acts, the residuals jump, and a search ends at the jump.
+    touches = touched_in(fit) if repeats and (is_doubtful(fit) or fit.solution.stuck) else ""
+    for _ in range(MAX_TOUCH_ROUNDS if touches else 0):
+        start = start_beyond_stops(search, fit) if is_doubtful(fit) else None
+        if start is None or search.interrupted:
+            break
+        fit = _fitted_from(search, fit.problem, start, "all data, beyond stops", fit) or fit
+    if touches and fit.solution.stuck and not is_doubtful(fit):
+        # Differences that straddle the jump are no slopes. The minimum may be at the jump itself.
+        finer = fit.problem.with_longer_differences(SHORTER_DIFFERENCES)
+        words = "all data, shorter differences"
+        fit = _fitted_from(search, finer, fit.solution.unknowns, words, fit) or fit
+        ended = replace(fit.solution, success=True, stuck=False, status=AT_JUMP)
+        fit = replace(fit, solution=ended if fit.solution.stuck else fit.solution)
+    fit = replace(fit, touches=touches)
 
     # Where the model does not explain whole recordings, the length of the segments matters.
     chooses_length = task.settings.segments is None and task.method != "newton"

@@ -415,6 +415,12 @@ def _warnings_of_search(
             f"{result.begun_instead} instead"
         )
 
+    if result.touches:
+        yield (
+            f"stops or contacts act: {result.touches}. The residuals jump where a touch comes or "
+            "goes; shorter segments (fit.segments) make the fit easier"
+        )
+
     if unpredictable:
         yield unpredictable
 
