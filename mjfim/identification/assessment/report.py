@@ -118,6 +118,9 @@ IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
 # at the bound.
 BOUND_TOLERANCE = 1e-6
 
+# Distance from the last physical value, relative to the value, at which an inertia is at a bound.
+PHYSICAL_TOLERANCE = 1e-3
+
 
 # Largest number of poorly known parameters that have a warning each.
 MAX_SEPARATE_WARNINGS = 4
@@ -188,7 +191,7 @@ def estimate_from(
 
     begin_stage("computing the intervals")
     accuracy = result.accuracy
-    at_bound, outside = _at_bounds(parameters, result.theta, task.settings.hold)
+    at_bound, outside = _at_bounds(result)
     comparison = compare_recordings(result)
 
     # A good fit needs no advice.
@@ -292,20 +295,26 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
     )
 
 
-def _at_bounds(
-    parameters: ParameterSet, theta: Array, held: Sequence[str]
-) -> tuple[tuple[str, ...], bool]:
+def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     """Names of the parameters at a bound or beyond it, and whether any is beyond.
 
-    Those that are held are where the user wants them.
+    Those that are held are where the user wants them. A bound of an inertia may be the last value
+    at which its body is physical.
     """
+    parameters, theta, held = result.task.system.parameters, result.theta, result.task.settings.hold
     tolerance = BOUND_TOLERANCE * parameters.magnitude
     below = theta < parameters.lower - tolerance
     above = theta > parameters.upper + tolerance
 
-    distance_below = theta - parameters.lower
-    distance_above = parameters.upper - theta
-    at_bound = np.flatnonzero(np.minimum(distance_below, distance_above) < tolerance)
+    distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
+    problem, at = result.problem, result.solution.unknowns
+    lower, upper = problem.bounds_at(at)
+    values, columns = problem.common_values(at), problem.parameter_of_column
+    near = np.minimum(values - lower, upper - values)
+    is_near = near < PHYSICAL_TOLERANCE * np.abs(values)
+    is_near &= (lower > problem.lower) | (upper < problem.upper)
+    distance[columns[is_near]] = 0.0
+    at_bound = np.flatnonzero(distance < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
     return names, bool((below | above).any())
 
