@@ -161,18 +161,20 @@ class FitUnknowns:
             return bounds[0], bounds[1]
         for column in self._of_inertias.tolist():
             j = self.shared[column]
-            begin, reach = float(at.theta[j]), LARGEST_MOVE * float(self.parameters.magnitude[j])
             for side, sign in enumerate((-1.0, 1.0)):
-                theta, share, end = np.array(at.theta), 0.0, sign * reach
-                if np.isfinite(bounds[side, column]):
-                    end = float(bounds[side, column]) - begin
-                theta[j] = begin + end
+                theta, inside, end = np.array(at.theta), at.theta[j], bounds[side, column]
+                if not np.isfinite(end):
+                    end = inside + sign * LARGEST_MOVE * self.parameters.magnitude[j]
+                theta[j] = end
                 if not self.system.impossible(theta):
                     continue
-                for halving in range(1, HALVINGS_TO_BOUND):
-                    theta[j] = begin + (share + 0.5**halving) * end
-                    share += 0.0 if self.system.impossible(theta) else 0.5**halving
-                bounds[side, column] = begin + share * end
+                for _ in range(HALVINGS_TO_BOUND):
+                    theta[j] = middle = 0.5 * (inside + end)
+                    if self.system.impossible(theta):
+                        end = middle
+                    else:
+                        inside = middle
+                bounds[side, column] = inside
         return bounds[0], bounds[1]
 
     @property
@@ -260,9 +262,9 @@ class FitUnknowns:
             own = share * by_theta[body.columns]
             theta[body.columns] = body.moved(at.theta[body.columns], own)
         # Pieces of inertias that move together may leave the bounds of each.
-        impossible = self.system.impossible if self.bounded and len(self._of_inertias) else None
-        is_long = fraction > SMALLEST_FRACTION
-        if impossible and is_long and impossible(theta) and not impossible(at.theta):
+        impossible = self.system.impossible
+        is_guarded = self.bounded and len(self._of_inertias) and fraction > SMALLEST_FRACTION
+        if is_guarded and impossible(theta) and not impossible(at.theta):
             return self.moved(at, step, 0.5 * fraction)
         return UnknownValues(
             theta=theta,

@@ -309,11 +309,10 @@ def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
     problem, at = result.problem, result.solution.unknowns
     lower, upper = problem.bounds_at(at)
-    values, columns = problem.common_values(at), problem.parameter_of_column
-    near = np.minimum(values - lower, upper - values)
-    is_near = near < PHYSICAL_TOLERANCE * np.abs(values)
-    is_near &= (lower > problem.lower) | (upper < problem.upper)
-    distance[columns[is_near]] = 0.0
+    values = problem.common_values(at)
+    near = np.minimum(values - lower, upper - values) < PHYSICAL_TOLERANCE * np.abs(values)
+    near &= (lower > problem.lower) | (upper < problem.upper)
+    distance[problem.parameter_of_column[near]] = 0.0
     at_bound = np.flatnonzero(distance < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
     return names, bool((below | above).any())
