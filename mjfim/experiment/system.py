@@ -37,7 +37,7 @@ from mjfim.model.coordinates import (
     tangent_components,
 )
 from mjfim.model.loading import ModelSource
-from mjfim.model.parameter_writer import ParameterWriter
+from mjfim.model.parameter_writer import MOMENT_ROUNDING, ParameterWriter
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.terms.library import resolve_terms
 from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
@@ -444,9 +444,13 @@ class System:
         return model
 
     def impossible(self, theta: Array) -> list[int]:
-        """Indices of parameters whose values at theta: (p,) give a body an unphysical inertia."""
+        """Indices of parameters whose values at theta: (p,) give a body an unphysical inertia.
+
+        MuJoCo refuses every one, so that rounding counts against it.
+        """
+        writer = ParameterWriter(self.parameters)
         try:
-            faults = ParameterWriter(self.parameters).unphysical_bodies(self.plant.source, theta)
+            faults = writer.unphysical_bodies(self.plant.source, theta, -MOMENT_ROUNDING)
         except ModelError:
             return np.flatnonzero(self.parameters.needs_compile).tolist()
 

@@ -18,6 +18,7 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
+from mjfim.identification.assessment.poor_fit import touched_in
 from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
@@ -39,6 +40,7 @@ from mjfim.identification.starts import (
     begin_fit,
     choose_length,
     describe_extreme_value,
+    start_beyond_stops,
     start_from_segments,
 )
 from mjfim.information.null_space import (
@@ -68,6 +70,15 @@ SHARE_THAT_DETERMINES = 0.2
 # Difference of two costs that is not relevant. A step to the minimum that is 0.14 standard
 # deviations long lowers the cost by this much.
 SAME_COST = 1e-2
+
+# Largest number of times that a fit begins on the other side of a touch of a stop or a contact.
+MAX_TOUCH_ROUNDS = 4
+
+# Factor by which differences are shorter next to a jump of the residuals.
+SHORTER_DIFFERENCES = 0.01
+
+# How a search ends whose next step would lead over a jump of the residuals.
+AT_JUMP = "converged: next to a jump of the residuals, where a stop or a contact comes or goes"
 
 # Reason for an estimate over whole recordings, although segments predict left-out data better.
 DIVERGED = "the fit over this length diverged"
@@ -198,11 +209,7 @@ def fit_task(
     stated = search.task
     problem, held_out = _problems(stated, workers)
     if checks_log and stated.method != "newton":
-        channels, logs = stated.system.channels, stated.recordings
-        is_faulty = bool(describe_extreme_value(logs, channels.control_columns))
-        if not (is_faulty or any(any(contradiction_remarks(channels, each)) for each in logs)):
-            begin_stage("looking for gross errors of the recordings")
-            refuse_gross_error(problem.system, problem.recordings, stated.start)
+        _check_log(problem, stated)
     search, dynamics, instead = begin_fit(search, problem)
     task = search.task
     repeats = task.settings.segment_length is None and task.method != "newton"
@@ -247,6 +254,9 @@ def fit_task(
             fit = _restarted(search, problem, fit, is_spread=is_spread)
     fit = _with_solution(fit, *search.converged(fit.problem, fit.solution))
 
+    if repeats:
+        fit = _beyond_stops(search, fit)
+
     # Where the model does not explain whole recordings, the length of the segments matters.
     chooses_length = task.settings.segments is None and task.method != "newton"
     if chooses_length and not search.interrupted and is_doubtful(fit):
@@ -254,13 +264,43 @@ def fit_task(
     return fit
 
 
+def _check_log(problem: FitProblem, task: FitTask) -> None:
+    """Refuse a gross error of the recordings, where no other fault of theirs is known."""
+    channels, logs = task.system.channels, task.recordings
+    is_faulty = bool(describe_extreme_value(logs, channels.control_columns))
+    if not (is_faulty or any(any(contradiction_remarks(channels, each)) for each in logs)):
+        begin_stage("looking for gross errors of the recordings")
+        refuse_gross_error(problem.system, problem.recordings, task.start)
+
+
+def _beyond_stops(search: FitSearch, fit: FitResult) -> FitResult:
+    """The fit, or a better one where a joint stop or a contact acts.
+
+    The residuals jump there, and a search ends at the jump.
+    """
+    touches = touched_in(fit) if is_doubtful(fit) or fit.solution.stuck else ""
+    for _ in range(MAX_TOUCH_ROUNDS if touches else 0):
+        start = start_beyond_stops(search, fit) if is_doubtful(fit) else None
+        if start is None or search.interrupted:
+            break
+        fit = _fitted_from(search, fit.problem, start, "all data, beyond stops", fit) or fit
+    if touches and fit.solution.stuck and not is_doubtful(fit):
+        # Differences that straddle the jump are no slopes. The minimum may be at the jump itself.
+        finer = fit.problem.with_longer_differences(SHORTER_DIFFERENCES)
+        words = "all data, shorter differences"
+        fit = _fitted_from(search, finer, fit.solution.unknowns, words, fit) or fit
+        ended = replace(fit.solution, success=True, stuck=False, status=AT_JUMP)
+        fit = replace(fit, solution=ended if fit.solution.stuck else fit.solution)
+    return replace(fit, touches=touches)
+
+
 def is_doubtful(fit: FitResult) -> bool:
     """Whether a fit may have ended in a local minimum, or before a minimum."""
     quality, is_stated = fit.quality, fit.task.noise_is_stated
     if quality.unexplained or not (fit.solution.success or is_stated):
         return True
-    tests = quality.whiteness
-    return bool(misfit_reasons(quality.chi2, quality.dof, is_stated, tests, missing=()))
+    tests, worst = quality.whiteness, quality.worst_residual
+    return bool(misfit_reasons(quality.chi2, quality.dof, is_stated, tests, (), worst))
 
 
 def _with_solution(fit: FitResult, problem: FitProblem, solution: Solution) -> FitResult:

@@ -17,7 +17,7 @@ from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.assessment.residual_tests import RELEVANT_SIZE_RATIO
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
-from mjfim.identification.segments import spread_over_data
+from mjfim.identification.segments import SIGMA_PER_MEDIAN, begins_elsewhere, spread_over_data
 from mjfim.model.parameters import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
     SearchSettings,
@@ -53,6 +53,7 @@ class FitTask:
         start: (p,) parameters at which the search starts, inside the bounds if the method has any
             [theta-unit].
         settings: The table `[fit]` of the experiment.
+        elsewhere: Sentences about recordings that do not begin at the stated initial state.
     """
 
     system: System
@@ -61,6 +62,7 @@ class FitTask:
     method: Method
     start: Array
     settings: FitSpec
+    elsewhere: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -100,6 +102,14 @@ class FitTask:
 
         _require_held(system, settings.hold)
         refuse_same_data(recordings, held_out)
+        elsewhere = begins_elsewhere(system, [*recordings, *held_out])
+        if elsewhere:
+            # As where recordings begin at releases that only they show.
+            experiment, names = system.experiment, system.source.coordinates.deviations
+            free = {component.name: (-np.inf, np.inf) for component in names}
+            initial = experiment.initial.model_copy(update={"free": free})
+            experiment = experiment.model_copy(update={"initial": initial})
+            system = replace(system, experiment=experiment)
         return cls(
             system=system,
             recordings=tuple(recordings),
@@ -107,6 +117,7 @@ class FitTask:
             method=method,
             start=_start(system, method, start),
             settings=settings,
+            elsewhere=elsewhere,
         )
 
     @property
@@ -252,9 +263,6 @@ NOISE_TOLERANCE = 5e-4
 
 # Smallest estimated standard deviation, as a share of the stated one.
 MIN_NOISE_SHARE = 1e-3
-
-# Standard deviation of normal noise over its median absolute value.
-SIGMA_PER_MEDIAN = 1.4826
 
 # Factors by which the differences of the derivatives are longer where the residuals are rough, and
 # iterations with them.

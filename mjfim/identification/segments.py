@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -21,14 +22,15 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording
+from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording, align
 from mjfim.model.elements import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.terms.term import FILTERS
 from mjfim.model.units import actuator_gear
 from mjfim.plant.outputs import outputs_by_state
+from mjfim.records.trajectory import Recording
 
 # Columns of the friction of a `dcmotor` in its bias: Coulomb, static, Stribeck speed.
 FRICTION_COLUMNS = slice(3, 6)
@@ -199,6 +201,18 @@ MAX_DELAY_GROWTH = 5.0
 # five samples of a fast log would be too short.
 MAX_DELAY_SHARE = 0.025
 
+# Number of rows whose scatter shows the noise, number of rows at the begin whose mean is compared
+# with the stated initial state, and standard deviations of a clear difference.
+ROWS_OF_NOISE = 25
+ROWS_AT_BEGIN = 4
+CLEAR_SIGMAS = 5.0
+
+# Standard deviation of normal noise over its median absolute value.
+SIGMA_PER_MEDIAN = 1.4826
+
+# Share of their uncertainty by which parameters are moved for differences.
+SMALL_MOVE = 1e-3
+
 # Multiples of the golden ratio, modulo 1, spread evenly without a period.
 GOLDEN_RATIO = 0.6180339887498949
 
@@ -246,6 +260,58 @@ def has_free_starts(system: System) -> bool:
     # Recordings may begin at releases that only they show, where nothing else moves the start.
     moves = system.parameters.initial_state_derivative(system.space.nx).any()
     return is_measured or (bool(system.experiment.initial.free) and not moves)
+
+
+def begins_elsewhere(system: System, recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Sentences about recordings whose first rows contradict the stated initial state.
+
+    They may differ by the noise, stated or seen, and by what uncertain parameters explain.
+
+    Args:
+        system: The system.
+        recordings: Recordings in SI units.
+
+    Raises:
+        RecordingError: A recording cannot be used.
+    """
+    if has_free_starts(system) or system.experiment.initial.free:
+        return ()
+    parameters, model, outputs = system.parameters, system.model, system.outputs.outputs
+    # What accelerations and forces are at first depends on the control.
+    stages = np.repeat(model.sensor_needstage, model.sensor_dim)
+    late = int(mujoco.mjtStage.mjSTAGE_ACC)
+    is_known = [o.sensor is None or stages[o.sensor] < late for o in outputs]
+    sizes = np.array([p.prior or p.scale for p in parameters.parameters])
+    moved = np.concatenate([np.zeros((1, len(sizes))), SMALL_MOVE * np.diag(sizes)])
+    found = []
+    for recording in recordings:
+        aligned = align(system, recording.first_rows(ROWS_OF_NOISE))
+        rough = np.nan_to_num(np.diff(aligned.y, n=2, axis=0)) / np.sqrt(6.0)
+        scatter = SIGMA_PER_MEDIAN * np.median(np.abs(rough), axis=0)
+        sigma = np.maximum(scatter, system.noise.sigma)
+
+        # The mean over the first rows, as far as the model hardly moves.
+        samples = np.rint(aligned.t[:ROWS_AT_BEGIN] / aligned.dt).astype(int)
+        y, is_finite = system.plant.measure(parameters.guess + moved, aligned.ctrl[: samples[-1]])
+        y = y[:, samples]
+        is_still = np.minimum.accumulate(np.abs(y[0] - y[0, 0]) <= sigma) & is_known
+        counted = is_still & aligned.measured[: len(samples)]
+        count = np.maximum(counted.sum(axis=0), 1)
+        difference = np.where(counted, aligned.y[: len(samples)] - y[0], 0.0).sum(axis=0) / count
+        by_theta = np.where(counted & is_finite[1:, None, None], y[1:] - y[0], 0.0).sum(axis=1)
+        by_theta = np.linalg.norm(by_theta / count / SMALL_MOVE, axis=0)
+        limit = CLEAR_SIGMAS * np.hypot(sigma / np.sqrt(count), by_theta)
+        by = [
+            f"{outputs[j].name.partition(':')[2] or outputs[j].name} {difference[j]:+.2g} "
+            f"{outputs[j].unit}".rstrip()
+            for j in np.flatnonzero(np.abs(difference) > limit)
+        ]
+        if by:
+            found.append(
+                f"{Path(recording.name).name} does not begin where [initial] says ({listed(by)}): "
+                "its initial state was estimated from its first rows"
+            )
+    return tuple(found)
 
 
 def stated_segments(

@@ -24,6 +24,7 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import jackknife_std, student_quantile
+from mjfim.identification.assessment.robust_covariance import inverse_root
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
 from mjfim.identification.left_out import (
@@ -54,6 +55,9 @@ LARGEST_FACTOR = 10.0
 
 # Number of spread starts from which a short search is made: those that cost least.
 SEARCHED_STARTS = 3
+
+# Smallest and largest distance of starts on either side of a touch [standard deviations].
+NEAR_SCALES = (0.3, 10.0)
 
 # A short search shows which start leads down.
 SHORT_SEARCH = SearchSettings(max_iterations=4, relinearise_at_end=False)
@@ -281,6 +285,40 @@ def _best_spread_start(search: FitSearch, problem: FitProblem, theta: Array) -> 
         found = search.minimise(problem, problem.begin(starts[i]), SHORT_SEARCH, phase)
         if found is not None and found.cost < least:
             best, least = problem.theta(found.unknowns), found.cost
+    return best
+
+
+def start_beyond_stops(search: FitSearch, fit: FitResult) -> UnknownValues | None:
+    """The best of many starts near a fit whose motion touches stops or contacts.
+
+    Where a touch comes or goes, the residuals jump, and a search ends at the jump. Starts on either
+    side are drawn from the covariance of the fit, at several scales.
+
+    Args:
+        search: Searches of the identification.
+        fit: The fit.
+
+    Returns:
+        The result of short searches from the best starts; None where it costs no less.
+    """
+    problem, solution = fit.problem, fit.solution
+    condensed = solution.condensed
+    root = inverse_root(condensed.information())
+    rng = np.random.default_rng(search.task.settings.seed)
+    size = np.sqrt(max(fit.quality.chi2 / fit.quality.dof, 1.0))
+    begins = []
+    for scale in size * np.geomspace(*NEAR_SCALES, SPREAD_STARTS):
+        common = scale * root @ rng.standard_normal(root.shape[1])
+        step = condensed.step_to(common, 0.0, condensed.column_norms)
+        begins.append(problem.moved(solution.unknowns, step, 1.0))
+    costs = [problem.cost(begin) for begin in begins]
+    best, least = None, solution.cost
+    for i in np.argsort(costs)[:SEARCHED_STARTS].tolist():
+        if not np.isfinite(costs[i]) or search.interrupted:
+            break
+        found = search.minimise(problem, begins[i], SHORT_SEARCH, f"start {i + 1} near stops")
+        if found is not None and found.cost < least:
+            best, least = found.unknowns, found.cost
     return best
 
 

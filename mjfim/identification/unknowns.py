@@ -20,12 +20,21 @@ from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unkno
 from mjfim.identification.segments import Segment
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
+from mjfim.model.targets import InertiaField, ModelField
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 # Standard deviation of the prior on a free initial state, relative to the natural sizes of the
 # state. This weak prior keeps components finite that no output determines.
 FREE_START_SIGMA = 1e3
+
+# Largest move of a piece of an inertia without a bound [magnitudes], and halvings of a move until
+# its body is physical.
+LARGEST_MOVE = 100.0
+HALVINGS_TO_BOUND = 16
+
+# Smallest fraction of a step that is halved.
+SMALLEST_FRACTION = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,6 +132,51 @@ class FitUnknowns:
         """(c,) upper bounds of the common unknowns [theta-unit]."""
         return self.parameters.upper[self.parameter_of_column] if self.bounded else self._infinite
 
+    @cached_property
+    def _of_inertias(self) -> np.ndarray:
+        """Common columns of shared pieces of inertias, which may make a body unphysical."""
+        columns = []
+        whole = [body.columns for body in self.shared_bodies]
+        for column, j in enumerate(self.shared.tolist()):
+            for target in self.parameters.parameters[j].targets:
+                field = target.field
+                if isinstance(field, ModelField):
+                    has_mass = field.array == "body_mass" and not self.lower[column] > 0.0
+                    columns += [column] * (has_mass or field.array == "body_inertia")
+                elif isinstance(field, InertiaField) and field.parametrisation != "logcholesky":
+                    columns += [column] * (not np.isin(j, whole))
+        return np.unique(np.array(columns, dtype=np.intp))
+
+    def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
+        """Bounds of each common unknown where the others stay: the stated ones and physical ones.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (c,) lower and (c,) upper bounds [theta-unit].
+        """
+        bounds = np.array([self.lower, self.upper])
+        if not self.bounded or not len(self._of_inertias) or self.system.impossible(at.theta):
+            return bounds[0], bounds[1]
+        for column in self._of_inertias.tolist():
+            j = self.shared[column]
+            for side, sign in enumerate((-1.0, 1.0)):
+                theta, inside, end = np.array(at.theta), at.theta[j], bounds[side, column]
+                if not np.isfinite(end):
+                    end = inside + sign * LARGEST_MOVE * self.parameters.magnitude[j]
+                theta[j] = end
+                if not self.system.impossible(theta):
+                    continue
+                for _ in range(HALVINGS_TO_BOUND):
+                    theta[j] = middle = 0.5 * (inside + end)
+                    if self.system.impossible(theta):
+                        end = middle
+                    else:
+                        inside = middle
+                bounds[side, column] = inside
+        return bounds[0], bounds[1]
+
     @property
     def _infinite(self) -> Array:
         """(c,) upper bounds where there are none."""
@@ -207,6 +261,11 @@ class FitUnknowns:
         for body in bodies:
             own = share * by_theta[body.columns]
             theta[body.columns] = body.moved(at.theta[body.columns], own)
+        # Pieces of inertias that move together may leave the bounds of each.
+        impossible = self.system.impossible
+        is_guarded = self.bounded and len(self._of_inertias) and fraction > SMALLEST_FRACTION
+        if is_guarded and impossible(theta) and not impossible(at.theta):
+            return self.moved(at, step, 0.5 * fraction)
         return UnknownValues(
             theta=theta,
             private=at.private + fraction * step.private,

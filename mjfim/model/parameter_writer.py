@@ -110,13 +110,15 @@ class ParameterWriter:
             mocap.put(model, mocap.start)
 
     def unphysical_bodies(
-        self, base: PlantModel | Any, theta: Array
+        self, base: PlantModel | Any, theta: Array, rounding: float = MOMENT_ROUNDING
     ) -> list[tuple[tuple[int, ...], str]]:
         """Bodies whose inertia at theta is unphysical.
 
         Args:
             base: A `PlantModel`, or an MjModel where nothing needs a compile.
             theta: (p,) values.
+            rounding: Share of the largest principal moment by which it may exceed the sum of the
+                others.
 
         Returns:
             For each of these bodies the indices of the parameters that determine its inertia, and
@@ -126,6 +128,7 @@ class ParameterWriter:
             ModelError: MuJoCo refuses to compile the values.
         """
         columns_of_body: dict[int, list[int]] = {}
+        of_moments = set[int]()
         for j, parameter in enumerate(self._parameters.parameters):
             for target in parameter.targets:
                 field = target.field
@@ -133,6 +136,8 @@ class ParameterWriter:
                     columns_of_body.setdefault(field.body, []).append(j)
                 elif isinstance(field, ModelField) and field.array in ("body_mass", "body_inertia"):
                     columns_of_body.setdefault(field.rows[0], []).append(j)
+                    if field.array == "body_inertia":
+                        of_moments.add(field.rows[0])
 
         model = copy.copy(self.base(base, theta))
         parametrised = {
@@ -143,7 +148,10 @@ class ParameterWriter:
 
         found = []
         for body, columns in columns_of_body.items():
-            fault = _inertia_fault(model, body, *parametrised.get(body, ("", None)))
+            # Moments that are no parameters are those of a model that MuJoCo has compiled.
+            kind, values = parametrised.get(body, ("", None))
+            allowed = rounding if kind or body in of_moments else np.inf
+            fault = _inertia_fault(model, body, kind, values, allowed)
             if fault:
                 name = element_name(model, "body", body)
                 found.append((tuple(dict.fromkeys(columns)), f"body {name!r} has {fault}"))
@@ -213,7 +221,7 @@ class ParameterWriter:
                     write_element(spec, source.model, source.model, target.path, number)
 
 
-def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> str:
+def _inertia_fault(model: Any, body: int, kind: str, values: Array | None, rounding: float) -> str:
     """Reason why this inertia is unphysical, in words; empty where it is physical.
 
     A body that is welded to bodies with mass may be massless.
@@ -223,13 +231,13 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> st
         body: Number of the body.
         kind: Parametrisation of its inertia; empty where the model holds all of it.
         values: (10,) coordinates in the parametrisation; None where the model holds all of them.
+        rounding: As in `unphysical_bodies`.
     """
     if kind == "logcholesky":
         return ""
 
     mass = float(model.body_mass[body])
     moments = np.sort(model.body_inertia[body])
-    excess = 0.0
 
     welded = model.body_weldid == model.body_weldid[body]
     welded[body] = False
@@ -244,8 +252,8 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> st
 
     if values is not None:
         moments = np.linalg.eigvalsh(INERTIA_PARAMETRISATIONS[kind].inertia(values).inertia)
-        excess = float(moments[2] - moments[0] - moments[1])
-    if moments[0] >= least and excess <= MOMENT_ROUNDING * moments[2]:
+    excess = float(moments[2] - moments[0] - moments[1])
+    if moments[0] >= least and (not moments[2] or excess / moments[2] <= rounding):
         return ""
 
     listed = ", ".join(f"{moment:.4g}" for moment in moments)

@@ -238,6 +238,9 @@ class Problem(Protocol):
     def upper(self) -> Array:
         """(c,) upper bounds of the common unknowns, inf without a bound."""
 
+    def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
+        """(c,) lower and (c,) upper bounds of each common unknown where the others stay."""
+
     def cost(self, at: UnknownValues) -> float:
         """The cost, up to a constant.
 
@@ -605,8 +608,7 @@ class _Search:
         """Minimiser of the damped linearised cost, within the bounds where the search is damped."""
         if self.settings.damped:
             values = self.problem.common_values(self.unknowns)
-            lower = self.problem.lower - values
-            upper = self.problem.upper - values
+            lower, upper = (bound - values for bound in self.problem.bounds_at(self.unknowns))
         else:
             upper = np.full(self.condensed.common_count, np.inf)
             lower = -upper

@@ -88,7 +88,7 @@ def first_active_constraint(
         The sample and descriptions of everything that acts there, or None if nothing ever acts.
     """
     for k, data in forward_samples(model, trajectory, range(trajectory.samples)):
-        constraints = sorted(set(_constraints(model, data)))
+        constraints = sorted(set(acting_constraints(model, data)))
         clamps = _force_ranges(model, clamped_actuators(model, data))
         if constraints or clamps:
             return k, (*constraints, *clamps)
@@ -129,7 +129,7 @@ def active_constraints(
     """
     constraints, clamped = set[str](), set[int]()
     for _, data in forward_samples(model, trajectory, samples):
-        constraints.update(_constraints(model, data))
+        constraints.update(acting_constraints(model, data))
         clamped.update(clamped_actuators(model, data))
     return (*sorted(constraints), *_force_ranges(model, clamped))
 
@@ -154,7 +154,7 @@ def _force_ranges(model: Any, actuators: Iterable[int]) -> list[str]:
     return [f"force range of {names[actuator]}" for actuator in sorted(actuators)]
 
 
-def _constraints(model: Any, data: Any) -> Iterator[str]:
+def acting_constraints(model: Any, data: Any) -> Iterator[str]:
     """Descriptions of all contacts and of the frictions and limits that act."""
     for contact in data.contact[: data.ncon]:
         names = [

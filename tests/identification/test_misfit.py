@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import mjfim
 from mjfim.identification.assessment.residual_tests import (
     autocorrelated,
     is_larger_than_noise,
@@ -14,8 +17,11 @@ from mjfim.identification.assessment.residual_tests import (
     misfit_reasons,
     worst_residual,
 )
+from mjfim.output.page import Level
+from mjfim.output.pages.estimate import estimate_page
 from mjfim.records.estimate import Whiteness, WorstResidual
 from tests.support.numerics import Array
+from tests.support.paths import MODELS
 
 NAMES = ("angle", "speed", "force")
 
@@ -188,10 +194,13 @@ def test_autocorrelation_matters_where_it_is_large_enough() -> None:
 def test_reasons_in_sentences() -> None:
     """There is one sentence for each cause, and none for the stated noise."""
     assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
-    assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (
-        "residuals are 2.00 times the stated noise",
-    )
-    assert misfit_reasons(4000.0, 1000, False, [seen()], ()) == (), (
+    assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (), "white: larger noise"
+    burst = WorstResidual(output="y", recording="log", begin=0.0, end=0.1, size=9.0, share=0.5)
+    few = replace(seen(), count=20)
+    larger = ("residuals are 2.00 times the stated noise",)
+    assert misfit_reasons(4000.0, 1000, True, [seen()], (), burst) == larger
+    assert misfit_reasons(4000.0, 1000, True, [few], ()) == larger
+    assert misfit_reasons(4000.0, 1000, False, [seen()], (), burst) == (), (
         "where sigmas are estimated, size tells nothing"
     )
     reasons = misfit_reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
@@ -207,3 +216,32 @@ def test_reasons_in_sentences() -> None:
     )
     lacking = misfit_reasons(1000.0, 1000, True, [seen()], ["dry friction"])
     assert len(lacking) == 1 and "model lacks" in lacking[0]
+
+
+@pytest.mark.parametrize(
+    ("filtered", "ratio", "said"),
+    [
+        (False, 2.05, "the noise is 2.0"),
+        (False, 0.5, "the stated σ is too large"),
+        pytest.param(True, 2.05, "misfit", marks=pytest.mark.slow),
+    ],
+)
+def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, said: str) -> None:
+    """The verdict says the size; coloured residuals remain a misfit."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = experiment.replace(noise={"state": 0.01}, fit={"bootstrap": 0})
+    control = 5.0 * np.sin(0.04 * np.arange(400))[:, None]
+    log, clean = (
+        mjfim.simulate(experiment.replace(noise={"state": size}), control) for size in (0.01, 1e-9)
+    )
+    noise = ratio * (log.y - clean.y)
+    if filtered:
+        noise[1:] = (noise[1:] + noise[:-1]) / np.sqrt(2.0)
+    found = mjfim.identify(experiment, [replace(log, y=clean.y + noise)], progress=False)
+    assert found.misfit == filtered
+    assert any(said in warning for warning in found.warnings)
+    verdict = estimate_page(found).verdict
+    assert (verdict.level is Level.GOOD) != filtered
+    assert (f"the noise is {np.sqrt(found.chi2 / found.dof):.2f} times" in verdict.text) == (
+        said.startswith("the noise")
+    )

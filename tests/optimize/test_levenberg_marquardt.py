@@ -88,6 +88,9 @@ class Analytic:
             common_rows=np.zeros((0, c + 1)),
         )
 
+    def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
+        return self.lower, self.upper
+
     def moved(self, at: UnknownValues, step: Step, length: float) -> UnknownValues:
         theta = np.clip(at.theta + length * step.common, self.lower, self.upper)
         return UnknownValues(theta=theta, private=at.private + length * step.private)

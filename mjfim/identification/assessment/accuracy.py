@@ -364,6 +364,7 @@ class FitResult:
         inverse_dynamics: The fit to the equation of motion from which the search started, or None.
         begun_instead: Where it began instead of the stated start, at which the model diverges, in
             words; empty where it does not diverge there.
+        touches: Stops and contacts that made the search begin anew near its result, in words.
     """
 
     task: FitTask
@@ -377,6 +378,7 @@ class FitResult:
     horizons: HorizonStudy | None = None
     inverse_dynamics: InverseDynamicsFit | None = None
     begun_instead: str = ""
+    touches: str = ""
 
     @property
     def theta(self) -> Array:

@@ -31,7 +31,6 @@ from mjfim.identification.assessment.robust_covariance import covariance_root
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.model.inertia import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.targets import ModelField
 from mjfim.records.estimate import Estimate, ParameterDraws
 from mjfim.records.events import begin_stage
 
@@ -366,7 +365,7 @@ def _physical_draws(
                 continue
             theta = np.array(estimate.theta)
             theta[drawn] = robot
-            if _is_physical(system, theta):
+            if not system.impossible(theta):
                 values[i], is_physical[row] = robot, True
         missing = missing[~is_physical]
         if not len(missing):
@@ -397,19 +396,3 @@ def _moved(
             return None
         robot[place] = body.moved(begin, step)
     return robot
-
-
-def _is_physical(system: System, theta: Array) -> bool:
-    """Whether all bodies have physical inertias at parameters theta: (p,)."""
-    if system.impossible(theta):
-        return False
-
-    # Principal moments that are parameters of their own need a test: of a rigid body, no moment
-    # exceeds the sum of the others, and MuJoCo refuses an MJCF in which one does.
-    fields = [target.field for p in system.parameters.parameters for target in p.targets]
-    moments_of = [f for f in fields if isinstance(f, ModelField) and f.array == "body_inertia"]
-    bodies = sorted({field.rows[0] for field in moments_of})
-    if not bodies:
-        return True
-    moments = np.sort(system.model_at(theta).body_inertia[bodies], axis=1)
-    return bool((moments[:, 2] <= moments[:, 0] + moments[:, 1]).all())

@@ -11,10 +11,16 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError
+from mjfim.errors import SimulationDivergedError, listed
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segments import MIN_SAMPLES
+from mjfim.model.variants import allows_dry_friction_only
 from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.plant.active_constraints import acting_constraints, forward_samples
+
+# Beginnings of the descriptions of what a motion touches.
+TOUCHES = ("contact ", "limit of ", "friction or limit of ")
 
 # Largest number of samples of a motion along which the amplification is computed.
 MAX_SAMPLES = 20_000
@@ -55,6 +61,26 @@ def sentence_about_instability(amplification: float, length: float, recommended:
         "free initial states, over which it typically grows less than "
         f"{GOOD_AMPLIFICATION:.0f}-fold"
     )
+
+
+def touched_in(fit: FitResult) -> str:
+    """Stops and contacts that act along the fitted motions, in words; empty without any."""
+    problem, at = fit.problem, fit.solution.unknowns
+    model, found = problem.system.plant.model(problem.theta(at)), dict[str, int]()
+    if allows_dry_friction_only(model):
+        return ""
+    samples = 0
+    for i in range(len(problem.recordings)):
+        motion = problem.motion(at, i, max(MAX_SAMPLES - samples, 1))
+        if motion is None:
+            continue
+        samples += motion.samples
+        for _, data in forward_samples(model, motion, range(motion.samples)):
+            for name in set(acting_constraints(model, data)):
+                if name.startswith(TOUCHES):
+                    found[name] = found.get(name, 0) + 1
+    found_in = [f"{name} in {n} of {samples} samples" for name, n in found.items()]
+    return listed(found_in) if found_in else ""
 
 
 def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> str:

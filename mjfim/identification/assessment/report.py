@@ -20,6 +20,8 @@ from mjfim.identification.assessment.honest_covariance import with_honest_covari
 from mjfim.identification.assessment.poor_fit import unpredictable_motion
 from mjfim.identification.assessment.recording_comparison import compare_recordings
 from mjfim.identification.assessment.residual_tests import (
+    are_white,
+    is_larger_than_noise,
     is_smaller_than_noise,
     misfit_reasons,
 )
@@ -32,6 +34,7 @@ from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.units import FORCE_UNITS, control_unit
 from mjfim.parallel.budget import Budget
+from mjfim.plant.outputs import Noise
 from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
@@ -111,6 +114,9 @@ IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
 # at the bound.
 BOUND_TOLERANCE = 1e-6
 
+# Distance from the last physical value, relative to the value, at which an inertia is at a bound.
+PHYSICAL_TOLERANCE = 1e-3
+
 
 # Longest list of remarks on poorly known parameters [characters].
 REMARKS_TEXT = 400
@@ -166,17 +172,28 @@ def estimate_from(
         begin_stage("looking for terms that the model lacks")
         tests = TermTests()
         if not (budget.stop.requested or quality.unexplained):
-            found = find_missing_terms(problem, task.recordings, solution.unknowns)
+            # Terms are compared with the noise that the residuals show.
+            tested, noise = problem, problem.noise
+            is_larger = is_larger_than_noise(quality.chi2, quality.dof)
+            if is_larger and are_white(quality.whiteness):
+                seen = quality.chi2 / quality.dof * noise.covariance
+                tested = problem.with_noise(Noise(covariance=seen, strides=noise.strides))
+            found = find_missing_terms(tested, task.recordings, solution.unknowns)
             tests = TermTests() if budget.stop.requested else found
     tests = tests.without(refuted or ())
     predictions = _predictions(result, budget)
     reasons = misfit_reasons(
-        quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, tests.named
+        quality.chi2,
+        quality.dof,
+        task.noise_is_stated,
+        quality.whiteness,
+        tests.named,
+        quality.worst_residual,
     )
 
     begin_stage("computing the intervals")
     accuracy = result.accuracy
-    at_bound, outside = _at_bounds(parameters, result.theta, task.settings.hold)
+    at_bound, outside = _at_bounds(result)
     comparison = compare_recordings(result)
 
     undetermined = accuracy.singular or accuracy.single_unidentifiable
@@ -290,20 +307,25 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
     )
 
 
-def _at_bounds(
-    parameters: ParameterSet, theta: Array, held: Sequence[str]
-) -> tuple[tuple[str, ...], bool]:
+def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     """Names of the parameters at a bound or beyond it, and whether any is beyond.
 
-    Those that are held are where the user wants them.
+    Those that are held are where the user wants them. A bound of an inertia may be the last value
+    at which its body is physical.
     """
+    parameters, theta, held = result.task.system.parameters, result.theta, result.task.settings.hold
     tolerance = BOUND_TOLERANCE * parameters.magnitude
     below = theta < parameters.lower - tolerance
     above = theta > parameters.upper + tolerance
 
-    distance_below = theta - parameters.lower
-    distance_above = parameters.upper - theta
-    at_bound = np.flatnonzero(np.minimum(distance_below, distance_above) < tolerance)
+    distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
+    problem, at = result.problem, result.solution.unknowns
+    lower, upper = problem.bounds_at(at)
+    values = problem.common_values(at)
+    near = np.minimum(values - lower, upper - values) < PHYSICAL_TOLERANCE * np.abs(values)
+    near &= (lower > problem.lower) | (upper < problem.upper)
+    distance[problem.parameter_of_column[near]] = 0.0
+    at_bound = np.flatnonzero(distance < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
     return names, bool((below | above).any())
 
@@ -411,10 +433,16 @@ def _limits_of_search(
     result: FitResult, at_bound: Sequence[str], reasons: Sequence[str], *, interrupted: bool
 ) -> Iterator[str]:
     """Warnings about the start, the end, and what the recordings do not determine."""
+    yield from result.task.elsewhere
     if result.begun_instead:
         yield (
             f"the model diverges at the start ({values_of_start(result.task)}): the search began "
             f"{result.begun_instead} instead"
+        )
+    if result.touches:
+        yield (
+            f"stops or contacts act: {result.touches}. The residuals jump where a touch comes or "
+            "goes; shorter segments (fit.segments) make the fit easier"
         )
     if interrupted and not result.solution.interrupted:
         yield "interrupted after the search: there are no predictions of data that were not fitted"
@@ -423,9 +451,12 @@ def _limits_of_search(
     if at_bound:
         yield f"at a bound: {listed(at_bound)}; formal standard deviations are not valid there"
     chi2, dof = result.quality.chi2, result.quality.dof
-    if is_smaller_than_noise(chi2, dof) and result.task.noise_is_stated and not reasons:
-        ratio = np.sqrt(chi2 / dof)
+    ratio = np.sqrt(chi2 / dof)
+    is_judged = result.task.noise_is_stated and not reasons
+    if is_judged and is_smaller_than_noise(chi2, dof):
         yield f"residuals are only {ratio:.2f} times the stated noise: the stated σ is too large"
+    if is_judged and is_larger_than_noise(chi2, dof):
+        yield f"the noise is {ratio:.2f} times what you stated; the intervals use it"
 
 
 def _contradictions(result: FitResult, comparison: RecordingComparison | None) -> Iterator[str]:

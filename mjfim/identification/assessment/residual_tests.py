@@ -73,6 +73,13 @@ PEAK_RATIO = 1.5
 # Neighbouring windows belong to the peak if their root mean square is at least this share of it.
 PEAK_SHARE = 0.5
 
+# Root mean square of the largest interval over that of all residuals, above which they are no noise
+# that is alike everywhere.
+LOCAL_RATIO = 3.0
+
+# Smallest number of residuals of an output that can be called white.
+MIN_VALUES_OF_WHITE = 50
+
 # Number of lags of the Ljung-Box test.
 LAGS = 20
 
@@ -142,14 +149,24 @@ def autocorrelated(tests: Sequence[Whiteness]) -> tuple[Whiteness, ...]:
     return tuple(sorted(found, key=lambda test: -test.inflation))
 
 
+def are_white(tests: Sequence[Whiteness]) -> bool:
+    """Whether residuals, by the tests of their outputs, are white and enough to tell."""
+    is_enough = all(not 0 < test.count < MIN_VALUES_OF_WHITE for test in tests)
+    return is_enough and not autocorrelated(tests)
+
+
 def misfit_reasons(
     chi2: float,
     dof: int,
     noise_is_stated: bool,
     tests: Sequence[Whiteness],
     missing: Sequence[object],
+    worst: WorstResidual | None = None,
 ) -> tuple[str, ...]:
-    """Reasons why residuals are not the expected noise.
+    """Reasons why residuals are no white noise.
+
+    White residuals that are larger than the stated noise are larger noise, unless they are too few
+    to tell, or large in one interval only.
 
     Args:
         chi2: Sum of squared whitened residuals.
@@ -157,15 +174,19 @@ def misfit_reasons(
         noise_is_stated: Whether the noise was stated rather than estimated from the residuals.
         tests: Test of every output.
         missing: Terms that would explain residuals.
+        worst: Interval in which residuals are largest; None without residuals.
 
     Returns:
-        Sentences; none where the residuals are the expected noise.
+        Sentences; none where the residuals are white noise.
     """
     reasons = []
-    if noise_is_stated and is_larger_than_noise(chi2, dof):
-        reasons.append(f"residuals are {np.sqrt(chi2 / dof):.2f} times the stated noise")
-
+    size = np.sqrt(chi2 / dof)
     found = autocorrelated(tests)
+    is_noise = are_white(tests) and not missing
+    is_local = worst is not None and worst.size > LOCAL_RATIO * size
+    if noise_is_stated and is_larger_than_noise(chi2, dof) and (is_local or not is_noise):
+        reasons.append(f"residuals are {size:.2f} times the stated noise")
+
     if found:
         listed = [f"{test.output} ({_describe(test)})" for test in found[:MAX_LISTED_OUTPUTS]]
         more = len(found) - len(listed)
@@ -439,14 +460,15 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
         if not len(errors):
             continue
 
-        # Residuals that are nearly as large as the motion, and larger than the noise.
+        # Residuals that are nearly as large as the motion, and larger than the noise, but no noise.
         rms[name] = float(np.sqrt(np.mean(errors**2)))
         values = [
             recording.y[mask[:, j], j]
             for recording, mask in zip(problem.recordings, problem.masks, strict=True)
         ]
         large = rms[name] > UNEXPLAINED_SHARE * float(np.std(np.concatenate(values)))
-        if large and float(np.nanmean(np.concatenate(series) ** 2)) > 1.0 / UNEXPLAINED_SHARE**2:
+        large &= whiteness[-1].variance > 1.0 / UNEXPLAINED_SHARE**2
+        if large and not are_white(whiteness[-1:]):
             unexplained.append(name)
 
     return FitQuality(

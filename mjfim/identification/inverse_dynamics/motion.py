@@ -20,7 +20,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.segments import measured_states
+from mjfim.identification.segments import SIGMA_PER_MEDIAN, measured_states
 from mjfim.model.coordinates import actuator_names, dof_names
 from mjfim.model.elements import element_name, is_rk4
 from mjfim.model.units import acts_at_joint
@@ -50,9 +50,6 @@ OUTLIER = 8.0
 
 # Rounds in which outliers are left out, at most: a spline through outliers hides smaller ones.
 MAX_OUTLIER_ROUNDS = 3
-
-# Standard deviation of normal noise over its median absolute value.
-SIGMA_PER_MEDIAN = 1.4826
 
 # Number of frequencies at which the noise of a derivative is integrated.
 FREQUENCIES = 400

@@ -13,6 +13,7 @@ import tomlkit
 from mjfim.arrays import NORMAL_95
 from mjfim.errors import first_ones, listed
 from mjfim.identification.assessment.accuracy import POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
+from mjfim.identification.assessment.residual_tests import is_larger_than_noise
 from mjfim.output.page import (
     IDENTIFIED,
     NOMINAL,
@@ -138,6 +139,8 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         )
         return Verdict(text, Level.DOUBTFUL)
     text = f"{model} explains the recordings: the residuals are {ratio:.2f} times the noise"
+    if is_larger_than_noise(estimate.chi2, estimate.dof):
+        text = f"{model} explains the recordings: the noise is {ratio:.2f} times what you stated"
     return Verdict(f"{text}{_worst_estimate(estimate)}.", Level.GOOD)
 
 
