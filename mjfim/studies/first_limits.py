@@ -1,0 +1,136 @@
+"""Limits within which a person would play a first motion: speeds, distances and bandwidth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
+from mjfim.model.clearance import GeomDistances, find_geom_pairs, with_floor
+from mjfim.model.coordinates import joint_names
+from mjfim.model.elements import translations, unique_names
+from mjfim.model.loading import ModelSource
+from mjfim.studies.first_motion import Start, TimeScale, driven_dofs
+
+# Derived limit of a speed, relative to the largest speed of the motion at rest, where that is
+# larger than the natural speed: a robot that sinks or falls keeps its limits.
+SPEED_ROOM = 2.0
+
+# Clearance, relative to the length of the robot. Pairs of bodies that are nearer than twice this
+# at rest are ignored.
+CLEARANCE_SHARE = 0.02
+
+# Bandwidth of the control in characteristic periods of the motion, and fewest periods of it within
+# the horizon.
+BANDWIDTH = 6.0
+FEWEST_PERIODS = 4.0
+
+# Largest number of configurations at rest whose distances are measured.
+MOST_CONFIGURATIONS = 20
+
+
+def resting_motion(model: Any, start: Start, horizon: float) -> tuple[Array, Array]:
+    """The motion under the resting control.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        start: Initial state and resting control.
+        horizon: Its duration [s].
+
+    Returns:
+        (n, nq) positions and (n, nv) velocities at every engine step, until the simulation ends or
+        diverges.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:], data.act[:], data.ctrl[:] = start.qpos, start.act, start.control
+    positions, velocities = [np.array(start.qpos)], [np.zeros(model.nv)]
+    for _ in range(round(horizon / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        if data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
+            break
+        positions.append(np.array(data.qpos))
+        velocities.append(np.array(data.qvel))
+    return np.stack(positions), np.stack(velocities)
+
+
+def playable_limits(
+    source: ModelSource, start: Start, times: TimeScale, length: float, stated: Mapping[str, float]
+) -> dict[str, Any]:
+    """Limits that the MJCF does not state, such that the robot at rest keeps them.
+
+    Speeds are those of a pendulum of the robot's length: they are limits of the driven joints.
+
+    Args:
+        source: The model.
+        start: Initial state and resting control.
+        times: Rate, horizon and period of the motion.
+        length: Length of the robot [m].
+        stated: Velocity limits that a URDF states by joint [m/s or rad/s].
+
+    Returns:
+        The keys `velocity`, `clearance`, `floor`, `ignored` and `bandwidth` of the table
+        `[limits]`; without those that nothing in the model can have.
+    """
+    model = source.model
+    positions, velocities = resting_motion(model, start, times.horizon)
+    natural = np.where(translations(model), length, 1.0) * 2.0 * np.pi / times.period
+    speeds = np.maximum(natural, SPEED_ROOM * np.abs(velocities).max(axis=0))
+    names = joint_names(model)
+    driven = driven_dofs(model)
+    derived = {
+        names[int(model.dof_jntid[dof])]: float(f"{speeds[dof]:.2g}")
+        for dof in (driven if not stated else ())
+    }
+    velocity: Any = dict(stated) or derived
+    if len(driven) == model.nv and len(set(derived.values())) == 1:
+        velocity = next(iter(derived.values()))
+
+    limits: dict[str, Any] = {"velocity": velocity} if velocity else {}
+    step = -(-len(positions) // MOST_CONFIGURATIONS)
+    limits |= _clearance(source, positions[::step], float(f"{CLEARANCE_SHARE * length:.1g}"))
+    bandwidth = max(BANDWIDTH / times.period, FEWEST_PERIODS / times.horizon)
+    if bandwidth < 0.5 * times.rate:
+        limits["bandwidth"] = float(f"{bandwidth:.2g}")
+    return limits
+
+
+def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:
+    """The least distance [m], a floor, and the pairs of bodies that are nearer at rest.
+
+    A robot above its base, without anything around it, gets a floor at the height of its base.
+
+    Args:
+        source: The model.
+        positions: (n, nq) positions at rest.
+        least: The least distance [m].
+    """
+    data, model = mujoco.MjData(source.model), source.model
+    data.qpos[:] = positions[0]
+    mujoco.mj_kinematics(model, data)
+    moves = model.body_weldid > 0
+    bases = set(model.body_parentid[moves].tolist()) - {0, *np.flatnonzero(moves).tolist()}
+    around = [b for b in model.geom_bodyid.tolist() if not moves[b] and b not in bases]
+    height = min((float(data.xpos[body, 2]) for body in bases), default=0.0)
+    stated: dict[str, Any] = {"clearance": least}
+    is_fixed = not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
+    lowest = data.geom_xpos[moves[model.geom_bodyid], 2].min(initial=np.inf)
+    if is_fixed and not around and lowest > height:
+        stated["floor"] = float(f"{height:.6g}")
+        model = with_floor(source, stated["floor"]).model
+    try:
+        pairs = find_geom_pairs(model, ())
+        distances = GeomDistances(model, pairs, 2.0 * least)
+    except ExperimentError:
+        return {}
+
+    nearest = distances(positions, slopes=False)[0].min(axis=0)
+    near = {name for name, d in zip(distances.columns, nearest, strict=True) if d < 2.0 * least}
+    if len(near) == len(nearest):
+        return {}
+    names = np.array(unique_names(model, "body"))[model.geom_bodyid]
+    ignored = {(names[p.first], names[p.second]): None for p in pairs if p.bodies in near}
+    return stated | ({"ignored": [[str(end) for end in each] for each in ignored]} if near else {})
