@@ -660,6 +660,8 @@ BEHIND = {
     "horizon": "duration of the experiment [s]",
     "cost.control": "the ranges bound the control; no weight is needed",
     "limits.velocity": "of driven joints [m/s or rad/s]",
+    "limits.position": "wider than in the MJCF, whose soft range the state at rest exceeds",
+    "limits.tendon_length": "wider than in the MJCF, whose soft range the state at rest exceeds",
     "limits.clearance": "between bodies [m]; ignored pairs are nearer at the start",
     "limits.floor": "height of a plane below the robot, which the MJCF does not have [m]",
     "limits.bandwidth": "of the controls [Hz]; a larger one gives more information",

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
+from mjfim.excitation.limits.limits import SOFT_SHARE
 from mjfim.model.clearance import GeomDistances, find_geom_pairs, with_floor
 from mjfim.model.coordinates import joint_names
 from mjfim.model.elements import translations, unique_names
@@ -19,6 +20,12 @@ from mjfim.studies.first_motion import Start, TimeScale, driven_dofs
 # Derived limit of a speed, relative to the largest speed of the motion at rest, where that is
 # larger than the natural speed: a robot that sinks or falls keeps its limits.
 SPEED_ROOM = 2.0
+
+# Room of a range that is exceeded at rest, relative to the excess.
+SOFT_ROOM = 4.0
+
+# Types of joints with one position.
+SINGLE = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 
 # Clearance, relative to the length of the robot. Pairs of bodies that are nearer than twice this
 # at rest are ignored.
@@ -33,7 +40,7 @@ FEWEST_PERIODS = 4.0
 MOST_CONFIGURATIONS = 20
 
 
-def resting_motion(model: Any, start: Start, horizon: float) -> tuple[Array, Array]:
+def resting_motion(model: Any, start: Start, horizon: float) -> tuple[Array, Array, Array]:
     """The motion under the resting control.
 
     Args:
@@ -42,19 +49,20 @@ def resting_motion(model: Any, start: Start, horizon: float) -> tuple[Array, Arr
         horizon: Its duration [s].
 
     Returns:
-        (n, nq) positions and (n, nv) velocities at every engine step, until the simulation ends or
-        diverges.
+        (n, nq) positions, (n, nv) velocities and (n, ntendon) lengths of tendons at every engine
+        step, until the simulation ends or diverges.
     """
     data = mujoco.MjData(model)
     data.qpos[:], data.act[:], data.ctrl[:] = start.qpos, start.act, start.control
-    positions, velocities = [np.array(start.qpos)], [np.zeros(model.nv)]
+    mujoco.mj_forward(model, data)
+    seen = [(data.qpos.copy(), data.qvel.copy(), data.ten_length.copy())]
     for _ in range(round(horizon / model.opt.timestep)):
         mujoco.mj_step(model, data)
         if data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
             break
-        positions.append(np.array(data.qpos))
-        velocities.append(np.array(data.qvel))
-    return np.stack(positions), np.stack(velocities)
+        seen.append((data.qpos.copy(), data.qvel.copy(), data.ten_length.copy()))
+    positions, velocities, lengths = (np.stack(each) for each in zip(*seen, strict=True))
+    return positions, velocities, lengths
 
 
 def playable_limits(
@@ -72,11 +80,10 @@ def playable_limits(
         stated: Velocity limits that a URDF states by joint [m/s or rad/s].
 
     Returns:
-        The keys `velocity`, `clearance`, `floor`, `ignored` and `bandwidth` of the table
-        `[limits]`; without those that nothing in the model can have.
+        Keys of the table `[limits]`, without those that nothing in the model can have.
     """
     model = source.model
-    positions, velocities = resting_motion(model, start, times.horizon)
+    positions, velocities, lengths = resting_motion(model, start, times.horizon)
     natural = np.where(translations(model), length, 1.0) * 2.0 * np.pi / times.period
     speeds = np.maximum(natural, SPEED_ROOM * np.abs(velocities).max(axis=0))
     names = joint_names(model)
@@ -90,12 +97,42 @@ def playable_limits(
         velocity = next(iter(derived.values()))
 
     limits: dict[str, Any] = {"velocity": velocity} if velocity else {}
+    limits |= _widened(model, positions, lengths)
     step = -(-len(positions) // MOST_CONFIGURATIONS)
     limits |= _clearance(source, positions[::step], float(f"{CLEARANCE_SHARE * length:.1g}"))
     bandwidth = max(BANDWIDTH / times.period, FEWEST_PERIODS / times.horizon)
     if bandwidth < 0.5 * times.rate:
         limits["bandwidth"] = float(f"{bandwidth:.2g}")
     return limits
+
+
+def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
+    """Ranges of joints and tendons that (n, nq) positions and (n, ntendon) lengths at rest exceed.
+
+    A stop is soft; the range is widened by some times the excess.
+    """
+    joints = np.flatnonzero(np.isin(model.jnt_type, SINGLE) & (model.jnt_limited > 0))
+    tendons = np.flatnonzero(model.tendon_limited)
+    names, places = joint_names(model), model.jnt_qposadr[joints]
+    found: dict[str, dict[str, list[float]]] = {}
+    for kind, owners, ranges, values in (
+        ("position", [names[i] for i in joints], model.jnt_range[joints], positions[:, places]),
+        (
+            "tendon_length",
+            [unique_names(model, "tendon")[i] for i in tendons],
+            model.tendon_range[tendons],
+            lengths[:, tendons],
+        ),
+    ):
+        for name, ends, each in zip(owners, ranges, values.T, strict=True):
+            low = float(min(each.min() - ends[0], 0.0))
+            high = float(max(each.max() - ends[1], 0.0))
+            excess, most = max(-low, high), SOFT_SHARE * float(ends[1] - ends[0])
+            if 0.0 < excess < most:
+                room = SOFT_ROOM * np.array([low, high])
+                wider = ends + np.clip(room, -most, most)
+                found.setdefault(kind, {})[name] = [float(f"{end:.6g}") for end in wider]
+    return {**found}
 
 
 def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:

@@ -604,3 +604,43 @@ def test_a_model_without_actuators_is_released(kind: str, tmp_path: Path) -> Non
     assert task.release is not None
     assert verify(task, task.initial).is_feasible
     assert "hinge_damping" in experiment.parameters
+
+
+HANGING = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="cup" pos="0 0 1">
+      <joint name="lift" type="slide" axis="0 0 1" damping="3" stiffness="20"/>
+      <geom size="0.02" mass="0.1" contype="0" conaffinity="0"/><site name="cup"/>
+      </body>
+    <body name="ball" pos="0 0 0.71">
+      <joint name="fall" type="slide" axis="0 0 1"/>
+      <geom size="0.02" mass="0.05" contype="0" conaffinity="0"/><site name="ball"/>
+    </body>
+  </worldbody>
+  <tendon><spatial name="string" limited="true" range="0 0.3">
+    <site site="ball"/><site site="cup"/></spatial></tendon>
+  <actuator><motor name="lift" joint="lift" ctrlrange="-5 5"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_soft_range_that_the_state_at_rest_exceeds_is_written_wider(tmp_path: Path) -> None:
+    """A ball hangs at a string that gives way; no motion could keep the range of the MJCF."""
+    path = tmp_path / "cup.xml"
+    path.write_text(HANGING, encoding="utf-8")
+    proposal, experiment = proposed(path, tmp_path)
+    assert not any("no motion about this start" in remark for remark in proposal.remarks)
+    low, high = experiment.limits.tendon_length["string"]
+    assert low == 0.0
+    assert 0.3 < high < 0.315
+    task = DesignTask.resolve(experiment)
+    assert verify(task, task.initial).is_feasible
+    # The string still acts along a design.
+    assert verify(task.relaxed(), task.relaxed().initial).is_feasible
+
+    # A range that is far wider than the MJCF's has no effect.
+    wide = experiment.replace(limits={"tendon_length": {"string": [-1.0, 1.0]}})
+    [limit] = [each for each in DesignTask.resolve(wide).limits if each.kind == "tendon_length"]
+    assert (limit.lower, limit.upper) == (0.0, 0.3)
