@@ -36,7 +36,7 @@ from mjfim.studies.first_candidates import (
     read_urdf,
     require_rate,
 )
-from mjfim.studies.first_limits import playable_limits
+from mjfim.studies.first_limits import playable_limits, played
 from mjfim.studies.first_motion import (
     FIRST_SHARE,
     SHRINKING,
@@ -76,6 +76,10 @@ WITHOUT_ROOM = ("control",)
 # break contacts are predictable for a short time only.
 LARGEST_AMPLIFICATION = 100.0
 SHORTEST_MOTION = 0.5
+
+# Number of disturbances of the start that are tried, and their size [sizes of the positions].
+DISTURBANCES = 4
+DISTURBANCE = 1e-4
 
 # Shortest horizon of a robot that falls out of its limits [characteristic periods], and the share
 # of the time until then that the horizon uses.
@@ -526,22 +530,27 @@ class _Refinement:
     def _predictable_samples(self, system: System, draft: Proposal) -> int:
         """Samples of the first motion until a small disturbance of the start has grown too much."""
         task = self._task(system, draft)
-        least = round(SHORTEST_MOTION * draft.times.period * draft.times.rate)
-        try:
-            A, _, _, _ = task.plant.derivatives.jacobians(task.theta, task.initial)
-        except SimulationDivergedError:
-            return draft.times.samples
+        model, substeps = self.source.model, task.system.grid.substeps
+        controls = np.repeat(task.control, substeps, axis=0)
+        sizes, change = position_sizes(model), np.zeros(model.nv)
+        rng = np.random.default_rng(0)
+        undisturbed = played(model, draft.start, controls)[0][substeps::substeps]
 
-        # Deviations of positions, in their sizes. Those of velocities grow at first where a servo
-        # is stiff.
-        nv, grown = self.source.model.nv, np.eye(A.shape[1])
-        sizes = position_sizes(self.source.model)
-        for k, transition in enumerate(A):
-            grown = transition @ grown
-            positions = grown[:nv, :nv] * (sizes / sizes[:, None])
-            if not np.linalg.norm(positions, 2) <= LARGEST_AMPLIFICATION:
-                return min(max(k, least), draft.times.samples)
-        return draft.times.samples
+        # A random direction has a share of the one that grows most. Only positions count:
+        # velocities grow at first where a servo is stiff.
+        samples, largest = len(undisturbed), LARGEST_AMPLIFICATION / np.sqrt(model.nv)
+        for _ in range(DISTURBANCES):
+            direction = rng.standard_normal(model.nv)
+            moved = DISTURBANCE * sizes * direction / np.linalg.norm(direction)
+            disturbed = played(model, draft.start, controls, moved)[0][substeps::substeps]
+            samples = min(samples, len(disturbed))
+            for k in range(samples):
+                mujoco.mj_differentiatePos(model, change, 1.0, undisturbed[k], disturbed[k])
+                if np.linalg.norm(change / sizes) > largest * DISTURBANCE:
+                    samples = k
+                    break
+        least = round(SHORTEST_MOTION * draft.times.period * draft.times.rate)
+        return min(max(samples, least), draft.times.samples)
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
         """Indices of the candidates that the chirp or the release identifies together.

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.excitation.limits.limits import SOFT_SHARE
+from mjfim.excitation.limits.limits import SOFT_KINDS, SOFT_SHARE, limits_of_model
 from mjfim.model.clearance import GeomDistances, find_geom_pairs, with_floor
 from mjfim.model.coordinates import joint_names
 from mjfim.model.elements import translations, unique_names
@@ -23,9 +23,6 @@ SPEED_ROOM = 2.0
 
 # Room of a range that is exceeded at rest, relative to the excess.
 SOFT_ROOM = 4.0
-
-# Types of joints with one position.
-SINGLE = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 
 # Clearance, relative to the length of the robot. Pairs of bodies that are nearer than twice this
 # at rest are ignored.
@@ -40,23 +37,29 @@ FEWEST_PERIODS = 4.0
 MOST_CONFIGURATIONS = 20
 
 
-def resting_motion(model: Any, start: Start, horizon: float) -> tuple[Array, Array, Array]:
-    """The motion under the resting control.
+def played(
+    model: Any, start: Start, controls: Array, moved: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """The motion in plain MuJoCo.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
-        start: Initial state and resting control.
-        horizon: Its duration [s].
+        start: Initial state.
+        controls: (n, nu) controls of the engine steps.
+        moved: (nv,) change of the initial positions; None without one.
 
     Returns:
-        (n, nq) positions, (n, nv) velocities and (n, ntendon) lengths of tendons at every engine
-        step, until the simulation ends or diverges.
+        (n+1, nq) positions, (n+1, nv) velocities and (n+1, ntendon) lengths of tendons; fewer rows
+        where the simulation diverges.
     """
     data = mujoco.MjData(model)
-    data.qpos[:], data.act[:], data.ctrl[:] = start.qpos, start.act, start.control
+    data.qpos[:], data.act[:] = start.qpos, start.act
+    if moved is not None:
+        mujoco.mj_integratePos(model, data.qpos, moved, 1.0)
     mujoco.mj_forward(model, data)
     seen = [(data.qpos.copy(), data.qvel.copy(), data.ten_length.copy())]
-    for _ in range(round(horizon / model.opt.timestep)):
+    for control in controls:
+        data.ctrl[:] = control
         mujoco.mj_step(model, data)
         if data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
             break
@@ -83,7 +86,8 @@ def playable_limits(
         Keys of the table `[limits]`, without those that nothing in the model can have.
     """
     model = source.model
-    positions, velocities, lengths = resting_motion(model, start, times.horizon)
+    resting = np.tile(start.control, (round(times.horizon / model.opt.timestep), 1))
+    positions, velocities, lengths = played(model, start, resting)
     natural = np.where(translations(model), length, 1.0) * 2.0 * np.pi / times.period
     speeds = np.maximum(natural, SPEED_ROOM * np.abs(velocities).max(axis=0))
     names = joint_names(model)
@@ -111,27 +115,17 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
 
     A stop is soft; the range is widened by some times the excess.
     """
-    joints = np.flatnonzero(np.isin(model.jnt_type, SINGLE) & (model.jnt_limited > 0))
-    tendons = np.flatnonzero(model.tendon_limited)
-    names, places = joint_names(model), model.jnt_qposadr[joints]
     found: dict[str, dict[str, list[float]]] = {}
-    for kind, owners, ranges, values in (
-        ("position", [names[i] for i in joints], model.jnt_range[joints], positions[:, places]),
-        (
-            "tendon_length",
-            [unique_names(model, "tendon")[i] for i in tendons],
-            model.tendon_range[tendons],
-            lengths[:, tendons],
-        ),
-    ):
-        for name, ends, each in zip(owners, ranges, values.T, strict=True):
-            low = float(min(each.min() - ends[0], 0.0))
-            high = float(max(each.max() - ends[1], 0.0))
-            excess, most = max(-low, high), SOFT_SHARE * float(ends[1] - ends[0])
-            if 0.0 < excess < most:
-                room = SOFT_ROOM * np.array([low, high])
-                wider = ends + np.clip(room, -most, most)
-                found.setdefault(kind, {})[name] = [float(f"{end:.6g}") for end in wider]
+    for limit in limits_of_model(model):
+        if limit.kind not in SOFT_KINDS or limit.is_magnitude:
+            continue
+        values = (positions if limit.kind == "position" else lengths)[:, limit.index]
+        ends = np.array([limit.lower, limit.upper])
+        excess = np.array([min(values.min() - ends[0], 0.0), max(values.max() - ends[1], 0.0)])
+        most = SOFT_SHARE * (ends[1] - ends[0])
+        if excess.any() and (np.abs(excess) < most).all():
+            wider = ends + np.clip(SOFT_ROOM * excess, -most, most)
+            found.setdefault(limit.kind, {})[limit.name] = [float(f"{end:.6g}") for end in wider]
     return {**found}
 
 
