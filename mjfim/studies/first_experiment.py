@@ -657,7 +657,10 @@ ABOVE = {
         'for example "qvel:<joint>" = [-1.0, 1.0].',
     ],
     "nuisance": ["The error of the release is unknown; the fit reads it from each log."],
-    "parameters": ["Unknown parameters. `mjfim list MODEL` lists every path."],
+    "parameters": [
+        f"Unknown parameters: at most {MOST_PARAMETERS} that the first motion identifies together,",
+        "one for equal joints of a large robot. `mjfim list MODEL` lists every path.",
+    ],
     "boundary": [
         'end = "rest" lets the motion end at a standstill; "free" gives more information.'
     ],

@@ -113,7 +113,7 @@ def playable_limits(
 def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
     """Ranges of joints and tendons that (n, nq) positions and (n, ntendon) lengths at rest exceed.
 
-    A stop is soft; the range is widened by some times the excess.
+    A stop is soft: where the start is outside, the range is widened by some times the excess.
     """
     found: dict[str, dict[str, list[float]]] = {}
     for limit in limits_of_model(model):
@@ -123,7 +123,8 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
         ends = np.array([limit.lower, limit.upper])
         excess = np.array([min(values.min() - ends[0], 0.0), max(values.max() - ends[1], 0.0)])
         most = SOFT_SHARE * (ends[1] - ends[0])
-        if excess.any() and (np.abs(excess) < most).all():
+        begins_outside = not limit.lower <= values[0] <= limit.upper
+        if begins_outside and (np.abs(excess) < most).all():
             wider = ends + np.clip(SOFT_ROOM * excess, -most, most)
             found.setdefault(limit.kind, {})[limit.name] = [float(f"{end:.6g}") for end in wider]
     return {**found}

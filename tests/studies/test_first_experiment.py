@@ -220,8 +220,13 @@ def test_a_urdf_gets_motors_and_keeps_its_limits(tmp_path: Path) -> None:
     assert model.actuator("shoulder").ctrlrange.tolist() == [-20.0, 20.0]
     assert experiment.limits.velocity == {"shoulder": 3.0, "elbow": 4.0}
     task = DesignTask.resolve(experiment)
-    assert verify(task, task.initial).is_feasible
-    assert proposal.boundary["start"] == "rest"
+    # Motors do not stop the first motion at its end; a design does.
+    margins = verify(task, task.initial).margins
+    assert {kind for kind, margin in margins.items() if margin < 0.0} <= {
+        "end_position",
+        "end_velocity",
+    }
+    assert proposal.boundary == {"start": "rest", "end": "rest"}
 
 
 def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Path) -> None:
