@@ -42,6 +42,14 @@ def init(
         str | None,
         typer.Option(metavar="BODY", help="Body that carries a load of unknown mass and place."),
     ] = None,
+    package: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=DIR",
+            help="Folder of a ROS package whose meshes a URDF names by package://; repeatable. "
+            "Others are found in ROS_PACKAGE_PATH and in the folders above the URDF.",
+        ),
+    ] = None,
     ask: Annotated[
         bool,
         typer.Option(
@@ -60,7 +68,12 @@ def init(
 
     file = output or Path(f"{model.stem}.toml")
     companion = file.with_name(f"{file.stem}_motors.xml")
-    wishes = Wishes(groups=_groups(parameters), payload=payload)
+    packages = {}
+    for name, _, place in (each.partition("=") for each in package or ()):
+        if not Path(place).is_dir() or not place:
+            raise ExperimentError(f"--package: needs NAME=DIR with a folder, not {name}={place}")
+        packages[name] = str(Path(place).resolve())
+    wishes = Wishes(groups=_groups(parameters), payload=payload, packages=packages)
     claim_file(file, [model], force=force)
     if is_urdf(model):
         claim_file(companion, [model], force=force)

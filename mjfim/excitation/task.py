@@ -12,7 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.limits.limits import Limit, limits_of
+from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task_parts import (
@@ -608,10 +608,14 @@ class DesignTask:
         if not stated.enforce:
             return None
 
+        # A stop acts inside of a limit that the file states wider than the MJCF.
+        model = self.system.model
+        own = {(each.kind, each.name): each for each in limits_of_model(model)}
         named: dict[str, set[str]] = defaultdict(set)
         for limit in self.limits:
-            named[limit.kind].add(limit.name)
-        model = self.system.model
+            stop = own.get((limit.kind, limit.name), limit)
+            if stop.lower <= limit.lower and limit.upper <= stop.upper:
+                named[limit.kind].add(limit.name)
 
         def chosen(names: tuple[str, ...], kind: str) -> tuple[int, ...]:
             """Numbers of the elements that have a limit of a kind."""

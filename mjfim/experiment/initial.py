@@ -217,7 +217,12 @@ def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> A
     if signal.offset is not None:
         offset = by_name("initial.control.offset", signal.offset, names, "actuator")
 
-    return offset + amplitude * _shape(signal, t, len(names))
+    shape = _shape(signal, t, len(names))
+    if signal.fade:
+        # Value and slope are zero at the end.
+        left = np.minimum((t[-1] - t) / signal.fade, 1.0)
+        shape *= (left**2 * (3.0 - 2.0 * left))[:, None]
+    return offset + amplitude * shape
 
 
 def _shape(signal: Signal, t: Array, nu: int) -> Array:
@@ -230,8 +235,8 @@ def _shape(signal: Signal, t: Array, nu: int) -> Array:
     if signal.kind == "chirp":
         first = signal.frequency
         last = signal.frequency_end or CHIRP_SPAN * first
-        sweeps = [scipy.signal.chirp(t, first * s, t[-1], last * s, phi=-90.0) for s in spread]
-        return np.stack(sweeps, axis=1)
+        cycles = first * t + 0.5 * (last - first) * t**2 / t[-1]
+        return np.asarray(np.sin(2.0 * np.pi * cycles[:, None] * spread))
 
     if signal.kind == "multisine":
         rng = np.random.default_rng(signal.seed)

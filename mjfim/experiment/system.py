@@ -27,6 +27,7 @@ from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
+from mjfim.model.clearance import with_floor
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import (
     ScalarJoint,
@@ -119,6 +120,8 @@ class System:
         _require_supported(source)
         source = source.extended(_terms_of(experiment, source.stated))
         source, laws = resolve_controllers(experiment, source)
+        if experiment.limits.floor is not None:
+            source = with_floor(source, experiment.limits.floor)
         require_units(experiment, source)
         model = source.model
 

@@ -226,6 +226,13 @@ class Signal(Section):
     seed: Integer = Field(
         default=0, ge=0, description="Seed of the random phases and weights of a multisine."
     )
+    fade: Seconds | None = Field(
+        default=None,
+        description=(
+            "Time at the end over which the signal fades to its offset [s], for a design that ends "
+            "at rest. Default: it does not fade."
+        ),
+    )
 
 
 class Initial(Section):

@@ -21,6 +21,7 @@ from mjfim.recordings.section import (
     Boolean,
     Finite,
     FiniteWithUnit,
+    Height,
     Hertz,
     Integer,
     Metres,
@@ -319,6 +320,13 @@ class Limits(Section):
             "measured by MuJoCo's geom distances. Default: distances are not limited."
         ),
     )
+    floor: Height | None = Field(
+        default=None,
+        description=(
+            "Height of a plane from which every geom of the robot keeps `clearance` [m], also "
+            "those that do not collide: a floor or a table that the MJCF does not have."
+        ),
+    )
     ignored: tuple[tuple[str, str], ...] = Field(
         default=(), description="Pairs of bodies that may come closer than `clearance`."
     )
@@ -338,13 +346,14 @@ class Limits(Section):
     )
 
     @model_validator(mode="after")
-    def _ignored_with_clearance(self) -> Limits:
-        """Refuse pairs that are ignored where distances are not limited."""
-        if self.ignored and self.clearance is None:
-            raise ValueError(
-                "ignored can only be given together with clearance: without it distances are not "
-                "limited"
-            )
+    def _distances_with_clearance(self) -> Limits:
+        """Refuse pairs and a floor where distances are not limited."""
+        for key, is_stated in (("ignored", bool(self.ignored)), ("floor", self.floor is not None)):
+            if is_stated and self.clearance is None:
+                raise ValueError(
+                    f"{key} can only be given together with clearance: without it distances are "
+                    "not limited"
+                )
         return self
 
 

@@ -46,7 +46,8 @@ class TimeGrid:
         if substeps is None:
             raise ExperimentError(
                 f"rate: at {rate:g} Hz, a sample is not a whole number of timesteps ({timestep:g} "
-                f"s); valid for example: {parts_of(1.0 / timestep)} Hz"
+                f"s); write one of {rates_near(1.0 / (rate * timestep), timestep)} Hz. A log keeps "
+                "its own rate, whatever `rate` is"
             )
         if substeps > MAX_SUBSTEPS:
             raise ExperimentError(
@@ -114,6 +115,12 @@ def whole_number(ratio: float) -> int | None:
     """A ratio of rates that is a whole number within the tolerance, or None."""
     n = round(ratio)
     return n if n >= 1 and abs(ratio - n) <= RATE_TOLERANCE * n else None
+
+
+def rates_near(steps: float, timestep: float) -> str:
+    """Rates [Hz] whose periods are whole numbers of timesteps [s] near a wanted one, in words."""
+    near = max(round(steps), 1)
+    return ", ".join(f"{1.0 / (k * timestep):.6g}" for k in (near + 1, near, near - 1) if k)
 
 
 def parts_of(rate: float) -> str:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.model.elements import geom_labels, model_length, unique_names
+from mjfim.model.loading import ModelSource
 
 # Array of indices.
 Indices = NDArray[np.intp]
@@ -287,6 +288,28 @@ def farthest_points(kind: int, size: Array, direction: Array) -> Array:
     return point
 
 
+# Name of the geom that stands for a floor which only an experiment states.
+FLOOR = "limits.floor"
+
+
+def with_floor(source: ModelSource, height: float) -> ModelSource:
+    """A model with a plane that touches nothing, for distances to it.
+
+    Args:
+        source: The model.
+        height: Height of the plane [m].
+    """
+    plane = {
+        "name": FLOOR,
+        "type": mujoco.mjtGeom.mjGEOM_PLANE,
+        "size": [0.0, 0.0, 1.0],
+        "pos": [0.0, 0.0, height],
+        "contype": 0,
+        "conaffinity": 0,
+    }
+    return source.with_elements((FLOOR, height), lambda spec: spec.worldbody.add_geom(**plane))
+
+
 @dataclass(frozen=True, kw_only=True)
 class GeomPair:
     """Two geoms that can come near each other.
@@ -371,6 +394,9 @@ class _Selection:
         self._contype = model.geom_contype.tolist()
         self._conaffinity = model.geom_conaffinity.tolist()
 
+        # Every geom that moves has a distance to a floor that only an experiment states.
+        self._floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, FLOOR)
+
         explicit = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         self._explicit = {frozenset(pair) for pair in explicit}
 
@@ -394,7 +420,7 @@ class _Selection:
         b = self._body[second]
         if not self.can_move(first) or self._weld[a] == self._weld[b]:
             return False
-        if frozenset((first, second)) in self._explicit:
+        if frozenset((first, second)) in self._explicit or second == self._floor:
             return True
 
         # Parent and child do not collide; a body that is fixed in the world is no parent.

@@ -223,12 +223,17 @@ def with_laws(source: ModelSource, numbers: Mapping[str, Mapping[str, float]]) -
     """
     if not numbers:
         return source
-    return source.with_numbers(
-        tuple(
-            (number_name(actuator), tuple(values[name] for name in (*DESCRIPTION, *NUMBERS)))
-            for actuator, values in numbers.items()
-        )
+    every = tuple(
+        (number_name(actuator), tuple(values[name] for name in (*DESCRIPTION, *NUMBERS)))
+        for actuator, values in numbers.items()
     )
+
+    def add(spec: Any) -> None:
+        """Add custom numbers, which MuJoCo ignores."""
+        for name, data in every:
+            spec.add_numeric(name=name, size=len(data), data=list(data))
+
+    return source.with_elements(every, add)
 
 
 def remove_numbers(spec: Any) -> None:

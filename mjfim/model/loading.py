@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from threading import Lock, RLock
+from types import MappingProxyType
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -16,17 +17,27 @@ import mujoco
 
 from mjfim.errors import ModelError, ModelWarning
 from mjfim.model.coordinates import ModelCoordinates
-from mjfim.model.model_files import PackedFiles, files_of_model, name_of
+from mjfim.model.model_files import (
+    PACKAGE,
+    PackedFiles,
+    files_of_model,
+    name_of,
+    package_file,
+)
 from mjfim.model.terms.term import StateLayout, Term, extended_spec
 from mjfim.parallel.shared_value import Kept
 
+# No folders of ROS packages.
+NO_PACKAGES: Mapping[str, str] = MappingProxyType({})
 
-def load_spec(path: Path, files: Any = None) -> Any:
+
+def load_spec(path: Path, files: Any = None, packages: Mapping[str, str] = NO_PACKAGES) -> Any:
     """MjSpec of an MJCF or URDF file. What MuJoCo warns of is told once.
 
     Args:
         path: The file.
         files: Virtual file system (`mujoco.MjVfs`) that holds it; None for the disk.
+        packages: Folders of ROS packages by name, besides those that the file states.
 
     Raises:
         ModelError: The file is absent or no model, or MuJoCo cannot read it.
@@ -48,8 +59,47 @@ def load_spec(path: Path, files: Any = None) -> Any:
     # MuJoCo takes NaN for a number that is not stated, or computes with it.
     if any("NaN" in warning for warning in found):
         raise ModelError(f"{path}: the model contains NaN; every number must be finite")
-    tell_once(path, found)
+    tell_once(path, (f"MuJoCo warns: {text}" for text in found))
+    resolve_packages(spec, path, files, packages)
     return spec
+
+
+def resolve_packages(
+    spec: Any, path: Path, files: Any = None, packages: Mapping[str, str] = NO_PACKAGES
+) -> None:
+    """Find the meshes that a URDF states as files of ROS packages, in place.
+
+    Geoms whose mesh is not found are left out, and a warning says so.
+
+    Args:
+        spec: The spec (`mujoco.MjSpec`), which may state the folders of packages as custom texts.
+        path: The file that it was read from.
+        files: Virtual file system (`mujoco.MjVfs`) that holds the meshes; None for the disk.
+        packages: Folders of ROS packages by name, besides those that the spec states.
+    """
+    stated = {text.name: text.data for text in spec.texts if text.name.startswith(PACKAGE)}
+    packages = {name.removeprefix(PACKAGE): each for name, each in stated.items()} | dict(packages)
+    absent: dict[str, list[str]] = {}
+    for mesh in spec.meshes:
+        if not mesh.file.startswith(PACKAGE):
+            continue
+        found = package_file(mesh.file, path, packages, () if files is None else files)
+        if found is None:
+            absent.setdefault(mesh.file.split("/")[2], []).append(mesh.name)
+        else:
+            mesh.file = found.as_posix()
+    names = {name for each in absent.values() for name in each}
+    for geom in [geom for geom in spec.geoms if geom.meshname in names]:
+        spec.delete(geom)
+    for mesh in [mesh for mesh in spec.meshes if mesh.name in names]:
+        spec.delete(mesh)
+    for package, meshes in absent.items():
+        message = (
+            f"meshes of the package {package!r} are not found and left out ({len(meshes)}); masses "
+            f"and inertias of links do not change. State its folder: `mjfim init URDF --package "
+            f"{package}=DIR`, or in ROS_PACKAGE_PATH"
+        )
+        tell_once(path, [message])
 
 
 def compile_spec(spec: Any, path: Path, *, tells: bool = False, files: Any = None) -> Any:
@@ -71,7 +121,7 @@ def compile_spec(spec: Any, path: Path, *, tells: bool = False, files: Any = Non
         raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
 
     if tells:
-        tell_once(path, found)
+        tell_once(path, (f"MuJoCo warns: {text}" for text in found))
     return model
 
 
@@ -164,26 +214,25 @@ class ModelSource:
                 stated._derived[key] = found
             return found
 
-    def with_numbers(self, numbers: tuple[tuple[str, tuple[float, ...]], ...]) -> ModelSource:
-        """This model with custom numbers, compiled once as long as it is in use.
+    def with_elements(self, key: tuple[Any, ...], add: Callable[[Any], object]) -> ModelSource:
+        """This model with elements that do not change its motion, compiled once while in use.
 
         Args:
-            numbers: Names of `numeric` elements of MJCF, each with its numbers; MuJoCo ignores
-                them.
+            key: Identifies the elements.
+            add: Adds them to an MjSpec.
 
         Returns:
             The model; it has the terms of this one, and the same model of the file.
         """
         with self._lock:
-            found = self._derived.get(numbers)
+            found = self._derived.get(key)
             if found is None:
                 spec = self.spec.copy()
-                for name, data in numbers:
-                    spec.add_numeric(name=name, size=len(data), data=list(data))
+                add(spec)
                 found = ModelSource(self.path, spec, self._files)
                 found.terms, found.layout = self.terms, self.layout
                 found._stated = self.stated
-                self._derived[numbers] = found
+                self._derived[key] = found
             return found
 
     @cached_property
@@ -339,13 +388,13 @@ def collected_warnings(*, of_reader: bool = False) -> Iterator[list[str]]:
 
 
 def tell_once(path: Path, messages: Iterable[str]) -> None:
-    """Warn about what MuJoCo says about a file, unless it was told before.
+    """Warn about a model file, unless it was told before.
 
     Worker processes read the files again and stay silent.
 
     Args:
         path: The file.
-        messages: MuJoCo's warnings.
+        messages: The warnings.
     """
     if multiprocessing.parent_process() is not None:
         return
@@ -354,7 +403,7 @@ def tell_once(path: Path, messages: Iterable[str]) -> None:
         text = " ".join(message.split())
         if (path, text) not in _told:
             _told.add((path, text))
-            warnings.warn(f"{path}: MuJoCo warns: {text}", ModelWarning, stacklevel=3)
+            warnings.warn(f"{path}: {text}", ModelWarning, stacklevel=3)
 
 
 # Number of packed models that a process keeps ready for use. A worker seldom serves more studies

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,10 @@ FILE_ATTRIBUTE = "file"
 
 # Separates the kind of a URI from its path, as in package://meshes/arm.stl.
 URI_SEPARATOR = "://"
+
+# Beginning of the URIs of ROS, and of the names of custom texts of an MJCF that state the folder of
+# a package.
+PACKAGE = "package://"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +91,7 @@ def files_of_model(path: Path) -> tuple[Path, ...]:
     # The list of models grows while it is read.
     for main in mains:
         places, folders = {main.parent}, {Path()}
+        packages: dict[str, str] = {}
         names: dict[str, bool] = {}
         for file, element in elements_of(main):
             places.add(file.parent)
@@ -95,11 +100,41 @@ def files_of_model(path: Path) -> tuple[Path, ...]:
                     names[value] = names.get(value, False) or element.tag == "model"
                 elif element.tag == "compiler" and key in FOLDERS:
                     folders.add(Path(value))
+            if element.tag == "text" and element.get("name", "").startswith(PACKAGE):
+                packages[element.attrib["name"].removeprefix(PACKAGE)] = element.get("data", "")
         for name, is_model in names.items():
-            files = _existing(name, places, folders)
+            in_package = package_file(name, main, packages) if name.startswith(PACKAGE) else None
+            files = _existing(name, places, folders) if in_package is None else [in_package]
             found.update(dict.fromkeys(files))
             mains += [file for file in files if is_model and file not in mains]
     return tuple(found)
+
+
+def package_file(
+    name: str, main: Path, packages: Mapping[str, str], held: Container[str] = ()
+) -> Path | None:
+    """The file that a URI of ROS names, as in package://robot/meshes/arm.stl.
+
+    Args:
+        name: The URI.
+        main: The model file.
+        packages: Folders of packages by name; others are looked for in ROS_PACKAGE_PATH and in the
+            folders above the model.
+        held: Paths of files that are not on the disk.
+
+    Returns:
+        The first place where the package has the file; None where there is none.
+    """
+    package, _, inside = name.removeprefix(PACKAGE).partition("/")
+    roots = [
+        Path(each) for each in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if each
+    ]
+    roots += Path(os.path.abspath(main)).parents
+    places = [root if root.name == package else root / package for root in roots]
+    if package in packages:
+        places.insert(0, Path(packages[package]))
+    files = [place / inside for place in places]
+    return next((file for file in files if file.as_posix() in held or file.is_file()), None)
 
 
 def is_urdf(path: Path) -> bool:

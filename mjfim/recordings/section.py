@@ -79,6 +79,7 @@ RangeWithUnit = tuple[Annotated[Bound, WithUnit()], Annotated[Bound, WithUnit()]
 Seconds = Annotated[Positive, WithUnit("s")]
 Hertz = Annotated[Positive, WithUnit("Hz")]
 Metres = Annotated[Positive, WithUnit("m")]
+Height = Annotated[Finite, WithUnit("m")]
 Period = tuple[Annotated[Bound, WithUnit("s")], Annotated[Bound, WithUnit("s")]]
 
 

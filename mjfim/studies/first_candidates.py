@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,21 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, ModelError, unknown
-from mjfim.model.coordinates import joint_names
-from mjfim.model.elements import element_count, element_name, identifier, names_of
+from mjfim.experiment.time_grid import rates_near, whole_number
+from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.elements import (
+    actuator_force_sizes,
+    element_count,
+    element_name,
+    force_sizes,
+    identifier,
+    names_of,
+    position_sizes,
+)
 from mjfim.model.inertia import body_inertia
-from mjfim.model.loading import load_spec
+from mjfim.model.loading import NO_PACKAGES, load_spec
+from mjfim.model.model_files import PACKAGE
+from mjfim.model.paths import unit_of
 from mjfim.model.units import servo_kind
 from mjfim.studies import GROUPS, Group
 
@@ -25,11 +37,14 @@ COMMENT = (
 )
 
 
-def read_urdf(path: Path) -> tuple[Callable[[str], str], dict[str, float]]:
+def read_urdf(
+    path: Path, packages: Mapping[str, str] = NO_PACKAGES
+) -> tuple[Callable[[str], str], dict[str, float]]:
     """Read a URDF, and give each revolute or prismatic joint a motor.
 
     Args:
         path: The URDF.
+        packages: Folders of ROS packages by name, which the MJCF states as custom texts.
 
     Returns:
         A function that writes an MJCF which attaches the URDF, whose path it gets, and adds the
@@ -38,7 +53,7 @@ def read_urdf(path: Path) -> tuple[Callable[[str], str], dict[str, float]]:
     Raises:
         ModelError: The URDF cannot be read, or has no joint to drive.
     """
-    spec = load_spec(path)
+    spec = load_spec(path, packages=packages)
     driven = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     joints = [joint for joint in spec.joints if joint.name and joint.type in driven]
     if not joints:
@@ -48,6 +63,10 @@ def read_urdf(path: Path) -> tuple[Callable[[str], str], dict[str, float]]:
         """Text of the MJCF; the path of the URDF is relative to it or absolute."""
         root = ElementTree.Element("mujoco", model=f"{spec.modelname} with motors")
         root.append(ElementTree.Comment(COMMENT))
+        if packages:
+            custom = ElementTree.SubElement(root, "custom")
+            for name, folder in packages.items():
+                ElementTree.SubElement(custom, "text", name=f"{PACKAGE}{name}", data=folder)
         asset = ElementTree.SubElement(root, "asset")
         ElementTree.SubElement(asset, "model", name="robot", file=file)
         world = ElementTree.SubElement(root, "worldbody")
@@ -83,10 +102,6 @@ def _velocities(path: Path) -> dict[str, float]:
     return found
 
 
-# Largest deviation of a sample period from a whole number of timesteps, relative to a timestep.
-STEP_TOLERANCE = 1e-6
-
-
 @dataclass(frozen=True, kw_only=True)
 class Wishes:
     """Wishes for a first experiment; what is None is proposed.
@@ -100,6 +115,7 @@ class Wishes:
         sigmas: Standard deviations of measured joints by kind: "angle" [rad], "length" [m],
             "angular velocity" [rad/s], "velocity" [m/s]. Sensors whose noise the MJCF states keep
             it.
+        packages: Folders of ROS packages by name.
     """
 
     groups: Sequence[Group] = GROUPS
@@ -108,6 +124,7 @@ class Wishes:
     rate: float | None = None
     horizon: float | None = None
     sigmas: Mapping[str, float] = field(default_factory=dict)
+    packages: Mapping[str, str] = field(default_factory=dict)
 
 
 def groups_of(text: str) -> list[Group]:
@@ -157,18 +174,16 @@ def require_rate(model: Any, rate: float) -> float:
     """
     timestep = float(model.opt.timestep)
     steps = 1.0 / (rate * timestep) if rate > 0.0 else 0.0
-    near = max(round(steps), 1)
-    if abs(steps - near) <= STEP_TOLERANCE * near:
+    if whole_number(steps) is not None:
         return rate
-
-    rates = ", ".join(f"{1.0 / (k * timestep):.6g}" for k in (near + 1, near, near - 1) if k)
     raise ExperimentError(
         f"a period of {rate:g} Hz is no whole number of timesteps of {timestep:g} s; rates nearby: "
-        f"{rates}"
+        f"{rates_near(steps, timestep)}"
     )
 
 
-# Bodies at the end of the chain whose mass and centre of mass are proposed.
+# Bodies at the end of the chain whose mass and centre of mass are proposed; bodies of equal depth
+# and mass, such as the feet of a robot, count once.
 LAST_BODIES = 3
 
 # Bodies lighter than this share of the median mass are not proposed.
@@ -176,6 +191,16 @@ SMALL_MASS = 0.1
 
 # Size of an unknown payload, relative to the mass of the body that carries it.
 PAYLOAD_SHARE = 0.2
+
+# Size of an unknown payload, relative to what the strongest actuator holds at the robot's length;
+# and of friction that the MJCF does not state, relative to a natural force.
+STRENGTH_SHARE = 0.05
+
+# A robot with more joints than this has one unknown for all elements with equal values.
+FEW_JOINTS = 3
+
+# Samples of the largest proposed delay.
+LONGEST_DELAY = 10
 
 AXES = ("x", "y", "z")
 
@@ -196,9 +221,12 @@ class Candidate:
     Attributes:
         name: Name of its table in the experiment file.
         group: Group to which it belongs.
-        path: Parameter path.
-        meaning: What it is, for the comment.
-        offset: Constant that is added to the parameter [unit of the path].
+        paths: Parameter paths that it sets.
+        quantity: What it is, for the comment.
+        owners: Names of the elements that have it; none for the whole robot.
+        value: Value in the model [unit of the paths].
+        family: Number of the bodies that are alike, to which its body belongs.
+        offset: Constant that is added to the parameter [unit of the paths].
         guess: Stated guess; None for the value in the model.
         scale: Stated scale; None for the default.
         bounds: Stated bounds, or None.
@@ -206,18 +234,32 @@ class Candidate:
 
     name: str
     group: Group
-    path: str
-    meaning: str
+    paths: tuple[str, ...]
+    quantity: str
+    owners: tuple[str, ...] = ()
+    value: float = 0.0
+    family: int = 0
     offset: float = 0.0
     guess: float | None = None
     scale: float | None = None
     bounds: tuple[float, float] | None = None
 
+    @property
+    def meaning(self) -> str:
+        """What it is, for the comment."""
+        return f"{self.quantity} of {', '.join(self.owners)}" if self.owners else self.quantity
+
+    @property
+    def is_absent(self) -> bool:
+        """Whether the model has no such effect; such a parameter stands in a comment only."""
+        return self.bounds is not None and self.value == 0.0 and bool(self.owners)
+
     def table(self) -> dict[str, Any]:
         """The table `[parameters.<name>]` of the experiment file."""
-        table: dict[str, Any] = {"target": self.path}
-        if self.offset:
-            table = {"targets": [{"path": self.path, "offset": self.offset}]}
+        table: dict[str, Any] = {"target": self.paths[0]}
+        if self.offset or len(self.paths) > 1:
+            added = {"offset": self.offset} if self.offset else {}
+            table = {"targets": [{"path": path, **added} for path in self.paths]}
         if self.guess is not None:
             table["guess"] = self.guess
         if self.scale is not None:
@@ -228,56 +270,77 @@ class Candidate:
 
 
 def candidates(
-    model: Any, groups: Sequence[Group] = GROUPS, payload: str | None = None
+    model: Any,
+    groups: Sequence[Group],
+    payload: str | None,
+    *,
+    length: float,
+    period: float,
+    rate: float,
 ) -> list[Candidate]:
     """Parameters of the wanted groups that exist in a model, with unique names.
+
+    The payload that is asked for comes first, then what servos have, then the rest by group.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
         groups: Wanted groups.
         payload: Body that carries an unknown payload; None without one.
+        length: Length of the robot [m].
+        period: Characteristic period of its motion [s].
+        rate: Rate of samples [Hz].
 
     Raises:
         ExperimentError: The body of the payload does not exist, or has no mass.
     """
-    found: list[Candidate] = []
-    if payload is not None:
-        found += _payload(model, payload)
-
+    friction, drives = (list(_joint_fields(model, group, period)) for group in JOINT_FIELDS)
+    found = list(_servos(model))
+    found += [*friction, *drives, _delay(rate)] if found else []
     # The last body carries what the robot grasps. With a stated payload, its mass is known.
-    elif "payload" in groups:
-        for body in _bodies_from_the_end(model)[:1]:
-            found += _mass_and_centre(model, body, "payload")
-    if "friction" in groups:
-        found += _joint_fields(model, "friction")
-    if "inertia" in groups:
-        found += _inertia(model)
-    if "motors" in groups:
-        found += _joint_fields(model, "motors")
-        found += _servos(model)
-
+    if payload is None:
+        for body, family in _last_bodies(model, 1):
+            found += _mass_and_centre(model, body, family, "payload")
     # The inertia of the body that carries the load is known.
-    own = [
+    found += [*friction, *_inertia(model), *drives]
+    found = [
         each
         for each in found
-        if each.group == "payload" or not each.path.startswith(f"body/{payload}:")
+        if each.group in groups and not each.paths[0].startswith(f"body/{payload}:")
     ]
-    return list(_with_unique_names(own))
+    if payload is not None:
+        found = [*_payload(model, payload, length, period), *found]
+    return _tied(model, found)
 
 
-def _with_unique_names(found: Iterable[Candidate]) -> Iterator[Candidate]:
-    """The candidates without repeated paths; equal names get a number."""
-    paths, names = set(), set()
+def _tied(model: Any, found: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates without repeated paths, with one for all equal values of a large robot."""
+    families: dict[tuple[str, ...], dict[str, Candidate]] = {}
     for each in found:
-        key = (each.path, each.offset)
-        if key in paths:
-            continue
-        name, number = each.name, 2
-        while name in names:
-            name, number = f"{each.name}_{number}", number + 1
-        paths.add(key)
-        names.add(name)
-        yield replace(each, name=name)
+        unit, value = unit_of(model, each.paths[0]), f"{each.value:.6g}"
+        key: tuple[str, ...] = (each.quantity, value, unit, f"{each.family}")
+        if model.njnt <= FEW_JOINTS or not each.owners:
+            key = (*each.paths, f"{each.offset}")
+        families.setdefault(key, {}).setdefault(each.paths[0], each)
+
+    # A family that is all of its kind needs no name of an element.
+    kinds = Counter(quantity for quantity, *_ in families)
+    tied: dict[str, Candidate] = {}
+    for first, *others in (list(family.values()) for family in families.values()):
+        name, number = first.name, 2
+        if others:
+            name = first.name.removeprefix(f"{first.owners[0]}_")
+            if kinds[first.quantity] > 1:
+                name = f"{name}_{first.owners[0]}_and_{len(others)}_more"
+        base = name
+        while name in tied:
+            name, number = f"{base}_{number}", number + 1
+        tied[name] = replace(
+            first,
+            name=name,
+            paths=(*first.paths, *(each.paths[0] for each in others)),
+            owners=(*first.owners, *(each.owners[0] for each in others)),
+        )
+    return list(tied.values())
 
 
 def require_carrier(model: Any, name: str) -> int:
@@ -297,35 +360,57 @@ def require_carrier(model: Any, name: str) -> int:
     return body
 
 
-def _payload(model: Any, name: str) -> Iterator[Candidate]:
+def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Candidate]:
     """Mass and first moments of an unknown payload that is fixed to a body."""
     body = require_carrier(model, name)
     mass = float(model.body_mass[body])
     radius = body_inertia(model, body).gyration_radius
+    # A light wrist carries more than a share of its own mass.
+    scale = PAYLOAD_SHARE * mass
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    if gravity > 0.0 and model.nu:
+        forces = np.abs(model.actuator_gear[:, 0]) * actuator_force_sizes(model, period)
+        scale = max(scale, STRENGTH_SHARE * float(forces.max()) / (gravity * length))
     yield Candidate(
         name="payload",
         group="payload",
-        path=f"body/{name}:mass",
-        meaning=f"mass of the load at {name}",
+        paths=(f"body/{name}:mass",),
+        quantity=f"mass of the load at {name}",
         offset=mass,
         guess=0.0,
-        scale=float(f"{PAYLOAD_SHARE * mass:.2g}"),
+        scale=float(f"{scale:.2g}"),
     )
     moments = mass * np.asarray(model.body_ipos[body])
     for i, axis in enumerate(AXES):
         yield Candidate(
             name=f"payload_moment_{axis}",
             group="payload",
-            path=f"body/{name}:firstmoment[{i}]",
-            meaning=f"mass times {axis} of the load's centre of mass, in the frame of {name}",
+            paths=(f"body/{name}:firstmoment[{i}]",),
+            quantity=f"mass times {axis} of the load's centre of mass, in the frame of {name}",
             offset=float(moments[i]),
             guess=0.0,
-            scale=float(f"{PAYLOAD_SHARE * mass * radius:.2g}"),
+            scale=float(f"{scale * radius:.2g}"),
         )
 
 
-def _bodies_from_the_end(model: Any) -> list[int]:
-    """Numbers of moving bodies with mass and a name, those with most joints below them first."""
+def _delay(rate: float) -> Candidate:
+    """The delay between the clocks of the controls and of the measurements."""
+    return Candidate(
+        name="delay",
+        group="motors",
+        paths=("output:delay",),
+        quantity="delay of all measurements",
+        guess=0.0,
+        scale=float(f"{1.0 / rate:.2g}"),
+        bounds=(0.0, float(f"{LONGEST_DELAY / rate:.2g}")),
+    )
+
+
+def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
+    """Moving bodies with mass and a name at the end of the chain, each with its family's number.
+
+    A family has equal mass and number of joints above it; those with most joints come first.
+    """
     depth = np.zeros(model.nbody, dtype=int)
     for body in range(1, model.nbody):
         depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body])
@@ -337,60 +422,82 @@ def _bodies_from_the_end(model: Any) -> list[int]:
 
     # Fingers and markers are too light to matter.
     typical = float(np.median(model.body_mass[moving])) if moving else 0.0
-    moving = [body for body in moving if model.body_mass[body] >= SMALL_MASS * typical]
-    return sorted(moving, key=lambda body: (-depth[body], -float(model.body_mass[body])))
+    alike: dict[tuple[int, float], list[int]] = {}
+    for body in moving:
+        if model.body_mass[body] >= SMALL_MASS * typical:
+            mass = float(f"{model.body_mass[body]:.6g}")
+            alike.setdefault((-int(depth[body]), -mass), []).append(body)
+    last = sorted(alike.items())[:families]
+    return [(body, i) for i, (_, bodies) in enumerate(last) for body in bodies]
 
 
-def _mass_and_centre(model: Any, body: int, group: Group) -> Iterator[Candidate]:
+def _mass_and_centre(model: Any, body: int, family: int, group: Group) -> Iterator[Candidate]:
     """Mass and centre of mass of a body."""
     name = element_name(model, "body", body)
     mass = float(model.body_mass[body])
     yield Candidate(
         name=f"{name}_mass",
         group=group,
-        path=f"body/{name}:mass",
-        meaning=f"mass of {name}",
+        paths=(f"body/{name}:mass",),
+        quantity="mass",
+        owners=(name,),
+        value=mass,
+        family=family,
         bounds=(0.0, float(f"{10.0 * mass:.3g}")),
     )
     for i, axis in enumerate(AXES):
         yield Candidate(
             name=f"{name}_com_{axis}",
             group=group,
-            path=f"body/{name}:ipos[{i}]",
-            meaning=f"{axis} of the centre of mass of {name}",
+            paths=(f"body/{name}:ipos[{i}]",),
+            quantity=f"{axis} of the centre of mass",
+            owners=(name,),
+            value=float(model.body_ipos[body, i]),
+            family=family,
         )
 
 
 def _inertia(model: Any) -> Iterator[Candidate]:
     """Masses, centres of mass and principal inertias of the last bodies."""
-    bodies = _bodies_from_the_end(model)[:LAST_BODIES]
-    for body in bodies:
-        yield from _mass_and_centre(model, body, "inertia")
-    for body in bodies:
+    bodies = _last_bodies(model, LAST_BODIES)
+    for body, family in bodies:
+        yield from _mass_and_centre(model, body, family, "inertia")
+    for body, family in bodies:
         name = element_name(model, "body", body)
         for i, axis in enumerate(AXES):
             if model.body_inertia[body, i] > 0.0:
                 yield Candidate(
                     name=f"{name}_inertia_{axis}",
                     group="inertia",
-                    path=f"body/{name}:inertia[{i}]",
-                    meaning=f"principal moment of inertia {axis} of {name}",
+                    paths=(f"body/{name}:inertia[{i}]",),
+                    quantity=f"principal moment of inertia {axis}",
+                    owners=(name,),
+                    value=float(model.body_inertia[body, i]),
+                    family=family,
                 )
 
 
-def _joint_fields(model: Any, group: Group) -> Iterator[Candidate]:
-    """Fields of joints that are not zero."""
+def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate]:
+    """Fields of joints; those that are zero in the model have a natural size."""
+    forces, sizes = STRENGTH_SHARE * force_sizes(model, period), position_sizes(model)
     for quantity, array, meaning in JOINT_FIELDS[group]:
+        # A force of friction, over a natural speed or acceleration.
+        power = {"damping": 1, "armature": 2}.get(quantity, 0)
         for joint in range(model.njnt):
-            name = element_name(model, "joint", joint)
-            value = float(getattr(model, array)[int(model.jnt_dofadr[joint])])
-            if name and value > 0.0:
+            name, dof = element_name(model, "joint", joint), int(model.jnt_dofadr[joint])
+            value = float(getattr(model, array)[dof])
+            is_single = joint_dofs(model, joint) == 1
+            size = float(forces[dof] * period**power / sizes[dof] ** (power > 0))
+            if name and (value > 0.0 or is_single):
                 yield Candidate(
                     name=f"{name}_{quantity}",
                     group=group,
-                    path=f"joint/{name}:{quantity}",
-                    meaning=f"{meaning} of {name}",
-                    bounds=(0.0, float(f"{10.0 * value:.3g}")),
+                    paths=(f"joint/{name}:{quantity}",),
+                    quantity=meaning,
+                    owners=(name,),
+                    value=value,
+                    scale=None if value > 0.0 else float(f"{size:.2g}"),
+                    bounds=(0.0, float(f"{10.0 * (value or size):.3g}")),
                 )
 
 
@@ -398,13 +505,15 @@ def _servos(model: Any) -> Iterator[Candidate]:
     """Gains of the servos."""
     for i in range(model.nactuator):
         name = element_name(model, "actuator", i)
-        has_gain = float(model.actuator_gainprm[i, 0]) != 0.0
-        if name and has_gain and servo_kind(model, i) == "position":
+        gain = float(model.actuator_gainprm[i, 0])
+        if name and gain != 0.0 and servo_kind(model, i) == "position":
             yield Candidate(
                 name=f"{name}_kp",
                 group="motors",
-                path=f"actuator/{name}:kp",
-                meaning=f"gain of the servo {name}",
+                paths=(f"actuator/{name}:kp",),
+                quantity="gain of the servo",
+                owners=(name,),
+                value=gain,
             )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.elements import position_sizes, unnamed_count
 from mjfim.model.limited_elements import QUATERNION_PLACE
-from mjfim.model.loading import ModelSource, silence_mujoco_log
+from mjfim.model.loading import ModelSource, resolve_packages, silence_mujoco_log
 from mjfim.model.model_files import is_urdf
 from mjfim.model.paths import unit_of
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
@@ -35,6 +36,7 @@ from mjfim.studies.first_candidates import (
     read_urdf,
     require_rate,
 )
+from mjfim.studies.first_limits import playable_limits, played
 from mjfim.studies.first_motion import (
     FIRST_SHARE,
     SHRINKING,
@@ -43,9 +45,9 @@ from mjfim.studies.first_motion import (
     Start,
     TimeScale,
     choose_start,
+    driven_dofs,
     first_amplitudes,
     influence_of_controls,
-    largest_feasible,
     propose_release,
     reach,
     rounded,
@@ -75,10 +77,22 @@ WITHOUT_ROOM = ("control",)
 LARGEST_AMPLIFICATION = 100.0
 SHORTEST_MOTION = 0.5
 
+# Number of disturbances of the start that are tried, and their size [sizes of the positions].
+DISTURBANCES = 4
+DISTURBANCE = 1e-4
+
 # Shortest horizon of a robot that falls out of its limits [characteristic periods], and the share
 # of the time until then that the horizon uses.
 SHORTEST_FALL = 0.1
 BEFORE_VIOLATION = 0.9
+
+# Smallest share of the amplitudes with which an arm ends at rest, and the time over which its
+# motion fades [characteristic periods].
+SMALLEST_ENDED = 0.1
+FADE = 0.5
+
+# Boundary of an experiment that begins at rest.
+AT_REST = {"start": "rest"}
 
 # Begin of the remark about a start that cannot be used.
 NO_MOTION = "no motion about this start keeps all limits"
@@ -87,7 +101,7 @@ NO_MOTION = "no motion about this start keeps all limits"
 NO_WISHES = Wishes()
 
 # Largest number of candidates whose information is computed.
-MOST_CANDIDATES = 48
+MOST_CANDIDATES = 24
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,9 +119,8 @@ class Proposal:
         noise: Noise of the outputs.
         chosen: Proposed parameters.
         others: Further parameters, for comments.
-        control_limits: Ranges of the controls that have none in the MJCF.
-        velocity_limits: Velocity limits that a URDF states [m/s or rad/s].
-        rest: Whether the experiment begins at rest.
+        limits: The table `[limits]`.
+        boundary: The table `[boundary]`.
         release: Release of a model without actuators; None for a model with actuators.
         remarks: Sentences for the head of the file.
     """
@@ -122,9 +135,8 @@ class Proposal:
     noise: Sequence[ProposedNoise]
     chosen: Sequence[Candidate]
     others: Sequence[Candidate]
-    control_limits: dict[str, tuple[float, float]]
-    velocity_limits: dict[str, float]
-    rest: bool
+    limits: dict[str, Any]
+    boundary: dict[str, str]
     remarks: Sequence[str]
     release: ProposedRelease | None = None
 
@@ -142,10 +154,6 @@ class Proposal:
             if self.start.act.any():
                 initial["act"] = self.start.act.tolist()
 
-        limits = {
-            "control": {name: list(both) for name, both in self.control_limits.items()},
-            "velocity": self.velocity_limits,
-        }
         values: dict[str, Any] = {
             "model": self.model,
             "rate": self.times.rate,
@@ -158,9 +166,9 @@ class Proposal:
             initial["control"] = self.control()
         else:
             values["nuisance"] = {"initial": dict.fromkeys(self.release[1], True)}
-        values["limits"] = {key: table for key, table in limits.items() if table}
-        if self.rest:
-            values["boundary"] = {"start": "rest"}
+        values["limits"] = self.limits
+        if self.boundary:
+            values["boundary"] = self.boundary
         if self.release is None:
             values["cost"] = {"control": 0.0}
         values["descent"] = {"seconds": SECONDS}
@@ -175,6 +183,8 @@ class Proposal:
             "frequency": self.chirp[0],
             "frequency_end": self.chirp[1],
         }
+        if "end" in self.boundary:
+            control["fade"] = float(f"{FADE * self.times.period:.2g}")
         offset = dict(zip(names, self.start.control.tolist(), strict=True))
         if any(offset.values()):
             control["offset"] = offset
@@ -201,17 +211,10 @@ def propose_experiment(
         ExperimentError: The model has neither an actuator nor a joint that can be released, or no
             parameter of the wanted groups, or a wish cannot be fulfilled.
     """
-    source, companion, velocities = _model(path, folder)
+    source, companion, velocities = _model(path, folder, wishes.packages)
     model = source.model
     if not model.njnt:
         raise ExperimentError(f"{path}: the model has no joint, so that nothing in it can move")
-    found = candidates(model, wishes.groups, wishes.payload)[:MOST_CANDIDATES]
-    if not found:
-        raise ExperimentError(
-            f"{path}: no parameter of {', '.join(wishes.groups)} can be proposed: bodies and "
-            "joints need names, and friction and armature a value > 0"
-        )
-
     data = mujoco.MjData(model)
     start = choose_start(model, wishes.keyframe)
     data.qpos[:] = start.qpos
@@ -219,6 +222,16 @@ def propose_experiment(
     mujoco.mj_forward(model, data)
     length = reach(model, data)
     times = wanted_times(time_scale(model, data), model, wishes)
+
+    sizes = {"length": length, "period": times.period, "rate": times.rate}
+    every = candidates(model, wishes.groups, wishes.payload, **sizes)
+    absent = [each for each in every if each.is_absent]
+    found = [each for each in every if not each.is_absent][:MOST_CANDIDATES]
+    if not found:
+        raise ExperimentError(
+            f"{path}: no parameter of {', '.join(wishes.groups)} can be proposed: bodies and "
+            "joints need names, and friction and armature a value > 0"
+        )
 
     controls = source.coordinates.controls
     release = None
@@ -238,12 +251,17 @@ def propose_experiment(
     # Ranges about the resting control for controls that have none in the MJCF.
     widths = CONTROL_LIMIT * wanted
     ranges = {
-        name: (float(f"{centre - width:.3g}"), float(f"{centre + width:.3g}"))
+        name: [float(f"{centre - width:.3g}"), float(f"{centre + width:.3g}")]
         for name, centre, width, is_limited in zip(
             controls, start.control, widths, model.actuator_ctrllimited, strict=True
         )
         if not is_limited
     }
+    limits: dict[str, Any] = {"control": ranges} if ranges else {}
+    if controls:
+        limits |= playable_limits(source, start, times, length, velocities)
+    elif velocities:
+        limits["velocity"] = velocities
     draft = Proposal(
         model=os.path.relpath(path, folder) if companion is None else companion_name,
         companion=companion,
@@ -257,10 +275,9 @@ def propose_experiment(
         ),
         noise=proposed_noise(model, length, times.period, wishes.sigmas),
         chosen=found,
-        others=(),
-        control_limits=ranges,
-        velocity_limits=velocities,
-        rest=False,
+        others=absent,
+        limits=limits,
+        boundary={},
         remarks=(),
         release=release,
     )
@@ -294,16 +311,19 @@ def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
     return replace(times, rate=rate, samples=samples, unstable=unstable)
 
 
-def _model(path: Path, folder: Path) -> tuple[ModelSource, str | None, dict[str, float]]:
+def _model(
+    path: Path, folder: Path, packages: Mapping[str, str]
+) -> tuple[ModelSource, str | None, dict[str, float]]:
     """The model with actuators, the MJCF that adds them to a URDF, and its velocity limits."""
     if not is_urdf(path):
         return ModelSource(path), None, {}
 
     # The MJCF around the URDF exists only in memory so far; its path of the URDF is absolute.
-    mjcf, velocities = read_urdf(path)
+    mjcf, velocities = read_urdf(path, packages)
     try:
         with silence_mujoco_log():
             spec = mujoco.MjSpec.from_string(mjcf(str(path.resolve())))
+        resolve_packages(spec, path)
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot add motors: {str(error).strip()}") from None
     return ModelSource(path, spec), mjcf(os.path.relpath(path, folder)), velocities
@@ -333,20 +353,32 @@ class _Refinement:
         # One parameter is enough where only the motion matters, and much quicker.
         lean = replace(draft, chosen=draft.chosen[:1])
         system = System.resolve(self._experiment(lean), source=self.source)
-        rest = self._begins_at_rest(system, lean)
+        if self._begins_at_rest(system, lean):
+            draft = replace(draft, boundary=AT_REST)
+            lean = replace(lean, boundary=AT_REST)
+        # Each joint of an arm is driven, so that the controls can stop it.
+        is_arm = len(driven_dofs(self.source.model)) == self.source.model.nv
 
-        remarks: list[str] = []
+        remarks: list[str] = list(draft.remarks)
         amplitudes = np.array(list(draft.amplitudes.values()))
         kept = self._kept_amplitudes(system, lean, amplitudes)
+        if draft.boundary and kept is not None and is_arm:
+            # Servos stop a motion that fades; under torques, the design has to find the end.
+            draft = replace(draft, boundary=AT_REST | {"end": "rest"})
+            ended = self._kept_amplitudes(system, replace(draft, chosen=lean.chosen), kept)
+            if ended is not None and (ended >= SMALLEST_ENDED * kept).all():
+                kept = ended
         if kept is None:
             smallest = rounded(amplitudes * SHRINKING**TRIALS)
             draft, remark = self._within_limits(system, draft, smallest)
             remarks.append(remark)
 
             # During a shorter horizon, the motion may be larger.
-            shorter = replace(lean, times=draft.times)
-            kept = self._kept_amplitudes(system, shorter, amplitudes)
-            kept = smallest if kept is None else kept
+            kept = smallest
+            if draft.times != lean.times:
+                shorter = replace(lean, times=draft.times)
+                kept = self._kept_amplitudes(system, shorter, amplitudes)
+                kept = smallest if kept is None else kept
         moved = _with_amplitudes(draft, kept)
         if not draft.start.held:
             remarks.append(
@@ -366,19 +398,18 @@ class _Refinement:
             remarks.append(
                 "Note: the motion amplifies small disturbances, so the horizon is short."
             )
-        return self._with_parameters(replace(moved, rest=rest), remarks)
+        return self._with_parameters(moved, remarks)
 
     def _kept_amplitudes(self, system: System, draft: Proposal, amplitudes: Array) -> Array | None:
         """(nu,) largest amplitudes that keep all limits, if possible with some room; or None."""
+        task = self._task(system, _with_amplitudes(draft, amplitudes))
+        room = cache(lambda share: self._room(task, share))
+        if room(SHRINKING**TRIALS) < 0.0:
+            return None
         for least in (ROOM, 0.0):
-
-            def has_room(tried: Array, least: float = least) -> bool:
-                """Whether the chirp with some amplitudes keeps this distance from the limits."""
-                return self._room(system, draft, tried) >= least
-
-            kept = largest_feasible(amplitudes, has_room)
-            if kept is not None:
-                return kept
+            for trial in range(TRIALS + 1):
+                if room(SHRINKING**trial) >= least:
+                    return rounded(amplitudes * SHRINKING**trial)
         return None
 
     def _within_limits(
@@ -410,7 +441,7 @@ class _Refinement:
         is_long_enough = samples >= max(SHORTEST_FALL * times.period * times.rate, 2.0)
         if is_long_enough and self.wishes.horizon is None:
             shorter = replace(times, samples=samples)
-            if self._room(system, replace(still, times=shorter), smallest) >= 0.0:
+            if self._room(self._task(system, replace(still, times=shorter)), 1.0) >= 0.0:
                 remark = (
                     f"Note: the horizon ends before the robot leaves a limit by itself: {first}."
                 )
@@ -425,31 +456,23 @@ class _Refinement:
             draft: The draft.
             length: Length of the robot [m].
         """
-        lean = replace(draft, chosen=draft.chosen[:1])
-
-        def keeps_limits(shares: Array) -> bool:
-            """Whether the motion from a release keeps all limits."""
-            found = propose_release(self.source.model, draft.start.qpos, length, float(shares[0]))
-            trial = replace(lean, release=found)
-            system = System.resolve(self._experiment(trial), source=self.source)
-            return self._room(system, trial, np.zeros(0)) >= 0.0
-
         remarks = ["The model has no actuators: a design chooses the release, `initial.free`."]
-        kept = largest_feasible(np.array([FIRST_SHARE]), keeps_limits)
-        if kept is None:
-            kept = np.array([FIRST_SHARE])
-            remarks.append("Warning: no release near this start keeps all limits.")
-
-        share = float(kept[0])
-        release = propose_release(self.source.model, draft.start.qpos, length, share)
-        moved = replace(draft, release=release)
-        return self._with_parameters(moved, remarks)
+        for trial in range(TRIALS):
+            share = float(rounded(np.array([FIRST_SHARE * SHRINKING**trial]))[0])
+            release = propose_release(self.source.model, draft.start.qpos, length, share)
+            lean = replace(draft, chosen=draft.chosen[:1], release=release)
+            system = System.resolve(self._experiment(lean), source=self.source)
+            if self._room(self._task(system, lean), 1.0) >= 0.0:
+                return self._with_parameters(replace(draft, release=release), remarks)
+        remarks.append("Warning: no release near this start keeps all limits.")
+        return self._with_parameters(draft, remarks)
 
     def _with_parameters(self, draft: Proposal, remarks: Sequence[str]) -> Proposal:
         """The draft with the parameters that its motion identifies, and with all remarks."""
         chosen = self._identified(draft)
         proposed = [draft.chosen[i] for i in chosen]
         others = [each for i, each in enumerate(draft.chosen) if i not in chosen]
+        others += draft.others
 
         # Parameters of bodies and joints without a name cannot be proposed.
         counts = {kind: unnamed_count(self.source.model, kind) for kind in ("body", "joint")}
@@ -460,12 +483,6 @@ class _Refinement:
             if count
         ]
         remarks = [*remarks, *unnamed]
-        payload = self.wishes.payload
-        if payload is not None and not any(each.group == "payload" for each in proposed):
-            remarks.append(
-                f"Warning: the first motion does not show the payload at {payload}, which stands "
-                "in comments only; name a body that moves, or choose another start."
-            )
         return replace(draft, remarks=remarks, chosen=proposed, others=others)
 
     def _experiment(self, draft: Proposal, **tables: Any) -> Experiment:
@@ -482,22 +499,26 @@ class _Refinement:
         if not draft.start.held:
             return False
         try:
-            task = self._task(system, draft, boundary={"start": "rest"})
+            task = self._task(system, draft, boundary=AT_REST)
             # A design searches without the stops of joints, too.
             holds = (task.initial_hold, task.relaxed().initial_hold)
             return bool(np.isfinite(holds).all())
         except MjfimError:
             return False
 
-    def _room(self, system: System, draft: Proposal, amplitudes: Array) -> float:
-        """Smallest distance of the chirp with some amplitudes from the limits in any engine step.
+    def _room(self, task: DesignTask, share: float) -> float:
+        """Smallest distance of the motion of a task from the limits in any engine step.
 
-        It is relative to half of the range, and negative where a limit is broken.
+        It is relative to half of the range, and negative where a limit is broken. The control
+        differs from rest by a share of what the task states.
         """
-        trial = _with_amplitudes(draft, amplitudes)
+        # A chirp begins at rest.
+        rest = task.control[:1]
         try:
-            task = self._task(system, trial)
-            found = verify(task, task.initial)
+            motion = task.initial
+            if share != 1.0:
+                motion = task.plant.simulate(task.theta, rest + share * (task.control - rest))
+            found = verify(task, motion)
         except SimulationDivergedError:
             return -np.inf
         if not found.is_feasible:
@@ -509,22 +530,27 @@ class _Refinement:
     def _predictable_samples(self, system: System, draft: Proposal) -> int:
         """Samples of the first motion until a small disturbance of the start has grown too much."""
         task = self._task(system, draft)
-        least = round(SHORTEST_MOTION * draft.times.period * draft.times.rate)
-        try:
-            A, _, _, _ = task.plant.derivatives.jacobians(task.theta, task.initial)
-        except SimulationDivergedError:
-            return draft.times.samples
+        model, substeps = self.source.model, task.system.grid.substeps
+        controls = np.repeat(task.control, substeps, axis=0)
+        sizes, change = position_sizes(model), np.zeros(model.nv)
+        rng = np.random.default_rng(0)
+        undisturbed = played(model, draft.start, controls)[0][substeps::substeps]
 
-        # Deviations of positions, in their sizes. Those of velocities grow at first where a servo
-        # is stiff.
-        nv, grown = self.source.model.nv, np.eye(A.shape[1])
-        sizes = position_sizes(self.source.model)
-        for k, transition in enumerate(A):
-            grown = transition @ grown
-            positions = grown[:nv, :nv] * (sizes / sizes[:, None])
-            if not np.linalg.norm(positions, 2) <= LARGEST_AMPLIFICATION:
-                return min(max(k, least), draft.times.samples)
-        return draft.times.samples
+        # A random direction has a share of the one that grows most. Only positions count:
+        # velocities grow at first where a servo is stiff.
+        samples, largest = len(undisturbed), LARGEST_AMPLIFICATION / np.sqrt(model.nv)
+        for _ in range(DISTURBANCES):
+            direction = rng.standard_normal(model.nv)
+            moved = DISTURBANCE * sizes * direction / np.linalg.norm(direction)
+            disturbed = played(model, draft.start, controls, moved)[0][substeps::substeps]
+            samples = min(samples, len(disturbed))
+            for k in range(samples):
+                mujoco.mj_differentiatePos(model, change, 1.0, undisturbed[k], disturbed[k])
+                if np.linalg.norm(change / sizes) > largest * DISTURBANCE:
+                    samples = k
+                    break
+        least = round(SHORTEST_MOTION * draft.times.period * draft.times.rate)
+        return min(max(samples, least), draft.times.samples)
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
         """Indices of the candidates that the chirp or the release identifies together.
@@ -545,8 +571,21 @@ class _Refinement:
         n = len(draft.chosen)
         hidden = F[:n, n:] @ np.linalg.pinv(F[n:, n:], hermitian=True) @ F[n:, :n]
         F, sizes, left = F[:n, :n] - hidden, task.parameters.scale[:n], list(range(n))
+        payload = self.wishes.payload
+        # A payload that is asked for is chosen, however little the first motion shows of it.
+        asked = [i for i, each in enumerate(draft.chosen) if payload and each.name == "payload"]
+        if (F[asked, asked] * sizes[asked] ** 2 < LEAST_SHARE).any():
+            # A mass whose first moments are known may have an effect where it has none beside them.
+            fewer = [i for i in left if not draft.chosen[i].name.startswith("payload_")]
+            if len(fewer) < n:
+                bare = replace(draft, chosen=[draft.chosen[i] for i in fewer])
+                return [fewer[i] for i in self._identified(bare)]
+            raise ExperimentError(
+                f"--payload: the first motion does not show a load at {payload!r}; name a body "
+                "that the motion accelerates or lifts"
+            )
         while True:
-            chosen = [left[i] for i in identifiable(F[np.ix_(left, left)], sizes[left])]
+            chosen = [left[i] for i in identifiable(F[np.ix_(left, left)], sizes[left], asked)]
             part = replace(draft, chosen=[draft.chosen[i] for i in chosen])
             tried = self._task(System.resolve(self._experiment(part), source=self.source), part)
             columns = point.sensitivity.of_parameters([*chosen, *range(n, len(task.parameters))])
@@ -556,26 +595,29 @@ class _Refinement:
             if len(chosen) == 1 or not shares.size:
                 return chosen
             members = shares[:, 0] > LEAST_SHARE * shares[:, 0].max()
-            left.remove(chosen[int(np.flatnonzero(members)[-1])])
+            removed = [i for i, is_in in zip(chosen, members, strict=True) if is_in]
+            left.remove(([i for i in removed if i not in asked] or chosen)[-1])
 
 
 # Largest relative standard deviation of a proposed parameter along the initial control. A designed
 # motion gives several times more information than the initial one.
-LARGEST_STD = 0.3
+LARGEST_STD = 0.5
 
-# A parameter belongs to a combination without effect if its share in it is larger than this.
+# A parameter belongs to a combination without effect if its share in it is larger than this. A
+# motion with less information about a payload of the stated size than this does not show it.
 LEAST_SHARE = 1e-4
 
 # Largest number of proposed parameters, so that a design takes a minute.
 MOST_PARAMETERS = 10
 
 
-def identifiable(F: Array, sizes: Array) -> Sequence[int]:
+def identifiable(F: Array, sizes: Array, asked: Sequence[int] = ()) -> Sequence[int]:
     """Choose parameters that a motion identifies together, one after the other.
 
     Args:
         F: (p, p) information of the motion [1 / (theta_i theta_j unit)].
         sizes: (p,) sizes of the parameters [theta-unit].
+        asked: Indices of parameters that are chosen however little is known about them.
 
     Returns:
         Indices of the candidates, in their order, that are known accurately together; the one about
@@ -583,9 +625,10 @@ def identifiable(F: Array, sizes: Array) -> Sequence[int]:
     """
     # Information about relative changes, in which units do not matter.
     relative = F * np.outer(sizes, sizes)
-    chosen: list[int] = []
+    chosen = list(asked)
     for i in range(len(sizes)):
-        if len(chosen) < MOST_PARAMETERS and _largest_std(relative, [*chosen, i]) <= LARGEST_STD:
+        worst = _largest_std(relative, [*chosen, i])
+        if i not in chosen and len(chosen) < MOST_PARAMETERS and worst <= LARGEST_STD:
             chosen.append(i)
     return chosen or [int(np.argmax(np.diag(relative)))]
 
@@ -614,8 +657,13 @@ ABOVE = {
         'for example "qvel:<joint>" = [-1.0, 1.0].',
     ],
     "nuisance": ["The error of the release is unknown; the fit reads it from each log."],
-    "parameters": ["Unknown parameters. `mjfim list MODEL` lists every path."],
-    "boundary": ['end = "rest" lets the motion also end at a standstill.'],
+    "parameters": [
+        f"Unknown parameters: at most {MOST_PARAMETERS} that the first motion identifies together,",
+        "one for equal joints of a large robot. `mjfim list MODEL` lists every path.",
+    ],
+    "boundary": [
+        'end = "rest" lets the motion end at a standstill; "free" gives more information.'
+    ],
 }
 
 # Comments behind keys.
@@ -623,6 +671,12 @@ BEHIND = {
     "rate": "samples and controls [Hz]",
     "horizon": "duration of the experiment [s]",
     "cost.control": "the ranges bound the control; no weight is needed",
+    "limits.velocity": "of driven joints [m/s or rad/s]",
+    "limits.position": "wider than in the MJCF, whose soft range the state at rest exceeds",
+    "limits.tendon_length": "wider than in the MJCF, whose soft range the state at rest exceeds",
+    "limits.clearance": "between bodies [m]; ignored pairs are nearer at the start",
+    "limits.floor": "height of a plane below the robot, which the MJCF does not have [m]",
+    "limits.bandwidth": "of the controls [Hz]; a larger one gives more information",
     "descent.seconds": "time budget of a design [s]; more gives better designs",
 }
 
@@ -680,8 +734,8 @@ def _about(proposal: Proposal) -> dict[str, list[str]]:
             "`mjfim list MODEL --kind limits` shows them.",
         ]
     limits += [
-        "Further limits: velocity, acceleration, control_rate, force, clearance,",
-        "for example: velocity = 2.0",
+        "Those below are derived from the robot's length and its state at rest. Write those that",
+        "your robot has; further ones are acceleration, control_rate and force.",
     ]
     if any(kind in QUATERNION_PLACE for kind in model.jnt_type.tolist()):
         limits.append("Of free and ball joints also: tilt, angular_velocity, in radians.")
@@ -741,5 +795,5 @@ def _add_others(table: Any, proposal: Proposal) -> None:
 
 def _meaning(model: Any, each: Candidate) -> str:
     """Meaning of a parameter, with its unit."""
-    unit = unit_of(model, each.path)
+    unit = unit_of(model, each.paths[0])
     return f"{each.meaning} [{unit}]" if unit else each.meaning

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -283,7 +283,7 @@ def _candidates(model: Any) -> Iterator[Start]:
     first = _start(model, inside, _resting_control(model, inside), keyframe=None, reason=reason)
     yield first
 
-    driven = _driven_dofs(model)
+    driven = driven_dofs(model)
     for locked, how in ((driven, "while its driven joints are locked"), ((), "by itself")):
         settled = _settled(model, first, locked)
         if settled is None:
@@ -464,8 +464,12 @@ def _time(model: Any, data: Any) -> float:
     return pendulum_time(model, data) or free_time(model)
 
 
-def _driven_dofs(model: Any) -> list[int]:
-    """Degrees of freedom of the slides and hinges at which an actuator acts."""
+def driven_dofs(model: Any) -> list[int]:
+    """Degrees of freedom of the slides and hinges at which an actuator acts.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
     joints = {
         int(model.actuator_trnid[i, 0])
         for i in range(model.nactuator)
@@ -560,23 +564,6 @@ def first_amplitudes(
 def rounded(values: Array) -> Array:
     """Numbers with two significant digits."""
     return np.array([float(f"{value:.2g}") for value in values])
-
-
-def largest_feasible(amplitudes: Array, feasible: Callable[[Array], bool]) -> Array | None:
-    """Shrink amplitudes until a motion keeps all limits.
-
-    Args:
-        amplitudes: (nu,) amplitudes of the first trial.
-        feasible: Whether the motion with some amplitudes keeps all limits.
-
-    Returns:
-        (nu,) amplitudes with two significant digits, or None where even tiny ones do not.
-    """
-    for trial in range(TRIALS):
-        shrunk = rounded(amplitudes * SHRINKING**trial)
-        if feasible(shrunk):
-            return shrunk
-    return None
 
 
 # Angle by which a hinge or ball joint without a range may be released to each side of the start

@@ -49,20 +49,23 @@ CASES: dict[str, str] = {
     "design previous": "design cart_pendulum+descent.max_iterations=10 -o a"
     ' ; design cart_pendulum+descent.previous=[\\"a/design.npz\\"]+descent.max_iterations=40 -o o',
     # Hard limits.
-    "limits": "design cart_pendulum_limits+descent.starts=1+descent.max_iterations=60 -o o",
-    "limits starts": "design cart_pendulum_limits+descent.starts=3+descent.seconds=8 -o o",
-    "limits velocity": "design cart_pendulum_limits+descent.starts=1+limits.velocity=2.0"
+    "limits": "design cart_pendulum_limits+boundary.end=free+descent.starts=1"
+    "+descent.max_iterations=60 -o o",
+    "limits starts": "design cart_pendulum_limits+boundary.end=free+descent.starts=3"
     "+descent.seconds=8 -o o",
+    "limits velocity": "design cart_pendulum_limits+boundary.end=free+descent.starts=1"
+    "+limits.velocity=2.0+descent.seconds=8 -o o",
     "limits rest": "design cart_pendulum_limits+descent.starts=1+limits.bandwidth=5.0"
     "+boundary.start=rest+boundary.end=rest+descent.seconds=8 -o o",
     "limits torque": "design double_pendulum+limits.velocity=6.0+limits.control.shoulder=[-4,4]"
     "+limits.control.elbow=[-4,4]+descent.starts=2+descent.seconds=8 -o o",
     "limits block": "design sliding_block+descent.starts=1+descent.seconds=8 -o o",
-    "limits infeasible": "design cart_pendulum_limits+limits.position.slide=[0.5,1.0] -o o",
+    "limits infeasible": "design cart_pendulum_limits+boundary.end=free"
+    "+limits.position.slide=[0.5,1.0] -o o",
     # A design that is stopped or killed.
-    "stopped": "@stop=6 design cart_pendulum_limits.toml -o o",
-    "stopped early": "@stop=1 design cart_pendulum_limits.toml -o o",
-    "killed": "@kill=6 design cart_pendulum_limits.toml -o o"
+    "stopped": "@stop=6 design cart_pendulum_limits+boundary.end=free -o o",
+    "stopped early": "@stop=1 design cart_pendulum_limits+boundary.end=free -o o",
+    "killed": "@kill=6 design cart_pendulum_limits+boundary.end=free -o o"
     " ; design cart_pendulum+descent.max_iterations=5 -o o",
     # Simulated recordings and estimates.
     "identify cart": "simulate cart_pendulum_guess.toml -o r.csv"

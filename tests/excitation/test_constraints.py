@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import mjfim
 from mjfim.excitation.limits.constraint_kinds import END_WEIGHT, ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem, values_of
@@ -419,3 +420,55 @@ def test_without_enforcement_only_the_boundary_constrains(tmp_path: Path) -> Non
         values = constraints.evaluate(*watched, slopes=False)
         assert isinstance(values, ConstraintValues)
         assert set(constraints.margins(values)) == kinds | {"end_position", "end_velocity"}
+
+
+def test_a_design_stays_above_a_floor_that_only_the_file_states(tmp_path: Path) -> None:
+    """The lowest point of the swinging rod, which collides with nothing, in plain MuJoCo."""
+    path = tmp_path / "rod.xml"
+    path.write_text(
+        """
+    <mujoco>
+      <option timestep="0.005"/>
+      <worldbody>
+        <body name="rod" pos="0 0 0.3" euler="0 90 0">
+          <joint name="hinge" axis="0 1 0" damping="0.1" ref="0"/>
+          <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="0.5" contype="0"
+                conaffinity="0"/>
+        </body>
+      </worldbody>
+      <actuator><motor name="motor" joint="hinge" ctrlrange="-9 9"/></actuator>
+    </mujoco>
+    """,
+        encoding="utf-8",
+    )
+    stated = {
+        "model": path.name,
+        "rate": 50.0,
+        "horizon": 0.6,
+        "initial": {
+            "control": {"kind": "sine", "amplitude": 0.5, "offset": -1.2, "frequency": 2.0}
+        },
+        "parameters": {"c": {"target": "joint/hinge:damping"}},
+        "noise": {"state": 0.01},
+        "cost": {"control": 0.0},
+        "descent": {"max_iterations": 15, "seconds": 20.0},
+        "limits": {"clearance": 0.05},
+    }
+
+    def lowest(**limits: object) -> float:
+        """Height of the lowest point of the rod along a design [m]."""
+        tables = {**stated, "limits": {**limits}}
+        found = mjfim.design(mjfim.Experiment(**tables, directory=tmp_path))
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        heights = []
+        for control in found.trajectory.ctrl:
+            data.ctrl[:] = control
+            for _ in range(4):
+                mujoco.mj_step(model, data)
+                tip = data.geom_xpos[0, 2] - 0.25 * abs(data.geom_xmat[0, 8])
+                heights.append(tip - 0.02)
+        return min(heights)
+
+    assert lowest() < 0.0
+    assert lowest(clearance=0.05, floor=0.0) >= 0.05 - 1e-6

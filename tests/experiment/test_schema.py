@@ -386,7 +386,8 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
             HOME,
             "limits.speed",
             "acceleration, angular_velocity, bandwidth, clearance, control, control_rate, enforce, "
-            "force, ignored, joint_force, position, tendon_force, tendon_length, tilt, velocity",
+            "floor, force, ignored, joint_force, position, tendon_force, tendon_length, tilt, "
+            "velocity",
         ],
     ),
     "reserved key": ('source = "x"\n' + SHORT, E, [HOME, "source", "valid:", "model"]),
@@ -457,7 +458,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "rate": (
         edited("rate = 100.0", "rate = 30.0"),
         E,
-        [HOME, "rate: at 30 Hz", "0.01 s", "100, 50, 25"],
+        [HOME, "rate: at 30 Hz", "0.01 s", "25, 33.3333, 50 Hz", "A log keeps its own rate"],
     ),
     "rate negative": (
         edited("rate = 100.0", "rate = -1.0"),

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
-from mjfim.model.model_files import files_of_model
+import pytest
+
+from mjfim.errors import ModelWarning
+from mjfim.model.loading import load_spec, packed_model
+from mjfim.model.model_files import PackedFiles, files_of_model
 from tests.support.mesh_model import FILES, write_mesh_model
 
 
@@ -39,3 +44,44 @@ def test_what_is_no_xml_is_left_to_mujoco(tmp_path: Path) -> None:
     model.write_text("<mujoco><include")
 
     assert files_of_model(model) == (model,)
+
+
+# A link whose mesh is a file of a ROS package.
+PACKAGED = """
+<robot name="one">
+  <link name="base"/>
+  <link name="arm">
+    <inertial><origin xyz="0 0 -0.2"/><mass value="1.2"/>
+      <inertia ixx="0.01" iyy="0.01" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="package://robot/meshes/arm.obj"/></geometry></collision>
+  </link>
+  <joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="9" velocity="3"/></joint>
+</robot>
+"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.mark.parametrize("place", ["above", "environment", "stated", "packed", "absent"])
+def test_meshes_of_ros_packages_are_found_or_left_out(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / ("robot" if place in ("above", "packed") else "elsewhere/robot")
+    (package / "meshes").mkdir(parents=True)
+    (package / "meshes" / "arm.obj").write_text(TETRAHEDRON, encoding="utf-8")
+    path = tmp_path / "robot" / "urdf" / "arm.urdf"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(PACKAGED, encoding="utf-8")
+
+    if place == "environment":
+        monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "elsewhere"))
+    if place == "packed":
+        files = PackedFiles.read(files_of_model(path), PackedFiles.of({}))
+        shutil.rmtree(package)
+        assert packed_model(files, path).model.ngeom == 1
+    elif place == "absent":
+        with pytest.warns(ModelWarning, match="meshes of the package 'robot' are not found"):
+            assert load_spec(path).compile().ngeom == 0
+    else:
+        packages = {"robot": str(package)} if place == "stated" else {}
+        assert load_spec(path, packages=packages).compile().ngeom == 1

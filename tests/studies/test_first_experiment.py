@@ -220,8 +220,13 @@ def test_a_urdf_gets_motors_and_keeps_its_limits(tmp_path: Path) -> None:
     assert model.actuator("shoulder").ctrlrange.tolist() == [-20.0, 20.0]
     assert experiment.limits.velocity == {"shoulder": 3.0, "elbow": 4.0}
     task = DesignTask.resolve(experiment)
-    assert verify(task, task.initial).is_feasible
-    assert proposal.rest
+    # Motors do not stop the first motion at its end; a design does.
+    margins = verify(task, task.initial).margins
+    assert {kind for kind, margin in margins.items() if margin < 0.0} <= {
+        "end_position",
+        "end_velocity",
+    }
+    assert proposal.boundary == {"start": "rest", "end": "rest"}
 
 
 def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Path) -> None:
@@ -234,13 +239,78 @@ def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Pat
     assert set(experiment.parameters) <= {"payload", *(f"payload_moment_{a}" for a in "xyz")}
 
 
-def test_a_payload_that_nothing_moves_is_named(tmp_path: Path) -> None:
+def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "bolted.xml"
     path.write_text(BOLTED, encoding="utf-8")
-    for body, told in (("base", True), ("arm", False)):
-        found = propose_experiment(path, tmp_path, Wishes(payload=body, groups=("friction",)))
-        said = f"the first motion does not show the payload at {body}"
-        assert any(said in remark for remark in found.remarks) == told
+    found = propose_experiment(path, tmp_path, Wishes(payload="arm"))
+    assert found.chosen[0].name == "payload"
+    with pytest.raises(ExperimentError, match="does not show a load at 'base'"):
+        propose_experiment(path, tmp_path, Wishes(payload="base", groups=("friction",)))
+
+    # The load of a light wrist follows from what the motors lift.
+    path.write_text(SERVO_ARM.format(floor=""), encoding="utf-8")
+    found = propose_experiment(path, tmp_path, Wishes(payload="wrist"))
+    assert found.chosen[0].name == "payload"
+    # Nothing is below this arm: it gets a floor at the height of its base.
+    assert found.limits["floor"] == 0.0
+    assert found.chosen[0].scale is not None
+    assert 0.01 < found.chosen[0].scale < 1.0
+
+
+# Four equal servos, the last of which turns a light wrist; no joint has a damping.
+SERVO_ARM = """
+<mujoco>
+  <compiler autolimits="true"/>
+  <option integrator="implicitfast"/>
+  <default>
+    <joint axis="0 1 0" range="-150 150" armature="0.02" frictionloss="0.05"/>
+    <geom type="capsule" size="0.02"/>
+    <position kp="200" kv="8" forcerange="-20 20" ctrlrange="-2 2"/>
+  </default>
+  <worldbody>
+    {floor}
+    <body name="base"><geom type="box" size="0.04 0.04 0.04" pos="0 0 0.04"/>
+      <body name="upper" pos="0 0 0.15"><joint name="pan" axis="0 0 1"/>
+        <geom fromto="0 0 0 0 0 0.1" mass="0.4"/>
+        <body name="lower" pos="0 0 0.1"><joint name="lift"/>
+          <geom fromto="0 0 0 0.2 0 0" mass="0.3"/>
+          <body name="fore" pos="0.2 0 0"><joint name="elbow"/>
+            <geom fromto="0 0 0 0.2 0 0" mass="0.2"/>
+            <body name="wrist" pos="0.2 0 0"><joint name="roll" axis="1 0 0"/>
+              <geom fromto="0 0 0 0.03 0 0.02" mass="0.02"/>
+            </body></body></body></body></body>
+  </worldbody>
+  <actuator>
+    <position name="pan" joint="pan"/><position name="lift" joint="lift"/>
+    <position name="elbow" joint="elbow"/><position name="roll" joint="roll"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_an_arm_with_servos_gets_a_file_that_a_person_would_play(tmp_path: Path) -> None:
+    """Unknowns of equal servos, limits that the motion keeps, and an end at rest."""
+    path = tmp_path / "arm.xml"
+    path.write_text(SERVO_ARM.format(floor='<geom type="plane" size="1 1 1"/>'), encoding="utf-8")
+    proposal, experiment = proposed(path, tmp_path)
+
+    # Equal joints share one unknown; what the MJCF does not have stands in a comment.
+    assert list(experiment.parameters)[:4] == ["kp", "frictionloss", "armature", "delay"]
+    assert [target.path for target in experiment.parameters["kp"].targets] == [
+        f"actuator/{name}:kp" for name in ("pan", "lift", "elbow", "roll")
+    ]
+    [damping] = [each for each in proposal.others if each.name == "damping"]
+    assert damping.scale is not None
+    assert damping.scale > 0.0
+
+    limits, boundary = experiment.limits, experiment.boundary
+    assert limits.velocity == pytest.approx(np.sqrt(9.81 / 0.4), rel=0.2)
+    assert limits.clearance == pytest.approx(0.008, rel=0.4)
+    assert limits.bandwidth is not None
+    assert limits.floor is None
+    assert (boundary.start, boundary.end) == ("rest", "rest")
+    task = DesignTask.resolve(experiment)
+    assert verify(task, task.initial).is_feasible
 
 
 def test_faults_are_named(tmp_path: Path) -> None:
@@ -539,3 +609,43 @@ def test_a_model_without_actuators_is_released(kind: str, tmp_path: Path) -> Non
     assert task.release is not None
     assert verify(task, task.initial).is_feasible
     assert "hinge_damping" in experiment.parameters
+
+
+HANGING = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="cup" pos="0 0 1">
+      <joint name="lift" type="slide" axis="0 0 1" damping="3" stiffness="20"/>
+      <geom size="0.02" mass="0.1" contype="0" conaffinity="0"/><site name="cup"/>
+      </body>
+    <body name="ball" pos="0 0 0.71">
+      <joint name="fall" type="slide" axis="0 0 1"/>
+      <geom size="0.02" mass="0.05" contype="0" conaffinity="0"/><site name="ball"/>
+    </body>
+  </worldbody>
+  <tendon><spatial name="string" limited="true" range="0 0.3">
+    <site site="ball"/><site site="cup"/></spatial></tendon>
+  <actuator><motor name="lift" joint="lift" ctrlrange="-5 5"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_soft_range_that_the_state_at_rest_exceeds_is_written_wider(tmp_path: Path) -> None:
+    """A ball hangs at a string that gives way; no motion could keep the range of the MJCF."""
+    path = tmp_path / "cup.xml"
+    path.write_text(HANGING, encoding="utf-8")
+    proposal, experiment = proposed(path, tmp_path)
+    assert not any("no motion about this start" in remark for remark in proposal.remarks)
+    low, high = experiment.limits.tendon_length["string"]
+    assert low == 0.0
+    assert 0.3 < high < 0.315
+    task = DesignTask.resolve(experiment)
+    assert verify(task, task.initial).is_feasible
+    # The string still acts along a design.
+    assert verify(task.relaxed(), task.relaxed().initial).is_feasible
+
+    # A range that is far wider than the MJCF's has no effect.
+    wide = experiment.replace(limits={"tendon_length": {"string": [-1.0, 1.0]}})
+    [limit] = [each for each in DesignTask.resolve(wide).limits if each.kind == "tendon_length"]
+    assert (limit.lower, limit.upper) == (0.0, 0.3)

@@ -26,6 +26,11 @@ from mjfim.model.limited_elements import (
 Stated = float | Range
 Box = tuple[Range, Range, Range]
 
+# Kinds whose ranges in the MJCF are soft, and the largest share of a range by which the experiment
+# file may widen each end of it.
+SOFT_KINDS = ("position", "tendon_length")
+SOFT_SHARE = 0.05
+
 # Largest number of engine steps of a sample at which the barrier is evaluated with derivatives.
 MAX_DERIVATIVE_SUBSTEPS = 5
 
@@ -140,7 +145,13 @@ def _limits_of_kind(
             lower, upper = by_name[name]
             Limit(kind=kind, name=name, index=element.index, lower=float(lower), upper=float(upper))
 
-        ranges = [each for each in (by_name.get(name), element.stated) if each is not None]
+        own = element.stated
+        if own is not None and name in by_name and kind in SOFT_KINDS:
+            # A stop gives way: an end that is stated a little outside of the MJCF's holds.
+            (lower, upper), room = by_name[name], SOFT_SHARE * (own[1] - own[0])
+            low = lower if own[0] - room <= lower < own[0] else own[0]
+            own = low, upper if own[1] < upper <= own[1] + room else own[1]
+        ranges = [each for each in (by_name.get(name), own) if each is not None]
         if not ranges:
             continue
 

@@ -1,0 +1,168 @@
+"""Limits within which a person would play a first motion: speeds, distances and bandwidth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
+from mjfim.excitation.limits.limits import SOFT_KINDS, SOFT_SHARE, limits_of_model
+from mjfim.model.clearance import GeomDistances, find_geom_pairs, with_floor
+from mjfim.model.coordinates import joint_names
+from mjfim.model.elements import translations, unique_names
+from mjfim.model.loading import ModelSource
+from mjfim.studies.first_motion import Start, TimeScale, driven_dofs
+
+# Derived limit of a speed, relative to the largest speed of the motion at rest, where that is
+# larger than the natural speed: a robot that sinks or falls keeps its limits.
+SPEED_ROOM = 2.0
+
+# Room of a range that is exceeded at rest, relative to the excess.
+SOFT_ROOM = 4.0
+
+# Clearance, relative to the length of the robot. Pairs of bodies that are nearer than twice this
+# at rest are ignored.
+CLEARANCE_SHARE = 0.02
+
+# Bandwidth of the control in characteristic periods of the motion, and fewest periods of it within
+# the horizon.
+BANDWIDTH = 6.0
+FEWEST_PERIODS = 4.0
+
+# Largest number of configurations at rest whose distances are measured.
+MOST_CONFIGURATIONS = 20
+
+
+def played(
+    model: Any, start: Start, controls: Array, moved: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """The motion in plain MuJoCo.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        start: Initial state.
+        controls: (n, nu) controls of the engine steps.
+        moved: (nv,) change of the initial positions; None without one.
+
+    Returns:
+        (n+1, nq) positions, (n+1, nv) velocities and (n+1, ntendon) lengths of tendons; fewer rows
+        where the simulation diverges.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:], data.act[:] = start.qpos, start.act
+    if moved is not None:
+        mujoco.mj_integratePos(model, data.qpos, moved, 1.0)
+    mujoco.mj_forward(model, data)
+    seen = [(data.qpos.copy(), data.qvel.copy(), data.ten_length.copy())]
+    for control in controls:
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        if data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
+            break
+        seen.append((data.qpos.copy(), data.qvel.copy(), data.ten_length.copy()))
+    positions, velocities, lengths = (np.stack(each) for each in zip(*seen, strict=True))
+    return positions, velocities, lengths
+
+
+def playable_limits(
+    source: ModelSource, start: Start, times: TimeScale, length: float, stated: Mapping[str, float]
+) -> dict[str, Any]:
+    """Limits that the MJCF does not state, such that the robot at rest keeps them.
+
+    Speeds are those of a pendulum of the robot's length: they are limits of the driven joints.
+
+    Args:
+        source: The model.
+        start: Initial state and resting control.
+        times: Rate, horizon and period of the motion.
+        length: Length of the robot [m].
+        stated: Velocity limits that a URDF states by joint [m/s or rad/s].
+
+    Returns:
+        Keys of the table `[limits]`, without those that nothing in the model can have.
+    """
+    model = source.model
+    resting = np.tile(start.control, (round(times.horizon / model.opt.timestep), 1))
+    positions, velocities, lengths = played(model, start, resting)
+    natural = np.where(translations(model), length, 1.0) * 2.0 * np.pi / times.period
+    speeds = np.maximum(natural, SPEED_ROOM * np.abs(velocities).max(axis=0))
+    names = joint_names(model)
+    driven = driven_dofs(model)
+    derived = {
+        names[int(model.dof_jntid[dof])]: float(f"{speeds[dof]:.2g}")
+        for dof in (driven if not stated else ())
+    }
+    velocity: Any = dict(stated) or derived
+    if len(driven) == model.nv and len(set(derived.values())) == 1:
+        velocity = next(iter(derived.values()))
+
+    limits: dict[str, Any] = {"velocity": velocity} if velocity else {}
+    limits |= _widened(model, positions, lengths)
+    step = -(-len(positions) // MOST_CONFIGURATIONS)
+    limits |= _clearance(source, positions[::step], float(f"{CLEARANCE_SHARE * length:.1g}"))
+    bandwidth = max(BANDWIDTH / times.period, FEWEST_PERIODS / times.horizon)
+    if bandwidth < 0.5 * times.rate:
+        limits["bandwidth"] = float(f"{bandwidth:.2g}")
+    return limits
+
+
+def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
+    """Ranges of joints and tendons that (n, nq) positions and (n, ntendon) lengths at rest exceed.
+
+    A stop is soft: where the start is outside, the range is widened by some times the excess.
+    """
+    found: dict[str, dict[str, list[float]]] = {}
+    for limit in limits_of_model(model):
+        if limit.kind not in SOFT_KINDS or limit.is_magnitude:
+            continue
+        values = (positions if limit.kind == "position" else lengths)[:, limit.index]
+        ends = np.array([limit.lower, limit.upper])
+        excess = np.array([min(values.min() - ends[0], 0.0), max(values.max() - ends[1], 0.0)])
+        most = SOFT_SHARE * (ends[1] - ends[0])
+        begins_outside = not limit.lower <= values[0] <= limit.upper
+        if begins_outside and (np.abs(excess) < most).all():
+            wider = ends + np.clip(SOFT_ROOM * excess, -most, most)
+            found.setdefault(limit.kind, {})[limit.name] = [float(f"{end:.6g}") for end in wider]
+    return {**found}
+
+
+def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:
+    """The least distance [m], a floor, and the pairs of bodies that are nearer at rest.
+
+    A robot above its base, without anything around it, gets a floor at the height of its base.
+
+    Args:
+        source: The model.
+        positions: (n, nq) positions at rest.
+        least: The least distance [m].
+    """
+    data, model = mujoco.MjData(source.model), source.model
+    data.qpos[:] = positions[0]
+    mujoco.mj_kinematics(model, data)
+    moves = model.body_weldid > 0
+    bases = set(model.body_parentid[moves].tolist()) - {0, *np.flatnonzero(moves).tolist()}
+    around = [b for b in model.geom_bodyid.tolist() if not moves[b] and b not in bases]
+    height = min((float(data.xpos[body, 2]) for body in bases), default=0.0)
+    stated: dict[str, Any] = {"clearance": least}
+    is_fixed = not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
+    lowest = data.geom_xpos[moves[model.geom_bodyid], 2].min(initial=np.inf)
+    if is_fixed and not around and lowest > height:
+        stated["floor"] = float(f"{height:.6g}")
+        model = with_floor(source, stated["floor"]).model
+    try:
+        pairs = find_geom_pairs(model, ())
+        distances = GeomDistances(model, pairs, 2.0 * least)
+    except ExperimentError:
+        return {}
+
+    nearest = distances(positions, slopes=False)[0].min(axis=0)
+    near = {name for name, d in zip(distances.columns, nearest, strict=True) if d < 2.0 * least}
+    if len(near) == len(nearest):
+        return {}
+    names = np.array(unique_names(model, "body"))[model.geom_bodyid]
+    ignored = {(names[p.first], names[p.second]): None for p in pairs if p.bodies in near}
+    return stated | ({"ignored": [[str(end) for end in each] for each in ignored]} if near else {})
