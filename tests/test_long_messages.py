@@ -50,6 +50,8 @@ def test_warnings_about_many_parameters_list_the_first_ones_and_count_the_others
 
 def test_a_warning_about_many_outputs_lists_the_first_ones() -> None:
     result = SimpleNamespace(
+        task=SimpleNamespace(elsewhere=()),
+        touches="",
         begun_instead="",
         quality=SimpleNamespace(unexplained=NAMES),
         accuracy=SimpleNamespace(groups=(), singular=False),
