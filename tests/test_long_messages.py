@@ -43,6 +43,8 @@ NAMES = tuple(f"inertia_of_link_{i}" for i in range(300))
 
 def test_warnings_about_many_parameters_list_the_first_ones_and_count_the_others() -> None:
     result = SimpleNamespace(
+        task=SimpleNamespace(elsewhere=()),
+        touches="",
         begun_instead="",
         quality=SimpleNamespace(chi2=1.0, dof=1),
         accuracy=SimpleNamespace(singular=False),

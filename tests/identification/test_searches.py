@@ -44,6 +44,9 @@ class OneParameter:
     lower = np.array([-np.inf])
     upper = np.array([np.inf])
 
+    def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
+        return self.lower, self.upper
+
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
         """The unknowns after a fraction of a step."""
         return replace(at, theta=at.theta + fraction * step.common)
