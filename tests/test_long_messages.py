@@ -43,12 +43,11 @@ NAMES = tuple(f"inertia_of_link_{i}" for i in range(300))
 
 def test_warnings_about_many_parameters_list_the_first_ones_and_count_the_others() -> None:
     result = SimpleNamespace(
-        task=SimpleNamespace(elsewhere=()),
+        task=SimpleNamespace(elsewhere=(), noise_is_stated=False),
         touches="",
         begun_instead="",
         quality=SimpleNamespace(chi2=1.0, dof=1),
         accuracy=SimpleNamespace(singular=False),
-        task=SimpleNamespace(noise_is_stated=False),
     )
     (warning,) = _limits_of_search(result, NAMES, (), interrupted=False)
     assert len(warning) < LONGEST_MESSAGE

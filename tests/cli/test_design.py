@@ -142,7 +142,7 @@ BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {
         ["study.toml", "horizn", "unknown key", "horizon"],
     ),
     "bad value": ({"rate": "-1"}, ["study.toml", "rate", "greater than 0"]),
-    "bad rate": ({"rate": "33.0"}, ["study.toml", "rate: at 33 Hz", "valid"]),
+    "bad rate": ({"rate": "33.0"}, ["study.toml", "rate: at 33 Hz", "write one of"]),
     "bad syntax": ({"rate": ""}, ["study.toml", "not valid TOML"]),
     "no model": ({"model": '"gone.xml"'}, ["gone.xml", "no such model file"]),
     "no table": ({"start": '"gone.csv"'}, ["gone.csv", "no such file"]),

@@ -272,7 +272,9 @@ class _Search:
                 break
             moved = [at(z + move)[1] for move in np.diag(steps)]
             slopes = np.array([weights * (each[0] - each[1]) - residual for each in moved])
-            A = np.column_stack([np.nan_to_num(slopes.T / steps), free])
+            # What overflows after a step has no slope.
+            with np.errstate(invalid="ignore", over="ignore"):
+                A = np.column_stack([np.nan_to_num(slopes.T / steps), free])
             lower, upper = np.append(low - z, friction), np.append(high - z, unbounded)
             z = z + bounded_least_squares(A, -residual, lower, upper)[: len(z)]
         return best
