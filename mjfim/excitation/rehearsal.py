@@ -19,6 +19,7 @@ import scipy
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
+from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.information.finite_steps import finite_steps
@@ -450,31 +451,41 @@ class _Stage:
             if limit.kind != "position" or limit.count != 1 or limit.index not in dof_of:
                 continue
             dof = dof_of[limit.index]
-            speed, place = float(qvel[-1, dof]), float(data.qpos[limit.index])
-            if abs(speed) <= SLOW_SHARE * np.abs(qvel[:, dof]).max():
+            is_slow = abs(qvel[-1, dof]) <= SLOW_SHARE * np.abs(qvel[:, dof]).max()
+            is_inside = limit.lower <= data.qpos[limit.index] <= limit.upper
+            if is_slow or not is_inside or not is_bounded.all():
                 continue
-            room = limit.upper - place if speed > 0.0 else place - limit.lower
-            if not np.isfinite(room) or not is_bounded.all():
-                continue
-            if speed**2 > 2.0 * self._brake(model, data, dof, speed) * max(room, 0.0):
+            if self._leaves(model, data, limit, dof):
                 yield limit.name
 
-    def _brake(self, model: Any, data: Any, dof: int, speed: float) -> float:
-        """Largest deceleration of a degree of freedom that the controls can reach, at least 0."""
-        bounds, sign = self.constraints.control.bounds, -np.sign(speed)
-        best = 0.5 * (bounds.lower + bounds.upper)
+    def _leaves(self, model: Any, end: Any, limit: Limit, dof: int) -> bool:
+        """Whether a joint leaves its range after the end (MjData) before the controls stop it.
 
-        def deceleration(ctrl: Array) -> float:
-            """Deceleration under one control."""
+        The controls keep the values that brake it most at the end.
+        """
+        bounds, direction = self.constraints.control.bounds, float(np.sign(end.qvel[dof]))
+        data = mujoco.MjData(model)
+
+        def begin(ctrl: Array) -> float:
+            """Return to the end of the motion; the acceleration under a control."""
+            mujoco.mj_copyData(data, model, end)
             data.ctrl[:] = ctrl
             mujoco.mj_forward(model, data)
-            return float(sign * data.qacc[dof])
+            return direction * float(data.qacc[dof])
 
+        best = 0.5 * (bounds.lower + bounds.upper)
         for k in range(len(best)):
             chosen = np.arange(len(best)) == k
             sides = [np.where(chosen, bound, best) for bound in (bounds.lower, bounds.upper)]
-            best = max(sides, key=deceleration)
-        return max(deceleration(best), 0.0)
+            best = min(sides, key=begin)
+        begin(best)
+        for _ in range(len(self.ctrl) * self.steps_per_row):
+            if data.qvel[dof] * direction <= 0.0:
+                return False
+            mujoco.mj_step(model, data)
+            if not limit.lower <= data.qpos[limit.index] <= limit.upper:
+                return True
+        return False
 
     def _margins(self, observed: Array | None, sent: Array, before: Array, states: Array) -> Array:
         """(l,) smallest margins of all limits over half of their ranges.

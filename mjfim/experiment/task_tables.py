@@ -33,6 +33,25 @@ from mjfim.recordings.section import (
     Section,
 )
 
+# A part of something, below the whole.
+Share = Annotated[Finite, Field(ge=0, lt=1)]
+
+# Kinds of limits.
+LimitKind = Literal[
+    "position",
+    "tilt",
+    "velocity",
+    "angular_velocity",
+    "acceleration",
+    "control",
+    "control_rate",
+    "force",
+    "joint_force",
+    "tendon_force",
+    "tendon_length",
+    "clearance",
+]
+
 # Ranges of the three coordinates of a place.
 Box = tuple[RangeWithUnit, RangeWithUnit, RangeWithUnit]
 
@@ -329,6 +348,15 @@ class Limits(Section):
     )
     ignored: tuple[tuple[str, str], ...] = Field(
         default=(), description="Pairs of bodies that may come closer than `clearance`."
+    )
+    reserve: dict[LimitKind, Share] = Field(
+        default_factory=dict,
+        description=(
+            "Distance that a design keeps from the limits of a kind, over half of each range, by "
+            "the name of the kind; for `clearance`, over the smallest distance. Robots that differ "
+            "from the model may use it. Default: none."
+        ),
+        examples=[{"position": 0.3}],
     )
     bandwidth: Hertz | None = Field(
         default=None,

@@ -356,12 +356,12 @@ class ConstraintSet:
 
 
 def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
-    """Resolve the limits and the boundary of a task.
+    """Resolve the limits and the boundary of a task, narrowed by the reserve of a design.
 
     Args:
         task: The task.
-        every: Include limits that are checked but not enforced. Otherwise only the boundary
-            constrains a design where `limits.enforce` is false.
+        every: Include limits that are checked but not enforced, and leave out the reserve.
+            Otherwise only the boundary constrains a design where `limits.enforce` is false.
 
     Returns:
         The constraint set.
@@ -407,13 +407,16 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         reach = stated.clearance + max(CLEARANCE_REACH * length, stated.clearance)
         clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
 
-    return ConstraintSet(
+    found = ConstraintSet(
         substeps=substeps,
         control=ControlConstraint(bounds=control),
         rate=rate,
         end=end,
         clearance=clearance,
     )
+    # What is checked are the limits themselves.
+    reserve = dict[str, float](stated.reserve.items())
+    return found if every or not reserve else found.tightened(reserve)
 
 
 def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepConstraint:

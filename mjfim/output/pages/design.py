@@ -280,16 +280,14 @@ def _cures(rehearsal: Rehearsal) -> Iterator[str]:
             "moves down, or `clearance` to a floor in the model."
         )
     reserve = rehearsal.reserve
+    needed: dict[str, float] = {}
     for i in np.flatnonzero(~rehearsal.kept.all(axis=0)).tolist():
-        limit = rehearsal.limits[i]
-        move = float(np.ceil(100.0 * reserve[i]) / 100.0) * limit.scale
-        if not 0.0 < move < limit.scale or limit.kind == "clearance":
-            continue
-        low, high = limit.lower + move, limit.upper - move
-        yield (
-            f"Design with a reserve for such robots: `[limits] {limit.kind} = {{ "
-            f"{limit.name} = [{low:.4g}, {high:.4g}] }}`."
-        )
+        kind, share = rehearsal.limits[i].kind, np.ceil(100.0 * reserve[i]) / 100.0
+        if 0.0 < share < 1.0:
+            needed[kind] = max(float(share), needed.get(kind, 0.0))
+    if needed:
+        shares = ", ".join(f"{kind} = {share:g}" for kind, share in needed.items())
+        yield f"Design with a reserve for such robots: `[limits] reserve = {{ {shares} }}`."
     if rehearsal.unbraked:
         yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
 
