@@ -38,7 +38,7 @@ from mjfim.parallel import one_blas_thread
 from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.records.design import Design, Evaluation
-from mjfim.records.rehearsal import FiniteSteps, Rehearsal, RehearsedLimit
+from mjfim.records.rehearsal import REST_SHARE, FiniteSteps, Rehearsal, RehearsedLimit
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of attempts to draw a robot whose bodies are physical.
@@ -73,9 +73,6 @@ PASSED_SHARE = 0.02
 
 # Cosine of the largest angle between a floor and the horizontal plane.
 LEVEL_FLOOR = 0.99
-
-# A joint that moves more slowly at the end than this share of its peak needs no brake.
-SLOW_SHARE = 0.02
 
 
 def rehearse(experiment: Experiment, design: Design, *, threads: int | None = None) -> Rehearsal:
@@ -451,7 +448,7 @@ class _Stage:
             if limit.kind != "position" or limit.count != 1 or limit.index not in dof_of:
                 continue
             dof = dof_of[limit.index]
-            is_slow = abs(qvel[-1, dof]) <= SLOW_SHARE * np.abs(qvel[:, dof]).max()
+            is_slow = abs(qvel[-1, dof]) <= REST_SHARE * np.abs(qvel[:, dof]).max()
             is_inside = limit.lower <= data.qpos[limit.index] <= limit.upper
             if is_slow or not is_inside or not is_bounded.all():
                 continue

@@ -28,9 +28,6 @@ REST_SHARE = 0.02
 # Kinds of limits that hold by a clamp of the simulation, which does not count as kept.
 CLAMPED_KINDS = ("force", "joint_force", "tendon_force")
 
-# Smallest reserve, over half of a range; smaller values are round-off.
-MIN_RESERVE = 1e-9
-
 
 @record
 class FiniteSteps(Record):
