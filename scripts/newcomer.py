@@ -342,8 +342,9 @@ def _joints(
             yield f"position of {name}", _excess(position, model.jnt_range[i])
         if model.jnt_actfrclimited[i]:
             yield f"force at {name}", _excess(shown.qfrc_actuator[v], model.jnt_actfrcrange[i])
-        if name in stated.get("velocity", {}):
-            bound = stated["velocity"][name]
+        speeds = stated.get("velocity", {})
+        if not isinstance(speeds, dict) or name in speeds:
+            bound = speeds[name] if isinstance(speeds, dict) else speeds
             ends = bound if isinstance(bound, list) else (-bound, bound)
             yield f"velocity of {name}", _excess(data.qvel[v], ends)
 

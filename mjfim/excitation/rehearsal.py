@@ -444,13 +444,16 @@ class _Stage:
         space, bounds = self.task.space, self.constraints.control.bounds
         dof_of = dict(zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True))
         is_bounded = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
+        # Without a drive, and with one whose strength nothing states, there is no brake to try.
+        if not len(is_bounded) or not is_bounded.all():
+            return
         for limit in self.limits:
             if limit.kind != "position" or limit.count != 1 or limit.index not in dof_of:
                 continue
             dof = dof_of[limit.index]
             is_slow = abs(qvel[-1, dof]) <= REST_SHARE * np.abs(qvel[:, dof]).max()
             is_inside = limit.lower <= data.qpos[limit.index] <= limit.upper
-            if is_slow or not is_inside or not is_bounded.all():
+            if is_slow or not is_inside:
                 continue
             if self._leaves(model, data, limit, dof):
                 yield limit.name
@@ -538,7 +541,8 @@ class _Stage:
     def _equilibrium(self, model: Any, stated: Array) -> tuple[Array, float]:
         """An equilibrium near a state, and the largest acceleration that is left.
 
-        The acceleration is relative to the size of its coordinate over the square of the horizon.
+        The acceleration is relative to the size of its coordinate over the square of the horizon,
+        and infinite where the equilibrium is unstable.
         """
         space, sizes = self.task.space, self.task.plant.sizes
         data = mujoco.MjData(model)
@@ -558,11 +562,13 @@ class _Stage:
         still = np.zeros(len(directions))
         if np.abs(relative_rates(still)).max(initial=0.0) <= MAX_REST_MOVE:
             return stated, 0.0
-        move = scipy.optimize.least_squares(
+        found = scipy.optimize.least_squares(
             relative_rates, still, xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=MAX_REST_STEPS
-        ).x
-        moves = float(np.abs(relative_rates(move)).max(initial=0.0))
-        return space.plus(stated, move @ directions), moves
+        )
+        # Nobody balances a robot on an equilibrium that it leaves within the motion.
+        growth = np.linalg.eigvals(found.jac[: space.nv, : space.nv]).real.max(initial=0.0)
+        moves = float(np.abs(relative_rates(found.x)).max(initial=0.0)) if growth < 1.0 else np.inf
+        return space.plus(stated, found.x @ directions), moves
 
     # ---- the controller, with or without feedback
 

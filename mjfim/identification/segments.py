@@ -292,7 +292,9 @@ def begins_elsewhere(system: System, recordings: Sequence[Recording]) -> tuple[s
 
         # The mean over the first rows, as far as the model hardly moves.
         samples = np.rint(aligned.t[:ROWS_AT_BEGIN] / aligned.dt).astype(int)
-        y, is_finite = system.plant.measure(parameters.guess + moved, aligned.ctrl[: samples[-1]])
+        y, is_finite = system.plant.measure(
+            parameters.guess + moved, aligned.ctrl[: max(samples[-1], 1)]
+        )
         y = y[:, samples]
         is_still = np.minimum.accumulate(np.abs(y[0] - y[0, 0]) <= sigma) & is_known
         counted = is_still & aligned.measured[: len(samples)]

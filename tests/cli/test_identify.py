@@ -65,7 +65,7 @@ def test_misfit(study: Path, recorded: Path, tmp_path: Path) -> None:
     result = run("identify", study, odd, "-o", tmp_path / "fit")
     assert result.exit_code == 1
     assert read(tmp_path / "fit" / "estimate.json")["misfit"] is True
-    assert "misfit: residuals are" in " ".join(result.stdout.split())
+    assert "residuals are" in " ".join(result.stdout.split())
 
 
 def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:

@@ -304,7 +304,7 @@ def test_limits_that_no_control_can_keep_end_with_exit_code_one(
     summary = loads(result.stdout)
     found = (result.exit_code, summary["status"], summary["limits"]["satisfied"])
     assert found == (1, "infeasible", False)
-    assert "velocity limits are exceeded by" in result.stderr
+    assert "it violates limits (velocity" in result.stderr
     assert "checked, not enforced" not in result.stderr
 
 

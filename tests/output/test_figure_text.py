@@ -228,17 +228,17 @@ def comparison(size: Size) -> Comparison:
 
 @cache
 def rehearsal(size: Size) -> Rehearsal:
-    """A rehearsal of twelve robots, some of which leave limits."""
+    """A rehearsal of twenty robots, some of which leave limits."""
     labels = size.labels
     rng = np.random.default_rng(0)
     joints = tuple(label.partition(" ")[0] for label in labels.positions)
-    speed = rng.uniform(1.0, 9.0, (13, len(joints)))
+    speed = rng.uniform(1.0, 9.0, (21, len(joints)))
     return results.rehearsal(
         limits=tuple(
             RehearsedLimit(kind="control_rate", name=name, lower=-1.0, upper=1.0, scale=1.0)
             for name in joints
         ),
-        margins=rng.uniform(-0.1, 0.5, (13, len(joints))),
+        margins=rng.uniform(-0.1, 0.5, (21, len(joints))),
         joints=joints,
         units=("rad/s",) * len(joints),
         speed=speed,

@@ -581,7 +581,9 @@ class _TermSearch:
         response = inverse @ H[np.ix_(others, tested)]
         information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
         places = np.searchsorted(others, stated)
-        moves = response[places] / np.sqrt(np.diag(inverse)[places])[:, None]
+        # A parameter that the data do not determine has no standard deviation.
+        variances = np.diag(inverse)[places]
+        moves = response[places] / np.sqrt(np.where(variances > 0.0, variances, np.inf))[:, None]
         return information, g[tested] - g[others] @ response, norms[tested], moves
 
     def _term(
