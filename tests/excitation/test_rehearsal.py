@@ -110,6 +110,7 @@ def test_robots_agree_with_a_plain_loop(tmp_path: Path) -> None:
     assert not found.has_floor and not found.passes_floor.any()
 
 
+@pytest.mark.slow
 def test_robots_are_drawn_as_stated(tmp_path: Path) -> None:
     """From the prior, within the bounds, and within the share of the size."""
     experiment, design = played(tmp_path)
@@ -130,7 +131,9 @@ def test_robots_are_drawn_as_stated(tmp_path: Path) -> None:
     [
         ({}, "keep all limits"),
         ({"speed": 0.6}, "violates limits"),
-        ({"speed": None}, "leave the limit on velocity of slide"),
+        pytest.param(
+            {"speed": None}, "leave the limit on velocity of slide", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_the_verdict_counts_robots(
@@ -236,6 +239,7 @@ def test_an_end_that_no_control_can_brake_is_not_played(room: float, tmp_path: P
     assert found.is_safe is (left < 2)
 
 
+@pytest.mark.slow
 def test_feedback_keeps_robots_near_the_plan(tmp_path: Path) -> None:
     """With little noise the robots follow the plan, late as stated."""
     experiment, design = played(tmp_path, noise=1e-6)
@@ -303,6 +307,7 @@ def test_a_standard_deviation_that_differs_is_stated_by_the_finite_step() -> Non
     assert "dry friction of hinge makes it approximate" in str(steps)
 
 
+@pytest.mark.slow
 def test_the_verb_plays_a_folder(tmp_path: Path) -> None:
     """It finds the experiment by itself, and agrees with the rehearsal of the design."""
     played(tmp_path)

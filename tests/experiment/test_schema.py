@@ -386,8 +386,8 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
             HOME,
             "limits.speed",
             "acceleration, angular_velocity, bandwidth, clearance, control, control_rate, enforce, "
-            "floor, force, ignored, joint_force, position, tendon_force, tendon_length, tilt, "
-            "velocity",
+            "floor, force, ignored, joint_force, position, reserve, tendon_force, tendon_length, "
+            "tilt, velocity",
         ],
     ),
     "reserved key": ('source = "x"\n' + SHORT, E, [HOME, "source", "valid:", "model"]),

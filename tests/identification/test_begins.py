@@ -40,6 +40,7 @@ def hung_elsewhere(experiment: mjfim.Experiment) -> Recording:
     return swung(experiment.model_copy(update={"initial": initial}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "said", "widest"),
     [("late", "slide +0.2 m/s", 0.05), ("elsewhere", "hinge +", 0.01)],

@@ -143,6 +143,7 @@ def test_positions_alone_and_servos_are_enough(arm: tuple[System, Recording]) ->
     assert cure_of(flipped)["ctrl:shoulder"]["scale"] == -1.0
 
 
+@pytest.mark.slow
 def test_the_fit_refuses_an_error_and_goes_on_with_its_cure(arm: tuple[System, Recording]) -> None:
     system, recording = arm
     wrong = with_ctrl(recording, lambda u: -u)

@@ -41,6 +41,7 @@ state = 0.005
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("piece", "guess", "true"),
     [

@@ -239,6 +239,7 @@ def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Pat
     assert set(experiment.parameters) <= {"payload", *(f"payload_moment_{a}" for a in "xyz")}
 
 
+@pytest.mark.slow
 def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "bolted.xml"
     path.write_text(BOLTED, encoding="utf-8")
