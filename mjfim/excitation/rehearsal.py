@@ -107,16 +107,23 @@ def rehearse(experiment: Experiment, design: Design, *, threads: int | None = No
 
 def rehearse_task(task: DesignTask, final: Evaluation) -> Rehearsal:
     """Rehearse the trajectory of an evaluation in a resolved task. See `rehearse`."""
-    steps = finite_steps(
+    steps = steps_along(task, final.trajectory, final.information, final.std)
+    return rehearsed(task, final.trajectory, final.gain, steps)
+
+
+def steps_along(
+    task: DesignTask, trajectory: Trajectory, information: Array, predicted: Array
+) -> FiniteSteps:
+    """Standard deviations along a trajectory of a task by finite steps. See `finite_steps`."""
+    return finite_steps(
         task.plant,
         task.system.noise,
         task.theta,
-        final.trajectory,
-        information=final.information,
-        prior=task.prior,
-        predicted=final.std,
+        trajectory,
+        information=information,
+        prior=task.information.prior,
+        predicted=predicted,
     )
-    return rehearsed(task, final.trajectory, final.gain, steps)
 
 
 @one_blas_thread()
@@ -198,7 +205,7 @@ class _SpeedGroup:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Played:
-    """What one robot does; see `Rehearsal`."""
+    """Measurements of one robot; see `Rehearsal`."""
 
     margins: Array
     speed: Array
@@ -270,13 +277,14 @@ class _Stage:
         moves = model.body_weldid[model.geom_bodyid] > 0
         self._geoms = np.flatnonzero(shapes & moves)
         self._base = np.flatnonzero(shapes & ~moves & (model.geom_bodyid > 0))
-        self.depth = PASSED_SHARE * float(model_length(model))
+        length = float(model_length(model))
+        self.depth = PASSED_SHARE * length
         self.floor, self.has_floor = self._floor_of(model, trajectory.state[0])
         ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
         self._distances: GeomDistances | None = None
         with suppress(ExperimentError):
             pairs = find_geom_pairs(model, ignored)
-            self._distances = GeomDistances(model, pairs, max(self.depth, 1.0))
+            self._distances = GeomDistances(model, pairs, length)
 
     @property
     def numbers(self) -> int:

@@ -36,7 +36,8 @@ from mjfim.recordings.section import (
 # A part of something, below the whole.
 Share = Annotated[Finite, Field(ge=0, lt=1)]
 
-# Kinds of limits.
+# Kinds of limits. They stand in `model.limited_elements`, too, which imports MuJoCo: a wrong key is
+# said before that.
 LimitKind = Literal[
     "position",
     "tilt",

@@ -274,7 +274,7 @@ class Rehearsal(ShownRecord):
                     "name": name,
                     "unit": self.units[i],
                     **{
-                        key: {"model": float(each[0, i]), "robots": worst_of(each[1:, i])}
+                        key: {"model": float(each[0, i]), "robots": _worst(each[1:, i])}
                         for key, each in (
                             ("speed", self.speed),
                             ("acceleration", self.acceleration),
@@ -285,13 +285,13 @@ class Rehearsal(ShownRecord):
                 for i, name in enumerate(self.joints)
             ],
             **{
-                key: {"model": float(each[0]), "robots": worst_of(each[1:], key)}
+                key: {"model": float(each[0]), "robots": _worst(each[1:], key)}
                 for key, each in ((name, getattr(self, name)) for name in measured)
             },
         }
 
 
-def worst_of(values: Array, key: str = "") -> float:
+def _worst(values: Array, key: str = "") -> float:
     """The worst of the values of all robots: the smallest height or distance, else the largest."""
     known = values[np.isfinite(values)]
     if not len(known):

@@ -26,7 +26,7 @@ from mjfim.excitation.evaluation import (
 from mjfim.excitation.initial_controls import initial_controls_of
 from mjfim.excitation.limits.verification import all_violations_of, require_feasible_start
 from mjfim.excitation.objective import DesignPoint, DesignProblem
-from mjfim.excitation.rehearsal import rehearsed
+from mjfim.excitation.rehearsal import rehearsed, steps_along
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.levels import regulator_for, require_coarse_factor
 from mjfim.excitation.task import (
@@ -45,7 +45,6 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.search import refuse_same_data
 from mjfim.identification.segments import recorded_release
 from mjfim.information.criteria import shared
-from mjfim.information.finite_steps import finite_steps
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
 from mjfim.information.smoothness import visible_columns
@@ -528,15 +527,7 @@ def _checked(
     steps = None
     if not stop.requested and point.trajectory is not None and point.information is not None:
         along = information.std(point.information)
-        steps = finite_steps(
-            task.plant,
-            task.system.noise,
-            task.theta,
-            point.trajectory,
-            information=point.information,
-            prior=task.information.prior,
-            predicted=along,
-        )
+        steps = steps_along(task, point.trajectory, point.information, along)
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
 

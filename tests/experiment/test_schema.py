@@ -17,7 +17,8 @@ from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment, json_schema
 from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Signal
-from mjfim.experiment.task_tables import Robust
+from mjfim.experiment.task_tables import LimitKind, Robust
+from mjfim.model.limited_elements import KINDS
 from mjfim.recordings.section import Section
 from tests.support.paths import MODELS
 
@@ -870,3 +871,7 @@ def test_a_missing_control_is_proposed(
         DesignTask.resolve(stated)
     assert fragment in str(error.value)
     assert "`mjfim init cart_pendulum.xml`" in str(error.value)
+
+
+def test_a_reserve_can_be_stated_for_every_kind_of_limit() -> None:
+    assert get_args(LimitKind) == (*KINDS, "clearance")

@@ -43,9 +43,6 @@ from mjfim.records.studies import (
     TrialStatistics,
 )
 
-# Largest number of missed limits that have a sentence each.
-MAX_MISSED_LIMITS = 8
-
 # What to do after a campaign, by how it ended.
 AFTER_CAMPAIGN = {
     CampaignStatus.WAITING: (
