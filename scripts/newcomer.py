@@ -5,8 +5,9 @@
 For each model, in a folder of its own and without an edit: `mjfim init`, `check`, `design`,
 `simulate` of a robot whose parameters differ from those of the model, and `identify` from that
 recording, which begins with the values of the model. The claims of `design` are judged by plain
-MuJoCo at every engine step: that all limits hold on the model, and what its rehearsal says of
-robots whose parameters differ. The result is a table in Markdown (stdout) and newcomer.json.
+MuJoCo: that all limits hold on the model at every engine step, and what its rehearsal says of
+robots whose parameters differ. Its standard deviations are judged by fits of simulated recordings.
+The result is a table in Markdown (stdout) and newcomer.json.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import mujoco
 import numpy as np
 import tomlkit
 
+import mjfim
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from scripts.verbs import call_verb
@@ -40,6 +42,11 @@ ROBOTS, WRONG = 300, 0.2
 
 # Share of the robots that may leave a limit in a motion that is safe.
 MAX_BROKEN = 0.05
+
+# Number of fits that judge the standard deviations, in parts of FITS_PART; no new part begins after
+# FITS_TIME [s]. A standard deviation agrees where both differ by less than AGREEMENT.
+FITS, FITS_PART, FITS_TIME = 200, 50, 120.0
+AGREEMENT = 0.3
 
 # Longest time of one verb; none should come near to it [s].
 PATIENCE = 600.0
@@ -71,6 +78,9 @@ class Walk:
         kept: Share of the robots of the rehearsal that keep all limits.
         kept_in_mujoco: The same share of robots in plain MuJoCo.
         approximate: Parameters whose standard deviation is stated by finite steps.
+        fits: Number of fits of simulated recordings that succeeded.
+        agree: Parameters whose scatter over these fits agrees with the stated standard deviation.
+        stated: Parameters with a finite stated standard deviation.
         inside: Number of true parameters inside their 95 % intervals.
         parameters: Number of parameters.
         misfit: Whether `identify` found a misfit.
@@ -89,6 +99,9 @@ class Walk:
     kept: float | None = None
     kept_in_mujoco: float | None = None
     approximate: int | None = None
+    fits: int = 0
+    agree: int | None = None
+    stated: int | None = None
     inside: int | None = None
     parameters: int | None = None
     misfit: bool | None = None
@@ -103,6 +116,7 @@ class Walk:
             "—" if self.inside is None else f"{self.inside} of {self.parameters}",
             self._limits(),
             self._rehearsal(),
+            "—" if self.agree is None else f"{self.agree} of {self.stated} ({self.fits} fits)",
         ]
 
     def _rehearsal(self) -> str:
@@ -145,6 +159,7 @@ HEADER = (
     "within 95 %",
     "limits held",
     "rehearsal (robots that keep limits: said / MuJoCo)",
+    "σ agrees with fits",
 )
 
 
@@ -169,6 +184,7 @@ def walk(model: Path, folder: Path) -> Walk:
     if _run(found, folder, "design", EXPERIMENT, "-o", "design") not in (0, 1):
         return found
     _judge_design(found, folder)
+    _judge_deviations(found, folder)
 
     _write_robot(folder)
     simulated = ("simulate", ROBOT, "design/design.npz", "-o", LOG)
@@ -258,8 +274,35 @@ def _judge_design(found: Walk, folder: Path) -> None:
         error = WRONG * rng.uniform(-1.0, 1.0, len(p)) * p.sizes(system.theta)
         theta = np.clip(system.theta + np.where(p.changes_model, error, 0.0), p.lower, p.upper)
         robot = system.model_at(theta)
-        broken += bool(violations(robot, trajectory, stated.get("limits", {})))
+        broken += bool(violations(robot, trajectory, stated.get("limits", {}), each_step=False))
     found.kept_in_mujoco = 1.0 - broken / ROBOTS
+
+
+def _judge_deviations(found: Walk, folder: Path) -> None:
+    """Compare the stated standard deviations with the scatter of fits of simulated recordings."""
+    design = mjfim.Design.load(folder / "design")
+    experiment = mjfim.Experiment.from_file(folder / EXPERIMENT)
+    estimates: list[np.ndarray] = []
+    begun = time.perf_counter()
+    for seed in range(FITS // FITS_PART):
+        if time.perf_counter() - begun > FITS_TIME:
+            break
+        try:
+            study = mjfim.monte_carlo(
+                experiment, design.trajectory, trials=FITS_PART, seed=seed, threads=1, progress=False
+            )
+        except mjfim.MjfimError as error:
+            found.messages["fits"] = str(error)
+            return
+        estimates += [study.sets["final"].estimates]
+    good = np.concatenate(estimates)
+    good = good[np.isfinite(good).all(axis=1)]
+    found.fits = len(good)
+    scatter = dict(zip(study.parameters, good.std(axis=0, ddof=1).tolist(), strict=True))
+    stated = dict(zip(design.parameters, design.stated_std.tolist(), strict=True))
+    ratios = [scatter[name] / stated[name] for name in scatter if np.isfinite(stated[name])]
+    found.stated = len(ratios)
+    found.agree = sum(abs(ratio - 1.0) < AGREEMENT for ratio in ratios)
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -269,7 +312,11 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def violations(
-    model: Any, trajectory: Mapping[str, np.ndarray], stated: Mapping[str, Any]
+    model: Any,
+    trajectory: Mapping[str, np.ndarray],
+    stated: Mapping[str, Any],
+    *,
+    each_step: bool = True,
 ) -> list[str]:
     """Play a design in plain MuJoCo, and describe each range that it leaves.
 
@@ -280,6 +327,7 @@ def violations(
         model: The untouched model (`mujoco.MjModel`).
         trajectory: t, qpos, qvel, act and ctrl of design.npz.
         stated: Table `limits` of the experiment file: ranges of controls and velocities by name.
+        each_step: Whether to look at every engine step, and not only whenever a control begins.
 
     Returns:
         One sentence for each range.
@@ -302,10 +350,12 @@ def violations(
     for k, ctrl in enumerate(trajectory["ctrl"]):
         data.ctrl[:] = ctrl
         steps = round((times[k + 1] - times[k]) / model.opt.timestep)
-        for _ in range(steps):
-            look()
-            mujoco.mj_step(model, data)
         look()
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+            if each_step:
+                look()
+    look()
     return [
         f"{name} by {100.0 * excess:.3g} % of half its range at {moment:.3g} s"
         for name, (excess, moment) in worst.items()

@@ -107,7 +107,7 @@ def test_the_table_has_a_row_for_each_model() -> None:
     assert len(lines) == 4
     assert lines[2].startswith("| arm | 0 | 0 (2 s) | 1 (3 s) | 0 (50 s) | no end (600 s) |")
     assert "12.3 (start breaks limits) | 9 of 10 | no: force of servo" in lines[2]
-    assert lines[3] == "| odd | 0 | 2 (1 s) | — | — | — | — | — | — | — |"
+    assert lines[3] == "| odd | 0 | 2 (1 s) | — | — | — | — | — | — | — | — |"
 
 
 def test_an_interval_without_ends_is_missed(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from mjfim.excitation.evaluation import (
     point_at_stated_rate,
     require_designable,
 )
-from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
+from mjfim.excitation.initial_controls import GIVEN, InitialControl, initial_controls_of
 from mjfim.excitation.limits.verification import require_feasible_start
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.release import design_release
@@ -35,12 +35,15 @@ from mjfim.experiment.schema import Experiment
 from mjfim.information.criteria import shared
 from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
-from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.parallel.budget import Budget, StopReason, StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design, Status
 from mjfim.records.events import DesignCallback, DesignEvent, shown_progress
 
 T = TypeVar("T")
+
+# Largest number of searches for a reserve that suffices.
+RESERVE_ROUNDS = 3
 
 # Largest number of candidates, stopped on a coarse level, that are compared at the stated rate.
 EVALUATED_STOPPED = 4
@@ -133,6 +136,43 @@ def design_task(
     budget = design_budget(task) if budget is None else budget
     # All parts of the design use the same processes, also those that replace killed ones.
     executor = None if executor is None else Workers.of(executor)
+    is_automatic = task.experiment.limits.reserve == "auto"
+    rounds = RESERVE_ROUNDS if is_automatic else 1
+    found: list[Design] = []
+    reserve: dict[str, float] = {}
+
+    for later in reversed(range(rounds)):
+        if is_automatic:
+            experiment = task.experiment.replace(limits={"reserve": reserve})
+            task = replace(task, system=replace(task.system, experiment=experiment))
+        part = budget if rounds == 1 else budget.share(0.5 if later else 1.0)
+        best = _searched(task, callback, initial_control, executor, part, identifiability)
+        if found:
+            # The given control of a later search is the design of the one before.
+            name = found[-1].found_by if best.found_by == GIVEN else best.found_by
+            best = replace(best, found_by=name, steps=found[-1].steps + best.steps)
+        found.append(replace(best, seconds=budget.seconds_used))
+        # A safe motion whose search was cut off at half of the time is improved.
+        is_cut = part.exhausted is StopReason.SECONDS
+        if best.rehearsal is None or (best.rehearsal.is_safe and not is_cut):
+            break
+        if best.trajectory.ctrl.shape == task.control.shape:
+            initial_control = best.trajectory.ctrl
+        needed = best.rehearsal.reserve
+        reserve |= {kind: max(share, reserve.get(kind, 0.0)) for kind, share in needed.items()}
+    # A later design knows what the robots need.
+    return max(reversed(found), key=lambda each: each.sound)
+
+
+def _searched(
+    task: DesignTask,
+    callback: DesignCallback | None,
+    initial_control: Array | None,
+    executor: ExecutorLike | None,
+    budget: Budget,
+    identifiability: Identifiability | None,
+) -> Design:
+    """Design the control of a task whose reserve is known."""
     if task.release is not None:
         return design_release(task, budget, callback, executor)
     _require_controls(task)

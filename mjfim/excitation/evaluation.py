@@ -508,6 +508,7 @@ class DesignReport:
             parameters.recording_specific,
         )
         history, motions = without_motions(best.history)
+        reserve = task.experiment.limits.reserve
         return Design(
             status=status,
             parameters=parameters.names,
@@ -535,4 +536,5 @@ class DesignReport:
             motions=motions,
             improvement=improvement_per_iteration(history, self.stage.problem.size(self.final)),
             rehearsal=rehearsal,
+            reserve={} if reserve == "auto" else dict[str, float](reserve.items()),
         )

@@ -23,6 +23,10 @@ LEAST_RANDOM_AMPLITUDE = 1.0
 MOST_RANDOM_AMPLITUDE = 6.0
 
 
+# Name of a control from which a caller begins.
+GIVEN = "given control"
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InitialControl:
     """A control from which an optimisation starts.
@@ -65,7 +69,7 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
     descent = task.experiment.descent
     first = InitialControl(name="initial control", control=task.control)
     if given is not None:
-        first = InitialControl(name="given control", control=given)
+        first = InitialControl(name=GIVEN, control=given)
 
     found = [first]
     for path in dict.fromkeys(descent.previous):

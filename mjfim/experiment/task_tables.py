@@ -350,14 +350,15 @@ class Limits(Section):
     ignored: tuple[tuple[str, str], ...] = Field(
         default=(), description="Pairs of bodies that may come closer than `clearance`."
     )
-    reserve: dict[LimitKind, Share] = Field(
+    reserve: Literal["auto"] | dict[LimitKind, Share] = Field(
         default_factory=dict,
         description=(
             "Distance that a design keeps from the limits of a kind, over half of each range, by "
             "the name of the kind; for `clearance`, over the smallest distance. Robots that differ "
-            "from the model may use it. Default: none."
+            "from the model may use it. The initial and the final state always keep half of their "
+            'own distance. "auto": as much as the robots of the rehearsal need. Default: none.'
         ),
-        examples=[{"position": 0.3}],
+        examples=["auto", {"position": 0.3}],
     )
     bandwidth: Hertz | None = Field(
         default=None,

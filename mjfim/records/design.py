@@ -445,6 +445,7 @@ class Design(ShownRecord):
             relative to one nat per parameter. NaN where it is unknown.
         rehearsal: What the design does to the model and to simulated robots; None where it was
             interrupted before.
+        reserve: Key `limits.reserve` that the search kept, also where it was found automatically.
     """
 
     status: Status
@@ -473,6 +474,7 @@ class Design(ShownRecord):
     motions: IterateMotions | None = None
     improvement: float = float("nan")
     rehearsal: Rehearsal | None = None
+    reserve: dict[str, float] = field(default_factory=dict)
 
     file_stem = "design"
     made_by = "`mjfim design EXPERIMENT -o DIR`"
@@ -499,6 +501,7 @@ class Design(ShownRecord):
         "prior",
         "data",
         "rehearsal",
+        "reserve",
     )
     json_names = {"outcome": "message"}
 

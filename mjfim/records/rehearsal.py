@@ -238,14 +238,27 @@ class Rehearsal(ShownRecord):
         return is_model_safe and has_few
 
     @property
-    def reserve(self) -> Array:
-        """(l,) distance by which the worst robot is closer to a limit than the model.
+    def reserve(self) -> dict[str, float]:
+        """Key `limits.reserve` for robots that leave limits: share of half of each range by kind.
 
-        It is over half of the range of the limit.
+        The excursion of a robot is taken to be in proportion to that of the model. It is at most
+        halved at once. Clamps come first: where one acts, everything else follows from it.
         """
-        finite = np.where(np.isfinite(self.margins), self.margins, np.nan)
-        worst = np.nanmin(finite, axis=0, initial=np.inf)
-        return np.asarray(np.maximum(np.where(np.isfinite(worst), finite[0] - worst, 0.0), 0.0))
+        broken = np.flatnonzero(~self.kept.all(axis=0)).tolist()
+        clamped = [i for i in broken if self.limits[i].kind in CLAMPED_KINDS]
+        found: dict[str, float] = {}
+        for i in clamped or broken:
+            kind, margins = self.limits[i].kind, self.margins[:, i]
+            worst = float(np.min(margins[np.isfinite(margins)], initial=0.0))
+            used = 1.0 - float(margins[0])
+            growth = 1.0 + self.wrong if clamped else (1.0 - worst) / used if used > 0.0 else 2.0
+            share = (
+                float(margins[0]) - worst if kind == "clearance" else 1.0 - used / min(growth, 2.0)
+            )
+            share = np.ceil(100.0 * share) / 100.0
+            if 0.0 < share < 1.0:
+                found[kind] = max(float(share), found.get(kind, 0.0))
+        return found
 
     @property
     def at_rest(self) -> bool:

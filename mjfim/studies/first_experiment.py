@@ -166,7 +166,7 @@ class Proposal:
             initial["control"] = self.control()
         else:
             values["nuisance"] = {"initial": dict.fromkeys(self.release[1], True)}
-        values["limits"] = self.limits
+        values["limits"] = {**self.limits, "reserve": "auto"}
         if self.boundary:
             values["boundary"] = self.boundary
         if self.release is None:
@@ -676,6 +676,7 @@ BEHIND = {
     "limits.tendon_length": "wider than in the MJCF, whose soft range the state at rest exceeds",
     "limits.clearance": "between bodies [m]; ignored pairs are nearer at the start",
     "limits.floor": "height of a plane below the robot, which the MJCF does not have [m]",
+    "limits.reserve": "as much as robots that differ from the model need",
     "limits.bandwidth": "of the controls [Hz]; a larger one gives more information",
     "descent.seconds": "time budget of a design [s]; more gives better designs",
 }

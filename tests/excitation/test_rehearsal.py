@@ -160,6 +160,44 @@ def test_the_verdict_counts_robots(
         assert "DESIGN_FOLDER" not in " ".join(page.next_steps)
 
 
+@pytest.mark.slow
+def test_an_automatic_reserve_keeps_robots_inside(tmp_path: Path) -> None:
+    """The design without it leaves the limit of its speed; with it, plain robots do not."""
+    experiment, _ = played(tmp_path, reach=1.0, speed=0.21)
+    experiment = experiment.replace(
+        descent={"max_iterations": 8}, limits={"enforce": True}, rehearsal={"robots": 30}
+    )
+    stated = mjfim.design(experiment, threads=1, progress=False)
+    found = mjfim.design(experiment.replace(limits={"reserve": "auto"}), threads=1, progress=False)
+    assert stated.rehearsal is not None and found.rehearsal is not None
+    assert not stated.rehearsal.is_safe and stated.reserve == {}
+    assert found.rehearsal.is_safe and 0.0 < found.reserve["velocity"] < 0.6
+    assert found.found_by == stated.found_by and found.steps > stated.steps
+
+    states = [looped(theta, found.trajectory.ctrl) for theta in found.rehearsal.theta]
+    speeds = np.array([np.abs(each[:, 2]).max() for each in states])
+    assert (speeds <= 0.21).all() and speeds[0] <= 0.21 * (1.0 - found.reserve["velocity"]) + 1e-9
+    # The same reserve, stated, gives a design that keeps it as well.
+    again = mjfim.design(
+        experiment.replace(limits={"reserve": found.reserve}), threads=1, progress=False
+    )
+    assert again.rehearsal is not None and again.rehearsal.margins[0].min() > 0.0
+    assert again.reserve == found.reserve
+
+
+def test_a_reserve_leaves_room_for_the_initial_state(tmp_path: Path) -> None:
+    """A start at a tenth of half of the range from its stop keeps a twentieth."""
+    experiment, _ = played(tmp_path, reach=1.0)
+    experiment = experiment.replace(
+        initial={"qpos": [0.9, 0.0]},
+        limits={"enforce": True, "reserve": {"position": 0.3}},
+        descent={"max_iterations": 4},
+    )
+    found = mjfim.design(experiment, threads=1, progress=False)
+    assert found.within_limits and found.rehearsal is not None
+    assert float(found.rehearsal.margins[0].min()) >= 0.05 - 1e-9
+
+
 FALLING = """
 <mujoco>
   <worldbody>

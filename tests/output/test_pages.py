@@ -97,7 +97,7 @@ def test_the_verdict(verb: str, changes: dict[str, Any], level: Level, words: st
     ("verb", "changes", "words"),
     [
         ("design", {}, "mjfim export"),
-        ("design", {"rehearsal": results.rehearsal(**BROKEN)}, "reserve = { position = 0.6 }"),
+        ("design", {"rehearsal": results.rehearsal(**BROKEN)}, "reserve = { position = 0.46 }"),
         ("design", {"limits": {"position": -0.1}}, "Widen the limit"),
         ("identify", {}, "Use `identified.xml`"),
         ("campaign", {"status": CampaignStatus.WAITING}, "--recordings FILE"),

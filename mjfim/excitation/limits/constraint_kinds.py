@@ -292,10 +292,12 @@ class SubstepConstraint:
         """See `Constraint.quantities_between_bounds`."""
         return self
 
-    def tightened(self, fractions: Mapping[str, float]) -> SubstepConstraint:
-        """Narrow the ranges by a fraction of their half-width, by kind."""
+    def tightened(
+        self, fractions: Mapping[str, float], room: Array | float = np.inf
+    ) -> SubstepConstraint:
+        """Narrow the ranges by a fraction of their half-width, by kind, and by at most `room`."""
         each = np.array([fractions.get(kind, 0.0) for kind in self.kinds])
-        return replace(self, bounds=self.bounds.tightened(each))
+        return replace(self, bounds=self.bounds.tightened(np.minimum(each, np.maximum(room, 0.0))))
 
     def quantities(self, observed: Array) -> Array:
         """The limited quantities.

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
@@ -41,6 +42,9 @@ from mjfim.optimize.cost_models import (
 from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
+
+# Share of the distance of the initial and the final state from a limit that a reserve may take.
+END_SHARE = 0.5
 
 # Attribute of `SubstepObservations` to which each kind of limit belongs; angles are turns.
 SOURCES = {
@@ -241,18 +245,21 @@ class ConstraintSet:
         )
         return tuple(member for member in every if member is not None)
 
-    def tightened(self, fractions: Mapping[str, float]) -> ConstraintSet:
+    def tightened(
+        self, fractions: Mapping[str, float], room: Array | float = np.inf
+    ) -> ConstraintSet:
         """Move the bounds inwards.
 
         Args:
             fractions: Distance by which bounds move, by kind, relative to half of each range; for
                 the clearance, relative to the least distance.
+            room: (n,) largest such distance of each quantity within samples.
 
         Returns:
             The tighter set; kinds that are not named keep their bounds.
         """
         return ConstraintSet(
-            substeps=self.substeps.tightened(fractions),
+            substeps=self.substeps.tightened(fractions, room),
             control=self.control.tightened(fractions),
             rate=None if self.rate is None else self.rate.tightened(fractions),
             end=None if self.end is None else self.end.tightened(fractions),
@@ -415,8 +422,39 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         clearance=clearance,
     )
     # What is checked are the limits themselves.
-    reserve = dict[str, float](stated.reserve.items())
-    return found if every or not reserve else found.tightened(reserve)
+    if every or not stated.reserve or stated.reserve == "auto":
+        return found
+    ends = [task.plant.initial_state(task.theta)]
+    if boundary.end == "rest":
+        ends.append(task.target)
+    held = np.array([quantities_at(task, substeps, state, task.system.rest) for state in ends])
+    room = substeps.bounds.margin(held).min(axis=0) / substeps.bounds.scale
+    return found.tightened(dict[str, float](stated.reserve.items()), END_SHARE * room)
+
+
+def quantities_at(
+    task: DesignTask, substeps: SubstepConstraint, state: Array, ctrl: Array
+) -> Array:
+    """The quantities that are limited within samples, at a state under a control.
+
+    Args:
+        task: The task.
+        substeps: Its constraint within samples.
+        state: (ns,) state.
+        ctrl: (nu,) control [u-unit].
+
+    Returns:
+        (n,) quantities [unit of each kind]; accelerations are zero.
+    """
+    model = task.plant.model(task.theta)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = task.space.split(state)
+    data.ctrl[:] = ctrl
+    mujoco.mj_forward(model, data)
+    observed = substeps.observations.values(
+        data.qpos, data.qvel, data.qvel, lambda name: np.asarray(getattr(data, name))
+    )
+    return substeps.quantities(observed)
 
 
 def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepConstraint:

@@ -11,13 +11,17 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.constraint_kinds import ClearanceConstraint
-from mjfim.excitation.limits.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
+from mjfim.excitation.limits.constraints import (
+    FORCE_KINDS,
+    ConstraintSet,
+    constraint_set_of,
+    quantities_at,
+)
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
@@ -397,29 +401,10 @@ def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, st
 def _quantities_at(
     task: DesignTask, constraints: ConstraintSet, state: Array, ctrl: Array
 ) -> Iterator[tuple[Limit, float]]:
-    """The quantities that are limited within samples, at a state under a control.
-
-    Args:
-        task: The task.
-        constraints: Its constraints.
-        state: (ns,) state.
-        ctrl: (nu,) control [u-unit].
-
-    Yields:
-        Each limit with its quantity; accelerations are zero.
-    """
-    model = task.plant.model(task.theta)
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.act[:] = task.space.split(state)
-    data.ctrl[:] = ctrl
-    mujoco.mj_forward(model, data)
-
+    """Each limit within samples, with its quantity at a state under a control."""
     substeps = constraints.substeps
     limits = {(limit.kind, limit.name): limit for limit in task.limits}
-    observed = substeps.observations.values(
-        data.qpos, data.qvel, data.qvel, lambda name: np.asarray(getattr(data, name))
-    )
-    values = substeps.quantities(observed).tolist()
+    values = quantities_at(task, substeps, state, ctrl).tolist()
     for kind, name, value in zip(substeps.kinds, substeps.names, values, strict=True):
         yield limits[kind, name], value
 

@@ -72,6 +72,7 @@ def design_page(design: Design) -> Page:
     if design.rehearsal is not None:
         sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
     before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    reserve = listed([f"{100 * share:.2g} % of {kind}" for kind, share in design.reserve.items()])
     return Page(
         kind="Design of an experiment",
         verdict=_verdict(design),
@@ -82,6 +83,7 @@ def design_page(design: Design) -> Page:
             "λ_min": f"{number(before)} → {number(after)}",
             "iterations": str(design.iterations),
             "time of the search": f"{design.seconds:.3g} s",
+            **({"reserve": reserve} if reserve else {}),
         },
         sections=sections,
     )
@@ -279,14 +281,8 @@ def _cures(rehearsal: Rehearsal) -> Iterator[str]:
             "Keep the robot above the floor: state ranges of `position` in `[limits]` for what "
             "moves down, or `clearance` to a floor in the model."
         )
-    reserve = rehearsal.reserve
-    needed: dict[str, float] = {}
-    for i in np.flatnonzero(~rehearsal.kept.all(axis=0)).tolist():
-        kind, share = rehearsal.limits[i].kind, np.ceil(100.0 * reserve[i]) / 100.0
-        if 0.0 < share < 1.0:
-            needed[kind] = max(float(share), needed.get(kind, 0.0))
-    if needed:
-        shares = ", ".join(f"{kind} = {share:g}" for kind, share in needed.items())
+    if rehearsal.reserve:
+        shares = ", ".join(f"{kind} = {share:g}" for kind, share in rehearsal.reserve.items())
         yield f"Design with a reserve for such robots: `[limits] reserve = {{ {shares} }}`."
     if rehearsal.unbraked:
         yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
