@@ -152,16 +152,15 @@ def design_task(
             name = found[-1].found_by if best.found_by == GIVEN else best.found_by
             best = replace(best, found_by=name, steps=found[-1].steps + best.steps)
         found.append(replace(best, seconds=budget.seconds_used))
-        # A safe motion whose search was cut off at half of the time is improved.
-        is_cut = part.exhausted is StopReason.SECONDS
-        if best.rehearsal is None or (best.rehearsal.is_safe and not is_cut):
+        # A good motion whose search was cut off at half of the time is improved.
+        needed = {} if best.rehearsal is None else best.rehearsal.reserve
+        if budget.stop.requested or not (needed or part.exhausted is StopReason.SECONDS):
             break
         if best.trajectory.ctrl.shape == task.control.shape:
             initial_control = best.trajectory.ctrl
-        needed = best.rehearsal.reserve
         reserve |= {kind: max(share, reserve.get(kind, 0.0)) for kind, share in needed.items()}
-    # A later design knows what the robots need.
-    return max(reversed(found), key=lambda each: each.sound)
+    # A later design knows what the robots need; after Ctrl-C it is not rehearsed.
+    return max(reversed(found), key=lambda each: each.rehearsal is not None and each.sound)
 
 
 def _searched(

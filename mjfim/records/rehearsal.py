@@ -200,8 +200,17 @@ class Rehearsal(ShownRecord):
     @property
     def kept(self) -> np.ndarray:
         """(n+1, l) True if the model, or a robot, keeps a limit."""
-        is_clamped = [limit.kind in CLAMPED_KINDS for limit in self.limits]
-        return np.where(is_clamped, self.margins > 0.0, self.margins >= 0.0)
+        return np.where(self.is_clamped, self.margins > 0.0, self.margins >= 0.0)
+
+    @property
+    def is_clamped(self) -> np.ndarray:
+        """(l,) True for a limit that holds by a clamp, which no robot can leave."""
+        return np.array([limit.kind in CLAMPED_KINDS for limit in self.limits], dtype=bool)
+
+    @property
+    def at_clamp(self) -> int:
+        """Number of robots that reach a clamp; the information of a design does not hold there."""
+        return int((~self.kept & self.is_clamped)[1:].any(axis=1).sum())
 
     @property
     def diverged(self) -> int:
@@ -227,12 +236,13 @@ class Rehearsal(ShownRecord):
     def is_safe(self) -> bool:
         """True if a person would play the motion on a robot.
 
-        The model and at least 95 % of the robots keep all limits, stay above the floor, and can be
-        braked at the end before a limit.
+        The model keeps all limits. At least 95 % of the robots keep those that are no clamps, stay
+        above the floor, and can be braked at the end before a limit.
         """
         allowed = MAX_BROKEN * self.robots
         is_model_safe = bool(self.kept[0].all()) and not self.passes_floor[0]
-        broken = self.robots - self.all_kept
+        is_inside = (self.kept | self.is_clamped).all(axis=1) & ~np.isnan(self.end_height)
+        broken = int((~is_inside[1:]).sum())
         worst = max(self.unbraked.values(), default=0)
         has_few = max(broken, self.below_floor, worst) < max(allowed, 1.0)
         return is_model_safe and has_few
@@ -244,9 +254,11 @@ class Rehearsal(ShownRecord):
         The excursion of a robot is taken to be in proportion to that of the model. It is at most
         halved at once. Clamps come first: where one acts, everything else follows from it.
         """
-        broken = np.flatnonzero(~self.kept.all(axis=0)).tolist()
-        clamped = [i for i in broken if self.limits[i].kind in CLAMPED_KINDS]
         found: dict[str, float] = {}
+        if self.is_safe and self.at_clamp < max(MAX_BROKEN * self.robots, 1.0):
+            return found
+        broken = np.flatnonzero(~self.kept.all(axis=0)).tolist()
+        clamped = [i for i in broken if self.is_clamped[i]]
         for i in clamped or broken:
             kind, margins = self.limits[i].kind, self.margins[:, i]
             worst = float(np.min(margins[np.isfinite(margins)], initial=0.0))

@@ -289,8 +289,9 @@ def _candidates(model: Any) -> Iterator[Start]:
         if settled is None:
             continue
 
-        # A joint that rests on the end of its range has no room to move.
-        inside = _inside_ranges(model, settled)
+        # A joint that rests on the end of its range has no room to move. But to move one joint of
+        # a closed chain would open it.
+        inside = settled if model.neq else _inside_ranges(model, settled)
         reason = f"the state in which the model comes to rest {how}"
         if not np.array_equal(inside, settled):
             reason += MOVED_INSIDE

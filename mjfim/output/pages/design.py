@@ -36,7 +36,7 @@ from mjfim.output.words import (
 )
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup
 from mjfim.records.design import Design, ScaledStart
-from mjfim.records.rehearsal import Rehearsal, RehearsedLimit
+from mjfim.records.rehearsal import MAX_BROKEN, Rehearsal, RehearsedLimit
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
@@ -143,7 +143,8 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
         yield f"{rehearsal.below_floor} pass through {floor}, by up to {deepest:.3g} m"
     worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
-    for i in sorted(broken.tolist(), key=lambda i: float(rehearsal.kept[:, i].sum())):
+    order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
+    for i in broken[order].tolist():
         limit, count = rehearsal.limits[i], int((~rehearsal.kept[1:, i]).sum())
         excess = -float(np.nanmin(worst[:, i])) * limit.scale
         manner = f"by up to {excess:.3g} {limit.unit}".rstrip() if excess > 0.0 else "to its clamp"
@@ -204,8 +205,15 @@ def _reservation(design: Design) -> str:
             f"it tells less than its start (λ_min {before:.3g} → {after:.3g}), because the cost "
             "weighs the control or the tracking more than the information"
         )
+    rehearsal = design.rehearsal
     if not found:
-        return ""
+        if rehearsal is None or rehearsal.at_clamp < max(MAX_BROKEN * rehearsal.robots, 1.0):
+            return ""
+        reached = np.flatnonzero(~rehearsal.kept.all(axis=0) & rehearsal.is_clamped).tolist()
+        limits = [rehearsal.limits[i] for i in reached]
+        names = first_ones([f"{_kind(limit)} of {limit.name}" for limit in limits])
+        who = f"{rehearsal.at_clamp} of {_robots(rehearsal)}"
+        return f"{who} reach the clamp on {names}, where σ does not hold"
     std, sizes = design.stated_std, design.sizes
     worst = max(found, key=lambda j: float(std[j] / sizes[j]) if np.isfinite(std[j]) else np.inf)
     text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
