@@ -94,9 +94,9 @@ def campaign(
         found = lab.campaign(measure, workers)
 
     parameters = CampaignParameters.stated(task.parameters, simulated=simulated)
-    print_result(False, {}, campaign_page(found, parameters), verbose=run.verbose)
     with writing(run.output):
         remarks = folder.write_campaign(found, simulated=simulated)
+    print_result(False, {}, campaign_page(found, parameters), verbose=run.verbose)
     for remark in remarks:
         say(f"warning: {remark}")
     if found.status is CampaignStatus.WAITING:

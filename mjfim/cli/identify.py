@@ -80,9 +80,7 @@ def identify(
 
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.archive import summary_with_origin
     from mjfim.output.folders import estimate_files, parts_of_identified, sample_files
-    from mjfim.output.pages import page_of
     from mjfim.output.pages.files import log_section
     from mjfim.recordings.read import read_log, recording_paths
 
@@ -120,12 +118,8 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    page = page_of(result, experiment=stated.source, output=run.output)
-    if run.verbose:
-        section = log_section([log.summary for log in logs])
-        page = replace(page, sections=[*page.sections, section])
-    run.print(summary_with_origin(result, system, run.output), page)
-    run.write(result, system)
+    sections = [log_section([log.summary for log in logs])] if run.verbose else []
+    run.finish(result, system, sections=sections)
     if not_drawn:
         say(f"warning: --samples: no robots were drawn{not_drawn}")
     write_wanted_video(video, system, result)
