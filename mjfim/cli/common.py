@@ -233,7 +233,14 @@ class Run:
             yield None
             return
 
-        with Pool(count) as pool:
+        # Processes share locks in /dev/shm, which some containers do not have.
+        try:
+            pool = Pool(count)
+        except OSError as error:
+            say(f"warning: no further processes can be started ({error}); one does all the work")
+            yield None
+            return
+        with pool:
             yield Workers(pool)
         if pool.has_lost_worker:
             say_from_program(LOST_SENTENCE)
