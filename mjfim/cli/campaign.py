@@ -61,13 +61,14 @@ def campaign(
     stated = mjfim.Experiment.from_file(experiment)
 
     from mjfim.excitation.task import DesignTask
-    from mjfim.experiment.packing import input_files
+    from mjfim.experiment.packing import input_files, with_model
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.pages.studies import campaign_page
     from mjfim.output.words import CampaignParameters
     from mjfim.records.campaign import CampaignStatus
 
-    task = DesignTask.resolve(with_target_accuracies(stated, wanted), threads=run.threads)
+    stated = with_target_accuracies(with_model(stated), wanted)
+    task = DesignTask.resolve(stated, threads=run.threads)
     folder = CampaignFolder(run.output, task.system, run.pictures)
     simulated = not (real or recordings)
     settings = campaign_settings(task.experiment, seed) if simulated else {}

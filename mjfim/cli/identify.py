@@ -78,12 +78,13 @@ def identify(
     if select and method == "newton":
         raise ExperimentError("--select: fits with the method least_squares only, not newton")
 
-    from mjfim.experiment.packing import input_files
+    from mjfim.experiment.packing import input_files, with_model
     from mjfim.experiment.system import System
     from mjfim.output.folders import estimate_files, parts_of_identified, sample_files
     from mjfim.output.pages.files import log_section
     from mjfim.recordings.read import read_log, recording_paths
 
+    stated = with_model(stated)  # it may be edited while it is identified
     system = System.resolve(stated, threads=run.threads)
     inputs = input_files(stated, [*recordings, *(held_out or [])])
     fitted_paths = recording_paths(recordings, system.channels)
