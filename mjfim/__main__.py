@@ -1,6 +1,6 @@
 """`python -m mjfim` and the command `mjfim`.
 
-Reacts to Ctrl-C while the program is imported, and takes no code from the current folder, which
+Reacts to signals while the program is imported, and takes no code from the current folder, which
 may hold a file `signal.py` beside the experiment.
 """
 
@@ -22,15 +22,23 @@ from contextlib import suppress  # noqa: E402
 from types import FrameType  # noqa: E402
 from typing import NoReturn  # noqa: E402
 
-from mjfim.parallel.budget import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS  # noqa: E402
+from mjfim.parallel.budget import (  # noqa: E402
+    INTERRUPTED_CODE,
+    NOTHING_SENTENCE,
+    SIGNALS,
+    heard_signals,
+)
 
 
 def main() -> NoReturn:
     """Run the command line, the entry point of `mjfim`."""
-    # A process that ignores Ctrl-C continues to ignore it.
-    handled = callable(signal.getsignal(signal.SIGINT))
-    for number in SIGNALS if handled else ():
+    for number in heard_signals():
         signal.signal(number, _end_at_once)
+
+    # No file gets the number of stdin, stdout or stderr where they are closed.
+    while (file := os.open(os.devnull, os.O_RDONLY)) <= 2:
+        os.set_inheritable(file, True)
+    os.close(file)
 
     _limit_memory()
     from mjfim.cli.main import main as run_command_line
@@ -39,7 +47,7 @@ def main() -> NoReturn:
     try:
         run_command_line()
     finally:
-        for number in SIGNALS if handled else ():
+        for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
 
@@ -58,7 +66,8 @@ def _limit_memory() -> None:
 
 def _end_at_once(number: int, frame: FrameType | None) -> None:
     """End the process; there is nothing to write or to tidy up yet."""
-    os.write(2, f"mjfim: {NOTHING_SENTENCE}\n".encode())
+    with suppress(OSError):
+        os.write(2, f"mjfim: {NOTHING_SENTENCE}\n".encode())
     os._exit(INTERRUPTED_CODE)
 
 

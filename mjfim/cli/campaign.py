@@ -61,13 +61,14 @@ def campaign(
     stated = mjfim.Experiment.from_file(experiment)
 
     from mjfim.excitation.task import DesignTask
-    from mjfim.experiment.packing import input_files
+    from mjfim.experiment.packing import input_files, with_model
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.pages.studies import campaign_page
     from mjfim.output.words import CampaignParameters
     from mjfim.records.campaign import CampaignStatus
 
-    task = DesignTask.resolve(with_target_accuracies(stated, wanted), threads=run.threads)
+    stated = with_target_accuracies(with_model(stated), wanted)
+    task = DesignTask.resolve(stated, threads=run.threads)
     folder = CampaignFolder(run.output, task.system, run.pictures)
     simulated = not (real or recordings)
     settings = campaign_settings(task.experiment, seed) if simulated else {}
@@ -94,9 +95,9 @@ def campaign(
         found = lab.campaign(measure, workers)
 
     parameters = CampaignParameters.stated(task.parameters, simulated=simulated)
-    print_result(False, {}, campaign_page(found, parameters), verbose=run.verbose)
     with writing(run.output):
         remarks = folder.write_campaign(found, simulated=simulated)
+    print_result(False, {}, campaign_page(found, parameters), verbose=run.verbose)
     for remark in remarks:
         say(f"warning: {remark}")
     if found.status is CampaignStatus.WAITING:

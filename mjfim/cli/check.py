@@ -34,7 +34,6 @@ def check(
     from mjfim.experiment.system import System
     from mjfim.output import archive
     from mjfim.output.folders import CHECK_FILES
-    from mjfim.output.pages import page_of
     from mjfim.recordings.read import read_recording, recording_paths
 
     system = System.resolve(stated, threads=run.threads)
@@ -51,8 +50,5 @@ def check(
     with run.workers() as workers, progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=run.threads, executor=workers)
 
-    if has_folder:
-        run.finish(result, system)
-    else:
-        run.print(result.summary(), page_of(result, experiment=stated.source))
+    run.finish(result, system)
     raise typer.Exit(0 if result.ok else 1)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import inspect
-import io
 import shlex
-import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +17,7 @@ import typer
 from typer.core import TyperCommand
 
 import mjfim
-from mjfim.cli.progress import out, progress, say, say_from_program
+from mjfim.cli.progress import lost_text, out, progress, say, say_from_program
 from mjfim.errors import (
     MAX_THREADS,
     InterruptedByUserError,
@@ -35,7 +33,7 @@ from mjfim.errors import (
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
 from mjfim.output.manifest import write_optional
-from mjfim.output.page import REPORT, Level, Page, PictureFormat
+from mjfim.output.page import REPORT, Level, Page, PictureFormat, Section
 from mjfim.output.video import require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
@@ -235,70 +233,78 @@ class Run:
             yield None
             return
 
-        with Pool(count) as pool:
+        # Processes share locks in /dev/shm, which some containers do not have.
+        try:
+            pool = Pool(count)
+        except OSError as error:
+            say(f"warning: no further processes can be started ({error}); one does all the work")
+            yield None
+            return
+        with pool:
             yield Workers(pool)
         if pool.has_lost_worker:
             say_from_program(LOST_SENTENCE)
 
-    def print(self, values: Mapping[str, object], page: Page, verdict: str = "") -> None:
-        """Print a result on stdout.
-
-        Args:
-            values: Contents of its JSON file.
-            page: Its words and tables.
-            verdict: Sentence for those who do not read the result on their terminal.
-        """
-        print_result(self.as_json, values, page, verbose=self.verbose)
-        if verdict and (self.as_json or not out.is_terminal):
-            say_from_program(verdict)
-
-    def write(
-        self,
-        result: ShownRecord,
-        system: System | None,
-        further: Mapping[str, object] = NOTHING,
-        remark: str = "",
-    ) -> None:
-        """Write the files of a result, and say where they are.
-
-        Args:
-            result: The result.
-            system: The experiment.
-            further: Further entries of the JSON file.
-            remark: What is said behind the name of the folder.
-        """
-        with writing(self.output):
-            from mjfim.output.folders import write_result  # imports matplotlib, which is slow
-
-            remarks = write_result(self.output, result, system, self.pictures, further)
-        for sentence in remarks:
-            say(f"warning: {sentence}")
-        say_written(self.output, remark)
-
     def finish(
         self,
         result: ShownRecord,
-        system: System,
+        system: System | None,
         *,
         design: Path | None = None,
         further: Mapping[str, object] = NOTHING,
+        sections: Iterable[Section] = (),
         verdict: str = "",
         remark: str = "",
     ) -> None:
-        """Print a result and write its files; see `print` and `write`.
+        """Write the files of a result where there is a folder, print it, and say where it is.
 
-        The next step names the design, where the result is one or is about one.
+        Args:
+            result: The result.
+            system: The experiment; None for a comparison of robots.
+            design: The design that the next step names, where the result is one or about one.
+            further: Further entries of the JSON file.
+            sections: Further sections of the printed page.
+            verdict: Sentence for those who do not read the result on their terminal; default: that
+                of the page, where the result is bad.
+            remark: What is said behind the name of the folder.
         """
+        remarks: Iterable[str] = ()
+        try:
+            if self.output:
+                with writing(self.output):
+                    from mjfim.output.folders import write_result  # imports matplotlib
+
+                    remarks = write_result(self.output, result, system, self.pictures, further)
+        finally:
+            # It is printed after it is written, also where it cannot be written.
+            self._print(result, system, design, further, sections, verdict)
+        for sentence in remarks:
+            say(f"warning: {sentence}")
+        if self.output:
+            say_written(self.output, remark)
+
+    def _print(
+        self,
+        result: ShownRecord,
+        system: System | None,
+        design: Path | None,
+        further: Mapping[str, object],
+        sections: Iterable[Section],
+        verdict: str,
+    ) -> None:
+        """Print a result on stdout; see `finish`."""
         from mjfim.output.archive import summary_with_origin
         from mjfim.output.pages import page_of
 
-        values = {**summary_with_origin(result, system, self.output), **further}
-        source = system.experiment.source
+        source = None if system is None else system.experiment.source
         page = page_of(result, experiment=source, design=design, output=self.output)
+        page = replace(page, sections=[*page.sections, *sections])
+        values = {**summary_with_origin(result, system, self.output), **further}
+        print_result(self.as_json, values, page, verbose=self.verbose)
         if page.verdict.level is Level.BAD:
             verdict = verdict or page.verdict.text
-        self.print(values, page, verdict)
-        self.write(result, system, further, remark)
+        if verdict and (self.as_json or not out.is_terminal):
+            say_from_program(verdict)
 
 
 def print_result(
@@ -407,13 +413,6 @@ def say_written(folder: Path, remark: str = "") -> None:
 # ---- verbs
 
 
-def replace_unencodable_characters() -> None:
-    """Let stdout and stderr write "?" for characters that their encoding does not have."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-
-
 def _version(wanted: bool) -> None:
     """Print the version and exit if the option is given."""
     if wanted:
@@ -502,6 +501,8 @@ def _carry_out(call: Callable[[], None]) -> None:
     finally:
         # A press may have come between the creation of a temporary file and its removal.
         remove_temporary_files()
+        if fault := lost_text():
+            say_from_program(f"stdout: {fault}; the text of the result is lost or not complete")
 
     # An interrupted verb did not do all that it was asked for.
     if interruption.incomplete:

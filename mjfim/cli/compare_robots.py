@@ -40,7 +40,6 @@ def compare_robots(
     from dataclasses import replace
 
     from mjfim.output.folders import ROBOT_FILES
-    from mjfim.output.pages import page_of
 
     estimates = [mjfim.Estimate.load(folder) for folder in (first, second)]
     inputs = [folder / name for folder in (first, second) for name in ESTIMATE_FILES]
@@ -50,8 +49,7 @@ def compare_robots(
 
     origin = {"first": _relative(first, run.output), "second": _relative(second, run.output)}
     verdict = str(result) if result.differs else ""
-    run.print({**origin, **result.summary()}, page_of(result), verdict)
-    run.write(result, None, origin)
+    run.finish(result, None, further=origin, verdict=verdict)
     raise typer.Exit(1 if result.differs or not result.is_reliable else 0)
 
 

@@ -96,10 +96,10 @@ def design(
         # The files describe the shortest horizon, not the stated one.
         system = System.resolve(found.experiment, threads=run.threads)
         further["shortest"] = found.summary()
+        found.save(run.output)
     motion = f"\nto see the motion: mjfim replay {run.output}"
     run.finish(result, system, design=run.output, further=further, remark=motion)
     if found is not None:
-        found.save(run.output)
         say(f"{found}" if found.reached else f"mjfim: {found}")
         if found.reached:
             say(f"to use this horizon further, state horizon = {found.horizon:g} in {experiment}")

@@ -78,14 +78,13 @@ def identify(
     if select and method == "newton":
         raise ExperimentError("--select: fits with the method least_squares only, not newton")
 
-    from mjfim.experiment.packing import input_files
+    from mjfim.experiment.packing import input_files, with_model
     from mjfim.experiment.system import System
-    from mjfim.output.archive import summary_with_origin
     from mjfim.output.folders import estimate_files, parts_of_identified, sample_files
-    from mjfim.output.pages import page_of
     from mjfim.output.pages.files import log_section
     from mjfim.recordings.read import read_log, recording_paths
 
+    stated = with_model(stated)  # it may be edited while it is identified
     system = System.resolve(stated, threads=run.threads)
     inputs = input_files(stated, [*recordings, *(held_out or [])])
     fitted_paths = recording_paths(recordings, system.channels)
@@ -120,12 +119,8 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    page = page_of(result, experiment=stated.source, output=run.output)
-    if run.verbose:
-        section = log_section([log.summary for log in logs])
-        page = replace(page, sections=[*page.sections, section])
-    run.print(summary_with_origin(result, system, run.output), page)
-    run.write(result, system)
+    sections = [log_section([log.summary for log in logs])] if run.verbose else []
+    run.finish(result, system, sections=sections)
     if not_drawn:
         say(f"warning: --samples: no robots were drawn{not_drawn}")
     write_wanted_video(video, system, result)

@@ -9,7 +9,8 @@ import importlib
 import sys
 from typing import NoReturn
 
-from mjfim.cli.common import app, permit_processes, replace_unencodable_characters
+from mjfim.cli.common import app, permit_processes
+from mjfim.cli.progress import lose_what_cannot_be_written
 
 ORDER = (
     "init",
@@ -43,7 +44,7 @@ load_verbs()
 
 def main() -> NoReturn:
     """Run the command line, the entry point of `mjfim`."""
-    replace_unencodable_characters()
+    lose_what_cannot_be_written()
     permit_processes()
     load_verbs()
     app(prog_name="mjfim")

@@ -66,13 +66,13 @@ def payload(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.experiment.packing import input_files
+    from mjfim.experiment.packing import input_files, with_model
     from mjfim.output.folders import estimate_files, parts_of_identified
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.studies.payload import PayloadTask
 
     task = PayloadTask.of(
-        stated,
+        with_model(stated),
         body=body,
         robot=None if robot is None else mjfim.Estimate.load(robot),
         size=size,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import time
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
@@ -35,9 +36,63 @@ LINE_SECONDS = 2.0
 LEAST_DONE = 0.1
 
 
+# Why text for stdout and stderr was lost, by the name of the stream.
+_faults: dict[str, str] = {}
+
+
+class LossyOutput(io.RawIOBase):
+    """Bytes of stdout or stderr. Those that cannot be written are lost, and the work goes on."""
+
+    def __init__(self, raw: Any, name: str) -> None:
+        self._raw = raw
+        self._name = name
+
+    def fileno(self) -> int:
+        """Number of the file."""
+        return int(self._raw.fileno())
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        return bool(self._raw.isatty())
+
+    def writable(self) -> bool:
+        """Always, as far as the writer can see."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Write bytes, or note why they are lost."""
+        try:
+            return int(self._raw.write(data))
+        except OSError as error:
+            _faults[self._name] = error.strerror or str(error)
+            return len(data)
+
+
+def lose_what_cannot_be_written() -> None:
+    """Let stdout and stderr lose text where they are closed or full, and work go on.
+
+    They write "?" for characters that their encoding does not have.
+    """
+    for number, name in enumerate(("stdout", "stderr"), start=1):
+        stream = getattr(sys, name)
+        buffer = io.FileIO(number, "w", closefd=False) if stream is None else stream.buffer
+        lossy = LossyOutput(getattr(buffer, "raw", buffer), name)
+        encoding = getattr(stream, "encoding", "utf-8")
+        text = io.TextIOWrapper(
+            io.BufferedWriter(lossy), encoding, errors="replace", line_buffering=True
+        )
+        setattr(sys, name, text)
+
+
+def lost_text() -> str:
+    """Why text for stdout was lost; empty if it was not."""
+    sys.stdout.flush()
+    return _faults.pop("stdout", "")
+
+
 def width_of_results() -> int | None:
     """Width of the lines of results [characters]; None for that of the terminal."""
-    if sys.stdout.isatty():
+    if sys.stdout is not None and sys.stdout.isatty():
         return None
     stated = os.environ.get("COLUMNS", "")
     width = int(stated) if stated.isdecimal() else FILE_WIDTH

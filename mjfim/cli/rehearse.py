@@ -50,16 +50,11 @@ def rehearse(
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output.folders import REHEARSAL_FILES
-    from mjfim.output.pages import page_of
 
     design = mjfim.Design.load(design_file)
     if run.output:
         run.claim(REHEARSAL_FILES, input_files(stated, [design_file]))
     with progress("playing the design"):
         result = mjfim.rehearse(stated, design, threads=run.threads)
-    if run.output:
-        run.finish(result, System.resolve(stated), design=design_file.parent)
-    else:
-        page = page_of(result, experiment=stated.source, design=design_file.parent)
-        run.print(result.summary(), page)
+    run.finish(result, System.resolve(stated), design=design_file.parent)
     raise typer.Exit(0 if result.is_safe else 1)

@@ -45,27 +45,42 @@ def for_workers(
     Raises:
         ExperimentError: A file cannot be read.
     """
-    before = experiment.files or PackedFiles.of(dict(source.contents))
+    before = experiment.files or PackedFiles.of(source.stated.contents)
     tables = [experiment.directory / name for name in experiment.tables]
     files = PackedFiles.read([*map(Path, before.contents), *tables, *further], before)
     return experiment.model_copy(update={"files": files.shared()})
 
 
-def model_of(experiment: Experiment) -> ModelSource:
-    """Load the model of an experiment; that of a packed one is parsed once in a process.
+def with_model(experiment: Experiment) -> Experiment:
+    """Make a copy that holds the files of its model as they are now; later edits do not matter.
 
     Raises:
-        ModelError: The model cannot be used.
+        ExperimentError: A file cannot be read.
+        ModelError: There is no such model file.
     """
     path = experiment.directory / experiment.model
-    if experiment.files is not None and experiment.files.content(path) is not None:
-        return packed_model(experiment.files, path)
+    packed = experiment.files or PackedFiles.of({})
+    if packed.content(path) is not None:
+        return experiment
     if not path.is_file():
         raise ModelError(
             f"{experiment.source}: model: {path}: no such model file; state the path of an MJCF or "
             "URDF, which begins in the folder of the experiment file"
         )
-    return ModelSource(path)
+    files = PackedFiles.read([*map(Path, packed.contents), *files_of_model(path)], packed)
+    return experiment.model_copy(update={"files": files})
+
+
+def model_of(experiment: Experiment) -> ModelSource:
+    """Load the model of an experiment, which is parsed once in a process as long as it is the same.
+
+    Raises:
+        ExperimentError: A file cannot be read.
+        ModelError: The model cannot be used.
+    """
+    files = with_model(experiment).files
+    assert files is not None
+    return packed_model(files, experiment.directory / experiment.model)
 
 
 def opened(experiment: Experiment, name: str) -> AbstractContextManager[Path]:

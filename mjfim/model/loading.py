@@ -163,7 +163,7 @@ class ModelSource:
         self.model = compile_spec(self.spec, path, tells=True, files=files)
         self.terms: dict[str, Term] = {}
         self.layout: StateLayout | None = None
-        self._files = files
+        self.files = files
 
         # The model without terms where this one has some, and its extensions that are in use. An
         # extension refers to the stated model, which must not refer to it in turn.
@@ -200,7 +200,7 @@ class ModelSource:
         with stated._lock:
             found = stated._derived.get(key)
             if found is None:
-                path, files = stated.path, stated._files
+                path, files = stated.path, stated.files
                 spec, layout = extended_spec(
                     stated.spec,
                     stated.model,
@@ -229,7 +229,7 @@ class ModelSource:
             if found is None:
                 spec = self.spec.copy()
                 add(spec)
-                found = ModelSource(self.path, spec, self._files)
+                found = ModelSource(self.path, spec, self.files)
                 found.terms, found.layout = self.terms, self.layout
                 found._stated = self.stated
                 self._derived[key] = found
@@ -237,8 +237,13 @@ class ModelSource:
 
     @cached_property
     def contents(self) -> dict[Path, bytes]:
-        """Bytes of the model's files by their paths, for processes that do not have them."""
+        """Bytes of the model's files by their paths, as they were loaded."""
         return {file: file.read_bytes() for file in files_of_model(self.path)}
+
+    def read(self, path: Path) -> bytes:
+        """Return the bytes of a file of the model, as it was loaded."""
+        contents = {file.resolve(): each for file, each in self.stated.contents.items()}
+        return contents.get(path.resolve()) or path.read_bytes()
 
     @cached_property
     def coordinates(self) -> ModelCoordinates:
@@ -296,7 +301,7 @@ class ModelSource:
                     if moved_bodies is None or body.name in moved_bodies:
                         body.simple = 0
                 edit(spec)
-                self._edited[place] = compile_spec(spec, self.path, files=self._files)
+                self._edited[place] = compile_spec(spec, self.path, files=self.files)
             return self._edited[place]
 
 
@@ -428,8 +433,17 @@ def packed_model(files: PackedFiles, path: Path) -> ModelSource:
     """
     # A second thread that asks for the same model waits until the first one has compiled it.
     key = files.digest, name_of(path)
+
+    def load() -> ModelSource:
+        """Parse and compile the model, from the disk where these files are there."""
+        contents = {Path(name): content for name, content in files.contents.items()}
+        are_here = all(file.is_file() and file.read_bytes() == contents[file] for file in contents)
+        source = ModelSource(path, files=None if are_here else _file_system(files))
+        source.contents = contents
+        return source
+
     with _packed_lock:
-        return _models.get(key, lambda: ModelSource(path, files=_file_system(files)))
+        return _models.get(key, load)
 
 
 def _file_system(files: PackedFiles) -> Any:

@@ -226,16 +226,16 @@ def write_design(folder: Path, design: Design, system: System) -> None:
 
 
 def summary_with_origin(
-    record: ShownRecord, system: System, folder: Path | None
+    record: ShownRecord, system: System | None, folder: Path | None
 ) -> dict[str, object]:
     """Return the contents of a result's JSON file, which `--json` prints as well.
 
     Args:
         record: The result.
-        system: The experiment of the result.
+        system: The experiment of the result; None for a comparison of robots.
         folder: Folder of results, relative to which files are named; without one, none are.
     """
-    origin = {} if folder is None else origin_of(system, folder)
+    origin = {} if system is None or folder is None else origin_of(system, folder)
     return {**origin, **record.summary()}
 
 

@@ -350,8 +350,8 @@ def _write_data(
         return []
 
     record.save_archive(folder)
-    origin = {} if system is None else archive.origin_of(system, folder)
-    write_json(folder / f"{record.file_stem}.json", {**origin, **record.summary(), **further})
+    values = archive.summary_with_origin(record, system, folder)
+    write_json(folder / f"{record.file_stem}.json", {**values, **further})
     if system is not None and isinstance(record, Comparison):
         for row in record.rows:
             if row.control is not None:

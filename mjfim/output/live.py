@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from mjfim.errors import ExperimentError, MjfimError
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 # Address of a viewer that is told nothing else, and the word for the viewer of this computer, which
 # may be opened.
-DEFAULT_ADDRESS = "127.0.0.1:9876"
+LOCAL_HOST = "127.0.0.1"
+DEFAULT_ADDRESS = f"{LOCAL_HOST}:9876"
 HERE = "here"
 
 # Form of an address: a host with a port, or a URL of Rerun.
@@ -152,15 +153,26 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+def start_viewer(*words: str, **streams: Any) -> subprocess.Popen[bytes]:
+    """Start a Rerun viewer that only this computer reaches, and that sends no usage statistics.
+
+    Args:
+        *words: Its further words.
+        **streams: Its standard streams, as for `subprocess.Popen`.
+    """
+    # With -P, Python does not look for the viewer in the current folder.
+    command = [sys.executable, "-P", "-m", "rerun", "--bind", LOCAL_HOST, *words]
+    # The variable is the viewer's own way to send and store no statistics, whatever its settings.
+    return subprocess.Popen(
+        command, env={**os.environ, "CI": "1"}, start_new_session=True, **streams
+    )
+
+
 def _open_viewer(url: str) -> None:
     """Open a viewer, and wait until it listens; it stays open after the program has ended."""
-    # With -P, Python does not look for the viewer in the current folder.
-    port = str(urlsplit(url).port)
-    command = [sys.executable, "-P", "-m", "rerun", "--port", port, "--hide-welcome-screen"]
     nowhere = subprocess.DEVNULL
-    viewer = subprocess.Popen(
-        command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True
-    )
+    words = ("--port", str(urlsplit(url).port), "--hide-welcome-screen")
+    viewer = start_viewer(*words, stdin=nowhere, stdout=nowhere, stderr=nowhere)
 
     deadline = time.monotonic() + START_SECONDS
     while time.monotonic() < deadline:
@@ -178,7 +190,7 @@ def _is_listening(url: str) -> bool:
     """Whether something listens at the host and the port of a URL."""
     parts = urlsplit(url)
     try:
-        place = (parts.hostname or "127.0.0.1", parts.port or urlsplit(f"//{DEFAULT_ADDRESS}").port)
+        place = (parts.hostname or LOCAL_HOST, parts.port or urlsplit(f"//{DEFAULT_ADDRESS}").port)
         with socket.create_connection(place, timeout=ANSWER_SECONDS):
             return True
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Budget of a computation, the token that asks it to stop, and what Ctrl-C and SIGTERM do.
+"""Budget of a computation, the token that asks it to stop, and what Ctrl-C and signals do.
 
 Long computations check `budget.exhausted` in their loops and return their best result so far; no
 exception is raised to stop them. `stop_on_interrupt`, which the verbs use, turns Ctrl-C into a
@@ -46,8 +46,18 @@ INTERRUPTED_CODE = 1
 # Begin of the file names of the code by which Python imports modules.
 IMPORT_MACHINERY = "<frozen importlib._bootstrap"
 
-# Signals that interrupt a program.
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Signals that interrupt a program. Windows has no SIGHUP, which comes when a terminal is closed.
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *[signal.SIGHUP] * hasattr(signal, "SIGHUP"))
+
+
+def heard_signals() -> list[signal.Signals]:
+    """Return the signals to which this program reacts: those that it does not ignore, and SIGTERM.
+
+    A shell lets its background jobs ignore SIGINT, and `nohup` lets a program ignore SIGHUP.
+    """
+    ignored = {each for each in SIGNALS if signal.getsignal(each) is signal.SIG_IGN}
+    return [each for each in SIGNALS if each not in ignored - {signal.SIGTERM}]
+
 
 # What the user reads where there is nothing to keep, after the first press, and before a process is
 # ended from outside its loops.
@@ -233,10 +243,9 @@ class Budget:
 
 
 class Interruption:
-    """Handler of Ctrl-C and SIGTERM while a program runs; a context manager.
+    """Handler of Ctrl-C, SIGTERM and SIGHUP while a program runs; a context manager.
 
-    Python delivers signals to the main thread only; in another thread the context has no effect. A
-    process that ignores Ctrl-C, such as a worker, continues to ignore it.
+    Python delivers signals to the main thread only; in another thread the context has no effect.
 
     Args:
         announce: Shows a sentence to the user; called from another thread.
@@ -267,11 +276,10 @@ class Interruption:
     def __enter__(self) -> Interruption:
         """Handle the signals from here on."""
         global _current
-        is_main_thread = threading.current_thread() is threading.main_thread()
-        if is_main_thread and callable(signal.getsignal(signal.SIGINT)):
+        if threading.current_thread() is threading.main_thread():
             _current = self
             self._watcher.start()
-            self._before = {number: signal.signal(number, self) for number in SIGNALS}
+            self._before = {number: signal.signal(number, self) for number in heard_signals()}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -296,6 +304,9 @@ class Interruption:
             InterruptedByUserError: There is nothing to keep.
             UnfinishedError: What is being written may be left out, and the user presses again.
         """
+        # A terminal that is closed may send its signal twice, which is no press of a user.
+        if self.presses and number not in SIGNALS[:2]:
+            return
         self.presses += 1
 
         # The thread that announces the first press must not see what this function changes later.

@@ -266,9 +266,10 @@ class Pool(Executor):
 
 @contextmanager
 def _starting_processes() -> Iterator[None]:
-    """Start processes that hear no Ctrl-C or SIGTERM and import nothing from the current folder.
+    """Start processes that do not hear the signals of their parent, and import nothing from here.
 
-    Otherwise they would take a file `signal.py` or `socket.py` there for the module of this name.
+    Otherwise they would take a file `signal.py` or `socket.py` in the current folder for the
+    module of this name.
     """
     with ExitStack() as restored:
         if hasattr(signal, "pthread_sigmask"):
@@ -334,7 +335,8 @@ def initialize_worker(stop: ctypes.c_bool, lifeline: connection.Connection, addr
     """Prepare a new worker process: it stops and ends with its pool alone."""
     global _pool_token
     _pool_token = StopToken(also=lambda: stop.value)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
     # `timeout` and cluster managers send it to all processes; a running task hands over its result.
     signal.signal(signal.SIGTERM, lambda number, frame: None if _task is not None else os._exit(1))

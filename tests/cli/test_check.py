@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from multiprocessing import synchronize
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ from matplotlib.image import imread
 import mjfim
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.studies import check
+from mjfim.parallel import pool
 from tests.support.cli import MODELS, loads, misused, names, read, run, write_experiment
 
 
@@ -76,6 +80,21 @@ def test_designs_and_recordings_are_checked(study: Path, archived: Path, recorde
     recording = loads(run("check", study, recorded, "--json").stdout)
     assert recording["source"] == "1 recording"
     np.testing.assert_allclose([row["std"] for row in recording["parameters"]], sigma, rtol=1e-4)
+
+
+def test_without_locks_between_processes_one_process_does_the_work(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container whose /dev/shm is missing or read-only."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(synchronize.SemLock, "__init__", refuse)
+    monkeypatch.setattr(pool, "cores", lambda: 2)
+    result = run("check", study, "--executor", "local:2")
+    assert (result.exit_code, result.stdout) == (0, run("check", study).stdout)
+    assert "Read-only file system); one does all the work" in result.stderr
 
 
 def test_misuse(study: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""File names with brackets, and terminals and locales that are not UTF-8."""
+"""File names with brackets, streams that are not UTF-8, and those that are full or closed."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from mjfim.cli.common import replace_unencodable_characters
-from mjfim.cli.progress import errors, out
+from mjfim.cli import main as cli
+from mjfim.cli.progress import errors, lose_what_cannot_be_written, out
 from mjfim.output.page import Row, Table
 from mjfim.output.terminal import TerminalPage
 from tests.support.cli import PROCESS, loads, misused, run, write_experiment
@@ -51,7 +51,7 @@ def test_streams_that_are_not_utf8(encoding: str, monkeypatch: pytest.MonkeyPatc
     """A character that the encoding does not have is printed as a question mark."""
     stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
     monkeypatch.setattr(sys, "stderr", stream)
-    replace_unencodable_characters()
+    lose_what_cannot_be_written()
     errors.print("σ of [/é]: λ_min", highlight=False)
     stream.flush()
     printed = stream.buffer.getvalue().decode(encoding)
@@ -80,3 +80,53 @@ def test_processes_that_are_not_utf8(tmp_path: Path, settings: dict[str, str]) -
     assert (done.returncode, b"Traceback" in done.stderr) == (0, False), done.stderr
     written = (tmp_path / "out" / "check.json").read_text(encoding="utf-8")
     assert "µ" in str(loads(written))
+
+
+@pytest.mark.usefixtures("empty_figures")
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_a_full_stream_costs_its_text_alone(
+    name: str, study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = {"stdout": "stderr", "stderr": "stdout"}[name]
+    texts = tmp_path / "texts"
+    with Path("/dev/full").open("w") as full, texts.open("w", encoding="utf-8") as kept:
+        monkeypatch.setattr(sys, name, full)
+        monkeypatch.setattr(sys, other, kept)
+        lose_what_cannot_be_written()
+        with pytest.raises(SystemExit) as end:
+            cli.app(["check", str(study), "-o", str(tmp_path / "out")])
+        getattr(sys, other).flush()
+        monkeypatch.undo()
+    assert end.value.code == 0
+    assert {"check.json", "check.npz", "report.html"} <= {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
+    told = texts.read_text(encoding="utf-8")
+    assert ("mjfim: stdout: No space left on device" in told) is (name == "stdout")
+    assert ("the least accurate is" in told) is (name == "stderr")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("verb", "streams"), [("check", ">&-"), ("check", "<&- >&- 2>&-"), ("identify", "| true")]
+)
+def test_streams_that_are_closed_or_full(
+    verb: str, streams: str, study: Path, recorded: Path, tmp_path: Path
+) -> None:
+    """The exit code is that of the result, its files are there, and stdout is named."""
+    words = [*PROCESS, verb, study, *([recorded] if verb == "identify" else []), "-o", "out"]
+    call = f'"$@" {streams} ; exit "${{PIPESTATUS[0]}}"'
+    done = subprocess.run(
+        ["bash", "-c", call, "bash", *words],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        cwd=tmp_path,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    found = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"check": "check.json", "identify": "identified.xml"}[verb] in found
+    assert "Traceback" not in done.stdout + done.stderr
+    assert ("mjfim: stdout: " in done.stderr) is ("2>&-" not in streams)

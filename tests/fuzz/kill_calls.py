@@ -1,4 +1,7 @@
-"""The calls that are killed: small studies, which end by themselves, of every verb that writes."""
+"""The calls that are killed: small studies, which end by themselves, of the verbs that write.
+
+`compare` ends by time alone, so that it cannot be repeated with the same result.
+"""
 
 from __future__ import annotations
 
@@ -62,12 +65,6 @@ CALLS = {
     "simulate": Call(words=("simulate", "study.toml", "design.npz", "-o", f"{OUTPUT}/made.csv")),
     "identify": Call(words=("identify", "study.toml", "run.csv", *FOLDER)),
     "montecarlo": Call(words=("montecarlo", "study.toml", "design.npz", *FOLDER, "--trials", "40")),
-    "compare": Call(
-        words=(
-            *("compare", "study.toml", *FOLDER, "--seconds", "1000", "--steps", "8000"),
-            *("--methods", "chirp,steps"),
-        )
-    ),
     "rehearse": Call(words=("rehearse", "made", *FOLDER, "--robots", "3")),
     "campaign": Call(
         words=("campaign", "guess.toml", *FOLDER, "--wanted", "0.0055", "--seed", "5"),

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mjfim.parallel.budget import NOTHING_SENTENCE
 from tests.fuzz.kill_calls import (
     CALLS,
     LONGEST_CALL,
@@ -53,10 +54,13 @@ LATEST = 1.05
 WORKER = "worker"
 KILLS = (
     ("SIGKILL",),
-    ("SIGKILL",),
     ("SIGINT",),
     ("SIGINT",),
     ("SIGTERM",),
+    ("SIGTERM",),
+    ("SIGHUP",),
+    ("SIGHUP",),
+    ("SIGHUP", "SIGTERM"),
     ("SIGINT", "SIGINT"),
     ("SIGINT", "SIGTERM"),
     ("SIGTERM", "SIGINT"),
@@ -74,12 +78,14 @@ class Kill:
         signals: Names of the signals.
         share: Time of the first signal, relative to the time of the undisturbed call.
         gap: Time between two signals [s].
+        is_deaf: Whether the call ignores SIGINT from its begin, as a background job of a shell.
     """
 
     name: str
     signals: tuple[str, ...]
     share: float
     gap: float
+    is_deaf: bool
 
     @classmethod
     def of(cls, case: Case) -> Kill:
@@ -92,16 +98,23 @@ class Kill:
             signals=signals,
             share=LATEST * float(rng.random()),
             gap=LONGEST_GAP * float(rng.random()),
+            is_deaf=bool(rng.integers(2)),
         )
+
+    @property
+    def heard(self) -> tuple[str, ...]:
+        """The signals to which the call reacts."""
+        return tuple(name for name in self.signals if not (self.is_deaf and name == "SIGINT"))
 
     def __str__(self) -> str:
         later = f" and {self.signals[1]} {self.gap:.2f} s later" if len(self.signals) > 1 else ""
-        return f"{self.name}, {self.signals[0]} after {100 * self.share:.0f} %{later}"
+        deaf = ", SIGINT ignored" if self.is_deaf else ""
+        return f"{self.name}, {self.signals[0]} after {100 * self.share:.0f} %{later}{deaf}"
 
     @property
     def group(self) -> str:
         """Name of the kind of kill for the counts."""
-        return "+".join(self.signals)
+        return "+".join(self.signals) + (" deaf" if self.is_deaf else "")
 
 
 def run(case: Case, folder: Path) -> Outcome:
@@ -114,7 +127,7 @@ def run(case: Case, folder: Path) -> Outcome:
     call, undisturbed = CALLS[kill.name], reference(kill.name)
     prepare(folder)
     seconds = kill.share * undisturbed.seconds
-    with _started(call, folder) as process:
+    with _started(call, folder, is_deaf=kill.is_deaf) as process:
         is_killed = _send(process, kill, seconds)
         complaints = [*_ending(process, kill, seconds), *_orphans(process.pid)]
 
@@ -123,8 +136,10 @@ def run(case: Case, folder: Path) -> Outcome:
     if "Traceback" in told and seconds >= starts:
         complaints.append("Traceback: " + "\n".join(told.splitlines()[-4:]))
     complaints += _files(folder / OUTPUT, has_ended_itself="SIGKILL" not in kill.signals)
-    if kill.signals == (WORKER,):
+    if not kill.heard or kill.heard == (WORKER,):
         complaints += _differences(folder, undisturbed)
+    elif "SIGKILL" not in kill.heard and seconds >= starts:
+        complaints += _lost(folder, told)
     complaints += [f"again: {fault}" for fault in _again(call, folder, undisturbed)]
     return Outcome(
         case=case,
@@ -135,7 +150,7 @@ def run(case: Case, folder: Path) -> Outcome:
 
 
 @contextlib.contextmanager
-def _started(call: Call, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[subprocess.Popen[bytes]]:
     """Start a call in a session of its own; end everything that it has started at the end.
 
     In a new session, the children are recognised by their process group.
@@ -149,6 +164,9 @@ def _started(call: Call, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
             stderr=errors,
             env=environment(),
             start_new_session=True,
+            preexec_fn=lambda: signal.signal(
+                signal.SIGINT, signal.SIG_IGN if is_deaf else signal.SIG_DFL
+            ),
         )
     try:
         yield process
@@ -220,8 +238,8 @@ def _table(columns: str) -> list[list[str]]:
 
 def _ending(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> list[str]:
     """Describe what is wrong with the end of a process that got signals after some seconds."""
-    limit = END_TIME if len(kill.signals) == 1 else SECOND_END_TIME
-    limit = LONGEST_CALL if kill.signals == (WORKER,) else limit
+    limit = END_TIME if len(kill.heard) == 1 else SECOND_END_TIME
+    limit = LONGEST_CALL if not kill.heard or kill.heard == (WORKER,) else limit
     try:
         code = process.wait(limit)
     except subprocess.TimeoutExpired:
@@ -229,7 +247,7 @@ def _ending(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> lis
 
     # Python itself cannot handle a signal while it starts.
     is_fatal = seconds < _start(CALLS[kill.name], reference(kill.name))
-    fatal = [name for name in kill.signals if name == "SIGKILL" or (is_fatal and name != WORKER)]
+    fatal = [name for name in kill.heard if name == "SIGKILL" or (is_fatal and name != WORKER)]
     allowed = (0, 1, *(-signal.Signals[name] for name in fatal))
     return [] if code in allowed else [f"exit code {code} after {kill.group}"]
 
@@ -284,6 +302,13 @@ def _again(call: Call, folder: Path, undisturbed: Reference) -> list[str]:
         code, wanted = done.returncode, undisturbed.code
         return [f"exit code {code} instead of {wanted}: {done.stderr[-600:]}"]
     return [*_files(folder / OUTPUT, has_ended_itself=True), *_differences(folder, undisturbed)]
+
+
+def _lost(folder: Path, told: str) -> list[str]:
+    """Describe a call that was asked to stop and left no result, though it did not say so."""
+    is_told = NOTHING_SENTENCE in told
+    written = {path.name for path in (folder / OUTPUT).rglob("*")} - {"run.csv"}
+    return [] if is_told or written else [f"the result is lost: {told[-300:]}"]
 
 
 def _differences(folder: Path, undisturbed: Reference) -> list[str]:

@@ -222,3 +222,18 @@ def test_nothing_is_left_where_the_text_cannot_express_the_value(
     assert os.listdir(new.parent) == ["identified.xml"]
     model = mujoco.MjModel.from_xml_path(str(new))
     assert model.body("hand").pos[0] == 0.25
+
+
+@pytest.mark.parametrize("edited", ["robot.xml", "parts/arm.xml"])
+def test_a_model_that_is_edited_meanwhile_is_written_as_it_was_loaded(
+    edited: str, robot: Path, tmp_path: Path
+) -> None:
+    """Its parameters belong to the text that was loaded, also where it is resolved again."""
+    task = task_of(robot, tmp_path, "joint/elbow:armature")
+    whole, new = tmp_path / "whole" / "identified.xml", tmp_path / "out" / "identified.xml"
+    assert write_identified(whole, task.system, np.array([0.02])) == []
+    with (robot.parent / edited).open("a", encoding="utf-8") as file:
+        file.write("<!-- edited -->")
+    assert write_identified(new, task.system, np.array([0.02])) == []
+    written = {path.name: path.read_bytes() for path in new.parent.iterdir()}
+    assert written == {path.name: path.read_bytes() for path in whole.parent.iterdir()}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
+import subprocess
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -397,3 +401,38 @@ class TestAddress:
         self, words: list[str], completed: list[str]
     ) -> None:
         assert with_live_address(words) == completed
+
+
+@pytest.mark.slow
+def test_a_viewer_listens_on_this_computer_alone_and_stores_no_statistics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What listens at all addresses answers at 127.0.0.2 as well, on Linux."""
+    for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    nowhere = subprocess.DEVNULL
+    viewer = live_module.start_viewer(
+        "--serve-grpc", "--port", str(port), stdout=nowhere, stderr=nowhere
+    )
+    try:
+        deadline = time.monotonic() + 60.0
+        while not answers("127.0.0.1", port) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        assert answers("127.0.0.1", port)
+        assert not answers("127.0.0.2", port)
+        assert list(tmp_path.rglob("*.json")) == []
+    finally:
+        os.killpg(viewer.pid, signal.SIGKILL)
+        viewer.wait()
+
+
+def answers(host: str, port: int) -> bool:
+    """Whether something listens at an address."""
+    try:
+        socket.create_connection((host, port), timeout=5.0).close()
+    except OSError:
+        return False
+    return True

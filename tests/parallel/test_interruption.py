@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM on the command line: what one press and two presses do at each moment."""
+"""Signals on the command line: what one press and two presses do at each moment."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -52,12 +52,49 @@ def test_no_number_of_presses_ends_a_computation_from_outside(
         assert inner.requested
         assert not hurried()
 
-        signal.raise_signal(number)
+        signal.raise_signal(signal.SIGINT)
         assert hurried()
 
     # The result is written however often the user presses.
-    signal.raise_signal(number)
+    signal.raise_signal(signal.SIGTERM)
     assert interruption.presses == 3
+
+
+# What a program heard: those signals that were not ignored when it began, and SIGTERM always.
+HEARD = {
+    (): {"SIGINT", "SIGTERM", "SIGHUP"},
+    ("SIGINT",): {"SIGTERM", "SIGHUP"},
+    ("SIGHUP",): {"SIGINT", "SIGTERM"},
+    ("SIGINT", "SIGTERM", "SIGHUP"): {"SIGTERM"},
+}
+
+
+@pytest.mark.parametrize("ignored", HEARD)
+@pytest.mark.parametrize("other", [signal.SIG_DFL, lambda *_: None])
+def test_signals_that_were_ignored_stay_so_but_for_sigterm(
+    ignored: tuple[str, ...], other: Callable[..., None] | signal.Handlers
+) -> None:
+    """A shell ignores SIGINT in a background job, and `nohup` ignores SIGHUP."""
+    before = {number: signal.getsignal(number) for number in module.SIGNALS}
+    try:
+        for number in module.SIGNALS:
+            signal.signal(number, signal.SIG_IGN if number.name in ignored else other)
+        for number in module.SIGNALS:
+            with Interruption(lambda _: None) as handler, stop_on_interrupt() as token:
+                signal.raise_signal(number)
+                assert token.requested is (number.name in HEARD[ignored])
+            assert handler.presses == int(token.requested)
+    finally:
+        for number, handled in before.items():
+            signal.signal(number, handled)
+
+
+def test_a_terminal_that_is_closed_presses_once(interruption: Interruption) -> None:
+    with stop_on_interrupt() as token:
+        for _ in range(2):
+            signal.raise_signal(signal.SIGHUP)
+    assert token.requested
+    assert not hurried()
 
 
 def test_a_computation_that_begins_after_a_press_is_stopped_at_once(

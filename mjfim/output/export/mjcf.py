@@ -391,7 +391,7 @@ def same_dynamics(a: Any, b: Any, tolerance: float = TOLERANCE) -> bool:
 def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) -> ModelXml:
     """The user's text with the values."""
     source = system.source
-    xml = ModelXml(system.model_path)
+    xml = ModelXml(system.model_path, source.read)
     if xml.root.tag != "mujoco":
         raise ModelError(f"the model is no MJCF but <{xml.root.tag}>")
     if source.terms:
@@ -422,8 +422,8 @@ def _printed(system: System, theta: Array, wanted: Any) -> ModelXml:
     # Inertias that are stated have to count.
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     spec.compiler.settotalmass = -1.0
-    compile_spec(spec, system.model_path)
-    xml = ModelXml(system.model_path, spec.to_xml().encode())
+    compile_spec(spec, system.model_path, files=system.source.files)
+    xml = ModelXml(system.model_path, lambda _: spec.to_xml().encode())
     state_differences(xml, xml.compiled(), wanted, names_needed=False)
     return xml
 

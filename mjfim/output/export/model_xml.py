@@ -96,17 +96,18 @@ class ModelXml:
         root: The main element: `mujoco` or `robot`.
     """
 
-    def __init__(self, path: Path, text: bytes | None = None) -> None:
+    def __init__(self, path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> None:
         """Read a model.
 
         Args:
             path: The main file.
-            text: The XML where it is not that of the file.
+            read: Gives the bytes of a file.
 
         Raises:
             ModelError: The text is no XML. The message is a clause.
         """
-        main = _source_file(path.resolve(), text)
+        main = _source_file(path.resolve(), read)
+        self._read = read
         self.root = main.root
         self._main = main
         self._included: list[SourceFile] = []
@@ -232,7 +233,7 @@ class ModelXml:
             if place is None or place.resolve() in known:
                 continue
 
-            included = _source_file(place.resolve())
+            included = _source_file(place.resolve(), self._read)
             included.include = element
             self._included.append(included)
             self._include(included)
@@ -401,9 +402,9 @@ def same_inertia(a: BodyInertia, b: BodyInertia, tolerance: float = ROUNDING) ->
 # ---- files
 
 
-def _source_file(path: Path, text: bytes | None = None) -> SourceFile:
-    """Read a file, or its text."""
-    content = path.read_bytes() if text is None else text
+def _source_file(path: Path, read: Callable[[Path], bytes]) -> SourceFile:
+    """Read a file."""
+    content = read(path)
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:
         root = etree.fromstring(content, parser)

@@ -106,7 +106,7 @@ def write_identified_urdfs(
     remarks = []
     for name, source in zip(urdf_files(path, system.model_path), sources, strict=True):
         try:
-            _write(path.with_name(name), source, system.model, wanted)
+            _write(path.with_name(name), source, system, wanted)
         except ModelError as error:
             remarks.append(f"{name}: not written: {error}")
         else:
@@ -134,7 +134,7 @@ def _is_held(parameter: Parameter) -> bool:
     )
 
 
-def _write(path: Path, source: UrdfSource, old: Any, wanted: Any) -> None:
+def _write(path: Path, source: UrdfSource, system: System, wanted: Any) -> None:
     """Write one URDF; raise ModelError, with a clause, where it cannot have the values."""
     if len(source.prefixes) > 1:
         raise ModelError(
@@ -143,8 +143,8 @@ def _write(path: Path, source: UrdfSource, old: Any, wanted: Any) -> None:
         )
 
     (prefix,) = source.prefixes
-    xml = ModelXml(source.path)
-    stated = _loaded(source.path, "MuJoCo does not load the URDF alone")
+    xml, old = ModelXml(source.path, system.source.read), system.model
+    stated = _loaded(source.path, "MuJoCo does not load the URDF alone", system.source.files)
     inertias: dict[str, BodyInertia] = {}
     for link in xml.root.iterchildren("link"):
         name = link.get("name")
@@ -183,12 +183,12 @@ def _check(
             raise ModelError(f"MuJoCo reads another friction of joint {joint!r} from it")
 
 
-def _loaded(path: Path, fault: str) -> Any:
+def _loaded(path: Path, fault: str, files: Any = None) -> Any:
     """MjModel of a URDF in which every link is a body of its own, also where it is fixed."""
     with loading(fault):
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(path.as_posix(), vfs=files)
         spec.compiler.fusestatic = False
-        return spec.compile()
+        return spec.compile(files)
 
 
 def _changed(link: str, own: BodyInertia, before: BodyInertia, after: BodyInertia) -> BodyInertia:

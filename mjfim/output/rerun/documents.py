@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import subprocess
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,6 +18,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.files import replacing
 from mjfim.output.archive import shown_positions
+from mjfim.output.live import start_viewer
 from mjfim.output.page import (
     DESIGNED,
     IDENTIFIED,
@@ -477,9 +477,7 @@ def show(path: Path) -> None:
     if not Path(path).is_file():
         raise RecordingError(f"there is no Rerun recording at {str(path)!r}")
 
-    # With -P, Python does not look for the viewer in the current folder.
-    command = [sys.executable, "-P", "-m", "rerun", "--new", str(path)]
-    viewer = subprocess.Popen(command, start_new_session=True)
+    viewer = start_viewer("--new", str(path))
     try:
         code = viewer.wait(timeout=START_SECONDS)
     except subprocess.TimeoutExpired:
