@@ -289,7 +289,12 @@ def _judge_deviations(found: Walk, folder: Path) -> None:
             break
         try:
             study = mjfim.monte_carlo(
-                experiment, design.trajectory, trials=FITS_PART, seed=seed, threads=1, progress=False
+                experiment,
+                design.trajectory,
+                trials=FITS_PART,
+                seed=seed,
+                threads=1,
+                progress=False,
             )
         except mjfim.MjfimError as error:
             found.messages["fits"] = str(error)
