@@ -252,18 +252,21 @@ class Rehearsal(ShownRecord):
         """Key `limits.reserve` for robots that leave limits: share of half of each range by kind.
 
         The excursion of a robot is taken to be in proportion to that of the model. It is at most
-        halved at once. Clamps come first: where one acts, everything else follows from it.
+        halved at once. Clamps come first: where one acts, everything else follows from it. A joint
+        that cannot be braked needs room in its position.
         """
         found: dict[str, float] = {}
         if self.is_safe and self.at_clamp < max(MAX_BROKEN * self.robots, 1.0):
             return found
-        broken = np.flatnonzero(~self.kept.all(axis=0)).tolist()
+        late = [each.kind == "position" and each.name in self.unbraked for each in self.limits]
+        broken = np.flatnonzero(~self.kept.all(axis=0) | np.array(late, dtype=bool)).tolist()
         clamped = [i for i in broken if self.is_clamped[i]]
         for i in clamped or broken:
             kind, margins = self.limits[i].kind, self.margins[:, i]
             worst = float(np.min(margins[np.isfinite(margins)], initial=0.0))
             used = 1.0 - float(margins[0])
-            growth = 1.0 + self.wrong if clamped else (1.0 - worst) / used if used > 0.0 else 2.0
+            growth = max((1.0 - worst) / used, 1.0 + self.wrong * late[i]) if used > 0.0 else 2.0
+            growth = 1.0 + self.wrong if clamped else growth
             share = (
                 float(margins[0]) - worst if kind == "clearance" else 1.0 - used / min(growth, 2.0)
             )

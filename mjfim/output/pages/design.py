@@ -176,8 +176,8 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
         for i in sorted(free, key=lambda i: -float(peaks[i])):
             fastest.setdefault(rehearsal.units[i], i)
         shown = [f"{peaks[i]:.2g} {unit} ({rehearsal.joints[i]})" for unit, i in fastest.items()]
-        joints = "1 joint" if len(free) == 1 else f"{len(free)} joints"
-        yield f"Nothing limits the speed of {joints}: it is up to {' and '.join(shown)}."
+        which = "1 speed has" if len(free) == 1 else f"{len(free)} speeds have"
+        yield f"{which} no limit, with a peak of {' and '.join(shown)}."
     if not rehearsal.at_rest:
         shares = rehearsal.end_speed[0] / np.where(peaks > 0.0, peaks, np.inf)
         i = int(np.argmax(shares))
@@ -289,11 +289,11 @@ def _cures(rehearsal: Rehearsal) -> Iterator[str]:
             "Keep the robot above the floor: state ranges of `position` in `[limits]` for what "
             "moves down, or `clearance` to a floor in the model."
         )
+    if rehearsal.unbraked and not rehearsal.at_rest:
+        yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
     if rehearsal.reserve:
         shares = ", ".join(f"{kind} = {share:g}" for kind, share in rehearsal.reserve.items())
         yield f"Design with a reserve for such robots: `[limits] reserve = {{ {shares} }}`."
-    if rehearsal.unbraked:
-        yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
 
 
 def rehearsal_page(rehearsal: Rehearsal) -> Page:
