@@ -10,7 +10,7 @@ from pathlib import Path
 from mjfim.errors import ModelError
 from mjfim.experiment.schema import Experiment
 from mjfim.model.loading import ModelSource, packed_model
-from mjfim.model.model_files import PackedFiles, files_of_model
+from mjfim.model.model_files import PackedFiles, files_of_model, is_present
 
 
 def input_files(experiment: Experiment, further: Iterable[Path | None] = ()) -> tuple[Path, ...]:
@@ -62,7 +62,7 @@ def with_model(experiment: Experiment) -> Experiment:
     packed = experiment.files or PackedFiles.of({})
     if packed.content(path) is not None:
         return experiment
-    if not path.is_file():
+    if not is_present(path):
         raise ModelError(
             f"{experiment.source}: model: {path}: no such model file; state the path of an MJCF or "
             "URDF, which begins in the folder of the experiment file"

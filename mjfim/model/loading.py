@@ -21,6 +21,7 @@ from mjfim.model.model_files import (
     PACKAGE,
     PackedFiles,
     files_of_model,
+    is_present,
     name_of,
     package_file,
 )
@@ -42,7 +43,7 @@ def load_spec(path: Path, files: Any = None, packages: Mapping[str, str] = NO_PA
     Raises:
         ModelError: The file is absent or no model, or MuJoCo cannot read it.
     """
-    if files is None and not path.is_file():
+    if files is None and not is_present(path):
         raise ModelError(f"{path}: no such model file")
     if path.suffix.lower() == ".toml":
         raise ModelError(
@@ -50,6 +51,8 @@ def load_spec(path: Path, files: Any = None, packages: Mapping[str, str] = NO_PA
             "that this file states"
         )
     name = str(path) if files is None else path.as_posix()
+    if files is None:
+        files_of_model(path)  # refuses pipes before MuJoCo waits for their ends
     try:
         with collected_warnings(of_reader=True) as found:
             spec = mujoco.MjSpec.from_file(name, vfs=files)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from mjfim.errors import ExperimentError
+from mjfim.errors import ExperimentError, ModelError
 from mjfim.parallel.shared_value import SharedValue
 
 # Attributes of <compiler> that state the folder of meshes or images.
@@ -134,7 +134,19 @@ def package_file(
     if package in packages:
         places.insert(0, Path(packages[package]))
     files = [place / inside for place in places]
-    return next((file for file in files if file.as_posix() in held or file.is_file()), None)
+    return next((file for file in files if file.as_posix() in held or is_present(file)), None)
+
+
+def is_present(file: Path) -> bool:
+    """Whether there is a regular file.
+
+    Raises:
+        ModelError: There is something of which reading may never end.
+    """
+    is_regular = os.path.isfile(file)
+    if os.path.exists(file) and not (is_regular or os.path.isdir(file)):
+        raise ModelError(f"{file}: a pipe or a device; a model is read from regular files only")
+    return is_regular
 
 
 def is_urdf(path: Path) -> bool:
@@ -191,7 +203,7 @@ def _existing(name: str, places: set[Path], folders: set[Path]) -> list[Path]:
         for folder in sorted(folders)
         for stated in dict.fromkeys((path, Path(path.name)))
     ]
-    return [Path(os.path.normpath(file)) for file in candidates if file.is_file()]
+    return [Path(os.path.normpath(file)) for file in candidates if is_present(file)]
 
 
 @dataclass(frozen=True, kw_only=True)

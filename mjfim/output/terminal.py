@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
-from rich import box
-from rich import table as rich_table
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.padding import Padding
+from rich.segment import Segment
+from rich.style import Style
 from rich.text import Text as Styled
 
 from mjfim.output.page import (
@@ -17,6 +18,7 @@ from mjfim.output.page import (
     Level,
     Listing,
     Page,
+    Row,
     Table,
     Text,
     capitalised,
@@ -82,7 +84,7 @@ class TerminalPage:
         for part in parts:
             if self.verbose and not isinstance(part, Text):
                 yield Styled()
-            yield from _rendered(part, width, verbose=self.verbose)
+            yield from _rendered(part, width, console, verbose=self.verbose)
         if hidden:
             rows = "1 row or sentence" if hidden == 1 else f"{hidden} rows and sentences"
             yield _styled(f"Not shown here: {rows}; --verbose shows everything", "dim")
@@ -154,8 +156,8 @@ def _without_last(part: Shown) -> Shown:
 
 
 def _rendered(
-    part: Shown, width: int, *, verbose: bool
-) -> Iterator[Styled | Padding | rich_table.Table]:
+    part: Shown, width: int, console: Console, *, verbose: bool
+) -> Iterator[Styled | Padding | Segment]:
     """A part as what Rich prints."""
     if isinstance(part, Text):
         yield _styled(part.text, STYLES[part.emphasis])
@@ -173,7 +175,7 @@ def _rendered(
     if widths is None:
         yield from _paragraphs(part, shown)
     else:
-        yield _grid(part, shown, widths)
+        yield from _grid(part, shown, widths, console)
     if part.note:
         yield _styled(part.note, "dim")
 
@@ -215,23 +217,35 @@ def _widths(table: Table, shown: Sequence[int], available: int) -> list[int] | N
     return least
 
 
-def _grid(table: Table, shown: Sequence[int], widths: Sequence[int]) -> rich_table.Table:
-    """A table whose columns have these widths."""
-    grid = rich_table.Table(
-        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, GAP - 1, 0, 0)
-    )
-    for k, width in zip(shown, widths, strict=True):
-        grid.add_column(
-            Styled(table.columns[k], style="dim"),
-            justify="left" if table.is_left(k) else "right",
-            vertical="top",
-            overflow="fold",
-            width=width,
-        )
-    for row in table.rows:
-        style = STYLES[row.emphasis]
-        grid.add_row(*(Styled(row.cells[k], style=style) for k in shown))
-    return grid
+def _grid(
+    table: Table, shown: Sequence[int], widths: Sequence[int], console: Console
+) -> Iterator[Styled | Segment]:
+    """The lines of a table whose columns have these widths.
+
+    A table of Rich itself takes minutes for the rows of a large model.
+    """
+    head = Row(table.columns, Emphasis.WEAK)
+    aligned = [str.ljust if table.is_left(k) else str.rjust for k in shown]
+    for row in (head, *table.rows):
+        cells = [
+            _folded(row.cells[k], size, console) for k, size in zip(shown, widths, strict=True)
+        ]
+        for parts in zip_longest(*cells, fillvalue=""):
+            # Some characters take two places.
+            line = (" " * GAP).join(
+                align(part, size + len(part) - cell_len(part))
+                for align, part, size in zip(aligned, parts, widths, strict=True)
+            )
+            yield Segment(f"{line.rstrip()}\n", Style.parse(STYLES[row.emphasis]))
+        if row is head:
+            yield Segment("─" * (sum(widths) + GAP * (len(widths) - 1)) + "\n")
+
+
+def _folded(text: str, width: int, console: Console) -> list[str]:
+    """The lines of a cell."""
+    if cell_len(text) <= width:
+        return [text]
+    return [line.plain for line in _styled(text, "").wrap(console, width)]
 
 
 def _paragraphs(table: Table, shown: Sequence[int]) -> Iterator[Styled | Padding]:

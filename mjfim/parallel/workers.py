@@ -22,7 +22,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from mjfim.errors import ExperimentError
+from mjfim.errors import MAX_THREADS, ExperimentError, shortened
+from mjfim.files import read_json
 from mjfim.parallel.pool import Pool
 
 T = TypeVar("T")
@@ -266,7 +267,9 @@ class StatedExecutor:
         word, colon, place = text.partition(":")
         kinds = {kind.value: kind for kind in ExecutorKind}
         if word not in kinds or (colon and not place):
-            raise ExperimentError(f"executor: {text!r} has no known form; state {FORMS}")
+            raise ExperimentError(
+                f"executor: {shortened(repr(text))} has no known form; state {FORMS}"
+            )
 
         stated = cls(text=text, kind=kinds[word], place=place)
         stated._require_place()
@@ -300,66 +303,65 @@ class StatedExecutor:
 
     def _require_place(self) -> None:
         """Raise ExperimentError where the place does not fit the kind."""
-        is_count = not self.place or (self.place.isdecimal() and int(self.place) >= 1)
-        if self.kind is ExecutorKind.LOCAL and not is_count:
-            raise ExperimentError(
-                f"executor: {self.text!r}: {self.place!r} is not a number of processes; state a "
-                "whole number from 1, such as local:2"
+        counts = map(str, range(1, MAX_THREADS + 1))
+        if self.kind is ExecutorKind.LOCAL and self.place not in ("", *counts):
+            raise self._error(
+                f"not a number of processes; state a whole number from 1 to {MAX_THREADS}, such as "
+                "local:2"
             )
 
         if self.kind is ExecutorKind.DASK and not self.place:
-            raise ExperimentError(
-                f"executor: {self.text!r} states no scheduler; state its address, such as "
-                "dask://host:8786, or the file that it writes, such as dask:scheduler.json"
+            raise self._error(
+                "states no scheduler; state its address, such as dask://host:8786, or the file "
+                "that it writes, such as dask:scheduler.json"
             )
 
         is_file = self.kind is ExecutorKind.DASK and "//" not in self.place
         if is_file and not Path(self.place).is_file():
-            raise ExperimentError(
-                f"executor: {self.text!r}: there is no file {self.place}; `dask scheduler "
-                f"--scheduler-file {self.place}` writes it"
-            )
+            raise self._error("no such file; `dask scheduler --scheduler-file FILE` writes it")
 
         module, colon, name = self.place.rpartition(":")
         if self.kind is ExecutorKind.PYTHON and not (module and colon and name.isidentifier()):
-            raise ExperimentError(
-                f"executor: {self.text!r} names no function; state a module or a file and a "
-                "function that returns an executor, such as python:cluster.py:make"
+            raise self._error(
+                "names no function; state a module or a file and a function that returns an "
+                "executor, such as python:cluster.py:make"
             )
+
+    def _error(self, words: str) -> ExperimentError:
+        """What is wrong with the stated executor, and what would be right."""
+        return ExperimentError(f"executor: {shortened(repr(self.text))}: {words}")
 
     # ---- Dask
 
     def _cluster(self) -> Any:
         """A client of the stated Dask cluster."""
-        # An address may state its protocol, such as dask:tls://host:8786.
-        if self.place.startswith("//"):
-            address = {"address": f"tcp:{self.place}"}
-        elif "//" in self.place:
-            address = {"address": self.place}
-        else:
-            address = {"scheduler_file": self.place}
-
         try:
             from distributed import Client
+            from distributed.comm import resolve_address
         except ImportError as error:
-            raise ExperimentError(
-                f"executor: {self.text!r} needs Dask, which is not installed: "
-                "pip install 'mjfim[dask]'"
+            raise self._error(
+                "needs Dask, which is not installed: pip install 'mjfim[dask]'"
             ) from error
 
+        # An address may state its protocol, such as dask:tls://host:8786.
+        address = f"tcp:{self.place}" if self.place.startswith("//") else self.place
+        if "//" not in address:
+            address = str(read_json(Path(address)).get("address"))
         try:
-            client = Client(**address, timeout=CONNECTION_SECONDS, set_as_default=False)
+            # A client whose address has a wrong form waits long when the process ends.
+            resolve_address(address)
+            client = Client(address, timeout=CONNECTION_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise ExperimentError(
-                f"executor: {self.text!r}: no scheduler answers there within "
-                f"{CONNECTION_SECONDS:g} s; start one with `dask scheduler`, and check the address "
-                "and the firewall"
+            raise self._error(
+                f"no scheduler answers there within {CONNECTION_SECONDS:g} s "
+                f"({shortened(str(error))}); start one with `dask scheduler`, and check the "
+                "address and the firewall"
             ) from error
         except TypeError as error:
             # Dask refuses an encrypted address so where it has no certificates.
-            raise ExperimentError(
-                f"executor: {self.text!r}: Dask cannot use this address: {error}; for tls:// state "
-                "the certificates in the configuration of Dask, under distributed.comm.tls"
+            raise self._error(
+                f"Dask cannot use this address: {error}; for tls:// state the certificates in the "
+                "configuration of Dask, under distributed.comm.tls"
             ) from error
 
         try:
@@ -377,18 +379,13 @@ class StatedExecutor:
         try:
             is_file = place.endswith(".py")
             known = runpy.run_path(place) if is_file else vars(importlib.import_module(place))
-        except (ImportError, OSError) as error:
-            raise ExperimentError(
-                f"executor: {self.text!r}: {place} cannot be imported: {error}; state the name of "
-                "an installed module, or the path of a file that ends with .py"
+            return known[name]()
+        except Exception as error:  # the code of the user may raise anything
+            raise self._error(
+                f"cannot call {shortened(name)} ({type(error).__name__}: {shortened(str(error))}); "
+                "state a function without arguments that returns an executor of the kind of "
+                "concurrent.futures, in an installed module or in a file that ends with .py"
             ) from error
-        factory = known.get(name)
-        if not callable(factory):
-            raise ExperimentError(
-                f"executor: {self.text!r}: {place} has no function {name}; it must return an "
-                "executor of the kind of concurrent.futures"
-            )
-        return factory()
 
 
 def own_versions() -> tuple[str, str]:

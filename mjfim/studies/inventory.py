@@ -104,36 +104,30 @@ def _parameters(source: ModelSource) -> Iterator[ListedParameter]:
     """Paths of all numbers that a parameter can set."""
     model = source.model
     for kind in NAMED_KINDS:
+        entries = list(_entries(model, kind))
         for name in names_of(model, kind):
-            if kind == "body" and name == WORLD:
-                continue
-            for field in fields_of(kind):
-                for path in _paths(model, f"{kind}/{name}:{field}", kind, field):
-                    yield from _entry(source, path, skip_zero=field in SPARSE_FIELDS)
+            for field, entry in entries if (kind, name) != ("body", WORLD) else ():
+                path = f"{kind}/{name}:{entry}"
+                yield from _entry(source, path, skip_zero=field in SPARSE_FIELDS)
 
-    for field in MODEL_ARRAYS["option"]:
-        for path in _paths(model, f"option:{field}", "option", field):
-            yield from _entry(source, path, skip_zero=False)
+    for _, entry in _entries(model, "option"):
+        yield from _entry(source, f"option:{entry}", skip_zero=False)
 
     for component in source.coordinates.deviations:
         if component.path:
             yield ListedParameter(path=component.path, value=0.0, unit=component.unit)
 
 
-def _paths(model: Any, path: str, kind: str, field: str) -> Iterator[str]:
-    """The path of a field, or one path for each of its entries."""
-    width = FURTHER_WIDTHS.get(field, 1)
-    array = MODEL_ARRAYS[kind].get(field)
-    if array is not None:
-        holder = getattr(model.opt if kind == "option" else model, array)
-        has_entries = np.ndim(holder) == (1 if kind == "option" else 2)
-        width = int(np.shape(holder)[-1]) if has_entries else 1
-
-    if width == 1:
-        yield path
-        return
-    for i in range(width):
-        yield f"{path}[{i}]"
+def _entries(model: Any, kind: str) -> Iterator[tuple[str, str]]:
+    """The fields of a kind of elements, each with the end of the path of each of its entries."""
+    for field in fields_of(kind):
+        width = FURTHER_WIDTHS.get(field, 1)
+        array = MODEL_ARRAYS[kind].get(field)
+        if array is not None:
+            holder = getattr(model.opt if kind == "option" else model, array)
+            has_entries = np.ndim(holder) == (1 if kind == "option" else 2)
+            width = int(np.shape(holder)[-1]) if has_entries else 1
+        yield from ((field, field if width == 1 else f"{field}[{i}]") for i in range(width))
 
 
 def _entry(source: ModelSource, path: str, *, skip_zero: bool) -> Iterator[ListedParameter]:

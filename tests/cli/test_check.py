@@ -29,6 +29,20 @@ def test_a_table_and_a_conclusion_are_printed_and_nothing_is_written(study: Path
     assert names(study.parent) == before
 
 
+def test_too_little_memory_for_the_engine_is_one_message(study: Path) -> None:
+    """The model compiles, but there is no memory for further copies of its state."""
+    resource = pytest.importorskip("resource")
+    model = study.parent / "cart_pendulum.xml"
+    text = model.read_text(encoding="utf-8")
+    model.write_text(text.replace("<worldbody>", '<size memory="1700M"/><worldbody>', 1))
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    resource.setrlimit(resource.RLIMIT_DATA, (4 * 2**30, before[1]))
+    try:
+        misused(run("check", study, "--threads", 8), "allocate memory")
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
 def test_all_tables_and_sentences_are_printed_on_request(study: Path) -> None:
     result = run("check", study, "--verbose")
     for word in ("time", "eigenvalues", "derivative self-test passed"):

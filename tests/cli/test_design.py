@@ -225,7 +225,11 @@ def test_start_that_diverges(
 
 @pytest.mark.parametrize(
     ("place", "message"),
-    [("cluster", "state local, local:N"), ("local:0", "not a number"), ("dask:no.json", "no file")],
+    [
+        ("cluster", "state local, local:N"),
+        ("local:0", "not a number"),
+        ("dask:no.json", "no such file"),
+    ],
 )
 def test_an_executor_that_cannot_be_had_is_misuse(
     place: str, message: str, study: Path, tmp_path: Path

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 
-from mjfim.errors import ModelWarning
+from mjfim.errors import ModelError, ModelWarning
 from mjfim.model.loading import load_spec, packed_model
 from mjfim.model.model_files import PackedFiles, files_of_model
 from tests.support.mesh_model import FILES, write_mesh_model
@@ -44,6 +46,31 @@ def test_what_is_no_xml_is_left_to_mujoco(tmp_path: Path) -> None:
     model.write_text("<mujoco><include")
 
     assert files_of_model(model) == (model,)
+
+
+TREES = {
+    "model.xml": "",
+    "inner.xml": '<include file="inner.xml"/>',
+    "deep/part.xml": '<include file="deep/between.xml"/>',
+    "arm.stl": '<asset><mesh name="m" file="arm.stl"/></asset>',
+    "meshes/arm.stl": '<compiler meshdir="meshes"/><asset><mesh name="m" file="arm.stl"/></asset>',
+    "sky.png": '<asset><texture name="m" type="2d" file="sky.png"/></asset>',
+    "other.xml": '<asset><model name="m" file="other.xml"/></asset>',
+}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+@pytest.mark.parametrize("place", TREES)
+def test_a_pipe_in_the_tree_of_a_model_is_refused(place: str, tmp_path: Path) -> None:
+    """MuJoCo would wait for its end; what is wrong is said before."""
+    for folder in ("deep", "meshes"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "deep/between.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+    (tmp_path / "model.xml").write_text(f"<mujoco>{TREES[place]}</mujoco>", encoding="utf-8")
+    (tmp_path / place).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / place)
+    with pytest.raises(ModelError, match=rf"{re.escape(place)}: a pipe or a device"):
+        load_spec(tmp_path / "model.xml")
 
 
 # A link whose mesh is a file of a ROS package.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import runpy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,13 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.experiment import System
 from mjfim.output import archive
-from mjfim.output.export.trajectories import yaml_number
+from mjfim.output.export.design import write_player
+from mjfim.output.export.trajectories import (
+    JointTrajectory,
+    RobotPlan,
+    write_trajectory_yaml,
+    yaml_number,
+)
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats import read_table
 from tests.output.conftest import Designed, designed
@@ -68,6 +76,21 @@ def test_a_trajectory_holds_the_rows_of_the_reference(
 
     # The shell puts the file into a goal of an action.
     assert load(f"{{trajectory: {text.rstrip()}}}") == {"trajectory": found}
+
+
+RARE = "\u2028\u0085\U0001f600\\u00e9\"'#\t\r\x7f:{é"
+
+
+def test_rare_characters_in_names_come_back(cart: Designed, tmp_path: Path) -> None:
+    """In the YAML and in the player, whose readers end lines at other characters than Python."""
+    plan = replace(RobotPlan.of(cart[1], System.resolve(cart[0])), name=RARE)
+    trajectory = JointTrajectory(joints=[RARE, "b"], nanoseconds=[0], fields={}, content="motion")
+    write_trajectory_yaml(tmp_path / "trajectory.yaml", trajectory, RARE)
+    text = (tmp_path / "trajectory.yaml").read_text(encoding="utf-8")
+    assert load(text)["joint_names"] == [RARE, "b"]
+
+    write_player(tmp_path / "play.py", plan)
+    assert runpy.run_path(str(tmp_path / "play.py"))["DESIGN"]["name"] == RARE
 
 
 def test_numbers_are_floats_in_old_and_new_yaml() -> None:

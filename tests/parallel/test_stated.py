@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mjfim.errors import ExperimentError
+from mjfim.errors import ExperimentError, MjfimError
 from mjfim.parallel import workers as stated_workers
 from mjfim.parallel.workers import StatedExecutor
 
@@ -44,6 +44,7 @@ def make_stated():
         ("local:", "has no known form"),
         ("local:0", "not a number of processes"),
         ("local:many", "not a number of processes"),
+        (f"local:{'9' * 5000}", "not a number of processes"),
         ("python:cluster", "names no function"),
         ("python:cluster.py:", "names no function"),
     ],
@@ -92,15 +93,30 @@ def test_workers_of_a_file_keep_their_stated_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "message"),
     [
-        ("python:not_there.py:make", "cannot be imported"),
-        ("python:no_such_module:make", "state the name of an installed module"),
-        ("python:json:make", "json has no function make"),
-        ("dask:not_there.json", "there is no file not_there.json; `dask scheduler"),
+        ("python:not_there.py:make", "FileNotFoundError"),
+        ("python:no_such_module:make", "No module named 'no_such_module'.*state a function"),
+        ("python:.a:make", "TypeError.*state a function"),
+        ("python:..:make", "TypeError.*state a function"),
+        ("python:json:make", "cannot call make .*KeyError"),
+        ("python:json:loads", "cannot call loads .*missing 1 required positional argument"),
+        ("python:{file}:make", "not callable"),
+        ("dask:not_there.json", "no such file; `dask scheduler"),
+        ("dask:{file}", "not a JSON file"),
+        ("dask:{scheduler}", r"no scheduler answers there .*missing port number"),
+        ("dask://[::1", r"no scheduler answers there .*invalid address '\[::1'"),
     ],
 )
-def test_what_is_missing_is_named(place: str, message: str) -> None:
-    with pytest.raises(ExperimentError, match=message), StatedExecutor.parse(place).started():
+def test_what_is_missing_is_named(place: str, message: str, tmp_path: Path) -> None:
+    """One message, and no client of Dask that waits when the process ends."""
+    files = {"file": tmp_path / "cluster.py", "scheduler": tmp_path / "scheduler.json"}
+    files["file"].write_text("make = 3", encoding="utf-8")
+    files["scheduler"].write_text('{"address": "nowhere"}', encoding="utf-8")
+    text = place.format(**files)
+    before = threading.active_count()
+    with pytest.raises(MjfimError, match=message) as raised, StatedExecutor.parse(text).started():
         pass
+    assert len(str(raised.value)) < 600
+    assert threading.active_count() == before
 
 
 def test_a_missing_dask_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +131,9 @@ def test_missing_certificates_are_explained(monkeypatch: pytest.MonkeyPatch) -> 
         """As the client of Dask for a tls:// address where no certificates are configured."""
         raise TypeError("TLS expects a `ssl_context` argument of type ssl.SSLContext")
 
+    comm = SimpleNamespace(resolve_address=str)
     monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=client))
+    monkeypatch.setitem(sys.modules, "distributed.comm", comm)
     place = StatedExecutor.parse("dask:tls://host:8786")
     with pytest.raises(ExperimentError, match=r"distributed\.comm\.tls"), place.started():
         pass

@@ -498,16 +498,22 @@ def write_trajectory_yaml(path: Path, trajectory: JointTrajectory, name: str) ->
 
     content = CONTENT[trajectory.content]
     lines = [
-        f"# {TRAJECTORY_TYPE} of the design {json.dumps(name)} by mjfim; {content}.",
+        f"# {TRAJECTORY_TYPE} of the design {yaml_text(name)} by mjfim; {content}.",
         "# Bring the robot to the first point before, and record the joint states and commands.",
         '{header: {stamp: {sec: 0, nanosec: 0}, frame_id: ""},',
-        f" joint_names: {json.dumps(trajectory.joints)},",
+        f" joint_names: [{', '.join(map(yaml_text, trajectory.joints))}],",
         " points: [",
         ",\n".join(points),
         " ]}",
     ]
     with replacing(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def yaml_text(value: str) -> str:
+    """Write a text for YAML, which has Python's escapes, and no pairs of surrogates as JSON has."""
+    escaped = value.encode("unicode_escape").decode().replace('"', '\\"')
+    return f'"{escaped}"'
 
 
 def yaml_number(value: float) -> str:
