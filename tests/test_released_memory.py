@@ -45,7 +45,9 @@ def short(name: str) -> mjfim.Experiment:
     """An experiment of the models' folder over a short time, with one iteration."""
     experiment = mjfim.Experiment.from_file(MODELS / name)
     descent = experiment.descent.model_copy(update={"max_iterations": 1})
-    return experiment.model_copy(update={"descent": descent, "horizon": 0.2})
+    return experiment.model_copy(update={"descent": descent, "horizon": 0.2}).replace(
+        rehearsal={"robots": 2}
+    )
 
 
 def test_designs_checks_and_fits_leave_no_simulator_behind(living) -> None:

@@ -59,6 +59,7 @@ EXPERIMENT: dict[str, Any] = {
     "noise": {"qpos:slide": 0.002, "qpos:hinge": 0.002, "qvel:hinge": 0.02},
     "cost": {"control": 1e-3},
     "descent": {"max_iterations": 3, "coarse": 1},
+    "rehearsal": {"robots": 4},
 }
 LIMITS = {
     "position": {"slide": (-0.3, 0.5)},
@@ -313,10 +314,7 @@ def assert_same(
             np.testing.assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
 
 
-DECIMAL = {
-    "slow": Units(time=1e3),
-    "small, light, quick": Units(length=1e-3, mass=1e-6, time=1e-3),
-}
+DECIMAL = {"small, light, quick": Units(length=1e-3, mass=1e-6, time=1e-3)}
 
 
 @pytest.mark.slow

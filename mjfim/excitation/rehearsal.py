@@ -7,7 +7,7 @@ begins. Limits are checked at every engine step, and what nothing limits is meas
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any
@@ -70,6 +70,9 @@ MAX_VALUES = 1 << 22
 # Height below the floor that counts as passing through it, over the length of the model. Soft
 # contacts give way by less.
 PASSED_SHARE = 0.02
+
+# Type of the constraints of joints at the ends of their ranges.
+JOINT_AT_STOP = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
 
 # Cosine of the largest angle between a floor and the horizontal plane.
 LEVEL_FLOOR = 0.99
@@ -364,17 +367,18 @@ class _Stage:
 
         data = mujoco.MjData(model)
         rows = evenly_spread_indices(len(states), INSTANTS)
-        lowest, touches, stops = [], 0, 0
+        poses, touches, stops = [], 0, 0
         for row in rows.tolist():
             data.qpos[:], data.qvel[:], data.act[:] = qpos[row], qvel[row], act[row]
             data.ctrl[:] = applied[min(row, len(applied) - 1)]
             mujoco.mj_forward(model, data)
-            lowest.append(self._lowest(model, data, self._geoms))
-            touches += bool((data.contact.dist < 0.0).any())
-            stops += int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT) in data.efc_type
+            poses.append(_pose(data))
+            touches += bool(data.ncon and (data.contact.dist < 0.0).any())
+            stops += bool(data.nefc and (data.efc_type == JOINT_AT_STOP).any())
+        lowest = self._lowest(model, poses, self._geoms)
         # Above the plane under a robot without a floor, the robot may come as low as it begins.
-        floor = self.floor if self.has_floor else min(self.floor, lowest[0])
-        heights = np.array(lowest) - (floor if np.isfinite(floor) else 0.0)
+        floor = self.floor if self.has_floor else min(self.floor, float(lowest[0]))
+        heights = lowest - (floor if np.isfinite(floor) else 0.0)
         nearest = np.nan
         if self._distances is not None:
             nearest = self._distances.nearest(qpos[rows])[0]
@@ -392,28 +396,31 @@ class _Stage:
             unbraked=tuple(self._unbraked(model, data, qvel)),
         )
 
-    def _lowest(self, model: Any, data: Any, geoms: np.ndarray) -> float:
-        """Height of the lowest of some geoms and of the moving bodies [m]."""
-        lowest = float((data.xipos[self._moving] @ self._up).min(initial=np.inf))
-        frames = data.geom_xmat[geoms].reshape(-1, 3, 3)
-        along = np.einsum("gij,i->gj", frames, self._up)
-        boxes = model.geom_aabb[geoms]
-        centre = data.geom_xpos[geoms] @ self._up + (along * boxes[:, :3]).sum(axis=1)
-        reach = (np.abs(along) * boxes[:, 3:]).sum(axis=1)
-        # The boxes about the geoms are lower bounds; from the lowest one on, geoms are measured.
-        for i in np.argsort(centre - reach).tolist():
-            if centre[i] - reach[i] >= lowest:
-                break
-            geom = int(geoms[i])
+    def _lowest(self, model: Any, poses: Sequence[tuple[Array, ...]], geoms: np.ndarray) -> Array:
+        """(n,) heights of the lowest of some geoms and of the moving bodies in n poses [m]."""
+        bodies, places, frames = (np.array(each) for each in zip(*poses, strict=True))
+        lowest = (bodies[:, self._moving] @ self._up).min(axis=1, initial=np.inf)
+        frames = frames[:, geoms].reshape(len(poses), len(geoms), 3, 3)
+        along = np.einsum("ngij,i->ngj", frames, self._up)
+        centre, half = np.split(model.geom_aabb[geoms], 2, axis=1)
+        height = places[:, geoms] @ self._up
+        bound = height + (along * centre - np.abs(along) * half).sum(axis=2)
+        # The boxes about the geoms are lower bounds; geoms are measured where these are lower.
+        for i in np.argsort(bound.min(axis=0)).tolist():
+            below = np.flatnonzero(bound[:, i] < lowest)
+            geom, down = int(geoms[i]), -along[below, i]
             kind, mesh = int(model.geom_type[geom]), int(model.geom_dataid[geom])
+            if not len(below):
+                continue
             if kind in PRIMITIVES:
-                point = farthest_points(kind, model.geom_size[geom], -along[i : i + 1])
+                points = farthest_points(kind, model.geom_size[geom], down)
+                reach = (points * down).sum(axis=1)
             else:
                 first = int(model.mesh_vertadr[mesh])
-                point = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-            height = float(data.geom_xpos[geom] @ self._up) + float((point @ along[i]).min())
-            lowest = min(lowest, height)
-        return lowest
+                points = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+                reach = (points @ down.T).max(axis=0)
+            lowest[below] = np.minimum(lowest[below], height[below, i] - reach)
+        return np.asarray(lowest)
 
     def _floor_of(self, model: Any, start: Array) -> tuple[float, bool]:
         """Height of the floor [m], and whether the experiment or the model states it.
@@ -428,7 +435,7 @@ class _Stage:
         data.qpos[:] = start[: model.nq]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        lowest = self._lowest(model, data, self._geoms)
+        lowest = float(self._lowest(model, [_pose(data)], self._geoms)[0])
         is_fixed = model.body_weldid[model.geom_bodyid] == 0
         normals = data.geom_xmat[:, 2::3] @ self._up
         is_floor = (model.geom_type == PLANE) & is_fixed & (normals > LEVEL_FLOOR)
@@ -437,7 +444,7 @@ class _Stage:
         if len(below):
             return float(below.max()), True
         if len(self._base):
-            return min(self._lowest(model, data, self._base), lowest), False
+            return min(float(self._lowest(model, [_pose(data)], self._base)[0]), lowest), False
         is_free = bool((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
         return (min(0.0, lowest) if is_free else -np.inf), False
 
@@ -626,6 +633,11 @@ class _Stage:
         for q, _ in self.task.space.quaternions:
             measured[q : q + 4] /= np.linalg.norm(measured[q : q + 4])
         return self.task.space.minus(planned, measured)
+
+
+def _pose(data: Any) -> tuple[Array, ...]:
+    """Copies of the places of bodies and geoms, and of the frames of geoms (MjData)."""
+    return data.xipos.copy(), data.geom_xpos.copy(), data.geom_xmat.copy()
 
 
 def _speed_groups(task: DesignTask) -> Iterator[_SpeedGroup]:

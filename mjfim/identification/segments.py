@@ -172,9 +172,9 @@ class KnownActivations:
         # a_{k+1} = a_k + s (u_k - a_k), with a_0 = u_0.
         time_constant = max(float(self.model.actuator_dynprm[actuator, 0]), mujoco.mjMINVAL)
         share = -np.expm1(-recording.dt / time_constant)
-        held = np.array([(1.0 - share) * u[0]])
-        after, _ = scipy.signal.lfilter([share], [1.0, share - 1.0], u, zi=held)
-        return np.asarray(np.concatenate([u[:1], after])[begins])
+        bands = np.array([np.ones(len(u) + 1), np.full(len(u) + 1, share - 1.0)])
+        filtered = scipy.linalg.solve_banded((1, 0), bands, np.append(u[:1], share * u))
+        return np.asarray(filtered[begins])
 
     def _bent(self, actuator: int, qvel: Array) -> Array:
         """(n,) deflections of a bristle in steady sliding at velocities qvel: (n, nv)."""

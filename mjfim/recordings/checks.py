@@ -517,7 +517,7 @@ def _sigma_by_name(channels: Channels) -> dict[str, float]:
 
 def _moves(x: Array) -> bool:
     """Whether a column x: (M,) is long enough to be inspected, and not constant."""
-    return len(x) >= SHORTEST_COLUMN and float(np.std(x)) > 0.0
+    return len(x) >= SHORTEST_COLUMN and float(np.ptp(x)) > 0.0
 
 
 def _rough_share(x: Array) -> float:

@@ -422,6 +422,7 @@ def test_without_enforcement_only_the_boundary_constrains(tmp_path: Path) -> Non
         assert set(constraints.margins(values)) == kinds | {"end_position", "end_velocity"}
 
 
+@pytest.mark.slow
 def test_a_design_stays_above_a_floor_that_only_the_file_states(tmp_path: Path) -> None:
     """The lowest point of the swinging rod, which collides with nothing, in plain MuJoCo."""
     path = tmp_path / "rod.xml"

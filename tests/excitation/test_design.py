@@ -27,7 +27,7 @@ def experiment() -> Experiment:
 @pytest.fixture(scope="module")
 def short(experiment: Experiment) -> Experiment:
     """A short horizon and a loose tolerance."""
-    return experiment.replace(horizon=1.0, descent={"tolerance": 0.1})
+    return experiment.replace(horizon=1.0, descent={"tolerance": 0.1}, rehearsal={"robots": 4})
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_metric_weight_on_psi_needs_the_metric_descent(experiment: Experiment) -
 
 def test_callback_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
     rows: list[HistoryRow] = []
-    loose = experiment.replace(descent={"tolerance": 0.1})
+    loose = experiment.replace(descent={"tolerance": 0.1}, rehearsal={"robots": 4})
     design = mjfim.design(loose, callback=lambda event: rows.append(event.row))
     assert [row.iteration for row in rows] == list(range(len(rows)))
     assert [row.rate for row in rows] == sorted(row.rate for row in rows)

@@ -67,6 +67,7 @@ def test_a_stop_before_the_first_iterate_leaves_the_start(task: DesignTask) -> N
     np.testing.assert_allclose(design.trajectory.ctrl, task.control, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_start_outside_the_limits_is_scaled_and_improved(tmp_path: Path) -> None:
     task = stiff_arm_task(tmp_path, descent={"max_iterations": 4})
     assert not cost_of(task).keeps(task.control)

@@ -31,6 +31,7 @@ STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
     horizon=1.5,
     initial={"control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}},
     descent={"starts": 1, "tolerance": 1e-3, "max_iterations": 15},
+    rehearsal={"robots": 4},
 )
 SIGMA = {"m": 0.0115, "l": 0.02, "c": 0.0125}  # target standard deviations; reached at about 1 s
 
@@ -116,6 +117,7 @@ def test_it_is_saved_and_loaded_with_its_experiment(
     np.testing.assert_array_equal(loaded.design.trajectory.ctrl, shorter.design.trajectory.ctrl)
 
 
+@pytest.mark.slow
 def test_an_experiment_with_a_function_cannot_be_saved(
     shorter: mjfim.ShortestExperiment, tmp_path: Path
 ) -> None:
@@ -137,7 +139,9 @@ def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> Non
     table = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").model_dump(exclude_unset=True)
     table = {**table, "horizon": 0.4, "initial": {"keyframe": "hanging", "control": "half.csv"}}
     hard = mjfim.Experiment(**table, directory=tmp_path).replace(
-        parameters={"m": {"wanted": 1e-4}}, descent={"starts": 1, "max_iterations": 2}
+        parameters={"m": {"wanted": 1e-4}},
+        descent={"starts": 1, "max_iterations": 2},
+        rehearsal={"robots": 4},
     )
     with pytest.raises(OutOfReachError, match=r"even 0\.6 s"):
         mjfim.shortest_experiment(hard)

@@ -110,8 +110,8 @@ def test_a_right_first_fit_is_not_repeated(tmp_path: Path) -> None:
 def test_guesses_that_are_wrong_by_factors_find_the_truth(
     tmp_path: Path, start: tuple[float, float]
 ) -> None:
-    system = pendulum(tmp_path, 30.0)
-    recording = swings(system, 30.0)
+    system = pendulum(tmp_path, 20.0)
+    recording = swings(system, 20.0)
     found = identify_system(system, [recording], start=system.parameters.true * start)
     assert is_found(system, found)
 
@@ -120,8 +120,8 @@ def test_guesses_that_are_wrong_by_factors_find_the_truth(
 def test_deviations_of_the_initial_state_and_biases_are_continued_too(tmp_path: Path) -> None:
     """Parameters of the initial state are no unknowns of segments, the others are."""
     nuisance = {"initial": {"qpos:hinge": 0.05}, "bias": 0.05, "per_recording": True}
-    system = pendulum(tmp_path, 30.0, nuisance=nuisance)
-    recording = swings(system, 30.0)
+    system = pendulum(tmp_path, 20.0, nuisance=nuisance)
+    recording = swings(system, 20.0)
     other = Recording(
         t=recording.t, ctrl=recording.ctrl, y=recording.y + 0.03, outputs=recording.outputs
     )

@@ -380,23 +380,24 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
     true = system.parameters.true
     trajectory = system.plant.simulate(true, references(400, 11))
 
-    study = mjfim.monte_carlo(experiment, trajectory, trials=40, seed=1, progress=False)
+    study = mjfim.monte_carlo(experiment, trajectory, trials=20, seed=1, progress=False)
 
     found = study.sets["final"]
     assert found.failed == 0
     spread = np.sqrt(np.diag(found.covariance) / found.trials)
     assert np.abs((found.mean - true) / spread).max() < 4.0
-    assert (found.efficiency > 0.5).all()
-    assert (found.efficiency < 1.8).all()
+    # The quantiles 2e-4 and 0.996 of the efficiency of 20 normal estimates.
+    assert (found.efficiency > 0.39).all()
+    assert (found.efficiency < 2.87).all()
 
     inside = []
-    for seed in range(5):
+    for seed in range(3):
         log = recorded(experiment, 400, 100 + seed)
-        settings = {"segments": 0.2, "bootstrap": 200}
+        settings = {"segments": 0.2, "bootstrap": 100}
         estimate = mjfim.identify(experiment.replace(fit=settings), [log], progress=False)
         low, high = estimate.interval.T
         inside.append((low < true) & (true < high))
-    assert np.mean(inside) > 0.83
+    assert np.mean(inside) > 0.8
 
 
 def panda_with_motors(folder: Path) -> Path:
@@ -449,7 +450,7 @@ def test_a_seven_joint_arm_with_feedforward(tmp_path: Path) -> None:
     )
 
     # Commands of a robot: smooth references, and the torque of gravity along them.
-    t = np.arange(250)[:, None] / 250.0
+    t = np.arange(150)[:, None] / 250.0
     phases = np.random.default_rng(0).uniform(0, 6, (5, 7))
     waves = [(np.sin(np.pi * k * t + p) - np.sin(p)) / k for k, p in enumerate(phases, 1)]
     reference = home + 0.25 * sum(waves)

@@ -49,6 +49,7 @@ def test_the_estimate_starts_from_the_equation_of_motion(folder: Path, estimate:
     assert (np.abs(fit.theta / true - 1.0) < 0.1).all()
 
 
+@pytest.mark.slow
 def test_it_is_saved_shown_and_drawn(estimate: Estimate, tmp_path: Path) -> None:
     estimate.save(tmp_path)
     loaded = Estimate.load(tmp_path)
@@ -77,6 +78,7 @@ def test_a_local_minimum_is_left_by_the_equation_of_motion(folder: Path, log: Re
     assert found.inverse_dynamics is not None
 
 
+@pytest.mark.slow
 def test_a_model_that_diverges_at_the_start_begins_at_the_equation_of_motion(
     folder: Path, log: Recording
 ) -> None:

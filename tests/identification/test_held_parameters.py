@@ -19,7 +19,7 @@ def stated(hold: tuple[str, ...]) -> mjfim.Experiment:
     """The cart-pendulum, one parameter of which is held at its true value."""
     base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     return base.replace(
-        horizon=2.0, parameters={"c": {"guess": 1.0}}, fit={"bootstrap": 0, "hold": hold}
+        horizon=1.0, parameters={"c": {"guess": 1.0}}, fit={"bootstrap": 0, "hold": hold}
     )
 
 

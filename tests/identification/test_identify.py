@@ -39,7 +39,9 @@ from tests.support.paths import ROOT
 def task() -> DesignTask:
     """The cart-pendulum for two seconds, with a design of few iterations."""
     stated = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    return DesignTask.resolve(stated.replace(horizon=2.0, descent={"max_iterations": 10}))
+    return DesignTask.resolve(
+        stated.replace(horizon=2.0, descent={"max_iterations": 10}, rehearsal={"robots": 4})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +52,10 @@ def design(task: DesignTask) -> mjfim.Design:
 @pytest.fixture(scope="module")
 def recording(task: DesignTask, design: mjfim.Design) -> Recording:
     return simulate_system(task.system, design.trajectory, seed=3)
+
+
+# A fit that compares no lengths of segments where the model does not explain the recording.
+WHOLE = {"segments": "whole"}
 
 
 def newton_raphson(problem: FitProblem, start: np.ndarray) -> Solution:
@@ -150,7 +156,7 @@ def test_bounds_are_kept_and_named(design: mjfim.Design, recording: Recording) -
     base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     tight = {**base.model_dump(exclude_unset=True)["parameters"]}
     tight["m"] = {**tight["m"], "bounds": [2.2, 3.0], "true": 2.4}
-    estimate = identify(base.replace(parameters=tight), [recording])
+    estimate = identify(base.replace(parameters=tight, fit=WHOLE), [recording])
     assert estimate.theta[0] == pytest.approx(2.2, abs=1e-4)
     assert estimate.at_bound == ("m",)
 
@@ -162,7 +168,7 @@ def test_prior_pulls_the_estimate_and_shrinks_its_deviation(
     base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     parameters = base.model_dump(exclude_unset=True)["parameters"]
     parameters["m"] = {**parameters["m"], "prior": 1e-4}
-    estimate = identify(base.replace(parameters=parameters), [recording])
+    estimate = identify(base.replace(parameters=parameters, fit=WHOLE), [recording])
     assert estimate.theta[0] == pytest.approx(2.5, abs=1e-3)
     assert estimate.std[0] < 1.01e-4
 

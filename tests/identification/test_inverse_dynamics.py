@@ -358,7 +358,8 @@ def slow_log(system: System, theta: Array, seconds: float) -> Recording:
     return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
 
 
-@pytest.mark.parametrize("kind", ["stribeck", pytest.param("lugre", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["stribeck", "lugre"])
 def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: Path) -> None:
     coulomb = {"stribeck": "joint/j:frictionloss", "lugre": "term/bristle:coulomb"}[kind]
     parameters = {

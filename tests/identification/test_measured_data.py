@@ -111,12 +111,13 @@ def assert_predicts_far_better_than_published(found: Estimate) -> None:
 def test_pendulum_predicts_the_other_file_far_better_than_published_and_both_agree() -> None:
     """The intervals from both files overlap. One test, because each fit takes long."""
     files = [PENDULUM / f"{name}_measured.csv" for name in ("dircol", "energy_shaping")]
-    stated = experiment("dfki_simple_pendulum", PUBLISHED_PENDULUM, bootstrap=300)
+    stated = experiment("dfki_simple_pendulum", PUBLISHED_PENDULUM, bootstrap=100)
     one, two = (
         identified(stated, [fitted], [held_out]) for fitted, held_out in (files, files[::-1])
     )
     for found in (one, two):
         assert_predicts_far_better_than_published(found)
+        assert not any(text.startswith("poor data") for text in found.warnings)
 
     for name in ("J", "mc", "coulomb"):
         j = one.parameters.index(name)
@@ -136,46 +137,40 @@ def test_poor_data_are_named() -> None:
     assert any("jumps from row to row" in s and "'torque'" in s for s in remarks)
     assert any("speed is rough" in s for s in remarks)
     assert any("ctrlrange" in s for s in remarks)
-    good = identified(
-        experiment("dfki_simple_pendulum", bootstrap=0, max_iterations=2),
-        [PENDULUM / "dircol_measured.csv"],
-        [],
-    )
-    assert not any(s.startswith("poor data") for s in good.warnings)
 
 
 @pytest.mark.slow
 def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
-    files = [DOUBLE / f"A0_0{i}.csv.gz" for i in range(3)]
-    stated = experiment("dfki_double_pendulum", bootstrap=300, max_iterations=5)
-    found = identified(stated, files, [], part=0.4)
+    """Short parts of two files, which predict a part of the third."""
+    *files, held_out = [DOUBLE / f"A0_0{i}.csv.gz" for i in (0, 2, 1)]
+    stated = experiment("dfki_double_pendulum", bootstrap=100, max_iterations=3)
+    found = identified(stated, files, [held_out], part=0.3)
     for name, published in PUBLISHED_DOUBLE.items():
         j = found.parameters.index(name)
         low, high = found.interval[j]
-        assert abs(found.theta[j] / published - 1.0) < 0.15 or not low <= published <= high, name
-    assert (
-        len(found.per_recording["bias elbow_angle"]) == 3
-    )  # the encoder's zero differs from log to log
+        assert abs(found.theta[j] / published - 1.0) < 0.15 or low <= published <= high, name
+    # The encoder's zero differs from log to log.
     assert np.ptp(found.per_recording["bias elbow_angle"]) > 0.1
-    assert [p.name for p in found.predictions] == [str(file) for file in files]
-    assert all(p.ratio < 1.15 for p in found.predictions)
-    assert sum(p.ratio < 0.95 for p in found.predictions) >= 2
+    (prediction,) = found.predictions
+    assert prediction.held_out and prediction.name == str(held_out)
+    assert prediction.ratio < 0.95
 
 
 @pytest.mark.slow
 def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
-    """Mean absolute errors of whole rollouts, of two recordings at each gain of the firmware."""
+    """Mean absolute errors of rollouts over three seconds, at two gains of the firmware."""
     stem = "2026-01-15_10h"
-    fitted = [SERVO / f"{stem}{t}.json" for t in ("28m10", "28m17", "28m57", "29m04")]
-    others = [SERVO / f"{stem}{t}.json" for t in ("28m24", "28m32", "28m42", "28m49")]
-    found = identified(experiment("bam_xl330", bootstrap=300, max_iterations=5), fitted, others)
+    fitted = [SERVO / f"{stem}{t}.json" for t in ("28m10", "28m57")]
+    others = [SERVO / f"{stem}{t}.json" for t in ("28m24", "28m42")]
+    stated = experiment("bam_xl330", bootstrap=100, max_iterations=3)
+    found = identified(stated, fitted, others, part=0.5)
     mine = np.mean([p.identified.mae[0] for p in found.predictions])
     for published in (PUBLISHED_SERVO, HEAD_SERVO):
         system = System.resolve(experiment("bam_xl330", published))
         errors = mjfim.predict(
             system.experiment,
             system.theta,
-            [read_recording(path, system.channels) for path in others],
+            [begin(read_recording(path, system.channels), 0.5) for path in others],
         )
         assert mine < 1.05 * np.mean([e.mae[0] for e in errors])
     assert "coulomb" in found.sloppy

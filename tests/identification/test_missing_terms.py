@@ -54,9 +54,9 @@ def rubbing_pendulum(folder: Path) -> Recording:
     ("added", "path", "amount", "horizon"),
     [
         ('frictionloss="0.5"', "joint/slide:frictionloss", 0.5, 2.0),
-        pytest.param('damping="0.6"', "joint/slide:damping", 0.6, 4.0, marks=pytest.mark.slow),
-        pytest.param('stiffness="2"', "joint/slide:stiffness", 2.0, 3.0, marks=pytest.mark.slow),
-        pytest.param('armature="0.5"', "joint/slide:armature", 0.5, 3.0, marks=pytest.mark.slow),
+        ('damping="0.6"', "joint/slide:damping", 0.6, 4.0),
+        ('stiffness="2"', "joint/slide:stiffness", 2.0, 3.0),
+        ('armature="0.5"', "joint/slide:armature", 0.5, 2.0),
     ],
 )
 @pytest.mark.slow
@@ -100,8 +100,8 @@ def test_a_small_term_that_matters_is_found_in_much_data() -> None:
 
     force = 0.01
     large = tilt(tested(force, 0))
-    found = [tested(6.0 * force / large, seed) for seed in range(4)]
-    assert sum(tilt(tests) > 0.0 for tests in found) >= 3
+    found = [tested(6.0 * force / large, seed) for seed in range(2)]
+    assert all(tilt(tests) > 0.0 for tests in found)
     assert max(term.share for tests in found for term in tests.terms) < 2.2e-3
     assert tested(0.0, 0).terms == ()
     assert found[0].data is not None
@@ -160,10 +160,10 @@ def test_feedback_on_noisy_measurements_is_no_delay(seed: int) -> None:
 
 @pytest.mark.slow
 def test_a_complete_model_has_no_missing_terms() -> None:
-    task = DesignTask.resolve(stated())
+    task = DesignTask.resolve(stated(horizon=2.0))
     found = [
         identify_system(task.system, [simulate_system(task.system, task.initial, seed)])
-        for seed in range(5)
+        for seed in range(4)
     ]
     assert not any(e.missing_terms or e.misfit for e in found)
 

@@ -17,7 +17,7 @@ from tests.support.paths import SHARED_MODELS
 from tests.support.rescaling import Units, rescale
 from tests.support.shared_models import EXPERIMENTS
 
-SEEDS = range(4)
+SEEDS = range(3)
 
 # A rotary pendulum for a table top: friction of 1e-3 N m, inertias of 1e-4 kg m².
 FURUTA = """
@@ -120,7 +120,7 @@ def test_its_verdicts_are_the_same_in_all_sizes(
     size: str, furuta: Experiment, tmp_path: Path
 ) -> None:
     rescaled = rescale(furuta, SIZES[size], tmp_path)
-    assert_is_complete(fits(System.resolve(rescaled.experiment), SEEDS[:2]))
+    assert_is_complete(fits(System.resolve(rescaled.experiment), SEEDS[:1]))
 
 
 @pytest.mark.slow
@@ -128,4 +128,4 @@ def test_the_furuta_of_another_project_has_no_misfit() -> None:
     shared_model(EXPERIMENTS["furuta"]["model"])
     stated = {**EXPERIMENTS["furuta"], "fit": {"bootstrap": 0}}
     experiment = Experiment(**stated, directory=SHARED_MODELS, source="furuta")
-    assert_is_complete(fits(System.resolve(experiment), SEEDS[:2]))
+    assert_is_complete(fits(System.resolve(experiment), SEEDS[:1]))

@@ -86,7 +86,7 @@ def test_a_singular_covariance_keeps_its_directions() -> None:
 SLOPES = np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]], dtype=float)
 
 
-@pytest.mark.parametrize("sweeps", [SWEEPS, MIN_SWEEPS])
+@pytest.mark.parametrize("sweeps", [pytest.param(SWEEPS, marks=pytest.mark.slow), MIN_SWEEPS])
 @pytest.mark.parametrize("correlation", [0.0, -0.45, 0.9])
 def test_a_positive_definite_matrix_cuts_off_as_rejection_does(
     correlation: float, sweeps: int, monkeypatch: pytest.MonkeyPatch

@@ -68,7 +68,7 @@ def test_a_short_design_improves_and_writes_all_files(
 
     task = DesignTask.resolve(
         mjfim.Experiment.from_file(design_file(name, tmp_path)).replace(
-            descent={"max_iterations": 3}
+            descent={"max_iterations": 3}, rehearsal={"robots": 4}
         )
     )
     design = design_task(task)

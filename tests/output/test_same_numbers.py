@@ -32,7 +32,9 @@ from tests.support.paths import MODELS
 def task() -> DesignTask:
     """The cart-pendulum for 2 s."""
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    return DesignTask.resolve(experiment.replace(horizon=2.0, descent={"max_iterations": 2}))
+    return DesignTask.resolve(
+        experiment.replace(horizon=1.0, descent={"max_iterations": 2}, rehearsal={"robots": 4})
+    )
 
 
 @pytest.fixture(scope="module")

@@ -85,6 +85,17 @@ def test_a_quick_velocity_contradicts_its_position_only_where_it_is_wrong(
     assert any("the integral of qvel:fin differ" in remark for remark in found) == is_found
 
 
+@pytest.mark.parametrize("rows", range(590, 610))
+def test_a_constant_control_is_no_noise(rows: int, tmp_path: Path) -> None:
+    """Its standard deviation is zero but for the rounding of a mean."""
+    system, log, _ = of_fin(tmp_path)
+    t, y = np.arange(rows) / 50.0, np.resize(log.y, (rows, log.y.shape[1]))
+    constant = replace(log, t=t, y=y, ctrl=np.full((rows - 1, 1), 4.2585187))
+    assert not any(
+        "control" in each for each in plausibility_remarks(system.channels, constant, None)
+    )
+
+
 def experiments() -> Iterator[tuple[mjfim.Experiment, int]]:
     """Experiments with encoders and velocities, and their number of logs of a design."""
     for name in SHIPPED:

@@ -170,6 +170,7 @@ def task() -> DesignTask:
             descent={"max_iterations": 2, "starts": 2},
             limits={"position": {"slide": [-2.0, 2.0]}},
             parameters={"c": {"nuisance": True}},
+            rehearsal={"robots": 4},
         )
     )
 

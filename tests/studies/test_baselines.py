@@ -93,7 +93,7 @@ def test_every_baseline_keeps_the_limits_and_its_time(
     task = cart_inside(tmp_path, **tables)
     clock = itertools.count(step=0.02)
     with measured_by(lambda: float(next(clock))):
-        order = BaselineSearch(experiment=task.experiment, method=method, seconds=2.0, threads=1)
+        order = BaselineSearch(experiment=task.experiment, method=method, seconds=1.0, threads=1)
         found = run_baseline(order, stop=StopToken())
     assert found.control is not None
     assert found.seconds < 12.0

@@ -47,6 +47,7 @@ STUDY = mjfim.Experiment.from_file(
     initial={"control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}},
     descent={"starts": 1, "tolerance": 1e-3, "max_iterations": 30},
     parameters={name: {"wanted": 0.008} for name in "mlc"},
+    rehearsal={"robots": 4},
 )
 
 
@@ -364,7 +365,7 @@ def write_study(folder: Path) -> Path:
     ):
         assert old in text
         text = text.replace(old, new, 1)
-    (folder / "study.toml").write_text(text, encoding="utf-8")
+    (folder / "study.toml").write_text(f"rehearsal.robots = 4\n{text}", encoding="utf-8")
     return folder / "study.toml"
 
 

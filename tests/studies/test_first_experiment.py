@@ -289,6 +289,7 @@ SERVO_ARM = """
 """
 
 
+@pytest.mark.slow
 def test_an_arm_with_servos_gets_a_file_that_a_person_would_play(tmp_path: Path) -> None:
     """Unknowns of equal servos, limits that the motion keeps, and an end at rest."""
     path = tmp_path / "arm.xml"

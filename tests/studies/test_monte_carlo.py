@@ -24,7 +24,8 @@ PAPER_BOUND = np.array([1.04e-3, 2.26e-3, 4.57e-2])
 
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
-    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    stated = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    return stated.replace(rehearsal={"robots": 4})
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +54,15 @@ def motion(short: Experiment) -> Trajectory:
 @pytest.mark.slow
 def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = monte_carlo(experiment, curves, trials=200, seed=0, measure_rate=25.0)
+    study = monte_carlo(experiment, curves, trials=60, seed=0, measure_rate=25.0)
     for s in study.sets.values():
         assert s.failed == 0
-        assert s.trials == 200
-        np.testing.assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.2)
+        assert s.trials == 60
+        # Two standard deviations of a variance of 60 values, sqrt(2 / 60).
+        np.testing.assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.37)
         assert np.all(s.efficiency_interval[:, 0] < s.efficiency)
         assert np.all(s.efficiency < s.efficiency_interval[:, 1])
-    np.testing.assert_allclose(np.diag(study.sets["initial"].covariance), PAPER_BOUND, rtol=0.25)
+    np.testing.assert_allclose(np.diag(study.sets["initial"].covariance), PAPER_BOUND, rtol=0.42)
     np.testing.assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
 
 

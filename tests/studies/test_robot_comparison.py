@@ -316,9 +316,9 @@ def test_equal_robots_rarely_differ() -> None:
     "setting", [Setting(K=1, phi=0.9), Setting(K=3, phi=0.9, c=8), Setting(K=4, tau=3.0)], ids=str
 )
 def test_rate_of_false_alarms(setting: Setting) -> None:
-    """The stated level is 5 %; 100 comparisons give more than 10 with a probability of 1 %."""
+    """The stated level is 5 %; 60 comparisons give more than 7 with a probability of 1 %."""
     rng = np.random.default_rng(1)
-    assert sum(setting.compared(rng).differs for _ in range(100)) <= 10
+    assert sum(setting.compared(rng).differs for _ in range(60)) <= 7
 
 
 @pytest.mark.slow
@@ -328,7 +328,8 @@ def test_rate_of_true_alarms(setting: Setting) -> None:
     rng = np.random.default_rng(2)
     found = setting.compared(rng)
     hits = 0
-    for _ in range(100):
+    # A binomial number with 60 and 0.8 is outside with a probability of 4e-4.
+    for _ in range(60):
         found = setting.compared(rng, float(found.detectable[0]))
         hits += 0 in found.changed
-    assert 66 <= hits <= 92
+    assert 37 <= hits <= 57

@@ -72,16 +72,20 @@ def test_the_missing_term_is_added_and_nothing_else(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
-    found = mjfim.select_terms(stated(), recorded(tmp_path, "", count=2))
+    logs = recorded(tmp_path, "", count=2)
+    found = mjfim.select_terms(stated(), logs)
     assert found.selection is not None
     assert not found.selection.terms
     assert len(found.selection.steps) == 1
     assert found.parameters == ("m", "l", "c")
 
     # Without a term, the estimate is that of an ordinary identification.
-    plain = mjfim.identify(stated(), recorded(tmp_path, "", count=2))
+    plain = mjfim.identify(stated(), logs)
     np.testing.assert_array_equal(found.theta, plain.theta)
     np.testing.assert_array_equal(found.interval, plain.interval)
+
+    # The length of the segments, which the user left free, is still free.
+    assert mjfim.selected_experiment(stated(), found.selection) == stated()
 
 
 @pytest.mark.slow
@@ -122,23 +126,21 @@ def test_a_selection_that_is_stopped_returns_what_it_has(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("segments", [None, "whole"])
 def test_a_selection_that_cannot_predict_left_out_data_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segments: str | None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The estimate is that of an ordinary identification, with the length that it chooses."""
     monkeypatch.setattr(selection_study, "held_out_losses", lambda *args: None)
     logs = recorded(tmp_path, 'frictionloss="0.5"', count=2, horizon=1.0)
-    experiment = stated() if segments is None else stated(segments=segments)
-    found = mjfim.select_terms(experiment, logs)
+    found = mjfim.select_terms(stated(), logs)
     selection = found.selection
     assert selection is not None
     assert "No part of the recordings could be predicted" in str(selection)
     assert not found.interrupted
 
-    plain = mjfim.identify(experiment, logs)
+    plain = mjfim.identify(stated(), logs)
     np.testing.assert_allclose(found.theta, plain.theta, rtol=1e-4)
-    assert (found.horizons is None) == (segments == "whole")
+    assert found.horizons is not None
 
     # The error that is not known is shown, drawn and saved as such.
     found.save(tmp_path / "results")
@@ -155,26 +157,16 @@ def test_a_term_with_which_the_simulation_diverges_is_not_added(
         raise SimulationDivergedError("the simulation diverges at the start")
 
     monkeypatch.setattr(selection_study, "refit_task", diverge)
-    found = mjfim.select_terms(
-        stated(), recorded(tmp_path, 'frictionloss="0.5"', count=2, horizon=1.0)
-    )
+    logs = recorded(tmp_path, 'frictionloss="0.5"', count=2, horizon=1.0)
+    found = mjfim.select_terms(stated(segments="whole"), logs)
     assert found.selection is not None
     assert not found.selection.terms
     assert "No further term predicts" in found.selection.ending
 
 
 @pytest.mark.slow
-def test_a_settled_selection_keeps_the_length_that_the_user_left_free(tmp_path: Path) -> None:
-    experiment = stated()
-    found = mjfim.select_terms(experiment, recorded(tmp_path, "", count=2))
-    selected = mjfim.selected_experiment(experiment, found.selection)
-    assert selected.fit.segments is None
-    assert selected == experiment
-
-
-@pytest.mark.slow
 def test_two_missing_terms_are_both_found(tmp_path: Path) -> None:
-    logs = recorded(tmp_path, 'frictionloss="0.3" stiffness="2"', count=3, horizon=3.0)
+    logs = recorded(tmp_path, 'frictionloss="0.3" stiffness="2"', count=2, horizon=3.0)
     found = mjfim.select_terms(stated(), logs)
     assert found.selection is not None
     paths = {term.path for term in found.selection.terms}

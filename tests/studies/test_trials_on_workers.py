@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import StudyEvent
 from mjfim.studies import monte_carlo as studies
-from tests.support.executors import KINDS, LosingThreads, move_to, processes
+from tests.support.executors import LosingThreads
 from tests.support.paths import MODELS
 
 # Trials of each trajectory, in two chunks.
@@ -90,18 +89,3 @@ def test_a_request_to_stop_keeps_the_trials_of_finished_workers(
         )
 
     assert 3 <= study.sets["final"].trials <= TRIALS
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_processes_in_another_folder_find_the_same_estimates(
-    kind: str, tmp_path: Path, curves: dict[str, mjfim.Trajectory], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # The path of the experiment is relative, so that processes elsewhere do not find its files.
-    monkeypatch.chdir(MODELS)
-    experiment = mjfim.Experiment.from_file("cart_pendulum.toml").replace(**SHORT)
-    alone = estimates(experiment, curves)
-
-    with processes(kind) as executor:
-        move_to(executor, tmp_path)
-        assert same(estimates(experiment, curves, executor=executor), alone)

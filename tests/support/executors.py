@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -46,14 +44,3 @@ def processes(kind: str) -> AbstractContextManager[Any]:
         n_workers=2, threads_per_worker=1, dashboard_address=":0", set_as_default=False
     )
     return client
-
-
-def move_to(executor: Any, folder: Path) -> None:
-    """Let all processes work in a folder."""
-    if hasattr(executor, "run"):
-        executor.run(os.chdir, str(folder))
-        return
-
-    # More tasks than processes, so that each of them does at least one.
-    for future in [executor.submit(os.chdir, folder) for _ in range(20)]:
-        future.result()

@@ -21,6 +21,7 @@ QUICKER = {
     "horizon = 3.0": "horizon = 1.5",
     "horizon = 4.0": "horizon = 2.0",
     "tolerance = 1e-7": "tolerance = 1e-3",
+    "starts = 4  ": "starts = 2  ",
     "tolerance = 1e-2": "tolerance = 1e-1",
 }
 
@@ -33,7 +34,9 @@ def quicker(text: str) -> str:
 
 
 def quicker_models(folder: Path) -> None:
-    """Copy models/ to a new folder, with smaller budgets."""
+    """Copy models/ to a new folder, with smaller budgets and few robots of a rehearsal."""
     shutil.copytree(MODELS, folder)
     for path in folder.rglob("*.toml"):
-        path.write_text(quicker(path.read_text(encoding="utf-8")), encoding="utf-8")
+        text = quicker(path.read_text(encoding="utf-8"))
+        few = "" if "[rehearsal]" in text else "rehearsal.robots = 4\n"
+        path.write_text(few + text, encoding="utf-8")
