@@ -229,7 +229,7 @@ def test_estimates_of_a_designed_release_reach_the_cramer_rao_bound(tmp_path: Pa
     experiment = short(tmp_path)
     design = mjfim.design(experiment)
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = monte_carlo(experiment, curves, trials=40, seed=3)
+    study = monte_carlo(experiment, curves, trials=100, seed=3)
     for name, evaluation in (("initial", design.initial), ("final", design.final)):
         found = study.sets[name]
         assert found.failed == 0
@@ -251,7 +251,7 @@ def test_figures_of_a_release_have_no_empty_panel(tmp_path: Path) -> None:
 FILE = """
 model = "swing_down.xml"
 rate = 50.0
-horizon = 0.6
+horizon = 1.0
 rehearsal.robots = 4
 initial = { qpos = ["30 deg"], free = { "qpos:hinge" = ["-120 deg", "120 deg"] } }
 parameters.damping = { target = "joint/hinge:damping", guess = 0.012, true = 0.01 }

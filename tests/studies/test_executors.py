@@ -20,7 +20,7 @@ import mjfim
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
-from mjfim.identification import fit_workers
+from mjfim.identification import fit_workers, segment_simulation
 from mjfim.parallel import Workers
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Design, Status
@@ -92,6 +92,17 @@ def test_all_executors_behave_alike(
     task = small_task(tmp_path)
     with started(kind) as executor:
         workers = Workers.of(executor)
+        # Processes in another folder do not find the files of a relative path. Recordings are sent,
+        # or found as files.
+        for future in [workers.submit(os.getpid) for _ in range(4)]:
+            future.result()
+        monkeypatch.chdir(MODELS)
+        monkeypatch.setattr(monte_carlo, "MIN_CHUNK", 2)
+        monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 2000)
+        if kind != "loky":
+            monkeypatch.setattr(fit_workers, "MIN_FILE_BYTES", 0)
+        assert fitted(Path("cart_pendulum.toml"), executor=workers) == estimated
+
         seen: list[DesignEvent] = []
 
         def kill(event: DesignEvent) -> None:
@@ -127,11 +138,3 @@ def test_all_executors_behave_alike(
         assert ended.status is not Status.INTERRUPTED
         assert ended.final.cost <= ended.initial.cost
         assert ended.seconds < SECONDS_TO_END
-
-        # Processes in another folder do not find the files of a relative path. Recordings are sent,
-        # or found as files.
-        monkeypatch.chdir(MODELS)
-        monkeypatch.setattr(monte_carlo, "MIN_CHUNK", 2)
-        if kind != "pool":
-            monkeypatch.setattr(fit_workers, "MIN_FILE_BYTES", 0)
-        assert fitted(Path("cart_pendulum.toml"), executor=workers) == estimated

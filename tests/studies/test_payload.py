@@ -57,7 +57,7 @@ def experiment(home: Path, **load: float) -> mjfim.Experiment:
     tables = {
         "model": "arm.xml",
         "rate": 50.0,
-        "horizon": 3.0,
+        "horizon": 4.0,
         "initial": {"control": {**swing, "amplitude": {"pitch": 1.2, "roll": 0.7}}},
         "parameters": {
             "pitch_damping": {"target": "joint/pitch:damping", "true": 0.12},

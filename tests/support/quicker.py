@@ -19,6 +19,7 @@ QUICKER = {
     '"max_iterations": 25': '"max_iterations": 5',
     "np.arange(1000)": "np.arange(400)",
     "horizon = 3.0": "horizon = 1.5",
+    "horizon=3.0": "horizon=1.5",
     "horizon = 4.0": "horizon = 2.0",
     "tolerance = 1e-7": "tolerance = 1e-3",
     "starts = 4  ": "starts = 2  ",
