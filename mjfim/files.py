@@ -225,9 +225,6 @@ def _plain(value: Any) -> Any:
 # Size of all arrays of a file above which they are not compressed [bytes].
 MAX_COMPRESSED_BYTES = 64 * 2**20
 
-# Largest size of a file's unpacked content, and of the columns read from it [bytes].
-MAX_UNPACKED_SIZE = 4 * 2**30
-
 # Errors that zipfile and NumPy raise for a damaged archive.
 DAMAGED_ARCHIVE = (
     ValueError,
@@ -242,19 +239,6 @@ DAMAGED_ARCHIVE = (
 )
 
 
-def check_unpacked_size(path: Path, unpacked: int) -> None:
-    """Refuse a file that unpacks to more than is ever read, before memory is allocated.
-
-    Raises:
-        RecordingError: The content is too large.
-    """
-    if unpacked > MAX_UNPACKED_SIZE:
-        raise RecordingError(
-            f"{path}: unpacks to more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size "
-            "that is read; split the file, or name fewer columns"
-        )
-
-
 def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     """Read all arrays of an npz file; pickled objects are refused.
 
@@ -263,7 +247,8 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
         kind: Kind of file for messages, such as "design".
 
     Raises:
-        RecordingError: There is no such file, or it is damaged, too large, or of another kind.
+        RecordingError: There is no such file, or it is damaged, larger than the memory, or of
+            another kind.
     """
     import numpy as np
 
@@ -273,9 +258,7 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
         raise RecordingError(f"{path}: no such {kind} file")
 
     try:
-        with zipfile.ZipFile(path) as archive:
-            check_unpacked_size(path, sum(member.file_size for member in archive.infolist()))
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as loaded:
+        with zipfile.ZipFile(path), np.load(path, allow_pickle=False) as loaded:
             return dict(loaded)
     except DAMAGED_ARCHIVE as error:
         raise RecordingError(

@@ -429,15 +429,6 @@ def test_files_of_others_are_refused(tmp_path: Path) -> None:
         Design.load(path)
 
 
-def test_archives_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are refused before memory is allocated, as logs are."""
-    path = tmp_path / "design.npz"
-    np.savez_compressed(path, t=np.zeros(1_000_000))
-    monkeypatch.setattr(files, "MAX_UNPACKED_SIZE", 2_000_000)
-    with pytest.raises(RecordingError, match=r"design\.npz: unpacks to more than 0\.00186 GiB"):
-        Design.load(path)
-
-
 def test_headers_that_announce_too_much(tmp_path: Path) -> None:
     """No memory is allocated for numbers that the file does not hold."""
     stream = io.BytesIO()
