@@ -32,13 +32,18 @@ import tomlkit
 import mjfim
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.model.parameter_writer import ParameterWriter
 from scripts.verbs import call_verb
 
-# Difference between the parameters of the simulated robot and those of the model, relative to them.
-DIFFERENCE = 0.05
+# Largest difference between the parameters of the simulated robot and those of the model, over
+# their sizes.
+DIFFERENCE = 0.1
 
 # Number of robots that play a design in plain MuJoCo, and largest relative error of a parameter.
 ROBOTS, WRONG = 300, 0.2
+
+# Number of draws of a robot after which its errors are halved.
+TRIES = 100
 
 # Share of the robots that may leave a limit in a motion that is safe.
 MAX_BROKEN = 0.05
@@ -216,15 +221,29 @@ def _run(found: Walk, folder: Path, verb: str, *words: str) -> int | None:
     return code
 
 
+def _physical(system: System, wrong: float, rng: np.random.Generator) -> np.ndarray:
+    """(p,) parameters of a robot whose bodies are physical, up to a share of the sizes off."""
+    p = system.parameters
+    reach = np.where(p.changes_model, wrong * p.sizes(system.theta), 0.0)
+    while True:
+        for _ in range(TRIES):
+            error = reach * rng.uniform(-1.0, 1.0, len(p))
+            theta = np.clip(system.theta + error, p.lower, p.upper)
+            if not ParameterWriter(p).unphysical_bodies(system.plant.source, theta):
+                return np.asarray(theta)
+        reach = 0.5 * reach
+
+
 def _write_robot(folder: Path) -> None:
     """Write the experiment of the simulated robot: the same with other true values."""
-    design = _read(folder / "design" / "design.json")
     document = tomlkit.parse((folder / EXPERIMENT).read_text(encoding="utf-8"))
+    system = System.resolve(Experiment.from_file(folder / EXPERIMENT), threads=1)
+    true = _physical(system, DIFFERENCE, np.random.default_rng(37))
     tables: Any = document["parameters"]
-    for name, value in zip(design["parameters"], design["theta"], strict=True):
+    for name, value in zip(system.parameters.names, true.tolist(), strict=True):
         # The unknown initial state has no table; the robot begins as the model does.
         if name in tables:
-            tables[name]["true"] = (1.0 + DIFFERENCE) * value
+            tables[name]["true"] = value
     (folder / ROBOT).write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
@@ -269,10 +288,8 @@ def _judge_design(found: Walk, folder: Path) -> None:
     broken = 0
     rng = np.random.default_rng(37)
     system = System.resolve(Experiment.from_file(folder / EXPERIMENT), threads=1)
-    p = system.parameters
     for _ in range(ROBOTS):
-        error = WRONG * rng.uniform(-1.0, 1.0, len(p)) * p.sizes(system.theta)
-        theta = np.clip(system.theta + np.where(p.changes_model, error, 0.0), p.lower, p.upper)
+        theta = _physical(system, WRONG, rng)
         robot = system.model_at(theta)
         broken += bool(violations(robot, trajectory, stated.get("limits", {}), each_step=False))
     found.kept_in_mujoco = 1.0 - broken / ROBOTS
