@@ -496,13 +496,13 @@ def _carry_out(call: Callable[[], None]) -> None:
         interruption.incomplete, code = True, INTERRUPTED_CODE
     except (MjfimError, MemoryError, OSError) as error:
         raise _told(error) from None
+    except typer.Exit as end:
+        code = end.exit_code
     except Exception as error:
         # MuJoCo has several kinds of errors for a lack of memory.
         if "allocate memory" not in str(error):
             raise
         raise _told(MemoryError(error)) from None
-    except typer.Exit as end:
-        code = end.exit_code
     finally:
         # A press may have come between the creation of a temporary file and its removal.
         remove_temporary_files()

@@ -75,6 +75,8 @@ def lose_what_cannot_be_written() -> None:
     """
     for number, name in enumerate(("stdout", "stderr"), start=1):
         stream = getattr(sys, name)
+        if stream is not None and not isinstance(stream, io.TextIOWrapper):
+            continue  # a caller in Python has replaced it
         buffer = io.FileIO(number, "w", closefd=False) if stream is None else stream.buffer
         lossy = LossyOutput(getattr(buffer, "raw", buffer), name)
         encoding = getattr(stream, "encoding", "utf-8")
