@@ -394,7 +394,7 @@ def _excesses(
     mujoco.mj_forward(unclamped, shown)
 
     yield from _joints(model, simulations, stated)
-    yield from _tendons(model, shown)
+    yield from _tendons(model, shown, stated)
     yield from _actuators(model, simulations, stated)
 
 
@@ -411,7 +411,8 @@ def _joints(
         name, v = model.joint(i).name or str(i), int(model.jnt_dofadr[i])
         if model.jnt_limited[i]:
             position = data.qpos[int(model.jnt_qposadr[i])]
-            yield f"position of {name}", _excess(position, model.jnt_range[i])
+            ends = stated.get("position", {}).get(name, model.jnt_range[i])
+            yield f"position of {name}", _excess(position, ends)
         if model.jnt_actfrclimited[i]:
             yield f"force at {name}", _excess(shown.qfrc_actuator[v], model.jnt_actfrcrange[i])
         speeds = stated.get("velocity", {})
@@ -431,13 +432,14 @@ def _ball(model: Any, data: Any, joint: int) -> Iterator[tuple[str, float]]:
         yield f"angle of {name}", _excess(angle, (-np.inf, float(model.jnt_range[joint].max())))
 
 
-def _tendons(model: Any, shown: Any) -> Iterator[tuple[str, float]]:
+def _tendons(model: Any, shown: Any, stated: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
     """Name and excess of lengths of tendons, and of the sums of the forces on them."""
     on_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
     for i in range(model.ntendon):
         name = model.tendon(i).name or str(i)
         if model.tendon_limited[i]:
-            yield f"length of {name}", _excess(shown.ten_length[i], model.tendon_range[i])
+            ends = stated.get("tendon_length", {}).get(name, model.tendon_range[i])
+            yield f"length of {name}", _excess(shown.ten_length[i], ends)
         if model.tendon_actfrclimited[i]:
             outputs = model.actuator_outadr[on_tendon & (model.actuator_trnid[:, 0] == i)]
             force = shown.actuator_force[outputs] @ model.actuator_gear[outputs, 0]
