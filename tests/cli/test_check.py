@@ -41,9 +41,11 @@ main()
 
 
 @pytest.mark.slow
-def test_too_little_memory_for_the_engine_is_one_message(study: Path) -> None:
+def test_too_little_memory_for_the_engine_is_one_message(tmp_path: Path) -> None:
     """The model compiles, but there is no memory for further copies of its state."""
     pytest.importorskip("resource")
+    # A model of its own: the one of `study` is shared by all tests.
+    study = write_experiment(tmp_path)
     model = study.parent / "cart_pendulum.xml"
     text = model.read_text(encoding="utf-8")
     model.write_text(text.replace("<worldbody>", '<size memory="1700M"/><worldbody>', 1))
