@@ -15,6 +15,9 @@ from mjfim.model.variants import PlantModel
 from mjfim.plant.batch import BatchSimulator
 from tests.support.paths import MODELS
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 # Objects that keep models or simulations of MuJoCo, which the garbage collector counts as small.
 KEEPERS = (BatchSimulator, ModelSource, ParameterSet, PlantModel)
 

@@ -22,6 +22,9 @@ from mjfim.records.trajectory import Recording
 from mjfim.studies.check import check
 from tests.support.rescaling import Rescaled, Units, rescale
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 CART = """
 <mujoco model="cart_pendulum">
   <option timestep="0.01" integrator="implicitfast"><flag contact="disable"/></option>

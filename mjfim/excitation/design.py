@@ -22,7 +22,12 @@ from mjfim.excitation.evaluation import (
     point_at_stated_rate,
     require_designable,
 )
-from mjfim.excitation.initial_controls import GIVEN, InitialControl, initial_controls_of
+from mjfim.excitation.initial_controls import (
+    GIVEN,
+    InitialControl,
+    initial_controls_of,
+    series_of,
+)
 from mjfim.excitation.limits.verification import require_feasible_start
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.release import design_release
@@ -205,7 +210,10 @@ def _searched(
         evaluation_seconds=evaluation_seconds,
     )
     steps_before = task.plant.engine_steps - steps_before
-    results = consume(search.run([candidate_of(start) for start in starts]), callback)
+    # A stated time that is left is used for series.
+    rng = np.random.default_rng(task.experiment.descent.seed)
+    further = None if np.isinf(budget.seconds_left) else map(candidate_of, series_of(task, rng))
+    results = consume(search.run([candidate_of(each) for each in starts], further), callback)
     if not search.grounds.is_limited:
         results = _with_stops_evaluated(stage, results)
     interrupted = budget.stop.requested

@@ -10,13 +10,29 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
+from mjfim.excitation.search.levels import boundary_splines
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.initial import fourier_basis
+from mjfim.experiment.initial import fourier_basis, independent_curves
 from mjfim.experiment.packing import opened
 from mjfim.recordings.control_table import read_control
 
 # Largest number of harmonics of a Fourier series.
 MAX_SERIES_HARMONICS = 15
+
+# Base frequencies of the first Fourier series, and bandwidths of the first B-splines [Hz].
+FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)
+SPLINE_BANDWIDTHS = (1.0, 2.0)
+
+# Number of further series and splines at random frequencies.
+RANDOM_SERIES = 15
+
+# Smallest and largest number of periods of the first harmonic within the horizon, and smallest
+# number of harmonics, for Fourier series at random base frequencies.
+RANDOM_PERIODS = (0.4, 5.0)
+MIN_RANDOM_HARMONICS = 5
+
+# Random bandwidths lie between these multiples of the smallest and of the largest usual one.
+RANDOM_BANDWIDTH_FACTORS = (0.5, 2.0)
 
 # Smallest and largest amplitude of a random multisine, relative to that of the initial control.
 LEAST_RANDOM_AMPLITUDE = 1.0
@@ -114,20 +130,72 @@ def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator
     """
     experiment = task.experiment
     bandwidth = experiment.limits.bandwidth or 0.5 * experiment.rate
-    harmonics = int(min(MAX_SERIES_HARMONICS, bandwidth / frequency))
-    if harmonics < 1:
+    if frequency > bandwidth:
         raise ExperimentError(
             f"{experiment.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of "
             f"{bandwidth:g} Hz"
         )
+    wanted = _multisine(task, rng)
+    return _in_curves(f"Fourier series of {frequency:g} Hz", task, wanted, _waves(task, frequency))
 
-    wanted = _multisine(task, rng) - task.centre
-    starts_at_rest = experiment.boundary.start == "rest"
-    ends_at_rest = experiment.boundary.end == "rest"
-    basis = fourier_basis(task.t, task.horizon, frequency, harmonics, starts_at_rest, ends_at_rest)
-    coefficients = np.linalg.lstsq(basis, wanted)[0]
-    control = task.centre + basis @ coefficients
-    return InitialControl(name=f"Fourier series of {frequency:g} Hz", control=control, basis=basis)
+
+def _waves(task: DesignTask, frequency: float, harmonics: int = MAX_SERIES_HARMONICS) -> Array:
+    """(N, M) waves of a base frequency [Hz] within the bandwidth that keep the boundary."""
+    experiment = task.experiment
+    bandwidth = experiment.limits.bandwidth or 0.5 * experiment.rate
+    count = max(min(harmonics, int(bandwidth / frequency + 1e-9)), 1)
+    from_rest, to_rest = experiment.boundary.start == "rest", experiment.boundary.end == "rest"
+    waves = fourier_basis(task.t, task.horizon, frequency, count, from_rest, to_rest)
+    return independent_curves(waves)
+
+
+def _in_curves(name: str, task: DesignTask, control: Array, curves: Array) -> InitialControl:
+    """The sum of curves, (N, M), that is nearest to a control."""
+    coefficients = np.linalg.lstsq(curves, control - task.centre)[0]
+    return InitialControl(name=name, control=task.centre + curves @ coefficients, basis=curves)
+
+
+def series_of(
+    task: DesignTask, rng: np.random.Generator, harmonics: int | None = MAX_SERIES_HARMONICS
+) -> Iterator[InitialControl]:
+    """Make series that are near the initial control, and then random ones.
+
+    Args:
+        task: The task.
+        rng: Source of random numbers.
+        harmonics: Largest number of harmonics of Fourier series; None for B-splines.
+
+    Yields:
+        Series at usual frequencies, and then at random ones.
+    """
+    experiment = task.experiment
+    fastest = experiment.limits.bandwidth or 0.5 * experiment.rate
+
+    def curves_of(frequency: float) -> Array:
+        """(N, M) curves of a base frequency or of a bandwidth [Hz]."""
+        if harmonics is None:
+            return independent_curves(boundary_splines(task, task.t, frequency))
+        return _waves(task, frequency, harmonics)
+
+    if harmonics is None:
+        usual: tuple[float, ...] = SPLINE_BANDWIDTHS
+        ends = np.multiply(RANDOM_BANDWIDTH_FACTORS, (usual[0], usual[-1]))
+        ends = np.minimum(ends, fastest)
+    else:
+        usual = FOURIER_FREQUENCIES
+        highest = fastest / min(harmonics, MIN_RANDOM_HARMONICS)
+        ends = np.minimum(np.divide(RANDOM_PERIODS, task.horizon), highest)
+
+    kind = "B-splines" if harmonics is None else "Fourier series"
+    for frequency in (each for each in usual if each <= fastest):
+        yield _in_curves(f"{kind} of {frequency:.3g} Hz", task, task.control, curves_of(frequency))
+    for number in range(1, RANDOM_SERIES + 1):
+        frequency = float(np.exp(rng.uniform(*np.log(ends))))
+        basis = curves_of(frequency)
+        coefficients = rng.normal(size=(basis.shape[1], len(task.centre)))
+        deviation = basis @ coefficients * task.plant.sizes.control / np.sqrt(basis.shape[1])
+        name = f"{kind} of {frequency:.3g} Hz, at random ({number})"
+        yield InitialControl(name=name, control=task.centre + deviation, basis=basis)
 
 
 def _first_part(task: DesignTask, count: int) -> Array:

@@ -643,8 +643,8 @@ def _calibrated(
     Args:
         system: The system.
         control: (N, nu) control.
-        known: A task on another plant, whose difference steps suit the same motion; None without
-            one.
+        known: A task on another plant, whose difference steps suit the same motion, and one with
+            other timesteps; None without one.
     """
     try:
         trajectory = system.plant.simulate(system.theta, control)
@@ -654,6 +654,8 @@ def _calibrated(
     # Clamps and stops that do not act along the motion do not change it.
     factors = None if known is None else known.plant.step_factors
     reference = None if known is None else known.reference
-    if factors is not None and reference is not None and trajectory.moves_as(reference):
+    moves_alike = reference is not None and trajectory.moves_as(reference)
+    is_rescaled = known is not None and known.system.variant.smoothed == system.variant.smoothed
+    if factors is not None and (moves_alike or is_rescaled):
         return replace(system, plant=system.plant.with_step_factors(factors)), trajectory
     return system.calibrated_along(system.theta, trajectory), trajectory

@@ -69,6 +69,11 @@ class ModelVariant:
     smoothing_speeds: tuple[float, ...] = ()
     smoothed: bool = False
 
+    @property
+    def is_coarse(self) -> bool:
+        """Whether motions differ from those of the stated level."""
+        return self.sample_factor > 1 or self.timestep_factor > 1 or self.smoothed
+
 
 # The model as the user states it.
 STATED = ModelVariant()

@@ -7,7 +7,7 @@ derivatives and the barrier of a design, so that only the form of the excitation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,12 +16,11 @@ import scipy.signal
 
 from mjfim.arrays import Array
 from mjfim.excitation.design import consume
-from mjfim.excitation.search.climb import Candidate
+from mjfim.excitation.initial_controls import series_of
 from mjfim.excitation.search.inside import LimitedCost, largest_share
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, boundary_splines
-from mjfim.excitation.search.search import Search
+from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis
+from mjfim.excitation.search.search import Search, candidate_of
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.initial import fourier_basis, independent_curves
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
@@ -180,21 +179,6 @@ def random_steps(settings: ExcitationSettings, z: Array) -> Array:
     share = np.where(settings.may_jump, 1.0, smooth)[:, None]
     return np.asarray((1.0 - share) * levels[index] + share * levels[index + 1])
 
-
-# Base frequencies of the first Fourier series, and bandwidths of the first B-splines [Hz].
-FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)
-SPLINE_BANDWIDTHS = (1.0, 2.0)
-
-# Number of further series and splines at random frequencies.
-RANDOM_SERIES = 15
-
-# Smallest and largest number of periods of the first harmonic within the horizon, and smallest
-# number of harmonics, for Fourier series at random base frequencies.
-RANDOM_PERIODS = (0.4, 5.0)
-MIN_RANDOM_HARMONICS = 5
-
-# Random bandwidths lie between these multiples of the smallest and of the largest usual one.
-RANDOM_BANDWIDTH_FACTORS = (0.5, 2.0)
 
 # Largest number of periods of a wave within the horizon.
 MAX_CYCLES = 40.0
@@ -407,7 +391,8 @@ def _optimise(
 
     rng = np.random.default_rng((search.seed, *search.part))
     part, parts = search.part
-    candidates = list(_series(stated, harmonics, rng))[part::parts]
+    starts = list(series_of(stated, rng, harmonics))[part::parts]
+    candidates = [candidate_of(start) for start in starts]
     results = consume(optimiser.run(candidates), watch)
     steps = optimiser.steps
     found = min(results, key=lambda each: (each.cost, each.rank), default=None)
@@ -415,47 +400,6 @@ def _optimise(
         return SearchResult(), steps
     control = found.over_horizon if found.best is None else found.best
     return SearchResult(control=control, cost=found.cost, found_by=found.name), steps
-
-
-def _series(
-    task: DesignTask, harmonics: int | None, rng: np.random.Generator
-) -> Iterator[Candidate]:
-    """Series at usual frequencies, and then at random ones."""
-    experiment = task.experiment
-    fastest = experiment.limits.bandwidth or 0.5 * experiment.rate
-    from_rest = experiment.boundary.start == "rest"
-    to_rest = experiment.boundary.end == "rest"
-
-    def basis_of(frequency: float) -> Array:
-        """(N, M) curves of a base frequency or of a bandwidth [Hz]."""
-        if harmonics is None:
-            return independent_curves(boundary_splines(task, task.t, frequency))
-        count = max(min(harmonics, int(fastest / frequency + 1e-9)), 1)
-        curves = fourier_basis(task.t, task.horizon, frequency, count, from_rest, to_rest)
-        return independent_curves(curves)
-
-    if harmonics is None:
-        usual: tuple[float, ...] = SPLINE_BANDWIDTHS
-        ends = np.multiply(RANDOM_BANDWIDTH_FACTORS, (usual[0], usual[-1]))
-        ends = np.minimum(ends, fastest)
-    else:
-        usual = FOURIER_FREQUENCIES
-        highest = fastest / min(harmonics, MIN_RANDOM_HARMONICS)
-        ends = np.minimum(np.divide(RANDOM_PERIODS, task.horizon), highest)
-
-    centre = task.centre
-    for frequency in (each for each in usual if each <= fastest):
-        basis = basis_of(frequency)
-        nearest = basis @ np.linalg.lstsq(basis, task.control - centre)[0]
-        name = f"{frequency:.3g} Hz"
-        yield Candidate(name=name, control=centre + nearest, curves=basis)
-    for number in range(1, RANDOM_SERIES + 1):
-        frequency = float(np.exp(rng.uniform(*np.log(ends))))
-        basis = basis_of(frequency)
-        coefficients = rng.normal(size=(basis.shape[1], len(centre)))
-        deviation = basis @ coefficients * task.plant.sizes.control / np.sqrt(basis.shape[1])
-        name = f"{frequency:.3g} Hz, at random ({number})"
-        yield Candidate(name=name, control=centre + deviation, curves=basis)
 
 
 Method = Callable[[BaselineSearch, DesignTask, Budget, SearchCallback], tuple[SearchResult, int]]

@@ -16,7 +16,7 @@ from mjfim.excitation.search import search as search_module
 from mjfim.excitation.search.climb import Candidate, Move, tightened, without_jumps
 from mjfim.excitation.search.descent import Barrier, Ground
 from mjfim.excitation.search.inside import InsideControl, InsideSearch, LimitedCost, largest_share
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis
+from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, coarse_level
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
@@ -175,6 +175,55 @@ def test_a_control_of_long_samples_has_no_steps_where_its_rate_is_limited(tmp_pa
     np.testing.assert_allclose(np.diff(smooth[2:-2], axis=0), 0.25)
     assert np.array_equal(without_jumps(free, steps, 4), steps)
     assert np.array_equal(without_jumps(limited, smooth, 4), smooth)
+
+
+# ---- time that is left
+
+
+def test_series_follow_while_they_help(tmp_path: Path) -> None:
+    """A stated time goes to series until three in turn did not help; the best one is the result."""
+    free = cart_inside(tmp_path, descent={"max_iterations": 3})
+    assert [start.name for start in design_task(free).starts] == ["initial control"]
+    timed = cart_inside(tmp_path, descent={"max_iterations": 3, "seconds": 60.0})
+    design = design_task(timed)
+    assert design.seconds < 45.0
+    first, *further = design.starts
+    assert first.name == "initial control" and len(further) >= 3
+    assert all(each.name.startswith("Fourier series of ") for each in further)
+    costs = [each.cost for each in design.starts]
+    assert design.final.cost == pytest.approx(min(costs), rel=1e-6)
+    assert min(costs[:-3]) == pytest.approx(min(costs), rel=0.01)
+
+
+def weighted(folder: Path, criterion: str) -> DesignTask:
+    """The cart with weights on its control, wide limits, and two engine steps in a sample."""
+    return cart_inside(
+        folder,
+        rate=50.0,
+        cost={"criterion": criterion, "control": 1e-3},
+        limits={"control": {"force": [-20.0, 20.0]}, "position": {"slide": [-3.0, 3.0]}},
+        descent={"max_iterations": 6},
+    )
+
+
+@pytest.mark.parametrize("criterion", ["E", "D"])
+def test_weights_alone_may_bound_a_control(criterion: str, tmp_path: Path) -> None:
+    """Without a barrier with E-optimality, inside a light barrier with D-optimality."""
+    task = weighted(tmp_path, criterion)
+    weights = [row.mu for row in design_task(task).history]
+    assert max(weights) == (0.0 if criterion == "E" else pytest.approx(1e-3))
+
+
+def test_a_coarse_level_has_longer_timesteps_where_a_sample_has_several(tmp_path: Path) -> None:
+    """Its samples stay, and its cost is never that of the design."""
+    task = weighted(tmp_path, "E")
+    coarse = coarse_level(task, task.problem.point(task.initial), None)
+    assert coarse is not None and coarse.system.variant.is_coarse
+    assert coarse.samples == task.samples
+    assert coarse.system.grid.substeps < task.system.grid.substeps
+    design = design_task(task)
+    again = task.problem.point(task.plant.simulate(task.theta, design.trajectory.ctrl))
+    assert design.final.cost == pytest.approx(again.cost, rel=1e-4)
 
 
 # ---- several starts, here and on workers

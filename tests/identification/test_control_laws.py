@@ -27,6 +27,9 @@ from tests.support.executors import LosingThreads
 from tests.support.paths import MODELS, SHARED_DATA, SHARED_MODELS
 from tests.support.shared_models import PANDA
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 NOISE = {"qpos:shoulder": 1e-3, "qpos:elbow": 1e-3}
 
 # Laws of both joints; the driver of the elbow takes commands faster than that of the shoulder.

@@ -34,6 +34,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(cart: Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:

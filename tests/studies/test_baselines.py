@@ -30,6 +30,9 @@ from mjfim.studies.baselines import (
 )
 from tests.support.limits import cart_inside
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 FRAME = ExcitationSettings(
     t=np.arange(500) * 0.01, horizon=5.0, nu=2, min_frequency=0.1, max_frequency=5.0, may_jump=True
 )
@@ -109,7 +112,7 @@ def test_series_remain_sums_of_their_curves(tmp_path: Path) -> None:
     order = BaselineSearch(experiment=task.experiment, method="fourier5", seconds=0.3, threads=1)
     found = run_baseline(order, stop=StopToken())
     assert found.control is not None
-    frequency = float(found.found_by.split(" Hz")[0])
+    frequency = float(found.found_by.split(" Hz")[0].split()[-1])
     curves = fourier_basis(task.t, task.horizon, frequency, 5, False, False)
     deviation = found.control - task.centre
     fitted = curves @ np.linalg.lstsq(curves, deviation)[0]

@@ -40,6 +40,9 @@ from tests.support.cli import PROCESS, misused, read, run
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 STUDY = mjfim.Experiment.from_file(
     MODELS / "cart_pendulum_guess.toml"
 ).replace(  # its guesses are 25 to 40 % off

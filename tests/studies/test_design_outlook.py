@@ -17,6 +17,9 @@ from tests.support import stiff_servos
 from tests.support.numerics import cart_task
 from tests.support.stiff_servos import stiff_arm_experiment, stiff_arm_task
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 # Changes of the experiment that a design refuses, and a part of its message.
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "start outside": (

@@ -19,6 +19,9 @@ from tests.support.contents import contents
 from tests.support.limits import ARM, cart_inside, floating_task
 from tests.support.numerics import filtered_task, make_task
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 
 def study(
     experiment: Experiment, folder: Path, *, threads: int, executor: Executor | None = None

@@ -58,6 +58,10 @@ SHORT = 0.05
 SHORT_WINDOW = 12
 STEEP = 100.0
 
+# Step length, relative to the full step, below which the derivatives of a descent without a barrier
+# mislead.
+LEAST_STEP = 1e-5
+
 # Largest part of J on the stated plant that a coarse level may miss.
 LARGEST_ERROR = 1.0 / 3.0
 
@@ -99,7 +103,7 @@ class Candidate:
         slope: Slope of the cost at the last iterate.
         history: Iterates.
         steps: Engine steps.
-        has_left: A descent without a barrier has left the limits.
+        has_left: A descent without a barrier has left the limits, or was misled by derivatives.
         is_held_up: Its steps were very short.
         is_judged: The last descent was compared on the stated plant.
     """
@@ -178,12 +182,16 @@ class Grounds:
             self._levels[level.task.system.variant] = level
             self._steps_before += level.task.plant.engine_steps
 
-    def ground(self, variant: ModelVariant, candidate: Candidate) -> Ground:
-        """The ground of a candidate on a variant of the plant."""
+    def level(self, variant: ModelVariant) -> DescentLevel:
+        """The level of a variant of the plant."""
         if variant not in self._levels:
             task = self.stated.task.with_variant(variant)
             self._levels[variant] = DescentLevel(task, self.stated.basis)
-        level = self._levels[variant]
+        return self._levels[variant]
+
+    def ground(self, variant: ModelVariant, candidate: Candidate) -> Ground:
+        """The ground of a candidate on a variant of the plant."""
+        level = self.level(variant)
         if candidate.curves is not None:
             return Ground.of(level, candidate.curves, candidate.repeats)
         key = variant, candidate.repeats
@@ -351,7 +359,8 @@ class Climb:
             if step.iterate.index <= last and not step.iterate.status:
                 offset = self.candidate.iterations
             last = step.iterate.index
-            if step.has_left:
+            is_misled = is_limited and 0.0 < step.iterate.gamma < LEAST_STEP
+            if step.has_left or is_misled:
                 self.candidate = replace(self.candidate, has_left=True)
                 return
             yield from self._recorded(step, ground, offset)
@@ -407,7 +416,7 @@ class Climb:
         found, iterate = self.candidate, step.iterate
         cost = np.inf if step.point is None or not step.is_inside else step.point.cost
         found = replace(found, slope=iterate.slope, status=iterate.status)
-        is_stated = ground.task.system.variant.sample_factor == 1
+        is_stated = not ground.task.system.variant.is_coarse
         if step.mu:
             if step.point is not None:
                 size = ground.level.problem.size(step.point)

@@ -232,7 +232,7 @@ class Ground:
         """Iterates of Algorithm 1 on this level; none where all controls diverge."""
         descent = self.task.experiment.descent
         tolerance, most = descent.tolerance, descent.max_iterations
-        if self.task.system.variant.sample_factor > 1:
+        if self.task.system.variant.is_coarse:
             tolerance, most = max(tolerance, COARSE_TOLERANCE), most // 2
         start = self._cheapest(problem, controls)
         if not np.isfinite(start.cost):
@@ -499,7 +499,7 @@ def _next_power(level: DescentLevel, eigenvalues: Array, status: Status | None) 
         return SMOOTH_POWERS[0] if meet else power
 
     # At the stated rate, a smooth criterion that is too far from the exact one is sharpened once.
-    if level.task.system.variant.sample_factor > 1 or not len(eigenvalues):
+    if level.task.system.variant.is_coarse or not len(eigenvalues):
         return power
     error = float(np.sum((eigenvalues[0] / eigenvalues) ** power) ** (1.0 / power))
     return SMOOTH_POWERS[-1] if error > MAX_SMOOTHING_ERROR else power

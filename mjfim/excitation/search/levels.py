@@ -181,10 +181,15 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
         basis: (t, s) identifiable combinations, or None.
 
     Returns:
-        The task with longer samples; None where the experiment states no coarse level, or where
-        the initial cost differs from that of the stated task by more than `MAX_COARSE_CHANGE`.
+        The task with a longer timestep, or with longer samples where a sample is one engine step;
+        None where the experiment states no coarse level, or where the initial cost differs too
+        much from that of the stated task (`MAX_CONSTRAINED_COARSE_CHANGE`, `MAX_COARSE_CHANGE`).
     """
     descent = task.experiment.descent
+    if descent.coarse == "auto" and descent.method == "lbfgs" and task.system.grid.substeps > 1:
+        easier = easier_level(DescentLevel(task, basis), first)
+        if easier is not None:
+            return easier.task
     factor = AUTO_COARSE_FACTOR if descent.coarse == "auto" else descent.coarse
     if factor == 1 or descent.method != "lbfgs":
         return None

@@ -10,9 +10,10 @@ descents run side by side. Each is one task or several, which may be lost withou
 from __future__ import annotations
 
 import uuid
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 
@@ -32,7 +33,6 @@ from mjfim.excitation.search.climb import (
 from mjfim.excitation.search.descent import MU_FACTOR, Barrier
 from mjfim.excitation.search.inside import InsideControl, InsideSearch, is_progress
 from mjfim.excitation.search.levels import DescentLevel, coarse_level, coarser_levels, easier_level
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import for_workers
 from mjfim.information.smoothness import is_rough
 from mjfim.parallel import (
@@ -49,6 +49,9 @@ from mjfim.records.design import (
     extended,
 )
 from mjfim.records.events import DesignEvent
+
+# Number of further controls without progress after which a search ends.
+FURTHER_STARTS = 3
 
 # On each rung, one of this number of candidates goes on to the next rung.
 HALVING_RATE = 4
@@ -83,8 +86,14 @@ CLOSE_LAST_WEIGHT = 1e-3
 BRIEF_LAST_WEIGHT = 0.03
 BRIEF_SHARE = 0.75
 
+# First barrier weight where weights in the cost bound the control.
+LIGHT_BARRIER = 1e-3
+
 # Number of evaluations for which there has to be time before a descent.
 FEWEST_EVALUATIONS = 20.0
+
+# Number of evaluations for which there has to be time before coarse levels are made.
+LADDER_EVALUATIONS = 5.0
 
 # Number of iterations for which each candidate should have time on the first rung.
 ITERATIONS_OF_A_START = 50
@@ -180,27 +189,35 @@ class Search:
         """Engine steps since the search began, also those of workers."""
         return self.grounds.steps + self.remote_steps
 
-    def run(self, candidates: Sequence[Candidate]) -> Generator[DesignEvent, None, list[Candidate]]:
+    def run(
+        self, candidates: Sequence[Candidate], further: Iterator[Candidate] | None = None
+    ) -> Generator[DesignEvent, None, list[Candidate]]:
         """Yield every iterate; return the candidates that were begun.
 
         Args:
             candidates: Controls from which the search begins. The first one is always begun, the
                 others as time allows.
+            further: Controls that follow under hard limits while there is time and they help. The
+                first one is the initial control as a sum of curves. None without such ones.
         """
         if not self.grounds.is_limited and not self.keeps_curves:
             return (yield from self._moved(candidates, self._free_rungs, is_last=True))
         if self.keeps_curves:
             return (yield from self._run_inside(list(candidates)))
 
+        further = iter(()) if further is None else further
         done: list[Candidate] = []
         waiting = list(candidates)
-        if _is_bounded_by_weights(self.stage.task):
-            if not self._has_time and waiting[0].control is self.stage.task.control:
+        is_rough = self._is_rough(waiting[0].control)
+        if self._needs_no_barrier:
+            if not self._has_time() and waiting[0].control is self.stage.task.control:
                 waiting[0] = self._enlarged(waiting[0])
             free = [each for each in waiting if each.curves is None and each.repeats == 1]
             climbed = yield from self._moved(free, self._free_rungs, is_last=True)
-            found = {each.name: each for each in climbed}
-            done = [self._judged(each) for each in climbed if not each.has_left]
+            found = {each.name: self._judged(each) for each in climbed}
+            # What seems to be an optimum is none where derivatives mislead.
+            goes_on = is_rough and self.budget.exhausted is None
+            done = [each for each in found.values() if not (each.has_left or goes_on)]
             left = {each.name for each in done}
             waiting = [
                 replace(found.get(each.name, each), has_left=False)
@@ -208,11 +225,34 @@ class Search:
                 if each.name not in left
             ]
         if waiting:
-            is_rough = self._is_rough(waiting[0].control)
-            waiting[0] = yield from self._prepared(waiting[0], is_rough=is_rough)
-            if is_rough and not self._has_time:
+            series = next(further, None)
+            if series is not None and waiting[0].control is self.stage.task.control:
+                # A control with few numbers improves quickly; on the next rung it is free.
+                waiting[0] = replace(waiting[0], curves=series.curves)
+            # Where derivatives mislead and time is short, random changes come first.
+            shortest = LADDER_EVALUATIONS * self.evaluation_seconds
+            is_short = is_rough and self.budget.seconds_left < shortest
+            ladder = () if is_short else self._ladder(waiting)
+            rung = ladder[0] if ladder else None
+            waiting[0] = yield from self._prepared(waiting[0], rung, is_rough=is_rough)
+            if is_rough and not self._has_time(rung):
                 return [*done, replace(waiting[0], status=Status.MAX_ITERATIONS)]
-            done += yield from self._run_inside(waiting)
+            done += yield from self._run_inside(waiting, ladder)
+        return (yield from self._followed(done, further))
+
+    def _followed(
+        self, done: list[Candidate], further: Iterator[Candidate]
+    ) -> Generator[DesignEvent, None, list[Candidate]]:
+        """Begin with further controls, until several of them in turn did not help."""
+        size = 1 if self.executor is None else Workers.of(self.executor).count
+        in_vain = 0
+        while in_vain < FURTHER_STARTS and self._has_time():
+            batch = list(islice(further, size))
+            if not batch:
+                break
+            before = min((each.cost for each in done), default=np.inf)
+            done += yield from self._run_inside(batch)
+            in_vain = 0 if is_progress(before, min(each.cost for each in done)) else in_vain + size
         return done
 
     # ---- before a descent
@@ -231,14 +271,14 @@ class Search:
         return first
 
     def _prepared(
-        self, first: Candidate, *, is_rough: bool
+        self, first: Candidate, rung: Rung | None, *, is_rough: bool
     ) -> Generator[DesignEvent, None, Candidate]:
         """The first candidate with a control within the limits, where one is found.
 
         The control is scaled into the limits. Where the start is far outside them, and where
         derivatives may mislead, random controls are tried as well.
         """
-        best = self._inside_of(first)
+        best = None if first.best is not None else self._inside_of(first)
         if best is None:
             return first
         first = first.improved(best.control, best.point)
@@ -246,8 +286,8 @@ class Search:
         is_outside = not ground.is_near(first.control)
         share = 0.0
         if is_rough:
-            share = PROBE_SHARE if self._has_time else CLOSING_SHARE
-        elif is_outside and self._has_time:
+            share = PROBE_SHARE if self._has_time(rung) else CLOSING_SHARE
+        elif is_outside and self._has_time(rung):
             share = OUTSIDE_SHARE
         if share:
             first, best = yield from self._by_chance(first, best, share, PATIENCE)
@@ -265,10 +305,10 @@ class Search:
     # ---- descents within the limits
 
     def _run_inside(
-        self, candidates: list[Candidate]
+        self, candidates: list[Candidate], ladder: tuple[Rung, ...] = ()
     ) -> Generator[DesignEvent, None, list[Candidate]]:
         """Let candidates climb within the limits, in batches while there is time."""
-        ladder = self._ladder(candidates)
+        ladder = ladder or self._ladder(candidates)
         done: list[Candidate] = []
         waiting = self._affordable(candidates, ladder[0])
         while waiting and (not done or self.budget.exhausted is None):
@@ -380,7 +420,7 @@ class Search:
             has_gained = is_progress(before, best.cost)
             if not is_useful and not has_gained:
                 break
-            is_useful = has_gained and self._has_time
+            is_useful = has_gained and self._has_time()
             if not is_useful:
                 continue
             before = best.cost
@@ -392,10 +432,12 @@ class Search:
             is_useful = is_progress(before, best.cost)
         return done
 
-    @property
-    def _has_time(self) -> bool:
-        """Whether the time that is left allows a descent."""
-        return self.budget.seconds_left > FEWEST_EVALUATIONS * self.evaluation_seconds
+    def _has_time(self, rung: Rung | None = None) -> bool:
+        """Whether the time that is left allows a descent on a rung, or on the stated level."""
+        stated = self.grounds.stated
+        level = stated if rung is None else self.grounds.level(rung.variant)
+        seconds = self.evaluation_seconds * level.engine_steps / stated.engine_steps
+        return self.budget.seconds_left > FEWEST_EVALUATIONS * seconds
 
     def _by_chance(
         self, candidate: Candidate, inside: InsideControl, share: float, patience: float
@@ -425,11 +467,33 @@ class Search:
 
     def _judged(self, candidate: Candidate) -> Candidate:
         """A candidate of a descent without a barrier, judged on the stated plant."""
+        if candidate.has_left and candidate.control is self.stage.task.control:
+            return candidate
         climb = Climb(self.grounds, self._move(candidate, (), self.budget.seconds_left, True))
         status = candidate.status
         return replace(climb.judged(self.grounds.stated.task.system.variant), status=status)
 
     # ---- rungs, and what they depend on
+
+    @cached_property
+    def _is_bounded_by_weights(self) -> bool:
+        """Whether weights on all controls may keep the limits without a barrier.
+
+        A barrier is needed for a boundary, a bandwidth, limits on control rates and a clearance.
+        """
+        task = self.stage.task
+        limits = task.experiment.limits
+        needs_barrier = task.is_shaped or bool(limits.control_rate) or limits.clearance is not None
+        return not needs_barrier and bool((task.control_weight > 0.0).all())
+
+    @property
+    def _needs_no_barrier(self) -> bool:
+        """Whether a search begins without a barrier.
+
+        The quasi-Newton direction of the barrier is better for D-optimality.
+        """
+        is_determinant = self.stage.task.experiment.cost.criterion == "D"
+        return self._is_bounded_by_weights and not is_determinant
 
     @cached_property
     def _free_rungs(self) -> tuple[Rung, ...]:
@@ -465,6 +529,8 @@ class Search:
             return (*rungs, Rung(variant=variant, barrier=sharp))
 
         usual = Barrier(tolerance=max(Barrier.tolerance, tolerance))
+        if self._is_bounded_by_weights and not self._needs_no_barrier:
+            usual = replace(usual, first=LIGHT_BARRIER)
         coarse = easier_level(stated, self.first)
         is_free = all(each.curves is None and each.repeats == 1 for each in candidates)
         if coarse is None and len(candidates) == 1 and (is_free or self.keeps_curves):
@@ -475,17 +541,17 @@ class Search:
         is_few = len(candidates) < HALVING_RATE and is_close
         last = CLOSE_LAST_WEIGHT if is_few else FIRST_LAST_WEIGHT
         share = FIRST_SHARE
-        if not self._has_time and level.engine_steps < stated.engine_steps:
+        if not self._has_time() and level.engine_steps < stated.engine_steps:
             last, share = BRIEF_LAST_WEIGHT, BRIEF_SHARE
         return (
             Rung(
                 variant=level.task.system.variant,
-                barrier=replace(usual, last=last),
+                barrier=replace(usual, last=min(last, usual.first)),
                 share=share,
             ),
             Rung(
                 variant=variant,
-                barrier=replace(usual, first=min(3.0 * last, FIRST_LAST_WEIGHT)),
+                barrier=replace(usual, first=min(3.0 * last, FIRST_LAST_WEIGHT, usual.first)),
             ),
         )
 
@@ -673,13 +739,3 @@ def _named_stop(candidate: Candidate, budget: Budget) -> Candidate:
     if budget.stop.requested and candidate.status is None:
         return replace(candidate, status=Status.INTERRUPTED)
     return candidate
-
-
-def _is_bounded_by_weights(task: DesignTask) -> bool:
-    """Check whether weights on all controls may keep the limits without a barrier.
-
-    A barrier is needed for a boundary, a bandwidth, limits on control rates and a clearance.
-    """
-    limits = task.experiment.limits
-    needs_barrier = task.is_shaped or bool(limits.control_rate) or limits.clearance is not None
-    return not needs_barrier and bool((task.control_weight > 0.0).all())
