@@ -23,6 +23,9 @@ from tests.support.numerics import (
     relative_error,
 )
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "control": 1e-2}
 SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}
 

@@ -23,6 +23,9 @@ from mjfim.records.trajectory import Recording
 from tests.support.cli import run
 from tests.support.paths import MODELS
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 MULTISINE = {"kind": "multisine", "amplitude": 6.0, "frequency": 0.3, "harmonics": 5}
 SHOULDER, ELBOW = ["qpos:shoulder", "qvel:shoulder"], ["qpos:elbow", "qvel:elbow"]
 

@@ -28,6 +28,9 @@ from tests.support import results
 from tests.support.pages import page_with
 from tests.support.paths import MODELS
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 # A name that would change a page, if it were not escaped.
 HOSTILE = "<script>alert('θ')</script> & \"m\""
 

@@ -31,6 +31,9 @@ from mjfim.studies.first_motion import (
 )
 from tests.support.cli import MODELS
 
+# Whole jobs: these tests run in `.ci/run` only.
+pytestmark = pytest.mark.slow
+
 URDF = """
 <robot name="two">
   <link name="base"/>
