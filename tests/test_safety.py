@@ -120,6 +120,7 @@ def test_importing_the_package_stays_light() -> None:
     assert heavy_libraries_after("import mjfim") == set()
 
 
+@pytest.mark.slow
 def test_a_campaign_begins_to_compute_before_it_imports_what_draws() -> None:
     """Ctrl-C before the first computation finds no long import."""
     assert heavy_libraries_after("import mjfim.output.campaign_folder") == set()

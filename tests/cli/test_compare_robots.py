@@ -33,6 +33,7 @@ def saved(folder: Path, shift: float, **changes: object) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_difference_is_said_and_written(tmp_path: Path) -> None:
     monday, friday = saved(tmp_path / "monday", 0.0), saved(tmp_path / "friday", 0.2)
     out = tmp_path / "out"

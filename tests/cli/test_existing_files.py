@@ -115,6 +115,7 @@ def test_every_file_of_a_verb_is_checked_before_the_work(
     assert set(folders.study_files(["m", "l", "c"])) >= {"histogram_m.png", "montecarlo.json"}
 
 
+@pytest.mark.slow
 def test_the_script_for_logs_does_not_replace_a_model_of_the_user(
     study: Path, recorded: Path, tmp_path: Path
 ) -> None:

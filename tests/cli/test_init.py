@@ -12,6 +12,7 @@ from typer.testing import Result
 from tests.support.cli import MODELS, loads, names, run
 
 
+@pytest.mark.slow
 def test_init_writes_a_file_that_validate_accepts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,6 +87,7 @@ def test_enter_takes_what_init_proposes_without_questions(tmp_path: Path) -> Non
     assert texts[0] == texts[1]
 
 
+@pytest.mark.slow
 def test_wrong_answers_are_asked_again(tmp_path: Path) -> None:
     answers = ["up", "hanging", "frictions", "friction", "hand", "none", "333", "100", "-1", "3.0"]
     result = asked(tmp_path / "asked.toml", *answers)

@@ -106,6 +106,7 @@ def test_help_and_misuse_import_nothing_slow() -> None:
     assert [code for _, code, _ in report] == [0] * (1 + len(helps)) + [2] * len(misuses)
 
 
+@pytest.mark.slow
 def test_a_wrong_key_is_said_before_the_engine_is_imported(tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.toml"
     wrong.write_text('model = "gone.xml"\nhorizn = 4.0\n')

@@ -127,6 +127,7 @@ def test_metric_weight_on_psi_needs_the_metric_descent(experiment: Experiment) -
         experiment.replace(descent={"psi_weight": 1.0})
 
 
+@pytest.mark.slow
 def test_callback_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
     rows: list[HistoryRow] = []
     loose = experiment.replace(descent={"tolerance": 0.1}, rehearsal={"robots": 4})

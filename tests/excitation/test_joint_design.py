@@ -73,6 +73,7 @@ def test_one_experiment_may_reveal_what_another_cannot(tmp_path) -> None:
     assert np.isfinite(helped.final.std).all()
 
 
+@pytest.mark.slow
 def test_nuisance_of_one_experiment_is_not_that_of_the_other(tmp_path) -> None:
     experiments = pair(tmp_path, nuisance={"initial": 0.05})
     together = mjfim.design_jointly(experiments, rounds=1)

@@ -361,6 +361,7 @@ def test_a_limit_that_applies_to_nothing_is_refused(limits: dict[str, Any], mess
         limits_of(model, control_names(model), Limits(**limits), 0.01)
 
 
+@pytest.mark.slow
 def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:
     path = write_experiment(tmp_path, max_iterations='2\n[boundary]\nstart = "rest"')
     jump = "the control may jump where the design begins or ends at rest"

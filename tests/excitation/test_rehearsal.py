@@ -185,6 +185,7 @@ def test_an_automatic_reserve_keeps_robots_inside(tmp_path: Path) -> None:
     assert again.reserve == found.reserve
 
 
+@pytest.mark.slow
 def test_a_reserve_leaves_room_for_the_initial_state(tmp_path: Path) -> None:
     """A start at a tenth of half of the range from its stop keeps a twentieth."""
     experiment, _ = played(tmp_path, reach=1.0)
@@ -213,6 +214,7 @@ FALLING = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floor", ["", '<geom type="plane" size="1 1 1" pos="0 0 0.2"/>'])
 @pytest.mark.parametrize(("thrust", "is_safe"), [(9.0, False), (9.81, True)])
 def test_what_falls_below_the_floor_is_not_played(
@@ -252,6 +254,7 @@ def test_what_falls_below_the_floor_is_not_played(
     assert mjfim.rehearse(stated, design).is_safe
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", [1e-4, 2.0])
 def test_an_end_that_no_control_can_brake_is_not_played(room: float, tmp_path: Path) -> None:
     """Held at its strongest brake after the end, the cart of plain MuJoCo leaves the limit."""
@@ -301,6 +304,7 @@ def whitened_change(design: Design, step: np.ndarray, noise: float, friction: fl
     return float(np.linalg.norm((sides[0] - sides[1])[1:] / noise))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "noise"), [(0.0, 0.004), (0.0, 0.4), (0.3, 0.05)])
 def test_finite_steps_agree_with_plain_loops(friction: float, noise: float, tmp_path: Path) -> None:
     """Along the principal axes of the covariance; for little noise the derivatives hold."""

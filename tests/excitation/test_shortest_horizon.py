@@ -96,6 +96,7 @@ def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperi
     assert not found.tried[0].reached and found.tried[0].horizon == 0.8
 
 
+@pytest.mark.slow
 def test_the_message_names_targets_out_of_reach_with_numbers() -> None:
     hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
     with pytest.raises(

@@ -62,6 +62,7 @@ def test_a_latency_that_is_a_parameter_is_no_missing_term() -> None:
     assert {"controller/shoulder:latency", "controller/elbow:feedback_latency"} <= paths[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "words"),
     [

@@ -37,6 +37,7 @@ def recorded(task: DesignTask, seed: int, swing: float = 1.0) -> Recording:
     return simulate_system(task.system, trajectory, seed)
 
 
+@pytest.mark.slow
 def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.Experiment) -> None:
     task = DesignTask.resolve(base)
     found = identify_system(task.system, [recorded(task, 0)], held_out=[recorded(task, 1, 1.5)])

@@ -23,6 +23,7 @@ def stated(hold: tuple[str, ...]) -> mjfim.Experiment:
     )
 
 
+@pytest.mark.slow
 def test_a_held_parameter_keeps_its_guess_and_the_others_are_fitted(tmp_path: Path) -> None:
     task = DesignTask.resolve(stated(("c",)), threads=1)
     recording = simulate_system(task.system, task.initial, 0)

@@ -173,6 +173,7 @@ def test_prior_pulls_the_estimate_and_shrinks_its_deviation(
     assert estimate.std[0] < 1.01e-4
 
 
+@pytest.mark.slow
 def test_recording_with_fewer_outputs_and_gaps_still_fits(
     task: DesignTask, recording: Recording
 ) -> None:
@@ -406,6 +407,7 @@ def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
     assert "rod.t2" not in estimate.sloppy
 
 
+@pytest.mark.slow
 def test_a_parameter_that_the_logs_do_not_determine_is_named_with_the_reason() -> None:
     """Dry friction that the robot does not have, beside the viscous friction that it has."""
     stated = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(

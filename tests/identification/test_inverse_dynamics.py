@@ -138,6 +138,7 @@ def test_irregular_rows_missing_values_and_several_recordings(tmp_path: Path) ->
     assert errors(fit, true).max() < 0.05
 
 
+@pytest.mark.slow
 def test_dry_friction_needs_no_start(tmp_path: Path) -> None:
     text = CART_PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.6"')
     tables = {**CART, "f": {"target": "joint/slide:frictionloss", "scale": 1.0}}
@@ -404,6 +405,7 @@ def stribeck_servo(folder: Path, **of_friction: dict[str, Any]) -> tuple[Experim
 EXCESS, SPEED = {"target": "term/bristle:excess"}, {"target": "term/bristle:speed"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "of_friction",
     [

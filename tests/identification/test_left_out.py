@@ -62,6 +62,7 @@ def test_it_is_the_fit_to_the_others(fit: dict[str, object]) -> None:
         assert np.linalg.norm(missed / sigma) < 0.2 * np.linalg.norm(moved / sigma)
 
 
+@pytest.mark.slow
 def test_a_search_follows_where_the_linearisation_does_not_lead_there() -> None:
     """Far from the fit, the search begins at the guess, where the others cost less."""
     problem, solution = fitted({})

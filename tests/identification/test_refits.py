@@ -68,6 +68,7 @@ def test_the_cheaper_one_of_two_starts_is_taken(fitted: FitResult) -> None:
         np.testing.assert_array_equal(again.solution.iterates[0].theta[:3], expected[:3])
 
 
+@pytest.mark.slow
 def test_a_model_with_more_states_begins_at_its_own_initial_states(tmp_path: Path) -> None:
     """Backlash adds a joint, whose initial states a fit without it does not have."""
     segments = {"segments": 0.5, "start": "measured", "bootstrap": 0}

@@ -189,6 +189,7 @@ def test_the_interval_covers_the_truth(phi: float, with_offsets: bool) -> None:
     assert s.apart.sum() <= 3
 
 
+@pytest.mark.slow
 def test_priors_count_as_scatter() -> None:
     """Sandwich and bootstrap are the spread about truths that are drawn from the prior.
 
@@ -201,6 +202,7 @@ def test_priors_count_as_scatter() -> None:
         np.testing.assert_allclose(deviation.mean(axis=0), true, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_recordings_that_disagree_are_found() -> None:
     """The interval includes the spread of recordings that differ; equal recordings agree."""
     rng, K, N = np.random.default_rng(5), 8, 480

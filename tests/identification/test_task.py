@@ -70,6 +70,7 @@ def test_a_minimal_experiment_identifies_its_parameters(
     np.testing.assert_allclose(errors.rms, 0.05, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_a_minimal_experiment_can_be_checked_on_recordings(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:

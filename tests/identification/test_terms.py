@@ -52,6 +52,7 @@ def some_fast(kinds: Iterable[str], fast: Collection[str]) -> list[Any]:
     return [pytest.param(k, marks=[] if k in fast else pytest.mark.slow) for k in kinds]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", some_fast(KINDS, {"actuator_lag", "tilt"}))
 def test_a_term_is_identified_from_a_log(tmp_path: Path, kind: str) -> None:
     guesses = GUESSES.get(kind, {})

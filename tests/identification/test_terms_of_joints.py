@@ -104,6 +104,7 @@ def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
     return find_missing_terms(problem, [log], at.unknowns)
 
 
+@pytest.mark.slow
 def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
     log = log_of(with_stribeck(experiment, JOINTS), 0)
@@ -142,6 +143,7 @@ def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: 
     assert members[0] in left.named
 
 
+@pytest.mark.slow
 def test_friction_that_one_joint_lacks_is_a_term_of_this_joint(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
     tests = term_tests(experiment, log_of(with_stribeck(experiment, ("lift",)), 0))

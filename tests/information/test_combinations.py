@@ -127,6 +127,7 @@ def test_an_estimate_of_combinations_serves_as_earlier_information(tmp_path) -> 
     assert {row.name for row in check_task(again).rows if np.isfinite(row.std)} == {"m2r2", "d"}
 
 
+@pytest.mark.slow
 def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
     with pytest.raises(UnidentifiableError, match=r"m1r1 .* m2"):
         design_task(pendulum(tmp_path, cost={"criterion": "c", "subset": ["m2"]}))
@@ -168,6 +169,7 @@ def test_check_and_identify_estimate_an_initial_state_per_recording(tmp_path) ->
     assert told.rows[0].std == pytest.approx(single / np.sqrt(3.0), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_quaternion_sensor_may_come_with_either_sign(tmp_path) -> None:
     task = pendulum(tmp_path, noise={"tip": 0.005}, parameters={"d": PARAMETERS["d"]})
     recording = simulate_system(task.system, task.initial, seed=1)

@@ -166,6 +166,7 @@ def test_json_holds_the_documented_keys(folder: Path, design: Design) -> None:
     )
 
 
+@pytest.mark.slow
 def test_json_names_nuisance_parameters_and_priors(tmp_path: Path) -> None:
     """The information contains the prior, which is also written so that it can be subtracted."""
     e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")

@@ -366,6 +366,7 @@ OTHER_SETTINGS = {
 }
 
 
+@pytest.mark.slow
 def test_settings_of_the_user_change_no_figure_and_stay(tmp_path: Path) -> None:
     picture = convergence(make_design())
     save(picture, tmp_path / "plain.png")

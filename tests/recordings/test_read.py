@@ -464,6 +464,7 @@ def test_degrees_are_found_by_the_slope(read: Read) -> None:
     assert column(read({"q": np.degrees(q), "v": v}, columns=silent), "qpos:pin").max() > 100
 
 
+@pytest.mark.slow
 def test_slopes_of_noise_are_ignored(read: Read) -> None:
     """At rest the ratio of position and velocity is random, and no reason to refuse."""
     for seed in range(20):

@@ -272,6 +272,7 @@ def test_a_comparison_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> N
     round_trip(comparison, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_campaign_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
     """One round with its design, recording and estimate, and a design that is not recorded yet."""
     wanted = task.experiment.replace(parameters={"m": {"wanted": 1e-6}})

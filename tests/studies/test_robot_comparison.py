@@ -305,6 +305,7 @@ class Setting:
         return compare_estimates(self.estimated(rng, 0.0, 1), self.estimated(rng, shift, 2))
 
 
+@pytest.mark.slow
 def test_equal_robots_rarely_differ() -> None:
     rng = np.random.default_rng(0)
     alarms = sum(Setting(K=2).compared(rng).differs for _ in range(40))
