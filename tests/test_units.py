@@ -320,7 +320,6 @@ def assert_same(
 DECIMAL = {"small, light, quick": Units(length=1e-3, mass=1e-6, time=1e-3)}
 
 
-@pytest.mark.slow
 def test_converged_designs_and_estimates_agree_in_decimal_units(
     tmp_path, recording: Recording
 ) -> None:

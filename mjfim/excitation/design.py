@@ -212,7 +212,7 @@ def _searched(
     steps_before = task.plant.engine_steps - steps_before
     # A stated time that is left is used for series.
     rng = np.random.default_rng(task.experiment.descent.seed)
-    further = None if np.isinf(budget.seconds_left) else map(candidate_of, series_of(task, rng))
+    further = () if np.isinf(budget.seconds_left) else map(candidate_of, series_of(task, rng))
     results = consume(search.run([candidate_of(each) for each in starts], further), callback)
     if not search.grounds.is_limited:
         results = _with_stops_evaluated(stage, results)

@@ -128,23 +128,26 @@ def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator
     Raises:
         ExperimentError: The frequency is above the bandwidth.
     """
-    experiment = task.experiment
-    bandwidth = experiment.limits.bandwidth or 0.5 * experiment.rate
+    bandwidth = _fastest(task)
     if frequency > bandwidth:
         raise ExperimentError(
-            f"{experiment.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of "
-            f"{bandwidth:g} Hz"
+            f"{task.experiment.source}: descent.fourier: {frequency:g} Hz is above the bandwidth "
+            f"of {bandwidth:g} Hz"
         )
     wanted = _multisine(task, rng)
     return _in_curves(f"Fourier series of {frequency:g} Hz", task, wanted, _waves(task, frequency))
 
 
+def _fastest(task: DesignTask) -> float:
+    """The stated bandwidth, or half of the sample rate [Hz]."""
+    return task.experiment.limits.bandwidth or 0.5 * task.experiment.rate
+
+
 def _waves(task: DesignTask, frequency: float, harmonics: int = MAX_SERIES_HARMONICS) -> Array:
     """(N, M) waves of a base frequency [Hz] within the bandwidth that keep the boundary."""
-    experiment = task.experiment
-    bandwidth = experiment.limits.bandwidth or 0.5 * experiment.rate
-    count = max(min(harmonics, int(bandwidth / frequency + 1e-9)), 1)
-    from_rest, to_rest = experiment.boundary.start == "rest", experiment.boundary.end == "rest"
+    count = max(min(harmonics, int(_fastest(task) / frequency + 1e-9)), 1)
+    boundary = task.experiment.boundary
+    from_rest, to_rest = boundary.start == "rest", boundary.end == "rest"
     waves = fourier_basis(task.t, task.horizon, frequency, count, from_rest, to_rest)
     return independent_curves(waves)
 
@@ -168,8 +171,7 @@ def series_of(
     Yields:
         Series at usual frequencies, and then at random ones.
     """
-    experiment = task.experiment
-    fastest = experiment.limits.bandwidth or 0.5 * experiment.rate
+    fastest = _fastest(task)
 
     def curves_of(frequency: float) -> Array:
         """(N, M) curves of a base frequency or of a bandwidth [Hz]."""

@@ -643,8 +643,8 @@ def _calibrated(
     Args:
         system: The system.
         control: (N, nu) control.
-        known: A task on another plant, whose difference steps suit the same motion, and one with
-            other timesteps; None without one.
+        known: A task on another plant. Its difference steps suit the same motion, also with longer
+            timesteps or samples. None without one.
     """
     try:
         trajectory = system.plant.simulate(system.theta, control)

@@ -80,7 +80,6 @@ def exact(system: System, inputs: np.ndarray) -> Recording:
     return Recording(t=t, ctrl=inputs, y=y[0], outputs=system.outputs.names, name="exact")
 
 
-@pytest.mark.slow
 def test_plant_gains_and_latency_are_found_from_references_alone() -> None:
     laws = {"shoulder": SHOULDER, "elbow": ELBOW}
     experiment = arm_experiment(
@@ -105,7 +104,6 @@ def test_plant_gains_and_latency_are_found_from_references_alone() -> None:
     assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
 
 
-@pytest.mark.slow
 def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
     """The rate matters: a slow law brakes less, and the plant would be blamed for it."""
     laws = {"shoulder": {**SHOULDER, "rate": 50.0}, "elbow": ELBOW}
@@ -245,7 +243,6 @@ def test_a_fit_on_workers_is_the_same_to_the_last_digit(
     assert np.array_equal(found.blocks, condensed.blocks)
 
 
-@pytest.mark.slow
 def test_a_check_of_a_log_knows_the_law() -> None:
     """Gain of the motor and gains of the law have one effect, which no reference tells apart."""
     motor = {"target": "actuator/shoulder:gainprm[0]", "guess": 1.0}
@@ -354,7 +351,6 @@ def test_a_duty_law_equals_the_same_law_as_three_controls(tmp_path: Path, enable
     assert np.ptp(outputs[0]) > 0.1
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="measured recordings are not here")
 def test_a_duty_law_predicts_measured_logs_as_three_controls() -> None:
     """Where the torque is switched off inside an engine step, both differ by this step."""
@@ -373,7 +369,6 @@ def test_a_duty_law_predicts_measured_logs_as_three_controls() -> None:
     assert max(differences) < 2e-3
 
 
-@pytest.mark.slow
 def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
     """Repetitions with whole recordings, and intervals of fits over segments."""
     experiment = arm_experiment(
@@ -422,7 +417,6 @@ def panda_with_motors(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not SHARED_MODELS.is_dir(), reason="the models of others are not here")
 def test_a_seven_joint_arm_with_feedforward(tmp_path: Path) -> None:
     """Payload, friction, all gains and the latency of the Panda's drivers, from references."""
@@ -474,7 +468,6 @@ def test_a_seven_joint_arm_with_feedforward(tmp_path: Path) -> None:
     assert len(found.controllers) == 7
 
 
-@pytest.mark.slow
 def test_a_law_acts_on_a_motor_with_a_lag() -> None:
     """No log shows what a law commands, so that the state of the lag is free in every segment."""
     terms = {"lag": {"kind": "actuator_lag", "actuator": "shoulder"}}
@@ -544,7 +537,6 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
     assert found.absent == ("kp",)
 
 
-@pytest.mark.slow
 def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Path) -> None:
     experiment = arm_with_torques(
         tmp_path, {"shoulder": SHOULDER, "elbow": ELBOW}, TORQUE1 + TORQUE2

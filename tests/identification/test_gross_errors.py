@@ -146,7 +146,6 @@ def test_positions_alone_and_servos_are_enough(arm: tuple[System, Recording]) ->
     assert cure_of(flipped)["ctrl:shoulder"]["scale"] == -1.0
 
 
-@pytest.mark.slow
 def test_the_fit_refuses_an_error_and_goes_on_with_its_cure(arm: tuple[System, Recording]) -> None:
     system, recording = arm
     wrong = with_ctrl(recording, lambda u: -u)
@@ -205,7 +204,6 @@ CLEAN = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CLEAN)
 def test_clean_logs_of_other_robots_have_no_error(name: str, tmp_path: Path) -> None:
     """Parameters are up to 50 % wrong, and every other robot has friction that the model lacks."""

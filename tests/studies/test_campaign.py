@@ -164,7 +164,6 @@ def test_robust_redesigns_sample_around_the_estimate(campaign: Campaign) -> None
     assert np.ptp(before.thetas, axis=0).min() > 10 * np.ptp(pool.thetas, axis=0).max()
 
 
-@pytest.mark.slow
 def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path) -> None:
     """A target is not reached where the estimate is wrong by many standard deviations."""
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
@@ -203,7 +202,6 @@ def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
     assert "wanted 0.008" in found.short and "wanted 0.008" in str(found)
 
 
-@pytest.mark.slow
 def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     """The bob loses a tenth of its mass between two rounds."""
     first = campaign.rounds[0]
@@ -222,7 +220,6 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
 
 
-@pytest.mark.slow
 def test_interrupted_while_recording(campaign: Campaign) -> None:
     token = StopToken()
 
@@ -281,7 +278,6 @@ def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_are_
     )
 
 
-@pytest.mark.slow
 def test_each_recording_has_a_separate_initial_state() -> None:
     """Deviations of the start are private: what one round learned about its own says nothing about
     the next's.
@@ -310,7 +306,6 @@ def test_each_recording_has_a_separate_initial_state() -> None:
     assert (np.abs(error) < 3.5 * last.attained[:3]).all()
 
 
-@pytest.mark.slow
 def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: DesignTask) -> None:
     limited = STUDY.replace(
         limits={"control": {"force": (-12.0, 12.0)}, "position": {"slide": (-1.0, 1.0)}},
@@ -372,7 +367,6 @@ def write_study(folder: Path) -> Path:
     return folder / "study.toml"
 
 
-@pytest.mark.slow
 def test_round_by_round_is_the_simulated_campaign(tmp_path: Path) -> None:
     """Calls that share nothing but the folder design and estimate as one call does; misuse is
     named.
@@ -427,7 +421,6 @@ def require_equal_rounds(folder: Path, other: Path) -> None:
             np.testing.assert_allclose(one[key], two[key], rtol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("empty_figures")
 def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
     """Its result is that of a campaign that nobody stopped, wherever in a round it was killed."""

@@ -4,6 +4,7 @@ codes, misuse.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -24,7 +25,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.draw import save
 from mjfim.output.plots.studies import compare
-from mjfim.parallel.budget import StopToken
+from mjfim.parallel.budget import StopToken, measured_by
 from mjfim.records.design import Design
 from mjfim.records.events import Event, StudyEvent
 from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
@@ -256,12 +257,14 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         "chirp,steps",
         "--json",
     )
-    result = run("compare", *words)
-    told = loads(result.stdout)
-    assert result.exit_code == (0 if told["ok"] else 1), result.stderr
+    with measured_by(time.process_time):
+        result = run("compare", *words)
+    assert result.exit_code == 0, result.stderr
     assert "1/3 chirp" in result.stderr
+    told = loads(result.stdout)
     assert told == read(out / "compare.json")
     assert [m["method"] for m in told["methods"]] == ["chirp", "steps", DESIGN]
+    assert told["ok"] is True
     assert told["budget"] == {"seconds": 2.0}
     assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
     controls = {f"control_{m}.csv" for m in ("chirp", "steps", DESIGN)}
@@ -273,10 +276,10 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         *controls,
     }
     assert imread(out / "compare.png").shape[0] > 300
-    again = run("compare", study, "-o", out, "--seconds", 1, "--methods", "chirp", "-v")
-    # Which method is ahead after one second depends on the computer.
-    ahead = loads((out / "compare.json").read_text(encoding="utf-8"))["ok"]
-    assert again.exit_code == (0 if ahead else 1), again.stderr
+    # Seconds of the processor, so that a busy computer decides nothing.
+    with measured_by(time.process_time):
+        again = run("compare", study, "-o", out, "--seconds", 2, "--methods", "chirp", "-v")
+    assert again.exit_code == 0, again.stderr
     assert names(out) == {
         MANIFEST,
         "compare.json",

@@ -109,7 +109,6 @@ def free(folder: Path) -> Experiment:
     return filtered_task(folder, descent={"max_iterations": 5, "starts": 2}).experiment
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("make", [clearance, robust, floating, free])
 def test_other_problems_give_the_same_files_with_any_threads(make: Any, tmp_path: Path) -> None:
     experiment = make(tmp_path)

@@ -211,7 +211,6 @@ def test_proposals_scale_with_the_size_of_the_robot(
     assert [each.name for each in other.chosen] == [each.name for each in small.chosen]
 
 
-@pytest.mark.slow
 def test_a_urdf_gets_motors_and_keeps_its_limits(tmp_path: Path) -> None:
     path = tmp_path / "two.urdf"
     path.write_text(URDF, encoding="utf-8")
@@ -242,7 +241,6 @@ def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Pat
     assert set(experiment.parameters) <= {"payload", *(f"payload_moment_{a}" for a in "xyz")}
 
 
-@pytest.mark.slow
 def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "bolted.xml"
     path.write_text(BOLTED, encoding="utf-8")
@@ -292,7 +290,6 @@ SERVO_ARM = """
 """
 
 
-@pytest.mark.slow
 def test_an_arm_with_servos_gets_a_file_that_a_person_would_play(tmp_path: Path) -> None:
     """Unknowns of equal servos, limits that the motion keeps, and an end at rest."""
     path = tmp_path / "arm.xml"
@@ -424,7 +421,6 @@ def test_a_servo_is_commanded_to_where_its_joint_is() -> None:
     assert start.act == pytest.approx([position])
 
 
-@pytest.mark.slow
 def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / "ball.xml"
     path.write_text(
@@ -510,7 +506,6 @@ def test_the_driven_joints_of_a_robot_on_the_floor_may_stay_where_they_are() -> 
     assert choose_start(model).drift <= standing.drift < 0.1 * reference.drift
 
 
-@pytest.mark.slow
 def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path: Path) -> None:
     # Seen from this small drone, a slight tilt soon leads far away.
     path = tmp_path / "drone.xml"
@@ -532,7 +527,6 @@ def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path:
     assert 0.4 * proposal.times.period < proposal.times.horizon < 2.9 * proposal.times.period
 
 
-@pytest.mark.slow
 def test_the_horizon_ends_before_a_falling_robot_leaves_a_limit(tmp_path: Path) -> None:
     """A robot that no control holds falls one metre, to the end of its range, in 0.45 s."""
     path = tmp_path / "falling.xml"
@@ -547,7 +541,6 @@ def test_the_horizon_ends_before_a_falling_robot_leaves_a_limit(tmp_path: Path) 
     assert verify(task, task.initial).is_feasible
 
 
-@pytest.mark.slow
 def test_a_horizon_that_the_user_wants_stays_and_the_limit_is_named(tmp_path: Path) -> None:
     path = tmp_path / "falling.xml"
     path.write_text(FALLING, encoding="utf-8")
@@ -557,7 +550,6 @@ def test_a_horizon_that_the_user_wants_stays_and_the_limit_is_named(tmp_path: Pa
     assert "no motion about this start keeps all limits: position of lift is" in warning
 
 
-@pytest.mark.slow
 def test_wishes_are_fulfilled(tmp_path: Path) -> None:
     wished: dict[str, object] = {
         "keyframe": "settled",

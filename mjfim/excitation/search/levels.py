@@ -116,11 +116,11 @@ class DescentLevel:
         """The cost on this level."""
         problem = self.task.problem
         information = replace(problem.information, basis=self.basis, power=self.power)
-        is_coarse = self.task.system.variant.sample_factor > 1
+        has_long_samples = self.task.system.variant.sample_factor > 1
         return replace(
             problem,
             information=information,
-            forward_differences_only=is_coarse,
+            forward_differences_only=has_long_samples,
             lumped=self._lumped,
         )
 
@@ -186,14 +186,13 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
         much from that of the stated task (`MAX_CONSTRAINED_COARSE_CHANGE`, `MAX_COARSE_CHANGE`).
     """
     descent = task.experiment.descent
-    if descent.coarse == "auto" and descent.method == "lbfgs" and task.system.grid.substeps > 1:
+    if descent.coarse == 1 or descent.method != "lbfgs":
+        return None
+    if descent.coarse == "auto" and task.system.grid.substeps > 1:
         easier = easier_level(DescentLevel(task, basis), first)
         if easier is not None:
             return easier.task
     factor = AUTO_COARSE_FACTOR if descent.coarse == "auto" else descent.coarse
-    if factor == 1 or descent.method != "lbfgs":
-        return None
-
     if task.samples % factor or task.samples < MIN_COARSE_SAMPLES * factor:
         return None
 

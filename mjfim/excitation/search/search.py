@@ -10,14 +10,13 @@ descents run side by side. Each is one task or several, which may be lost withou
 from __future__ import annotations
 
 import uuid
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 
 import numpy as np
 
-from mjfim.arrays import Array
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.climb import (
@@ -190,7 +189,7 @@ class Search:
         return self.grounds.steps + self.remote_steps
 
     def run(
-        self, candidates: Sequence[Candidate], further: Iterator[Candidate] | None = None
+        self, candidates: Sequence[Candidate], further: Iterable[Candidate] = ()
     ) -> Generator[DesignEvent, None, list[Candidate]]:
         """Yield every iterate; return the candidates that were begun.
 
@@ -198,25 +197,25 @@ class Search:
             candidates: Controls from which the search begins. The first one is always begun, the
                 others as time allows.
             further: Controls that follow under hard limits while there is time and they help. The
-                first one is the initial control as a sum of curves. None without such ones.
+                first one is the initial control as a sum of curves.
         """
         if not self.grounds.is_limited and not self.keeps_curves:
             return (yield from self._moved(candidates, self._free_rungs, is_last=True))
         if self.keeps_curves:
             return (yield from self._run_inside(list(candidates)))
 
-        further = iter(()) if further is None else further
+        further = iter(further)
         done: list[Candidate] = []
         waiting = list(candidates)
-        is_rough = self._is_rough(waiting[0].control)
-        if self._needs_no_barrier:
+        begins_as_stated = waiting[0].control is self.stage.task.control
+        if self._is_bounded_by_weights and not self._is_determinant:
             if not self._has_time() and waiting[0].control is self.stage.task.control:
                 waiting[0] = self._enlarged(waiting[0])
             free = [each for each in waiting if each.curves is None and each.repeats == 1]
             climbed = yield from self._moved(free, self._free_rungs, is_last=True)
             found = {each.name: self._judged(each) for each in climbed}
             # What seems to be an optimum is none where derivatives mislead.
-            goes_on = is_rough and self.budget.exhausted is None
+            goes_on = self.budget.exhausted is None and begins_as_stated and self._is_rough
             done = [each for each in found.values() if not (each.has_left or goes_on)]
             left = {each.name for each in done}
             waiting = [
@@ -230,6 +229,7 @@ class Search:
                 # A control with few numbers improves quickly; on the next rung it is free.
                 waiting[0] = replace(waiting[0], curves=series.curves)
             # Where derivatives mislead and time is short, random changes come first.
+            is_rough = begins_as_stated and self._is_rough
             shortest = LADDER_EVALUATIONS * self.evaluation_seconds
             is_short = is_rough and self.budget.seconds_left < shortest
             ladder = () if is_short else self._ladder(waiting)
@@ -487,13 +487,9 @@ class Search:
         return not needs_barrier and bool((task.control_weight > 0.0).all())
 
     @property
-    def _needs_no_barrier(self) -> bool:
-        """Whether a search begins without a barrier.
-
-        The quasi-Newton direction of the barrier is better for D-optimality.
-        """
-        is_determinant = self.stage.task.experiment.cost.criterion == "D"
-        return self._is_bounded_by_weights and not is_determinant
+    def _is_determinant(self) -> bool:
+        """Whether the design is D-optimal; the quasi-Newton direction of the barrier is better."""
+        return self.stage.task.experiment.cost.criterion == "D"
 
     @cached_property
     def _free_rungs(self) -> tuple[Rung, ...]:
@@ -529,7 +525,7 @@ class Search:
             return (*rungs, Rung(variant=variant, barrier=sharp))
 
         usual = Barrier(tolerance=max(Barrier.tolerance, tolerance))
-        if self._is_bounded_by_weights and not self._needs_no_barrier:
+        if self._is_bounded_by_weights and self._is_determinant:
             usual = replace(usual, first=LIGHT_BARRIER)
         coarse = easier_level(stated, self.first)
         is_free = all(each.curves is None and each.repeats == 1 for each in candidates)
@@ -575,13 +571,11 @@ class Search:
         """Largest number of iterations of one candidate."""
         return self.stage.task.experiment.descent.max_iterations
 
-    def _is_rough(self, control: Array) -> bool:
-        """Check whether derivatives may mislead along a control.
-
-        This is known of the initial control only; for others the answer is False.
-        """
+    @cached_property
+    def _is_rough(self) -> bool:
+        """Whether derivatives may mislead along the initial control."""
         task = self.stage.task
-        if control is not task.control or self.first.trajectory is None:
+        if self.first.trajectory is None:
             return False
         if self.grounds.stated.task.system.variant.smoothing_speeds:
             return True
