@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.design import design
+from mjfim.excitation.initial_controls import series_of
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -204,6 +206,23 @@ def test_the_control_of_least_drift_is_the_same_in_all_units(tmp_path, name: str
     found = DesignTask.resolve(rescaled.experiment).centres
     factor = rescaled.controls["force"]
     np.testing.assert_allclose(np.array(found) / factor, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("harmonics", [15, None])
+@pytest.mark.parametrize("name", SCALES)
+def test_series_with_which_a_search_goes_on_are_the_same_in_all_units(
+    tmp_path, name: str, harmonics: int | None
+) -> None:
+    """A stated time is filled with series; they know the horizon, and no second."""
+    original = stated(tmp_path / "original")
+    found = []
+    for units in (Units(), SCALES[name]):
+        rescaled = rescale(original, units, tmp_path / "rescaled")
+        task = DesignTask.resolve(rescaled.experiment)
+        series = islice(series_of(task, np.random.default_rng(0), harmonics), 8)
+        found.append([each.control / rescaled.controls["force"] for each in series])
+    assert len(found[0]) == 8
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-9)
 
 
 NUISANCE = {"initial": {"qpos:slide": 0.01, "qvel:slide": True}, "bias": {"qpos:hinge": True}}

@@ -19,9 +19,10 @@ from mjfim.recordings.control_table import read_control
 # Largest number of harmonics of a Fourier series.
 MAX_SERIES_HARMONICS = 15
 
-# Base frequencies of the first Fourier series, and bandwidths of the first B-splines [Hz].
-FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)
-SPLINE_BANDWIDTHS = (1.0, 2.0)
+# Periods within the horizon of the first harmonic of the first Fourier series, and of the bandwidth
+# of the first B-splines.
+FOURIER_PERIODS = (0.5, 0.25, 1.0, 2.0)
+SPLINE_PERIODS = (3.0, 6.0)
 
 # Number of further series and splines at random frequencies.
 RANDOM_SERIES = 15
@@ -180,13 +181,15 @@ def series_of(
         return _waves(task, frequency, harmonics)
 
     if harmonics is None:
-        usual: tuple[float, ...] = SPLINE_BANDWIDTHS
-        ends = np.multiply(RANDOM_BANDWIDTH_FACTORS, (usual[0], usual[-1]))
-        ends = np.minimum(ends, fastest)
+        periods: tuple[float, ...] = SPLINE_PERIODS
+        ends = np.multiply(RANDOM_BANDWIDTH_FACTORS, (periods[0], periods[-1]))
+        highest = fastest
     else:
-        usual = FOURIER_FREQUENCIES
+        periods = FOURIER_PERIODS
+        ends = np.array(RANDOM_PERIODS)
         highest = fastest / min(harmonics, MIN_RANDOM_HARMONICS)
-        ends = np.minimum(np.divide(RANDOM_PERIODS, task.horizon), highest)
+    usual = np.divide(periods, task.horizon)
+    ends = np.minimum(ends / task.horizon, highest)
 
     kind = "B-splines" if harmonics is None else "Fourier series"
     for frequency in (each for each in usual if each <= fastest):

@@ -25,7 +25,7 @@ from mjfim.errors import (
     listed,
 )
 from mjfim.excitation.design import design_budget, design_task
-from mjfim.excitation.search.levels import AUTO_COARSE_FACTOR, MIN_COARSE_SAMPLES
+from mjfim.excitation.search.levels import MIN_COARSE_SAMPLES, SAMPLE_FACTORS
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.packing import opened
@@ -680,8 +680,9 @@ def _sample_grid(task: DesignTask) -> SampleGrid:
         return SampleGrid(unit=1, first_multiple=0)
 
     if descent.coarse == "auto":
-        first_multiple = MIN_COARSE_SAMPLES * AUTO_COARSE_FACTOR
-        return SampleGrid(unit=AUTO_COARSE_FACTOR, first_multiple=first_multiple)
+        # With the largest factor, horizons would be too far apart.
+        unit = SAMPLE_FACTORS[1]
+        return SampleGrid(unit=unit, first_multiple=MIN_COARSE_SAMPLES * unit)
 
     return SampleGrid(unit=descent.coarse, first_multiple=0, minimum=max(descent.coarse, 2))
 

@@ -644,7 +644,7 @@ def _calibrated(
         system: The system.
         control: (N, nu) control.
         known: A task on another plant. Its difference steps suit the same motion, also with longer
-            timesteps or samples. None without one.
+            timesteps or samples over the same horizon. None without one.
     """
     try:
         trajectory = system.plant.simulate(system.theta, control)
@@ -655,7 +655,11 @@ def _calibrated(
     factors = None if known is None else known.plant.step_factors
     reference = None if known is None else known.reference
     moves_alike = reference is not None and trajectory.moves_as(reference)
-    is_rescaled = known is not None and known.system.variant.smoothed == system.variant.smoothed
+    is_rescaled = (
+        known is not None
+        and known.system.experiment.horizon == system.experiment.horizon
+        and known.system.variant.differs_in_time_only(system.variant)
+    )
     if factors is not None and (moves_alike or is_rescaled):
         return replace(system, plant=system.plant.with_step_factors(factors)), trajectory
     return system.calibrated_along(system.theta, trajectory), trajectory

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -73,6 +73,11 @@ class ModelVariant:
     def is_coarse(self) -> bool:
         """Whether motions differ from those of the stated level."""
         return self.sample_factor > 1 or self.timestep_factor > 1 or self.smoothed
+
+    def differs_in_time_only(self, other: ModelVariant) -> bool:
+        """Whether another variant is equal but for its timestep and sample period."""
+        factors = {"sample_factor": 1, "timestep_factor": 1}
+        return replace(self, **factors) == replace(other, **factors)
 
 
 # The model as the user states it.

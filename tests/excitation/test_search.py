@@ -16,7 +16,7 @@ from mjfim.excitation.search import search as search_module
 from mjfim.excitation.search.climb import Candidate, Move, tightened, without_jumps
 from mjfim.excitation.search.descent import Barrier, Ground
 from mjfim.excitation.search.inside import InsideControl, InsideSearch, LimitedCost, largest_share
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, coarse_level
+from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, easier_level
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
@@ -217,8 +217,9 @@ def test_weights_alone_may_bound_a_control(criterion: str, tmp_path: Path) -> No
 def test_a_coarse_level_has_longer_timesteps_where_a_sample_has_several(tmp_path: Path) -> None:
     """Its samples stay, and its cost is never that of the design."""
     task = weighted(tmp_path, "E")
-    coarse = coarse_level(task, task.problem.point(task.initial), None)
-    assert coarse is not None and coarse.system.variant.is_coarse
+    easier = easier_level(DescentLevel(task, None), task.problem.point(task.initial))
+    assert easier is not None and easier.task.system.variant.is_coarse
+    coarse = easier.task
     assert coarse.samples == task.samples
     assert coarse.system.grid.substeps < task.system.grid.substeps
     design = design_task(task)

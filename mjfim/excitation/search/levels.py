@@ -67,33 +67,21 @@ def boundary_splines(task: DesignTask, t: Array, bandwidth: float) -> Array:
     )
 
 
-# Default factor by which the samples of a coarse level are longer.
-AUTO_COARSE_FACTOR = 4
-
 # Smallest number of samples of a coarse level.
 MIN_COARSE_SAMPLES = 50
 
-# Factors by which the samples and the timestep of several coarse levels are longer, where each
-# sample is one engine step; the coarsest level first.
+# Factors by which the timestep of a coarse level may be longer, and those of its samples where no
+# factor of the timestep divides their engine steps; the coarsest level first.
+TIMESTEP_FACTORS = (5, 4, 3, 2)
 SAMPLE_FACTORS = (8, 4, 2)
 
 # Growth of a small deviation along the trajectory above which the projection uses feedback. It is
 # measured in the best units of the state, see `amplification_in_best_units`.
 FEEDBACK_THRESHOLD = 10.0
 
-# Largest relative change of the initial cost that a coarse level without hard limits may cause.
-MAX_COARSE_CHANGE = 0.05
-
-# Factors by which the timestep of a coarse level under hard limits may be longer, tried in this
-# order.
-TIMESTEP_FACTORS = (5, 4, 3, 2)
-
-# Factor by which samples become longer where no factor of the timestep divides their engine steps.
-SAMPLE_FACTOR = 2
-
-# Largest relative change of the initial cost that a coarse level under hard limits may cause. It is
-# large, because the design is optimised again on the stated level.
-MAX_CONSTRAINED_COARSE_CHANGE = 0.5
+# Largest relative change of the initial cost that a coarse level may cause. It is large, because
+# the design is optimised again on the stated level.
+MAX_COARSE_CHANGE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +138,7 @@ def require_coarse_factor(task: DesignTask) -> None:
         task: The stated task.
 
     Raises:
-        ExperimentError: The factor does not divide the samples. Under hard limits it may divide
-            the engine steps of a sample instead.
+        ExperimentError: The factor divides neither the engine steps of a sample nor the samples.
     """
     descent, samples = task.experiment.descent, task.samples
     substeps = task.system.grid.substeps
@@ -159,74 +146,20 @@ def require_coarse_factor(task: DesignTask) -> None:
     if factor == "auto" or descent.method != "lbfgs" or samples % factor == 0:
         return
 
-    key = f"{task.experiment.source}: descent.coarse: {factor}"
-    if not task.is_limited:
-        valid = ", ".join(str(k) for k in range(1, 17) if samples % k == 0)
-        raise ExperimentError(
-            f"{key} does not divide the {samples} samples; valid for example: {valid}"
-        )
     if substeps % factor:
+        valid = [k for k in range(1, 17) if samples % k == 0 or substeps % k == 0]
         raise ExperimentError(
-            f"{key} divides neither the {substeps} engine steps of a sample nor the {samples} "
-            "samples"
+            f"{task.experiment.source}: descent.coarse: {factor} divides neither the {substeps} "
+            f"engine steps of a sample nor the {samples} samples; valid for example: "
+            f"{', '.join(map(str, valid))}"
         )
-
-
-def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> DesignTask | None:
-    """Make the coarse level of a descent without hard limits.
-
-    Args:
-        task: The stated task.
-        first: Its initial control, evaluated.
-        basis: (t, s) identifiable combinations, or None.
-
-    Returns:
-        The task with a longer timestep, or with longer samples where a sample is one engine step;
-        None where the experiment states no coarse level, or where the initial cost differs too
-        much from that of the stated task (`MAX_CONSTRAINED_COARSE_CHANGE`, `MAX_COARSE_CHANGE`).
-    """
-    descent = task.experiment.descent
-    if descent.coarse == 1 or descent.method != "lbfgs":
-        return None
-    if descent.coarse == "auto" and task.system.grid.substeps > 1:
-        easier = easier_level(DescentLevel(task, basis), first)
-        if easier is not None:
-            return easier.task
-    factor = AUTO_COARSE_FACTOR if descent.coarse == "auto" else descent.coarse
-    if task.samples % factor or task.samples < MIN_COARSE_SAMPLES * factor:
-        return None
-
-    coarse = task.coarser(factor)
-    size = task.problem.size(first)
-    similar = has_similar_cost(DescentLevel(coarse, basis), first, size, MAX_COARSE_CHANGE)
-    return coarse if similar else None
-
-
-def has_similar_cost(coarse: DescentLevel, first: DesignPoint, size: float, share: float) -> bool:
-    """Check whether the initial control costs nearly as much on a coarse level.
-
-    Args:
-        coarse: The coarse level.
-        first: The initial control, evaluated on the stated level.
-        size: Size of its cost.
-        share: Largest tolerated difference of the two costs, relative to the size.
-
-    Returns:
-        True where the difference is small enough; False where the cost on the stated level is
-        infinite.
-    """
-    if not np.isfinite(first.cost):
-        return False
-
-    point = first_point(coarse)
-    return point is not None and abs(point.cost - first.cost) <= share * size
 
 
 def easier_level(fine: DescentLevel, evaluated: DesignPoint | None = None) -> DescentLevel | None:
-    """Make a coarser or smoother level for the first round under hard limits.
+    """Make a coarser or smoother level on which a descent begins.
 
     Args:
-        fine: The stated level, on the plant without clamps.
+        fine: The stated level; under hard limits, on the plant without clamps.
         evaluated: The initial control on the unmodified plant; None where it is not known.
 
     Returns:
@@ -256,7 +189,7 @@ def _coarse_factors(task: DesignTask) -> tuple[int, ...]:
 
     if stated == "auto":
         dividing = tuple(factor for factor in TIMESTEP_FACTORS if substeps % factor == 0)
-        return dividing or (SAMPLE_FACTOR,)
+        return dividing or SAMPLE_FACTORS
 
     return () if stated == 1 else (stated,)
 
@@ -277,11 +210,7 @@ def _coarser(level: DescentLevel, first: DesignPoint, factor: int) -> DescentLev
     task = level.task
     longer_timestep = task.system.grid.substeps % factor == 0
 
-    # Longer samples have to divide the horizon, and each part of it that is optimised alone.
-    parts = [task.samples // count for count in (1, *task.experiment.descent.repeats)]
-    enough_samples = task.samples >= MIN_COARSE_SAMPLES * factor
-    longer_samples = enough_samples and all(N % factor == 0 for N in parts)
-    if not (longer_timestep or longer_samples):
+    if not (longer_timestep or _divides_samples(task, factor)):
         return None
 
     coarser = task.stretched if longer_timestep else task.coarser
@@ -326,7 +255,7 @@ def moved_alike(evaluated: DesignPoint, trajectory: Trajectory) -> DesignPoint |
 def similar_level(
     fine: DescentLevel, first: DesignPoint, make: Callable[[], DesignTask]
 ) -> DescentLevel | None:
-    """Make a coarse level under hard limits, where the initial control costs nearly as much.
+    """Make a coarse level, where the initial control costs nearly as much.
 
     Args:
         fine: The finer level.
@@ -334,17 +263,19 @@ def similar_level(
         make: Makes the task of the coarse level; it may raise ExperimentError.
 
     Returns:
-        The level; None where the model does not allow it, or where the initial cost differs from
-        that of the finer level by more than `MAX_CONSTRAINED_COARSE_CHANGE`.
+        The level; None where the model does not allow it, where a motion diverges, or where the
+        initial cost differs from that of the finer level by more than `MAX_COARSE_CHANGE`.
     """
     try:
         coarse = DescentLevel(make(), fine.basis)
     except ExperimentError:
         return None
 
-    size = fine.task.problem.size(first)
-    similar = has_similar_cost(coarse, first, size, MAX_CONSTRAINED_COARSE_CHANGE)
-    return coarse if similar else None
+    point = first_point(coarse)
+    if point is None or not np.isfinite(first.cost):
+        return None
+    change = abs(point.cost - first.cost) / fine.task.problem.size(first)
+    return coarse if change <= MAX_COARSE_CHANGE else None
 
 
 def coarser_levels(
@@ -373,15 +304,17 @@ def coarser_levels(
     # Dry friction is smooth in the motion as well.
     stated = task.system.variant
     smooth = replace(stated, smoothed=bool(stated.smoothing_speeds))
-    variants = [replace(smooth, sample_factor=factor) for factor in _sample_factors(task)]
+    factors = [k for k in SAMPLE_FACTORS if _divides_samples(task, k)]
+    variants = [replace(smooth, sample_factor=factor) for factor in factors]
     levels = [similar_level(fine, first, partial(task.with_variant, each)) for each in variants]
     return tuple(level for level in levels if level is not None)
 
 
-def _sample_factors(task: DesignTask) -> list[int]:
-    """Factors of the samples that divide the horizon and leave enough samples."""
-    N = task.samples
-    return [k for k in SAMPLE_FACTORS if N % k == 0 and MIN_COARSE_SAMPLES * k <= N]
+def _divides_samples(task: DesignTask, factor: int) -> bool:
+    """Whether a factor divides the horizon, and each part of it that is optimised alone."""
+    parts = [task.samples // count for count in (1, *task.experiment.descent.repeats)]
+    enough = task.samples >= MIN_COARSE_SAMPLES * factor
+    return enough and all(samples % factor == 0 for samples in parts)
 
 
 def regulator_for(task: DesignTask) -> Regulator:

@@ -31,7 +31,7 @@ from mjfim.excitation.search.climb import (
 )
 from mjfim.excitation.search.descent import MU_FACTOR, Barrier
 from mjfim.excitation.search.inside import InsideControl, InsideSearch, is_progress
-from mjfim.excitation.search.levels import DescentLevel, coarse_level, coarser_levels, easier_level
+from mjfim.excitation.search.levels import DescentLevel, coarser_levels, easier_level
 from mjfim.experiment.packing import for_workers
 from mjfim.information.smoothness import is_rough
 from mjfim.parallel import (
@@ -246,13 +246,16 @@ class Search:
         """Begin with further controls, until several of them in turn did not help."""
         size = 1 if self.executor is None else Workers.of(self.executor).count
         in_vain = 0
+        least = min((each.cost for each in done), default=np.inf)
         while in_vain < FURTHER_STARTS and self._has_time():
             batch = list(islice(further, size))
             if not batch:
                 break
-            before = min((each.cost for each in done), default=np.inf)
+            before = least
             done += yield from self._run_inside(batch)
-            in_vain = 0 if is_progress(before, min(each.cost for each in done)) else in_vain + size
+            # A request to stop leaves no result of the batch.
+            least = min((each.cost for each in done), default=np.inf)
+            in_vain = 0 if is_progress(before, least) else in_vain + size
         return done
 
     # ---- before a descent
@@ -494,13 +497,13 @@ class Search:
     @cached_property
     def _free_rungs(self) -> tuple[Rung, ...]:
         """The coarse and the stated level without a barrier."""
-        task = self.stage.task
-        coarse = coarse_level(task, self.first, self.stage.basis)
-        rungs = [Rung(variant=task.system.variant)]
-        if coarse is not None:
-            self.grounds.keep(DescentLevel(coarse, self.stage.basis))
-            rungs.insert(0, Rung(variant=coarse.system.variant))
-        return tuple(rungs)
+        stated = Rung(variant=self.stage.task.system.variant)
+        is_fine = self.stage.task.experiment.descent.method != "lbfgs"
+        coarse = None if is_fine else easier_level(self.stage, self.first)
+        if coarse is None:
+            return (stated,)
+        self.grounds.keep(coarse)
+        return (Rung(variant=coarse.task.system.variant), stated)
 
     def _ladder(self, candidates: Sequence[Candidate]) -> tuple[Rung, ...]:
         """The rungs within the limits."""
