@@ -78,9 +78,11 @@ def small_task(folder: Path) -> DesignTask:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Design, list[Any]]:
-    """A design, a fit and trials of one process."""
+    """A design, a fit and trials of one process, with the trials in the same chunks."""
     task = small_task(tmp_path_factory.mktemp("alone"))
-    return design_task(task), fitted(MODELS / "cart_pendulum.toml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(monte_carlo, "MIN_CHUNK", 2)
+        return design_task(task), fitted(MODELS / "cart_pendulum.toml")
 
 
 @pytest.mark.slow

@@ -137,6 +137,12 @@ class _Change:
         changed: dict[str, Any] = {name: array}
         return replace(self, **changed)
 
+    @property
+    def signs_alone(self) -> _Change:
+        """The change with the signs of its factors and without unknown numbers."""
+        signs = np.sign(self.factor)
+        return replace(self, factor=signs, where=self.where[:0], sizes=self.sizes[:0])
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Search:
@@ -206,9 +212,12 @@ class _Search:
             return ""
         changes = list(self._changes(none, names=bool(stated.max() > SHARE_OF_NAMES**2)))
         scores = [self.fitted(change, is_quick=True)[0] for change in changes]
+        ranked = [(k, changes[k]) for k in np.argsort(scores)[:FITTED_ERRORS].tolist()]
+        # Where the parameters leave the size of a factor open, its sign alone explains as much.
+        ranked += [(-1, each.signs_alone) for _, each in ranked if each.unknown == "factor"]
         cures = []
-        for k in np.argsort(scores)[:FITTED_ERRORS].tolist():
-            score, squares, change = self.fitted(changes[k])
+        for k, tried in ranked:
+            score, squares, change = self.fitted(tried)
             left = squares / stated
             cured = is_gross & (left <= LEFT_SHARE) & (squares <= EXPLAINED_SHARE**2)
             is_small = (squares <= SHARE_OF_NAMES**2) & (left <= MOST_RAISED)
