@@ -259,7 +259,11 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
 
     try:
         with zipfile.ZipFile(path), np.load(path, allow_pickle=False) as loaded:
-            return dict(loaded)
+            arrays = dict(loaded)
+        for name, value in arrays.items():
+            if not isinstance(value, np.ndarray):
+                raise ValueError(f"{name} is no array")
+        return arrays
     except DAMAGED_ARCHIVE as error:
         raise RecordingError(
             f"{path}: not a {kind} archive (npz of named arrays without pickles, as numpy.savez "

@@ -82,6 +82,7 @@ class Call:
         fails: True if exit code 0 is wrong.
         accepted: True if a refusal is wrong.
         room: Largest size of a file that can be written [bytes]; None for no limit.
+        has_home: False where the home folder cannot be used.
     """
 
     words: list[str]
@@ -90,6 +91,7 @@ class Call:
     fails: bool = False
     accepted: bool = False
     room: int | None = None
+    has_home: bool = True
 
 
 def toml_of(value: Any) -> str:

@@ -6,6 +6,7 @@ They are a kind of their own, so that the seeds of `bad_inputs` keep their meani
 from __future__ import annotations
 
 import functools
+import gzip
 import json
 import os
 import shutil
@@ -54,6 +55,8 @@ ODD_NAMES = (
     "$HOME",
     "back\\slash",
     "tab\there",
+    "lines\u2028of\u0085Unicode",
+    "\U0001d4b3",
     ".hidden",
     "x" * 200,
 )
@@ -188,7 +191,19 @@ def _bomb() -> Path:
 
 
 def packed_bomb(rng: Rng, folder: Path) -> Call:
-    """A design or a recording that unpacks to a thousand times its size."""
+    """A design or a recording that unpacks to a thousand times its size, or that is very deep."""
+    if rng.random() < 0.5:
+        name = str(pick(rng, ("log.csv.gz", "log.json", "log.npz")))
+        if name == "log.csv.gz":
+            (folder / name).write_bytes(gzip.compress(bytes(BOMB_SIZE), 1))
+        elif name == "log.json":
+            inner = pick(rng, ("[", '{"a":', '[{"t":'))
+            (folder / name).write_text(inner * 200_000, encoding="utf-8")
+        else:
+            with zipfile.ZipFile(folder / name, "w", zipfile.ZIP_DEFLATED) as archive:
+                for i in range(20_000):
+                    archive.writestr(f"{i}.npy", b"")
+        return Call(words=identify(name), spoiled=f"a bomb {name}", refused=True)
     words = pick(
         rng,
         (
@@ -201,6 +216,37 @@ def packed_bomb(rng: Rng, folder: Path) -> Call:
     )
     shutil.copy(_bomb(), folder / "design.npz")
     return Call(words=list(words), spoiled="a packed bomb", refused=True)
+
+
+# Texts of `--executor` that name no executor.
+EXECUTORS = (
+    "",
+    "local:",
+    "local:0",
+    "local:-1",
+    "local:1.5",
+    "local:" + "9" * 5000,
+    "python:",
+    "python:.a:make",
+    "python:..:make",
+    "python:json:loads",
+    "python:os:nothing",
+    "dask:",
+    "dask:missing.json",
+    "dask:study.toml",
+    "dask://[::1",
+    "dask:tcp://",
+    "http://x",
+    "\u2028",
+)
+
+
+def wrong_executor(rng: Rng, folder: Path) -> Call:
+    """An executor that there is not."""
+    text = str(pick(rng, EXECUTORS))
+    words = ["montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"]
+    words = pick(rng, (words, list(IDENTIFY)))
+    return Call(words=[*words, "--executor", text], spoiled=f"executor {text[:20]!r}", refused=True)
 
 
 def no_methods(rng: Rng, folder: Path) -> Call:
@@ -497,18 +543,20 @@ def odd_file(rng: Rng, folder: Path) -> Call:
     name = str(pick(rng, ("study.toml", "cart_pendulum.xml", "cart_pendulum.csv", "run.csv")))
     name = str(pick(rng, (name, "design.npz")))
     file = folder / name
-    how = pick(rng, ("link", "dangling link", "loop", "folder", "device", "unreadable"))
+    how = pick(rng, ("link", "dangling link", "loop", "folder", "device", "unreadable", "pipe"))
     (folder / "far").mkdir()
     target = folder / "far" / name
     shutil.move(file, target)
     links = {"link": f"far/{name}", "dangling link": "missing", "loop": name, "device": "/dev/zero"}
     if how == "folder":
         file.mkdir()
+    elif how == "pipe" and hasattr(os, "mkfifo"):
+        os.mkfifo(file)
     elif how == "unreadable":
         shutil.copy(target, file)
         file.chmod(0)
     else:
-        file.symlink_to(links[how])
+        file.symlink_to(links.get(how, "missing"))
 
     readers = {
         "design.npz": (SIMULATE,),
@@ -549,6 +597,12 @@ def odd_output(rng: Rng, folder: Path) -> Call:
     return Call(words=list(words), spoiled=f"output: {how}", fails=fails)
 
 
+def no_home(rng: Rng, folder: Path) -> Call:
+    """A home folder in which nothing can be written; nothing else is wrong."""
+    words = pick(rng, (SIMULATE, IDENTIFY, CHECK))
+    return Call(words=list(words), spoiled="no home", accepted=True, has_home=False)
+
+
 def full_disk(rng: Rng, folder: Path) -> Call:
     """A disk that is full after some bytes of a file."""
     words = pick(
@@ -572,7 +626,9 @@ FAULTS: tuple[tuple[Callable[[Rng, Path], Call], float], ...] = (
     (dictionary_column, 0.04),
     (same_log_twice, 0.05),
     (boolean_measurement, 0.05),
-    (packed_bomb, 0.03),
+    (packed_bomb, 0.04),
+    (wrong_executor, 0.05),
+    (no_home, 0.02),
     (no_methods, 0.02),
     (two_faults, 0.17),
     (short_log, 0.06),

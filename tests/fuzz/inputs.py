@@ -58,7 +58,7 @@ def run(case: Case, folder: Path) -> Outcome:
     for name in STUDY:
         shutil.copy(valid_study() / name, folder)
     call = spoil(rng, folder)
-    is_new = rng.random() < NEW_PROCESS or call.room is not None
+    is_new = rng.random() < NEW_PROCESS or call.room is not None or not call.has_home
     description = f"{call.words[0] if call.words else ''}: {call.spoiled}"
     announce(description)
 
@@ -122,6 +122,7 @@ def in_new_process(call: Call, folder: Path) -> Ending:
     with subprocess.Popen(
         [*PROCESS, *call.words],
         cwd=folder,
+        env=dict(os.environ) if call.has_home else _without_home(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -136,6 +137,12 @@ def in_new_process(call: Call, folder: Path) -> Ending:
             results, errors = process.communicate()
             return Ending(code=process.returncode, errors=errors, fault="no end within the limit")
     return Ending(code=process.returncode, errors=errors, results=results)
+
+
+def _without_home() -> dict[str, str]:
+    """The environment without a home folder, and without folders for the settings of programs."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("XDG_", "MPL"))}
+    return {**kept, "HOME": "/dev/null/home", "MPLBACKEND": "Agg"}
 
 
 def _limit_files(room: int) -> None:
