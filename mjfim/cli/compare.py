@@ -1,4 +1,4 @@
-"""`mjfim compare`: the design compared with parametric excitations of equal budget."""
+"""`mjfim compare`: compare the design with parametric excitations of equal budget."""
 
 from __future__ import annotations
 

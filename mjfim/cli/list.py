@@ -1,4 +1,4 @@
-"""`mjfim list`: everything that an experiment file can name in a model."""
+"""`mjfim list`: list everything that an experiment file can name in a model."""
 
 from __future__ import annotations
 
@@ -39,17 +39,13 @@ def list_(
         inventory = inventory.only(kind)
 
     if wanted is not None:
-        pattern = f"*{wanted.lower()}*"
-        inventory = inventory.selected(lambda name: _matches(name, pattern))
+        # Brackets are no part of the pattern's syntax.
+        pattern = f"*{wanted.lower()}*".replace("[", "[[]")
+        inventory = inventory.selected(lambda name: fnmatchcase(name.lower(), pattern))
         if not inventory.count:
             raise ExperimentError(
                 f"{model}: no path or name contains {wanted!r}; `mjfim list {model}` lists all"
             )
 
-    # Everything that was asked for is listed.
+    # The user asked for these entries, so the page leaves none out.
     print_result(as_json, inventory.summary(), inventory_page(inventory), verbose=True)
-
-
-def _matches(name: str, pattern: str) -> bool:
-    """Whether a name has a pattern; brackets are no part of the pattern's syntax."""
-    return fnmatchcase(name.lower(), pattern.replace("[", "[[]"))

@@ -2,15 +2,17 @@
 
 Standard deviations fall like T^-1/2 or faster with the duration T. So the secant method on their
 logarithms finds the duration at which the largest ratio of a predicted to a target standard
-deviation is 1. Both ends of the bracket are designs: the returned one reaches the targets, and one
+deviation is 1. Both ends of the bracket are designs. The returned one reaches the targets, and one
 that is shorter by the tolerance does not.
+
+`mjfim design --shortest` calls the verb. Campaigns use its targets and ratios.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -38,9 +40,9 @@ from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 
-# Factor between two successive numbers of samples where the ratio is infinite, so that it does not
-# show the distance to feasibility.
-BLIND_FACTOR = 2.0
+# Factor between two successive numbers of samples where the ratio is infinite. An infinite ratio
+# does not show how far the target is.
+FACTOR_WITHOUT_RATIO = 2.0
 
 # Smallest factor between the first two numbers of samples. It is squared from step to step.
 MIN_FIRST_FACTOR = 1.05
@@ -48,15 +50,24 @@ MIN_FIRST_FACTOR = 1.05
 # Largest factor between two successive numbers of samples.
 MAX_FACTOR = 4.0
 
-# Number of samples by which round-off may change a number before it is rounded.
+# Round-off of a number of samples, before it is rounded [samples].
 ROUNDING_TOLERANCE = 1e-9
 
 # Distance of a candidate from the ends of the bracket, relative to the tolerance. It is less than
 # 1, so that one evaluation can close the bracket.
 END_DISTANCE = 0.9
 
-# Every so many evaluations, the middle of the bracket takes the place of the secant.
+# Number of evaluations after which the middle of the bracket follows instead of the secant.
 MIDDLE_PERIOD = 3
+
+# Longest list of identifiable combinations in a message [characters].
+LONGEST_COMBINATIONS = 150
+
+# Ratio of the longest horizon that is tried by default to the stated one.
+MAX_HORIZON_FACTOR = 4.0
+
+# Default tolerance of the horizon, relative to the horizon.
+DEFAULT_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +87,7 @@ class SampleGrid:
     minimum: int = 2
 
     def round_down(self, samples: float) -> int:
-        """Round to the next allowed number below.
-
-        Args:
-            samples: Number of samples.
-
-        Returns:
-            The largest allowed number that is not above it, or the minimum.
-        """
+        """Largest allowed number that is not above a number of samples, or the minimum."""
         n = int(np.floor(samples + ROUNDING_TOLERANCE))
         if n >= self.first_multiple:
             n -= n % self.unit
@@ -91,14 +95,7 @@ class SampleGrid:
         return max(n, self.minimum)
 
     def round_up(self, samples: float) -> int:
-        """Round to the next allowed number above.
-
-        Args:
-            samples: Number of samples.
-
-        Returns:
-            The smallest allowed number that is not below it.
-        """
+        """Smallest allowed number that is not below a number of samples."""
         n = int(np.ceil(samples - ROUNDING_TOLERANCE))
         if n >= self.first_multiple:
             n += -n % self.unit
@@ -115,22 +112,20 @@ def smallest_feasible(
 ) -> tuple[int | None, int | None]:
     """Find the smallest number of samples whose ratio is at most 1.
 
-    An example is the ratio of a reached to a required standard deviation. The ratio is assumed to
-    fall at least with the inverse square root of the number of samples. The search brackets the
-    number where the ratio is 1, and narrows the bracket by secants.
+    The search assumes that the ratio falls like the inverse square root of the number of samples,
+    or faster. It brackets the number where the ratio is 1, and narrows the bracket by secants.
 
     Args:
-        ratio: Ratio of a number of samples; infinite where a parameter is not identifiable, None
-            where the search is to end.
+        ratio: Ratio of a predicted to a required standard deviation with a number of samples. It is
+            infinite where a parameter is not identifiable, and None ends the search.
         first: Number of samples to begin with, on the grid.
         largest: Largest number of samples, on the grid.
         grid: Numbers that are allowed.
         tolerance: Largest acceptable width of the bracket, as a function of its upper end.
 
     Returns:
-        The smallest evaluated number that is feasible, and the largest evaluated number that is
-        infeasible; None where there is no such number. Where the search was stopped, the bracket
-        may be wider than the tolerance.
+        The smallest evaluated number that is feasible, and the largest one that is infeasible; None
+        where there is no such number. After a stop, the bracket may be wider than the tolerance.
     """
     known: dict[int, float] = {}
     feasible: int | None = None
@@ -146,38 +141,40 @@ def smallest_feasible(
         if feasible is not None and infeasible is not None:
             width = tolerance(feasible)
             is_open = feasible - infeasible > width
-            following = _inside(known, infeasible, feasible, width, grid) if is_open else None
+            following = _next_inside(known, infeasible, feasible, width, grid) if is_open else None
         elif feasible is not None:
-            smaller = min(feasible * _factor(value, len(known)), feasible - 1)
+            smaller = min(feasible * _step_factor(value, len(known)), feasible - 1)
             following = grid.round_down(smaller) if feasible > grid.minimum else None
         else:
-            larger = grid.round_up(max(following * _factor(value, len(known)), following + 1))
+            larger = grid.round_up(max(following * _step_factor(value, len(known)), following + 1))
             following = min(larger, largest) if following < largest else None
     return feasible, infeasible
 
 
-def _factor(ratio: float, evaluations: int) -> float:
+def _step_factor(ratio: float, evaluations: int) -> float:
     """Factor from one number of samples to the next one, while one end of the bracket is open."""
     if not np.isfinite(ratio):
-        return BLIND_FACTOR
+        return FACTOR_WITHOUT_RATIO
     least = min(MIN_FIRST_FACTOR**2.0 ** (evaluations - 1), MAX_FACTOR)
     if ratio <= 1.0:
         return float(np.clip(ratio**2, 1.0 / MAX_FACTOR, 1.0 / least))
     return float(np.clip(ratio**2, least, MAX_FACTOR))
 
 
-def _inside(
+def _next_inside(
     known: dict[int, float], low: int, high: int, width: int, grid: SampleGrid
 ) -> int | None:
-    """Root of the secant of logarithms in a bracket, or its middle; None where it is narrow."""
+    """Next number of samples inside a bracket, by the secant of logarithms or in its middle.
+
+    None where no number of the grid is inside.
+    """
     x = float(np.sqrt(low * high))
     has_secant = np.isfinite(known[low]) and known[high] < known[low]
     if has_secant and len(known) % MIDDLE_PERIOD:
         share = np.log(known[low]) / np.log(known[low] / known[high])
         x = float(low * (high / low) ** share)
 
-    # A candidate that is closer to an end than the tolerance closes the bracket, if the ratio is 1
-    # between the candidate and that end.
+    # A candidate near an end closes the bracket if the ratio is 1 between this end and it.
     if high - low > 2 * width:
         x = float(np.clip(x, low + END_DISTANCE * width, high - END_DISTANCE * width))
     n = grid.round_up(x) if x * x > low * high else grid.round_down(x)
@@ -188,15 +185,8 @@ def _inside(
     return n if low < n < high else None
 
 
-# Longest list of identifiable combinations in a message [characters].
-LONGEST_COMBINATIONS = 150
-
-
 def target_accuracies(task: DesignTask) -> Array:
-    """Collect the target standard deviations that the experiment states.
-
-    Args:
-        task: The task.
+    """Collect the target standard deviations that the experiment of a task states.
 
     Returns:
         (p,) standard deviations [theta-unit], infinite for a parameter without a target.
@@ -225,7 +215,7 @@ def largest_ratio_to_target(std: Array, wanted: Array) -> tuple[float, int]:
     Returns:
         The ratio, at most 1 where all targets are reached, and the index of its parameter.
     """
-    ratio = np.where(np.isfinite(wanted), std / wanted, 0.0)
+    ratio = np.divide(std, wanted, out=np.zeros(len(std)), where=np.isfinite(wanted))
     return float(ratio.max()), int(np.argmax(ratio))
 
 
@@ -246,7 +236,7 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
 
     names = listed([task.parameters.names[j] for j in unreachable])
 
-    # A single combination of very many parameters is not shown.
+    # A single combination of many parameters is too long for a message.
     known, words = "", first_ones(design.combinations, "; ", LONGEST_COMBINATIONS)
     if design.combinations:
         known = f": {words}"
@@ -260,18 +250,8 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
     )
 
 
-# Ratio of the longest horizon that is tried by default to the stated one.
-MAX_HORIZON_FACTOR = 4.0
-
-# Default tolerance of the horizon, relative to the horizon.
-DEFAULT_TOLERANCE = 0.02
-
-# Rounding error of a number of samples [samples].
-ROUNDING = 1e-9
-
-
 class OutOfReachError(ExperimentError):
-    """Error that even the longest experiment misses a target standard deviation."""
+    """Even the longest experiment misses a target standard deviation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -333,30 +313,22 @@ class ShortestExperiment(SavedRecord):
 
     @property
     def reached(self) -> bool:
-        """True where the design reaches every target.
-
-        False only where the search was stopped before any duration reached them.
-        """
+        """True where the design reaches every target; False only after an early stop."""
         return any(tried.reached for tried in self.tried)
 
     @property
     def missed(self) -> Tried | None:
         """The longest of the shorter durations that do not reach the targets."""
-        missing = [tried for tried in self.tried if not tried.reached]
-        shorter = [tried for tried in missing if tried.horizon < self.horizon]
+        shorter = [each for each in self.tried if each.horizon < self.horizon and not each.reached]
         return max(shorter, key=lambda tried: tried.horizon, default=None)
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of shortest.json."""
-        tried = [
-            {"horizon": t.horizon, "ratio": t.ratio, "parameter": t.parameter, "why": t.why}
-            for t in self.tried
-        ]
         return {
             "horizon": self.horizon,
             "tolerance": self.tolerance,
             "closed": self.closed,
-            "tried": tried,
+            "tried": [asdict(tried) for tried in self.tried],
         }
 
     def __str__(self) -> str:
@@ -475,36 +447,28 @@ class _HorizonSearch:
 
         largest = self.grid.round_down(longest * rate)
         first = min(self.grid.round_up(self.base.samples), largest)
-        found, below = smallest_feasible(self.ratio, first, largest, self.grid, self.slack)
+        found, below = smallest_feasible(self.ratio, first, largest, self.grid, self.tolerance_at)
         has_reached = found is not None
         if found is None:
-            found = self._best_so_far(largest)
+            # After a stop, the result is the design that is closest to the targets.
+            if not self.stop.requested:
+                raise self._out_of_reach(largest)
+            if not self.designs:
+                raise NoResultError("the search was stopped before it had found a design")
+            found = min(self.designs, key=lambda samples: self.tried[samples].ratio)
 
         # The bracket is closed where its lower end was tried, or where no shorter design exists.
         is_shortest = has_reached and found <= self.grid.minimum
-        is_narrow = below is not None and found - below <= self.slack(found)
+        is_narrow = below is not None and found - below <= self.tolerance_at(found)
         return ShortestExperiment(
             experiment=self.at(found),
             design=self.designs[found],
             tried=tuple(self.tried.values()),
-            tolerance=self.slack(found) / rate,
+            tolerance=self.tolerance_at(found) / rate,
             closed=(is_shortest or is_narrow) and not self.stop.requested,
         )
 
-    def _best_so_far(self, largest: int) -> int:
-        """Number of samples whose design is closest to the targets, of a search that was stopped.
-
-        Raises:
-            OutOfReachError: The search was not stopped.
-            NoResultError: There is no design.
-        """
-        if not self.stop.requested:
-            self._raise_out_of_reach(largest)
-        if not self.designs:
-            raise NoResultError("the search was stopped before it had found a design")
-        return min(self.designs, key=lambda samples: self.tried[samples].ratio)
-
-    def slack(self, samples: int) -> int:
+    def tolerance_at(self, samples: int) -> int:
         """Tolerance at a number of samples [samples].
 
         It is at least the distance to the next smaller number of the grid.
@@ -514,7 +478,7 @@ class _HorizonSearch:
             width = self.tolerance * self.experiment.rate
 
         resolution = samples - self.grid.round_down(samples - 1)
-        return max(int(width + ROUNDING), resolution)
+        return max(int(width + ROUNDING_TOLERANCE), resolution)
 
     def at(self, samples: int) -> Experiment:
         """The experiment with a number of samples, and those repeats that divide it."""
@@ -545,8 +509,8 @@ class _HorizonSearch:
     def _try(self, samples: int) -> Tried | None:
         """Design the experiment with a number of samples, from one or two controls.
 
-        The first is that of the nearest design so far. The second is the initial control, where
-        the first one does not reach the targets.
+        The first design begins with the control of the nearest design so far. Where it does not
+        reach the targets, a second one begins with the initial control.
 
         Returns:
             The better outcome; None where the first design was stopped.
@@ -575,7 +539,9 @@ class _HorizonSearch:
         horizon = samples / self.experiment.rate
         try:
             task = self.base.restated(self.at(samples))
-            initial = None if near is None else fitted(task, self.designs[near].trajectory.ctrl)
+            initial = None
+            if near is not None:
+                initial = fit_control(task, self.designs[near].trajectory.ctrl)
             design = design_task(
                 task,
                 callback=self.callback,
@@ -593,7 +559,9 @@ class _HorizonSearch:
             return Tried(horizon=horizon, ratio=np.inf, why=str(error))
 
         if design.status is Status.INFEASIBLE:
-            why = f"{design.status.value} ({_violated_limits(design)})"
+            margins = design.limits.items()
+            violated = [f"{kind} by {-margin:.3g}" for kind, margin in margins if margin < 0.0]
+            why = f"{design.status.value} ({', '.join(violated)})"
             return Tried(horizon=horizon, ratio=np.inf, why=why)
 
         ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
@@ -602,11 +570,11 @@ class _HorizonSearch:
         return Tried(horizon=horizon, ratio=ratio, parameter=name)
 
     def _interrupted(self, samples: int, design: Design) -> Tried | None:
-        """Use the design of a number of samples whose search was stopped.
+        """Use the design of a number of samples whose search was stopped, if it is of use.
 
         Returns:
-            The outcome where the design keeps the limits and reaches the targets, or where no
-            earlier design has an outcome; else None.
+            The outcome of a design that keeps the limits and either reaches the targets or is the
+            first one; else None.
         """
         is_feasible = all(margin >= 0.0 for margin in design.limits.values())
         ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
@@ -623,8 +591,8 @@ class _HorizonSearch:
         if known is None or ratio < largest_ratio_to_target(known.final.std, self.targets)[0]:
             self.designs[samples] = design
 
-    def _raise_out_of_reach(self, samples: int) -> NoReturn:
-        """Raise OutOfReachError, which says how far the longest experiment is from the targets."""
+    def _out_of_reach(self, samples: int) -> OutOfReachError:
+        """The error that says how far the longest experiment is from the targets."""
         longest = self.tried[samples]
         design = self.designs.get(samples)
 
@@ -633,7 +601,7 @@ class _HorizonSearch:
             names = self.base.parameters.names
             missed = missed_targets(names, design.final.std, self.targets)
             reason = f"the target is missed by {missed}"
-        raise OutOfReachError(
+        return OutOfReachError(
             f"{self.experiment.source}: even {longest.horizon:g} s is too short: {reason}. Allow a "
             "longer experiment (`longest`, or a longer table of the initial control) or a "
             "stronger control, or relax the targets; `mjfim check` prints the number of "
@@ -641,23 +609,11 @@ class _HorizonSearch:
         )
 
 
-def _violated_limits(design: Design) -> str:
-    """The limits that a design violates, in words."""
-    return ", ".join(
-        f"{kind} by {-margin:.3g}" for kind, margin in design.limits.items() if margin < 0.0
-    )
+def fit_control(task: DesignTask, control: Array) -> Array:
+    """Fit a control of another duration to a task: (n, nu) to (N, nu) [u-unit].
 
-
-def fitted(task: DesignTask, control: Array) -> Array:
-    """Fit a control of another duration to a task.
-
-    Args:
-        task: The task.
-        control: (n, nu) control [u-unit].
-
-    Returns:
-        (N, nu) control. A longer one is cut where the final state is free, a shorter one is
-        repeated where no limits hold; all others are stretched.
+    A longer one is cut where the final state is free. A shorter one is repeated where the task has
+    no limits. All others are stretched.
     """
     N, n = task.samples, len(control)
     if n == N:
@@ -667,14 +623,14 @@ def fitted(task: DesignTask, control: Array) -> Array:
     if n < N and not task.is_limited:
         return np.asarray(np.resize(control, (N, control.shape[1])))
 
-    # Stretch: interpolate over the relative time, between the middles of the samples.
+    # The stretched control is interpolated over the relative time, between middles of samples.
     given = (np.arange(n) + 0.5) / n
     wanted = (np.arange(N) + 0.5) / N
     return np.stack([np.interp(wanted, given, column) for column in control.T], axis=1)
 
 
 def _sample_grid(task: DesignTask) -> SampleGrid:
-    """The numbers of samples that a coarse level can divide, where the descent uses one."""
+    """The numbers of samples that a design may have: those that its coarse level can divide."""
     descent = task.experiment.descent
     if descent.method != "lbfgs":
         return SampleGrid(unit=1, first_multiple=0)
@@ -688,7 +644,7 @@ def _sample_grid(task: DesignTask) -> SampleGrid:
 
 
 def _default_longest(task: DesignTask) -> float:
-    """Longest horizon by default [s]; no longer than the table of the initial control lasts."""
+    """Longest horizon by default [s], no longer than the table of the initial control."""
     experiment = task.experiment
     longest = MAX_HORIZON_FACTOR * task.horizon
     if isinstance(experiment.initial.control, Signal):

@@ -1,4 +1,8 @@
-"""The task of an identification, and its searches: over a subset, from several starts, over all."""
+"""The task of an identification, and its searches for the parameters.
+
+A search runs over a subset of the data, from several starts, or over all data. `identify`, the
+restarts in `starts` and the studies of models choose among them.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +38,7 @@ from mjfim.records.trajectory import Recording
 # paper's Newton-Raphson iteration without bounds.
 Method = Literal["least_squares", "newton"]
 
-# Largest difference of two clocks that count as the same [mean sample periods]. Copies of a log in
+# Largest difference of two times that count as the same [mean sample periods]. Copies of a log in
 # other formats have rounded times.
 CLOCK_TOLERANCE = 0.01
 
@@ -52,7 +56,6 @@ class FitTask:
         method: Method of the search.
         start: (p,) parameters at which the search starts, inside the bounds if the method has any
             [theta-unit].
-        settings: The table `[fit]` of the experiment.
         elsewhere: Sentences about recordings that do not begin at the stated initial state.
     """
 
@@ -61,7 +64,6 @@ class FitTask:
     held_out: tuple[Recording, ...]
     method: Method
     start: Array
-    settings: FitSpec
     elsewhere: tuple[str, ...] = ()
 
     @classmethod
@@ -100,13 +102,13 @@ class FitTask:
                 "outputs; remove `correlated`"
             )
 
-        _require_held(system, settings.hold)
+        _require_holdable(system, settings.hold)
         refuse_same_data(recordings, held_out)
         elsewhere = begins_elsewhere(system, [*recordings, *held_out])
         if elsewhere:
-            # As where recordings begin at releases that only they show.
-            experiment, names = system.experiment, system.source.coordinates.deviations
-            free = {component.name: (-np.inf, np.inf) for component in names}
+            # The fit can reach another initial state only if all its components are free.
+            experiment, components = system.experiment, system.source.coordinates.deviations
+            free = {component.name: (-np.inf, np.inf) for component in components}
             initial = experiment.initial.model_copy(update={"free": free})
             experiment = experiment.model_copy(update={"initial": initial})
             system = replace(system, experiment=experiment)
@@ -116,9 +118,13 @@ class FitTask:
             held_out=tuple(held_out),
             method=method,
             start=_start(system, method, start),
-            settings=settings,
             elsewhere=elsewhere,
         )
+
+    @property
+    def settings(self) -> FitSpec:
+        """The table `[fit]` of the experiment."""
+        return self.system.experiment.fit
 
     @property
     def noise_is_stated(self) -> bool:
@@ -148,10 +154,9 @@ def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTa
         task: The task.
         length: The length [s], or "whole"; None for a length that the fit chooses.
     """
-    system = task.system
     settings = task.settings.model_copy(update={"segments": length})
-    experiment = system.experiment.model_copy(update={"fit": settings})
-    return replace(task, system=replace(system, experiment=experiment), settings=settings)
+    experiment = task.system.experiment.model_copy(update={"fit": settings})
+    return replace(task, system=replace(task.system, experiment=experiment))
 
 
 def refuse_same_data(fitted: Sequence[Recording], held_out: Sequence[Recording]) -> None:
@@ -172,7 +177,7 @@ def _same_data(one: Recording, other: Recording) -> bool:
     """Whether two recordings have equal values at the same times since their begin."""
     if one.outputs != other.outputs or len(one.t) != len(other.t) or not len(one.t):
         return False
-    # The first rows show most differences without a look at all others.
+    # Most recordings differ in their first row, which is quick to compare.
     for rows in (slice(0, 1), slice(None)):
         if not np.array_equal(one.y[rows], other.y[rows], equal_nan=True):
             return False
@@ -183,10 +188,10 @@ def _same_data(one: Recording, other: Recording) -> bool:
     return bool(np.abs(difference).max() <= CLOCK_TOLERANCE * period)
 
 
-def _require_held(system: System, names: Sequence[str]) -> None:
-    """Raise ExperimentError where a parameter that is to be held cannot be.
+def _require_holdable(system: System, names: Sequence[str]) -> None:
+    """Raise ExperimentError where one of the named parameters cannot be held.
 
-    A parameter with a value for each recording, or a deviation of the initial state, is not held.
+    Parameters with a value for each recording and deviations of the initial state cannot.
     """
     parameters = system.parameters
     source = system.experiment.source
@@ -221,42 +226,44 @@ def _start(system: System, method: Method, start: Array | None) -> Array:
 # Settings of the paper's Newton-Raphson iteration.
 NEWTON = SearchSettings(max_iterations=50, tolerance=1e-5, damped=False)
 
-# Length of a step [standard deviations] below which the search over all data has converged, and
-# that length with much data, where every linearisation takes long.
+# Length of a step below which the search over all data has converged [standard deviations]. With
+# much data, every linearisation takes long, and the limit is larger.
 FINAL_TOLERANCE = 1e-3
 FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
 
-# Number of samples that one linearisation simulates, with two-sided differences, above which the
-# amount of data is large.
+# Number of samples that one linearisation with two-sided differences simulates, from which on there
+# is much data.
 SAMPLES_OF_MUCH_DATA = SAMPLES_FOR_ONE_SIDED
 
-# Length of a step [standard deviations] at which the search over the first data ends, and decrease
-# of the cost, as a share of it, that its last step may bring. Closer to the minimum, few data are
-# fitted at the expense of the others.
+# Length of a step at which the search over the first data ends [standard deviations]. Closer to the
+# minimum, few data are fitted at the expense of the others.
 FIRST_TOLERANCE = 0.1
-FIRST_ROUGH_SHARE = 1e-2
 
-# That share where the stated noise is only the first guess.
+# Decrease of the cost, as a share of it, below which a step is the last one of a search
+# (`SearchSettings.rough_share`): over the first data, and where the stated noise is only the first
+# guess.
+FIRST_ROUGH_SHARE = 1e-2
 ROUGH_SHARE = 0.1
 
-# That share where much data are clearly missed, also if the cost falls by twice this share, so that
-# searches from other starts follow.
+# This share where the fit clearly misses much data, even if the cost falls by twice this share.
+# Searches from other starts follow then.
 MISSED_ROUGH_SHARE = 0.02
 
-# That share in a fit that is only compared with others by its predictions.
+# This share where the predictions of a fit are only compared with those of others.
 COMPARED_ROUGH_SHARE = 1e-4
 
 # A search from a random start, or for initial states at given parameters.
 SHORT_SEARCH = SearchSettings(max_iterations=8, tolerance=1e-2, relinearise_at_end=False)
 INITIAL_STATES = replace(SHORT_SEARCH, tolerance=0.1, rough_share=0.01)
 
-# Iterations of the initial states of all segments, after theta was found on a subset of them, and
-# the share of each segment, at its begin, that is enough for them.
+# Iterations for the initial states of all segments, after theta was found on a subset of them. The
+# first part of each segment is enough for them; this is its share.
 INITIAL_STATE_ITERATIONS = 2
 INITIAL_STATE_SHARE = 0.2
 
-# Largest number of times that the noise is estimated, and relative changes of a standard deviation
-# below which the search converges, and below which the noise stays.
+# Largest number of times that the noise is estimated. Where its standard deviations change by less
+# than the first share, the next search ends at the minimum. No search follows a change below the
+# second share.
 MAX_NOISE_ROUNDS = 10
 NEAR_NOISE = 0.02
 NOISE_TOLERANCE = 5e-4
@@ -264,21 +271,19 @@ NOISE_TOLERANCE = 5e-4
 # Smallest estimated standard deviation, as a share of the stated one.
 MIN_NOISE_SHARE = 1e-3
 
-# Factors by which the differences of the derivatives are longer where the residuals are rough, and
-# iterations with them.
+# Factors by which the differences for derivatives are longer where the residuals are rough, and
+# number of iterations with them.
 LONGER_DIFFERENCES = (100.0, 1000.0)
 ROUGH_ITERATIONS = 15
 
 # Number of samples of a subset of segments that is quick to simulate.
 QUICK_SAMPLES = 40_000
 
-# Share of the data on which the search begins, where that leaves enough samples, and the least
-# number of segments, which are half of the data at most.
+# Share of the data on which the search begins, and the least numbers of samples and segments in it.
+# With fewer data, the search begins on the segments that are quick to simulate.
 FIRST_SHARE = 0.25
 MIN_FIRST_SAMPLES = 2_000
 MIN_FIRST_SEGMENTS = 3
-
-Callback = Callable[[FitEvent], None]
 
 
 # ---- subsets of the segments
@@ -311,7 +316,7 @@ def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
 
 
 def _from_start(problem: FitProblem, budget: Budget, *, begin: UnknownValues) -> Solution | None:
-    """Short search from one start; None where the simulation diverges there."""
+    """Search for a while from one start, in a worker; None where the simulation diverges there."""
     return minimise(problem, begin, SHORT_SEARCH, budget)
 
 
@@ -328,7 +333,7 @@ class FitSearch:
 
     task: FitTask
     budget: Budget
-    callback: Callback | None = None
+    callback: Callable[[FitEvent], None] | None = None
     begins_near: bool = False
 
     @property
@@ -340,12 +345,11 @@ class FitSearch:
         self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
     ) -> Solution | None:
         """Search for a minimum, and report the iterations; None where the start diverges."""
-        callback = self.callback
 
         def report(iteration: int, cost: float, step: float) -> None:
             """Report one iteration as an event."""
-            if callback is not None:
-                callback(FitEvent(phase=phase, iteration=iteration, cost=cost, step=step))
+            if self.callback is not None:
+                self.callback(FitEvent(phase=phase, iteration=iteration, cost=cost, step=step))
 
         return minimise(problem, begin, settings, self.budget, report)
 
@@ -366,10 +370,10 @@ class FitSearch:
             begin: Unknowns at the begin.
             phase: Name of the search in events.
             is_rough: Whether the fit is only compared with others, so that few digits are enough.
-            is_first: Whether searches from other starts follow where the data are missed. With much
-                data, it then ends near its minimum, and `converged` goes on.
-            cost_to_beat: Cost of another fit with the stated noise. A search without a chance to
-                cost less ends early.
+            is_first: Whether searches from other starts follow where the fit misses the data. With
+                much data, it then ends near its minimum, and `converged` continues it.
+            cost_to_beat: Cost of another fit with the stated noise. A search that cannot reach a
+                lower cost ends early.
 
         Returns:
             The problem, weighted with the noise of the fit, and the solution.
@@ -387,17 +391,17 @@ class FitSearch:
             )
         if self.task.noise_is_stated:
             settings = replace(settings, cost_to_beat=cost_to_beat)
-            if is_first and self._is_much(problem):
+            if is_first and self._has_much_data(problem):
                 dof = problem.value_count - problem.unknown_count
                 least = 0.5 * dof * RELEVANT_SIZE_RATIO**2 / (1.0 - 2.0 * MISSED_ROUGH_SHARE)
                 settings = replace(settings, rough_share=MISSED_ROUGH_SHARE, rough_above=least)
-            return problem, self._found(problem, begin, settings, phase)
+            return problem, self._minimise_or_raise(problem, begin, settings, phase)
 
-        # The stated noise is only the first guess: its minimum is left as soon as it is near. The
-        # noise of the residuals weights them in the next search, which ends likewise until the
-        # noise hardly changes.
+        # The stated noise is only the first guess, so the first search ends near its minimum. The
+        # noise of its residuals weights the next search. Each search ends near its minimum until
+        # the noise hardly changes.
         rough = replace(settings, relinearise_at_end=False, rough_share=ROUGH_SHARE)
-        solution = self._found(problem, begin, rough, phase)
+        solution = self._minimise_or_raise(problem, begin, rough, phase)
         complete, rough = (replace(each, begins_near=True) for each in (settings, rough))
         is_complete = False
         for number in range(MAX_NOISE_ROUNDS):
@@ -422,11 +426,11 @@ class FitSearch:
             if found is None:
                 status = "stopped: the simulation diverges next to the estimate"
                 return problem, replace(solution, success=False, status=status)
-            problem, solution = reweighted, _after(solution, found)
+            problem, solution = reweighted, _continued(solution, found)
         return problem, solution
 
     def best_start(self, problem: FitProblem, begin: UnknownValues) -> UnknownValues:
-        """Find where the search over all data begins: on a subset of them, from several starts.
+        """Find where the search over all data begins, by searches on a subset of them.
 
         Args:
             problem: The problem of all data.
@@ -445,12 +449,12 @@ class FitSearch:
         if is_whole and starts == 1:
             return placed
 
-        # Costs of several starts can be compared only if all searches come close to their minimum.
+        # The costs of several starts are comparable only if all searches come near their minimum.
         rough_share = 0.0
         if starts == 1:
             rough_share = FIRST_ROUGH_SHARE if self.task.noise_is_stated else ROUGH_SHARE
         settings = self._settings_of_part(part, rough_share)
-        found = [self._found(part, placed, settings, "part of the data")]
+        found = [self._minimise_or_raise(part, placed, settings, "part of the data")]
         found += self._from_random_starts(part)
         best = min(found, key=lambda solution: solution.cost).unknowns
         if is_whole:
@@ -462,7 +466,7 @@ class FitSearch:
         whole = replace(best, private=private)
         if self.interrupted:
             return whole
-        candidates = [self._with_begun_states(problem, each) for each in (whole, begin)]
+        candidates = [self._with_quick_initial_states(problem, each) for each in (whole, begin)]
         return min(candidates, key=problem.cost)
 
     def better_start(
@@ -473,7 +477,7 @@ class FitSearch:
         Args:
             problem: The problem of all data, with the noise of both starts.
             begin: Unknowns at the start.
-            beaten: The unknowns that are to cost more.
+            beaten: The unknowns whose cost the improved start has to stay below.
 
         Returns:
             The improved start; None where it costs more on the subset, or diverges there.
@@ -491,10 +495,12 @@ class FitSearch:
             return None
         at = found.unknowns
         begin = replace(begin, theta=at.theta, per_recording=at.per_recording)
-        return self._with_begun_states(problem, begin)
+        return self._with_quick_initial_states(problem, begin)
 
-    def _with_begun_states(self, problem: FitProblem, begin: UnknownValues) -> UnknownValues:
-        """Unknowns with initial states improved by the first part of each segment."""
+    def _with_quick_initial_states(
+        self, problem: FitProblem, begin: UnknownValues
+    ) -> UnknownValues:
+        """Unknowns with initial states improved on the first part of each segment alone."""
         first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
         return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
 
@@ -514,7 +520,7 @@ class FitSearch:
     def converged(self, problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
         """Continue a search that ended near its minimum, or because no step lowered the cost.
 
-        Contacts and dry friction make residuals rough, over which longer differences reach.
+        Contacts and dry friction make residuals rough. Longer differences average over that.
 
         Returns:
             The problem of the last search and its solution; the given ones where the search had
@@ -523,7 +529,7 @@ class FitSearch:
         if solution.rough and not self.interrupted:
             settings = replace(self._settings(problem), begins_near=True)
             found = self.minimise(problem, solution.unknowns, settings, "all data")
-            solution = solution if found is None else _after(solution, found)
+            solution = solution if found is None else _continued(solution, found)
         for factor in LONGER_DIFFERENCES:
             if not solution.stuck or self.task.method == "newton" or self.interrupted:
                 break
@@ -534,20 +540,20 @@ class FitSearch:
             )
             if found is None:
                 break
-            found = _after(solution, found)
+            found = _continued(solution, found)
             if found.success:
                 return longer, found
 
-            # A lower cost counts, but slopes that lead nowhere do not.
+            # The lower cost counts, but not its linearisation by longer differences.
             condensed = problem.condense(found.unknowns)
             if condensed is not None and found.cost < solution.cost:
                 solution = replace(found, condensed=condensed)
         return problem, solution
 
-    def _found(
+    def _minimise_or_raise(
         self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
     ) -> Solution:
-        """Solution of a search. Raises SimulationDivergedError where its start diverges."""
+        """Search for a minimum; SimulationDivergedError where the start diverges."""
         found = self.minimise(problem, begin, settings, phase)
         if found is None:
             raise SimulationDivergedError(
@@ -559,19 +565,18 @@ class FitSearch:
         """Settings of a search that ends at the minimum."""
         if self.task.method == "newton":
             return NEWTON
-        is_linear = self.task.settings.loss == "linear"
-        is_much = self._is_much(problem)
+        has_much_data = self._has_much_data(problem)
         return SearchSettings(
             max_iterations=self.task.settings.max_iterations,
-            tolerance=FINAL_TOLERANCE_OF_MUCH_DATA if is_much else FINAL_TOLERANCE,
-            relinearise_at_end=not is_much,
+            tolerance=FINAL_TOLERANCE_OF_MUCH_DATA if has_much_data else FINAL_TOLERANCE,
+            relinearise_at_end=not has_much_data,
             curved_rows=problem.curved_rows,
             begins_near=self.begins_near,
             in_true_deviations=True,
-            lengthens=not is_linear,
+            lengthens=self.task.settings.loss != "linear",
         )
 
-    def _is_much(self, problem: FitProblem) -> bool:
+    def _has_much_data(self, problem: FitProblem) -> bool:
         """Whether one linearisation of a problem takes long."""
         samples = problem.sample_count * 2 * len(self.task.system.parameters)
         return samples >= SAMPLES_OF_MUCH_DATA
@@ -586,7 +591,7 @@ class FitSearch:
         )
 
     def _from_random_starts(self, problem: FitProblem) -> list[Solution]:
-        """Results of short searches from random parameters; those that diverge are left out."""
+        """Solutions of short searches from random parameters, without those that diverge."""
         settings, system = self.task.settings, self.task.system
         if settings.starts == 1 or self.interrupted:
             return []
@@ -602,13 +607,13 @@ class FitSearch:
         return [solution for solution in searched if solution is not None]
 
     def _residual_sigma(self, problem: FitProblem, at: UnknownValues) -> Array:
-        """(ny,) standard deviations of the residuals, without outliers for a robust loss [y-unit].
+        """(ny,) standard deviations of the residuals [y-unit]; a robust loss ignores outliers.
 
-        Those of the problem where the simulation diverges, or where an output has no values.
+        The problem's noise stays where the simulation diverges or an output has no values.
         """
         sigma = np.array(problem.noise.sigma)
         smallest = MIN_NOISE_SHARE * self.task.system.noise.sigma
-        # Fitted parameters make residuals smaller than the noise.
+        # The fit makes residuals smaller than the noise.
         count = problem.value_count
         correction = np.sqrt(count / max(count - problem.unknown_count, 1))
         for j, errors in enumerate(problem.errors_at(at) or ()):
@@ -620,8 +625,8 @@ class FitSearch:
         return sigma
 
 
-def _after(first: Solution, found: Solution) -> Solution:
-    """A solution with the iterates of the search at whose end its own search began before them."""
+def _continued(first: Solution, found: Solution) -> Solution:
+    """The second of two searches, with the iterates of the first one, at whose end it began."""
     return replace(
         found,
         iterates=(*first.iterates, *found.iterates[1:]),

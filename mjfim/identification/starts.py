@@ -1,14 +1,16 @@
-"""Starts of a fit besides the stated one, and the length of its segments where no start is enough.
+"""Other starts of a fit than the stated one, and the length of its segments.
 
-Where the model diverges at the stated start, or where a fit does not explain the recordings, the
-search begins elsewhere: at a fit to the equation of motion, or at spread values. Residuals over
-short segments with free initial states have few local minima, so that fits over longer and longer
-segments lead from a poor start to a good one.
+`identify` asks for them where the stated start is not enough.
 
-Where a model does not explain the data, its estimates depend on the length of the segments: short
-ones show quick effects, long ones show what adds up. Fits over each of several lengths predict
-parts of the data that were left out, over times of each length. The lengths are compared by the
-relative error over all these times, so that no time dominates because its errors are larger.
+The model may diverge at the stated start, or a fit may not explain the recordings. Then the search
+begins at a fit to the equation of motion, or at spread values. Residuals over short segments with
+free initial states have few local minima. So fits over longer and longer segments lead from a poor
+start to a good one.
+
+Where a model does not explain the data, its estimates depend on the length of the segments. Short
+segments show quick effects, and long ones show effects that add up. Fits over several lengths
+predict left-out parts of the data, over times of each length. The lengths are compared by the
+relative error over all these times, so that times with larger errors do not dominate.
 """
 
 from __future__ import annotations
@@ -48,36 +50,36 @@ from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.events import begin_stage
 from mjfim.records.trajectory import Recording
 
-# Number of starts that are spread about a guess, with the guess, and the largest factor between
-# them and the guess.
+# Number of starts that are spread about a guess, which is one of them. The factor between a start
+# and the guess is at most the second number.
 SPREAD_STARTS = 32
 LARGEST_FACTOR = 10.0
 
-# Number of spread starts from which a short search is made: those that cost least.
+# Number of starts from which a short search is made: those that cost least.
 SEARCHED_STARTS = 3
 
 # Smallest and largest distance of starts on either side of a touch [standard deviations].
 NEAR_SCALES = (0.3, 10.0)
 
-# A short search shows which start leads down.
-SHORT_SEARCH = SearchSettings(max_iterations=4, relinearise_at_end=False)
+# Short search that compares starts.
+TRIAL_SEARCH = SearchSettings(max_iterations=4, relinearise_at_end=False)
 
-# Number of parts into which a recording is cut for the first fit, at most, and smallest number of
-# rows of a segment. Fewer rows tell little besides the free initial state.
+# Largest number of segments of a recording in the first fit, and smallest number of rows of a
+# segment. Fewer rows tell little besides the free initial state.
 MAX_SEGMENTS = 64
 MIN_ROWS = 12
 
-# Number of samples, and least number of segments, that lead near enough to a minimum for a search
-# over all data to begin there.
+# Number of samples, and least number of segments, of a fit over segments. They are enough to lead
+# near the minimum over all data.
 RESTART_SAMPLES = 3_000
 MIN_RESTART_SEGMENTS = 12
 
-# Ratio of the lengths of the segments of one fit and of the fit before it. Segments that are longer
-# than the share of a recording are hardly better than the whole one.
+# Ratio of the lengths of the segments of a fit and of the fit before it, and largest share of a
+# recording in a segment. Longer segments are hardly better than the whole recording.
 LENGTH_RATIO = 4.0
 MAX_SHARE = 0.5
 
-# A fit over segments, of which only the neighbourhood is needed.
+# Search over segments, which only has to end near its minimum.
 SEGMENT_SEARCH = SearchSettings(
     max_iterations=12,
     tolerance=0.1,
@@ -87,16 +89,34 @@ SEGMENT_SEARCH = SearchSettings(
 )
 
 # Free initial states make an iteration over segments longer than one over whole recordings. All
-# fits over segments together take about the time of so many iterations over whole recordings.
+# fits over segments together take about as long as this number of iterations over whole recordings.
 ITERATIONS_OF_ALL_SEGMENTS = 45
 FEWEST_SEGMENT_ITERATIONS = 3
 
 # A value is a fault of the log if it exceeds the typical magnitude of its column by this factor.
 EXTREME_RATIO = 1e6
 
-# Starts instead of that at which the model diverges, in words.
+# Where the search begins if the model diverges at the stated start, in words.
 AT_EQUATION = "at a fit to the equation of motion"
 AT_SPREAD_START = f"at the best of {SPREAD_STARTS} starts spread about it"
+
+# Largest number of samples of a fit that is compared with others, and of the predictions over one
+# length. Of more data, segments that are spread over them are used.
+MAX_SAMPLES = 10_000
+
+# Number of samples of all recordings above which whole recordings are not among the lengths.
+MAX_WHOLE_SAMPLES = 50_000
+
+# Share of the mean loss by which predictions have to be worse before a shorter length is chosen.
+RELEVANT_SHARE = 0.01
+
+# Smallest number of parts of the data whose scatter tells differences from chance, and the
+# probability of a difference by chance.
+MIN_PARTS = 3
+SIGNIFICANCE = 0.01
+
+# Probability that an interval holds the true value.
+CONFIDENCE = 0.95
 
 
 # ---- where a fit begins
@@ -108,9 +128,8 @@ def begin_fit(
     """Find a start at which the model does not diverge.
 
     Returns:
-        The searches from this start, the fit to the equation of motion at which they begin, if
-        there was one, and where they begin instead of the stated start, in words, if the model
-        diverges at that.
+        The searches from this start, and the fit to the equation of motion at which they begin, or
+        None. The text says where they begin if the model diverges at the stated start.
 
     Raises:
         SimulationDivergedError: The simulation diverges at the start, and no other start is found.
@@ -121,31 +140,31 @@ def begin_fit(
         begin_stage("fitting the equation of motion")
         dynamics = fit_equations(problem.system, problem.recordings, task.start)
         if _is_finite(problem, dynamics.theta):
-            return _from(search, dynamics.theta), dynamics, ""
+            return _begun_at(search, dynamics.theta), dynamics, ""
     begin_stage("simulating the segments from the initial guess")
     if _is_finite(problem, task.start):
         return search, dynamics, ""
 
-    # An extreme value is a fault of the log, for which no start helps. The method of the paper
-    # starts where it is told.
+    # An extreme value is a fault of the log, for which no start helps. The method of the paper has
+    # no other start than the stated one.
     extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
     if not extreme and task.method != "newton" and not is_asked:
         for theta, found, words in _other_starts(search, problem):
             if _is_finite(problem, theta):
-                return _from(search, theta), found, words
+                return _begun_at(search, theta), found, words
     raise divergence_at_start(task, problem, extreme)
 
 
 def _other_starts(
     search: FitSearch, problem: FitProblem
 ) -> Iterator[tuple[Array, InverseDynamicsFit | None, str]]:
-    """Parameters where the search may begin instead, with words for them."""
+    """Other parameters at which the search may begin, each with a text that says where it is."""
     task = search.task
     found = try_fit_equations(problem.system, problem.recordings, task.start)
     if found is not None:
         yield found.theta, found, AT_EQUATION
 
-    # The length of the segments is that of the user where it is stated.
+    # A stated length of the segments is kept. Otherwise, fits over several lengths follow.
     if task.settings.segment_length is not None:
         part = problem.of_segments(problem.spread(RESTART_SAMPLES, MIN_RESTART_SEGMENTS))
         theta = _best_spread_start(search, part, task.start)
@@ -157,8 +176,8 @@ def _other_starts(
         yield problem.theta(start), None, AT_SPREAD_START
 
 
-def _from(search: FitSearch, theta: Array) -> FitSearch:
-    """The searches from parameters theta: (p,) that are near the data."""
+def _begun_at(search: FitSearch, theta: Array) -> FitSearch:
+    """The searches from parameters theta: (p,) that are near the minimum."""
     return replace(search, task=replace(search.task, start=np.array(theta)), begins_near=True)
 
 
@@ -172,12 +191,12 @@ def _is_finite(problem: FitProblem, theta: Array) -> bool:
 
 
 def divergence_at_start(task: FitTask, problem: FitProblem, extreme: str) -> Exception:
-    """The error that names the start and the probable cause of the divergence.
+    """The error that names the stated start and the probable cause of the divergence.
 
     Args:
-        task: The task, with the stated start.
+        task: The task.
         problem: Its problem.
-        extreme: An extreme value of the recordings, in words; empty without any.
+        extreme: The text of `describe_extreme_value`.
     """
     cause = f"; {extreme}; is it a fault of the log?"
     if not extreme:
@@ -241,17 +260,17 @@ def spread_starts(
     unphysical: Callable[[Array], Sequence[int]],
     rng: np.random.Generator,
 ) -> Array:
-    """Spread starts about parameters, evenly in each of them.
+    """Spread starts about given values, evenly in each parameter.
 
     Args:
         parameters: The p parameters.
-        theta: (p,) parameters about which starts are spread.
+        theta: (p,) given values.
         held: Names of parameters that keep their values.
-        unphysical: Indices of the parameters of unphysical bodies, by theta.
+        unphysical: Gives the indices of the parameters of unphysical bodies at a theta.
         rng: Source of random numbers.
 
     Returns:
-        (n, p) starts, the given one first; only this one if nothing can move.
+        (n, p) starts, the given one first; only this one if all parameters keep their values.
     """
     starts = np.tile(theta, (SPREAD_STARTS, 1))
     moved = ~np.isin(parameters.names, held) & ~np.asarray(parameters.outside_model)
@@ -272,34 +291,27 @@ def spread_starts(
 
 
 def _best_spread_start(search: FitSearch, problem: FitProblem, theta: Array) -> Array | None:
-    """(p,) result of short searches from the best of many starts; None where all diverge."""
+    """(p,) best parameters after short searches from spread starts; None where all diverge."""
     system, settings = problem.system, search.task.settings
     rng = np.random.default_rng(settings.seed)
     starts = spread_starts(system.parameters, theta, settings.hold, system.impossible, rng)
-    costs = np.array([problem.cost(problem.begin(start)) for start in starts])
-    best, least = None, np.inf
-    for i in np.argsort(costs)[:SEARCHED_STARTS].tolist():
-        if not np.isfinite(costs[i]) or search.interrupted:
-            break
-        phase = f"start {i + 1} of {len(starts)}"
-        found = search.minimise(problem, problem.begin(starts[i]), SHORT_SEARCH, phase)
-        if found is not None and found.cost < least:
-            best, least = problem.theta(found.unknowns), found.cost
-    return best
+    begins = [problem.begin(start) for start in starts]
+    best = _best_after_trials(search, problem, begins, f"of {len(starts)}", np.inf)
+    return None if best is None else problem.theta(best)
 
 
 def start_beyond_stops(search: FitSearch, fit: FitResult) -> UnknownValues | None:
     """The best of many starts near a fit whose motion touches stops or contacts.
 
-    Where a touch comes or goes, the residuals jump, and a search ends at the jump. Starts on either
-    side are drawn from the covariance of the fit, at several scales.
+    Where a touch comes or goes, the residuals jump, and a search ends at the jump. Starts on both
+    sides are drawn from the covariance of the fit, at several scales.
 
     Args:
         search: Searches of the identification.
         fit: The fit.
 
     Returns:
-        The result of short searches from the best starts; None where it costs no less.
+        The best unknowns after short searches; None where none cost less than the fit.
     """
     problem, solution = fit.problem, fit.solution
     condensed = solution.condensed
@@ -311,12 +323,31 @@ def start_beyond_stops(search: FitSearch, fit: FitResult) -> UnknownValues | Non
         common = scale * root @ rng.standard_normal(root.shape[1])
         step = condensed.step_to(common, 0.0, condensed.column_norms)
         begins.append(problem.moved(solution.unknowns, step, 1.0))
+    return _best_after_trials(search, problem, begins, "near stops", solution.cost)
+
+
+def _best_after_trials(
+    search: FitSearch,
+    problem: FitProblem,
+    begins: Sequence[UnknownValues],
+    place: str,
+    least: float,
+) -> UnknownValues | None:
+    """The best unknowns after short searches from the starts that cost least.
+
+    Args:
+        search: Searches of the identification.
+        problem: The problem.
+        begins: Unknowns at the starts.
+        place: End of the name of each search in events.
+        least: Cost that the best unknowns have to stay below; otherwise, the result is None.
+    """
     costs = [problem.cost(begin) for begin in begins]
-    best, least = None, solution.cost
+    best: UnknownValues | None = None
     for i in np.argsort(costs)[:SEARCHED_STARTS].tolist():
         if not np.isfinite(costs[i]) or search.interrupted:
             break
-        found = search.minimise(problem, begins[i], SHORT_SEARCH, f"start {i + 1} near stops")
+        found = search.minimise(problem, begins[i], TRIAL_SEARCH, f"start {i + 1} {place}")
         if found is not None and found.cost < least:
             best, least = found.unknowns, found.cost
     return best
@@ -332,23 +363,23 @@ def start_from_segments(
     *,
     spread: bool,
 ) -> tuple[UnknownValues | None, tuple[float, ...], InverseDynamicsFit | None]:
-    """Fit longer and longer segments, and take the result that costs least over whole recordings.
+    """Fit longer and longer segments, and take the result with the least cost of whole recordings.
 
     Args:
         search: Searches of the identification.
         problem: The problem of the whole recordings.
         null_space: Directions that no recording determines, which are held.
-        spread: Begin at the best of many starts instead of a fit to the equation of motion.
+        spread: Begin at the best spread start instead of a fit to the equation of motion.
 
     Returns:
-        Unknowns of the whole recordings at the best result, None without any, the lengths of the
-        segments [s], and the fit to the equation of motion at which they began, if they did.
+        Unknowns of the whole recordings at the best result, or None; the lengths of the segments
+        [s]; and the fit to the equation of motion at which the fits began, or None.
     """
     used: list[float] = []
     best, least, dynamics = None, np.inf, None
     theta = np.array(search.task.start)
     lengths = segment_lengths(problem.recordings)
-    for length, cut in _cut(problem, RESTART_SAMPLES, MIN_RESTART_SEGMENTS):
+    for length, cut in _problems_by_length(problem, RESTART_SAMPLES, MIN_RESTART_SEGMENTS):
         if search.interrupted:
             break
         part = cut if null_space is None else cut.pinned(theta, null_space)
@@ -357,9 +388,16 @@ def start_from_segments(
             if first is None:
                 break
             theta = first
+
+        # Two simulations for each direction and one without a change linearise a problem.
+        directions = [int(each.estimated.sum()) + each.private_count for each in (problem, part)]
+        whole_time, part_time = (1 + 2 * count for count in directions)
+        allowed = int(ITERATIONS_OF_ALL_SEGMENTS / len(lengths) * whole_time / part_time)
         settings = replace(
             SEGMENT_SEARCH,
-            max_iterations=_iterations(problem, part, len(lengths)),
+            max_iterations=min(
+                max(allowed, FEWEST_SEGMENT_ITERATIONS), SEGMENT_SEARCH.max_iterations
+            ),
             lengthens=search.task.settings.loss != "linear",
         )
         begin = part.begin(theta)
@@ -378,7 +416,10 @@ def start_from_segments(
 def _first_start(
     search: FitSearch, part: FitProblem, *, spread: bool
 ) -> tuple[Array | None, InverseDynamicsFit | None]:
-    """The start of the fit over the shortest segments; None where every start diverges."""
+    """The start of the fits over segments, with its fit to the equation of motion, if there is one.
+
+    It is None where every spread start diverges.
+    """
     start = search.task.start
     if spread:
         return _best_spread_start(search, part, start), None
@@ -388,13 +429,15 @@ def _first_start(
     return start, None
 
 
-def _cut(problem: FitProblem, samples: int, least: int) -> Iterator[tuple[float, FitProblem]]:
-    """Lengths of segments [s], shortest first, and their problems, with segments over all data.
+def _problems_by_length(
+    problem: FitProblem, samples: int, least: int
+) -> Iterator[tuple[float, FitProblem]]:
+    """Lengths of segments [s], shortest first, and problems of such segments over all data.
 
     Args:
         problem: The problem of the whole recordings.
-        samples: About the number of samples of a problem, at most.
-        least: Least number of its segments, if there are as many.
+        samples: Largest number of samples of a problem, approximately.
+        least: Least number of its segments, if the recordings have so many.
     """
     for length in segment_lengths(problem.recordings):
         part = problem.cut(length)
@@ -414,33 +457,7 @@ def segment_lengths(recordings: Sequence[AlignedRecording]) -> tuple[float, ...]
     return tuple(lengths)
 
 
-def _iterations(problem: FitProblem, part: FitProblem, count: int) -> int:
-    """Largest number of iterations of one of several fits over segments."""
-    # Both are linearised by two simulations for each direction and one without a change.
-    whole, parts = (
-        1 + 2 * (int(each.estimated.sum()) + each.private_count) for each in (problem, part)
-    )
-    allowed = int(ITERATIONS_OF_ALL_SEGMENTS / count * whole / parts)
-    return min(max(allowed, FEWEST_SEGMENT_ITERATIONS), SEGMENT_SEARCH.max_iterations)
-
-
-# Number of samples of a fit, and of the predictions over one horizon; of more data, segments that
-# are spread over them are used.
-MAX_SAMPLES = 10_000
-
-# Number of samples of all recordings above which whole recordings are not among the lengths.
-MAX_WHOLE_SAMPLES = 50_000
-
-# Share of the mean loss by which predictions have to be worse before a shorter length is chosen.
-RELEVANT_SHARE = 0.01
-
-# Smallest number of parts of the data whose scatter tells differences from chance, and the
-# probability of a difference by chance.
-MIN_PARTS = 3
-SIGNIFICANCE = 0.01
-
-# Probability that an interval holds the true value.
-CONFIDENCE = 0.95
+# ---- the length of the segments
 
 
 def choose_length(
@@ -454,8 +471,8 @@ def choose_length(
         whole: The fit over whole recordings.
 
     Returns:
-        The comparison, the chosen length [s], None for whole recordings, and the (p,) estimate over
-        it; None where fewer than two lengths can be compared, where a parameter moves the initial
+        The comparison; the chosen length [s], or None for whole recordings; and the (p,) estimate
+        over it. None if fewer than two lengths can be compared, if a parameter moves the initial
         state, or after a request to stop.
     """
     system = search.task.system
@@ -463,17 +480,17 @@ def choose_length(
         return None
     tried: list[tuple[float | None, FitProblem]] = [
         (length, part.pinned(search.task.start, whole.null_space))
-        for length, part in _cut(problem, MAX_SAMPLES, MAX_FOLDS)
+        for length, part in _problems_by_length(problem, MAX_SAMPLES, MAX_FOLDS)
     ]
     if problem.sample_count <= MAX_WHOLE_SAMPLES:
         tried.append((None, problem.of_segments(problem.spread(MAX_SAMPLES, MAX_FOLDS))))
-    parts = _parts(problem)
+    parts = _parts_to_leave_out(problem)
     lengths: list[float | None] = []
     problems: list[FitProblem] = []
     fits: list[Array] = []
     for number, (length, part) in enumerate(tried):
         begin_stage("comparing lengths of the segments", number, len(tried))
-        found = _fitted(search, whole, length, part, parts)
+        found = _estimates_over(search, whole, length, part, parts)
         if search.interrupted:
             return None
         if found is not None:
@@ -483,7 +500,7 @@ def choose_length(
     if len(fits) < 2:
         return None
 
-    # Losses of each fit over each horizon.
+    # Losses of each fit over the segments of each fit.
     sigma = system.noise.sigma
     blocks, budget = blocks_of(parts), search.budget
     losses = [
@@ -524,14 +541,14 @@ def choose_length(
     return study, lengths[chosen], fits[chosen][0]
 
 
-def _fitted(
+def _estimates_over(
     search: FitSearch,
     whole: FitResult,
     length: float | None,
     problem: FitProblem,
     parts: Sequence[LeftOutPart],
 ) -> Array | None:
-    """(K+1, p) estimates over segments of a length, of all data and without each of K parts.
+    """(K+1, p) estimates over segments of a length: from all data, and without each of K parts.
 
     None where a simulation diverges.
     """
@@ -550,8 +567,8 @@ def _fitted(
     return np.array(estimates)
 
 
-def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
-    """Parts that are left out: groups of recordings, or stretches of a few ones."""
+def _parts_to_leave_out(problem: FitProblem) -> tuple[LeftOutPart, ...]:
+    """Parts of the data that are left out: groups of many recordings, or stretches of few ones."""
     count = len(problem.recordings)
     if count >= MAX_FOLDS:
         return tuple(left_out_parts(problem))
@@ -564,7 +581,7 @@ def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
 
 
 def _over_all_horizons(losses: Sequence[Sequence[HeldOutLosses]], index: int) -> HeldOutLosses:
-    """Losses of one fit over all horizons, each relative to the smallest mean loss there.
+    """Losses of one fit over all horizons, relative to the smallest mean loss over each horizon.
 
     Args:
         losses: Losses of each fit over each horizon.
@@ -585,7 +602,7 @@ def _over_all_horizons(losses: Sequence[Sequence[HeldOutLosses]], index: int) ->
 
 
 def _chosen(losses: Sequence[HeldOutLosses]) -> int:
-    """Index of the longest segments whose predictions are not clearly worse than the best ones."""
+    """Index of the longest segments whose predictions are not clearly worse than the best."""
     best = min(losses, key=lambda each: each.error)
     relevant = RELEVANT_SHARE * best.error**2
     good = []

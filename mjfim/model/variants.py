@@ -76,8 +76,8 @@ class ModelVariant:
 
     def differs_in_time_only(self, other: ModelVariant) -> bool:
         """Whether another variant is equal but for its timestep and sample period."""
-        factors = {"sample_factor": 1, "timestep_factor": 1}
-        return replace(self, **factors) == replace(other, **factors)
+        samples, timestep = self.sample_factor, self.timestep_factor
+        return self == replace(other, sample_factor=samples, timestep_factor=timestep)
 
 
 # The model as the user states it.

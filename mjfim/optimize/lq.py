@@ -1,7 +1,8 @@
 """Time-varying linear-quadratic problems: linear recursions, regulator and descent.
 
-A linear recursion over all samples is a banded system with a unit triangular matrix. One LAPACK
-call solves it, without a Python loop, and for many right-hand sides at once.
+The search for a design solves them along every trajectory. A linear recursion over all samples is
+a banded system with a unit triangular matrix. One call of LAPACK solves it without a Python loop,
+and for many right-hand sides at once.
 """
 
 from __future__ import annotations
@@ -27,17 +28,14 @@ class LinearRecursion:
 
     @cached_property
     def _banded_matrix(self) -> Array:
-        """(2n, (N+1) n) the unit lower triangular matrix of the recursion.
-
-        It is stored by diagonals, as LAPACK stores banded matrices.
-        """
+        """(2n, (N+1) n) unit lower triangular matrix of the recursion, by diagonals for LAPACK."""
         N, n, _ = self.A.shape
         band = np.zeros((2 * n, (N + 1) * n), order="F")
         band[0] = 1.0
 
-        # Entry (i, j) of block k couples z_{k+1, i} with z_{k, j}, which is n + i - j rows below
-        # the diagonal. So the entries of a column lie side by side in memory, and those of the next
-        # column begin 2 n - 1 numbers later.
+        # Entry (i, j) of block k couples z_{k+1, i} with z_{k, j}. It is n + i - j rows below the
+        # diagonal. So the entries of a column lie side by side in memory. Those of the next column
+        # begin 2 n - 1 numbers later.
         blocks = band.T[:-n].reshape(N, 2 * n * n)
         blocks[:, n:].reshape(N, n, 2 * n - 1)[:, :, :n] = -self.A.swapaxes(1, 2)
         return band
@@ -117,7 +115,7 @@ def products_at_samples(matrices: Array, vectors: Array) -> Array:
 def largest_amplification(A: Array, sizes: Array | None = None) -> float:
     """Largest amplification of a deviation of the state.
 
-    Deviations from the first to any sample and from any to the last sample are examined.
+    It covers deviations from the first sample to any other, and from any sample to the last.
 
     Args:
         A: (N, nx, nx) transition matrices.
@@ -125,7 +123,7 @@ def largest_amplification(A: Array, sizes: Array | None = None) -> float:
             default: 1.
 
     Returns:
-        The largest spectral norm of the products of these transition matrices; at least 1.
+        The largest spectral norm of the products of transition matrices; at least 1.
     """
     if sizes is not None:
         A = A * (sizes / sizes[:, None])
@@ -136,20 +134,18 @@ def largest_amplification(A: Array, sizes: Array | None = None) -> float:
 def amplification_in_best_units(A: Array, sizes: Array | None = None) -> float:
     """Upper bound of the amplification of deviations, in units of the state that make it small.
 
-    It is the smaller one of two bounds over the deviations of `largest_amplification`, each in
-    units of its own.
+    It is the smaller one of two bounds. The first bound is `largest_amplification` in units of the
+    sizes.
 
-    The first bound is `largest_amplification` in units of the sizes.
+    The second bound uses a matrix M. Its entry (i, j) is the largest deviation of component i after
+    a deviation 1 of component j. Units D of the state turn M into `D^-1 M D`. The best units make
+    its largest row sum equal to the spectral radius of M (Perron and Frobenius). In these units and
+    the largest norm, no deviation grows by a larger factor.
 
-    For the second one, the entry (i, j) of a matrix M is the largest deviation of component i that
-    follows from a deviation 1 of component j. Units D of the state turn M into `D^-1 M D`. The
-    smallest value, over all units, of its largest row sum is the spectral radius of M (Perron and
-    Frobenius), and no deviation grows more than that in these units, in the largest norm.
-
-    So a position that only integrates a speed does not count, however long the motion is, nor does
-    a slow oscillation, whose speeds are small beside its positions. But the entries of M are
-    largest at different times, so that the second bound grows with the number of states; the first
-    one does not.
+    So a position that only integrates a speed does not count, however long the motion is. A slow
+    oscillation does not count either, because its speeds are small beside its positions. But the
+    entries of M are largest at different times. So the second bound grows with the number of
+    states; the first one does not.
 
     Args:
         A: (N, nx, nx) transition matrices.
@@ -191,19 +187,6 @@ def _products(A: Array) -> tuple[Array, Array]:
     return from_start, to_end
 
 
-def _solve_positive_definite(S: Array, rhs: Array) -> Array:
-    """Product S^-1 rhs for a small symmetric positive definite matrix S.
-
-    LAPACK is called directly, because the checks of NumPy take longer than the solution.
-    """
-    _, x, info = scipy.linalg.lapack.dposv(S, rhs)
-    if info != 0:
-        raise np.linalg.LinAlgError(
-            "the Riccati recursion lost positive definiteness; its weights must be positive"
-        )
-    return np.asarray(x)
-
-
 def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
     """Feedback gain of the linear-quadratic regulator.
 
@@ -233,7 +216,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
 class TangentCurve:
     """A tangent vector zeta = (z, v) of the trajectory manifold.
 
-    Functions that say so take m of them as well, which are stacked along a further first axis.
+    Some functions also take m of them, stacked along a further first axis; they say so.
 
     Attributes:
         z: (N+1, nx) change of the state [x-unit].
@@ -272,9 +255,6 @@ class Weights:
         Args:
             other: The form to add.
             factor: Number with which the other form is multiplied.
-
-        Returns:
-            The sum; neither form is changed.
         """
         return Weights(
             Q=self.Q + factor * other.Q,
@@ -288,9 +268,6 @@ class Weights:
 
         Args:
             factor: The number.
-
-        Returns:
-            The scaled form.
         """
         return Weights(Q=factor * self.Q, S=factor * self.S, R=factor * self.R, W=factor * self.W)
 
@@ -346,14 +323,12 @@ def descent(
 
 
 def _constant_weights(N: int, Q: Array, R: Array, terminal: Array) -> Weights:
-    """The form that weighs each of N samples alike, but for the last state."""
-    nx = len(Q)
-    nu = len(R)
+    """The form with the same weights at N samples, and a weight of its own for the last state."""
     return Weights(
         Q=np.stack([*[Q] * N, terminal]),
-        S=np.zeros((N, nu, nx)),
+        S=np.zeros((N, len(R), len(Q))),
         R=np.stack([R] * N),
-        W=np.zeros((N + 1, nu)),
+        W=np.zeros((N + 1, len(R))),
     )
 
 
@@ -361,9 +336,9 @@ def _constant_weights(N: int, Q: Array, R: Array, terminal: Array) -> Weights:
 class RiccatiSolution:
     """Factored linear-quadratic problem with weights that vary over time.
 
-    The Riccati equations are solved once; the minimiser of any linear cost then needs only two
-    banded systems. With weights on the control's changes, the state of the problem is extended by
-    the control of the previous sample, and its size n is nx + nu; otherwise, n is nx.
+    The Riccati equations are solved once. The minimiser of any linear cost then needs only two
+    banded systems. The size n of the problem's state is nx. Weights on the control's changes extend
+    the state by the control of the previous sample, so that n is nx + nu.
 
     Attributes:
         K: (N, nu, n) feedback gain.
@@ -398,8 +373,8 @@ class RiccatiSolution:
         if weights.W.any():
             A, B, weights = _with_previous_control(A, B, weights)
 
-        # Each step of the recursion is one quadratic form of (v_k, z_k): its own weights, and those
-        # of the next state, which the matrix [B A] gives.
+        # Each step of the recursion is one quadratic form of (v_k, z_k). It adds the weights of the
+        # sample and those of the next state, which the matrix [B A] gives.
         to_next = np.concatenate([B, A], axis=2)
         forms = _forms_of_samples(weights)
         factors = np.empty((N, nu, forms.shape[2]))
@@ -408,10 +383,16 @@ class RiccatiSolution:
         steps = zip(to_next[::-1], forms[::-1], factors[::-1], strict=True)
         for matrix, form, factor in steps:
             form += matrix.T.dot(P).dot(matrix)
-            factor[:] = _solve_positive_definite(form[:nu, :nu], form[:nu])
 
-            # The minimum over v_k is a form of z_k. Symmetrise: round-off grows backwards in time
-            # otherwise.
+            # LAPACK is called directly, because the checks of NumPy take longer than the solution.
+            _, factor[:], info = scipy.linalg.lapack.dposv(form[:nu, :nu], form[:nu])
+            if info != 0:
+                raise np.linalg.LinAlgError(
+                    "the Riccati recursion lost positive definiteness; its weights must be positive"
+                )
+
+            # The minimum over v_k is a form of z_k. It is made symmetric, because round-off would
+            # grow backwards in time.
             P = (form - form[:, :nu].dot(factor))[nu:, nu:]
             P = 0.5 * (P + P.T)
 
@@ -431,14 +412,14 @@ class RiccatiSolution:
         Returns:
             The tangent curve, or m of them.
         """
-        # Backward: costate of the closed loop.
+        # The costate of the closed loop comes backwards in time.
         n = self.B.shape[1]
         driving = np.zeros((*a.shape[:-1], n))
         driving[..., : self.nx] = a
         driving[..., :-1, :] -= products_at_samples(self.K.swapaxes(1, 2), b)
         costate = self.closed_loop.adjoint(driving)
 
-        # Forward: the open-loop part of the control moves the closed loop.
+        # The open-loop part of the control moves the closed loop forwards in time.
         reduced = b + products_at_samples(self.B.swapaxes(1, 2), costate[..., 1:, :])
         feedforward = products_at_samples(self.inverse, reduced)
         inputs = -products_at_samples(self.B, feedforward)
@@ -537,8 +518,7 @@ class CurveCoordinates:
         if self._has_feedback:
             driving[..., :-1, :] -= products_at_samples(self.K.swapaxes(1, 2), b)
         costate = self._closed_loop.adjoint(driving)
-        through_state = products_at_samples(self.B.swapaxes(1, 2), costate[..., 1:, :])
-        return b + through_state
+        return b + products_at_samples(self.B.swapaxes(1, 2), costate[..., 1:, :])
 
     def lift(self, c: Array) -> TangentCurve:
         """Tangent curve of a curve coordinate.

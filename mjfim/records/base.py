@@ -1,10 +1,13 @@
-"""Frozen records: read-only arrays, JSON that follows from the fields, files without pickles."""
+"""Base classes of all records: read-only arrays, JSON from the fields, files without pickles.
+
+Every result of the package is a record of `mjfim.records`, or of the module that computes it.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -30,7 +33,8 @@ VERSION = 2
 MAX_VALUE_LENGTH = 48
 MAX_ENTRIES = 4
 
-# Modules that show records as HTML, and that draw their figures.
+# Modules that show records as HTML, and that draw their figures. They are imported by name where
+# they are used, because records must not depend on the output.
 PRESENTATION = "mjfim.output.report"
 PICTURES = "mjfim.output.plots.pictures"
 
@@ -45,52 +49,55 @@ def no_array(*shape: int) -> Any:
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
 def record(kind: type[T]) -> type[T]:
     """Make a frozen dataclass whose fields are keywords and whose arrays nobody can change."""
-    arrays = tuple(name for name, hint in kind.__annotations__.items() if hint == "Array")
+    hints = kind.__annotations__.items()
+    arrays = tuple(name for name, hint in hints if hint in ("Array", "Array | None"))
     kind.array_fields = arrays  # type: ignore[attr-defined]
     return dataclass(frozen=True, kw_only=True, eq=not arrays, repr=False)(kind)
 
 
 class NamedEnum(Enum):
-    """Outcomes that files hold by their names; the values are sentences for people."""
+    """Base class of outcomes. Files hold their names; their values are sentences for people."""
 
     @classmethod
     def _missing_(cls, value: object) -> Any:
-        """The member of a name, as a file holds it."""
+        """The member with a name, as pydantic asks for it when it reads a file."""
         return cls.__members__.get(str(value))
 
 
 class Record:
-    """Base class of records, which the decorator `record` makes dataclasses.
+    """Base class of records. The decorator `record` makes a dataclass of each of them.
 
     Attributes:
         array_fields: Names of the fields that are arrays.
-        in_json: Paths of fields and properties that people read in JSON; default: all fields.
-        json_names: Names in JSON of those that have another one there.
+        in_json: Paths of fields and properties that JSON files show; default: all fields.
+        json_names: Name in JSON by the path, where it is not the last part of the path.
     """
 
     array_fields: ClassVar[tuple[str, ...]] = ()
     in_json: ClassVar[tuple[str, ...]] = ()
     json_names: ClassVar[Mapping[str, str]] = {}
 
-    # Pydantic refuses what a record does not have.
+    # Pydantic refuses fields that the record does not have.
     __pydantic_config__: ClassVar[Mapping[str, Any]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
-        freeze(self, *self.array_fields)
+        freeze(self, *(name for name in self.array_fields if getattr(self, name) is not None))
 
     def __repr__(self) -> str:
-        lines = [f"  {each.name}={_short(getattr(self, each.name))}" for each in _fields(self)]
+        names = [each.name for each in fields(self)]  # type: ignore[arg-type]
+        lines = [f"  {name}={_short_text(getattr(self, name))}" for name in names]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])
 
     @property
     def words(self) -> str:
-        """The record in words, where it has some."""
+        """The record as a text for people."""
         return str(self)
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON files, which people and other programs read."""
         found = {}
-        for path in self.in_json or [each.name for each in _fields(self)]:
+        names = [each.name for each in fields(self)]  # type: ignore[arg-type]
+        for path in self.in_json or names:
             key = self.json_names.get(path, path.rpartition(".")[2])
             found[key] = _summary(attrgetter(path)(self))
         return found
@@ -110,7 +117,7 @@ class SavedRecord(Record):
     array_names: ClassVar[Mapping[str, str]] = {}
 
     def save(self, folder: str | Path) -> None:
-        """Write the record's JSON and npz file; an incomplete file never remains."""
+        """Write the record's JSON file and npz file; an incomplete file never remains."""
         self.save_archive(folder)
         write_json(Path(folder) / f"{self.file_stem}.json", self.summary())
 
@@ -119,7 +126,7 @@ class SavedRecord(Record):
         write_arrays(Path(folder) / f"{self.file_stem}.npz", self._archived())
 
     def as_saved(self) -> Self:
-        """The record as `load` builds it from its files, which are not read."""
+        """The record as `load` would build it, without any file."""
         return self._from_archive(self._archived(), Path(self.file_stem))
 
     @classmethod
@@ -158,7 +165,7 @@ class SavedRecord(Record):
 
     @classmethod
     def _from_archive(cls, arrays: Mapping[str, np.ndarray], path: Path) -> Self:
-        """The record that the arrays of an npz file hold."""
+        """Build the record from the arrays of its npz file."""
         advice = f"write it again with {cls.made_by}"
         try:
             content = json.loads(str(arrays[RECORD]))
@@ -181,8 +188,11 @@ class SavedRecord(Record):
                 json.dumps(values), strict=True, context=dict(arrays)
             )
         except ValueError as error:
+            fault = error.errors()[0]  # type: ignore[attr-defined]
+            place = ".".join(str(part) for part in fault["loc"])
             raise RecordingError(
-                f"{path}: not a {cls.__name__} of this version of mjfim: {_fault(error)}; {advice}"
+                f"{path}: not a {cls.__name__} of this version of mjfim: the field {place!r}: "
+                f"{fault['msg']}; {advice}"
             ) from None
         return made
 
@@ -197,7 +207,7 @@ class ShownRecord(SavedRecord):
         return names
 
     def plot(self, picture: str | None = None, *, file: str | os.PathLike[str] = "") -> Any:
-        """Draw a figure of the record; the verbs of the command line write the same figures.
+        """Draw a figure of the record. The command line writes the same figures.
 
         Args:
             picture: Name of the figure; default: the usual one, see `pictures`.
@@ -214,13 +224,8 @@ class ShownRecord(SavedRecord):
         return html
 
 
-def _fields(value: Any) -> Iterable[Any]:
-    """The fields of a dataclass."""
-    return fields(value)
-
-
 def _summary(value: Any) -> Any:
-    """A value in JSON for people: records by their summaries, outcomes by their names."""
+    """A value as it is shown in JSON: summaries of records, names of outcomes."""
     if isinstance(value, Record):
         return value.summary()
     if isinstance(value, Mapping):
@@ -233,7 +238,14 @@ def _summary(value: Any) -> Any:
 
 
 def _stored(value: Any, path: str, arrays: dict[str, np.ndarray], names: Mapping[str, str]) -> Any:
-    """A value in the text of an archive; its arrays are collected, each under its path."""
+    """A value as it is written into the text of an npz file.
+
+    Args:
+        value: The value.
+        path: Its path from the record.
+        arrays: The arrays that were found so far, by their names; those of the value are added.
+        names: Names of arrays by their path, where they differ from the path.
+    """
     prefix = f"{path}." if path else ""
     if isinstance(value, np.ndarray):
         name = names.get(path, path)
@@ -260,21 +272,14 @@ def _stored(value: Any, path: str, arrays: dict[str, np.ndarray], names: Mapping
 
 @cache
 def _reader(kind: type) -> Any:
-    """What builds a record from the text of an archive."""
+    """The adapter of pydantic that builds a record from the text of an npz file."""
     from pydantic import TypeAdapter  # slow, and needed only where a file is read
 
     return TypeAdapter(kind)
 
 
-def _fault(error: ValueError) -> str:
-    """The first fault that pydantic has found, with the field."""
-    first = error.errors()[0]  # type: ignore[attr-defined]
-    place = ".".join(str(part) for part in first["loc"])
-    return f"the field {place!r}: {first['msg']}"
-
-
-class _Short(Repr):
-    """Values in a few words: arrays, records and long values by their size."""
+class _ShortRepr(Repr):
+    """Short texts of values. They give only the size of arrays, mappings and long sequences."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -282,7 +287,7 @@ class _Short(Repr):
         self.maxtuple = MAX_ENTRIES
 
     def repr1(self, value: Any, level: int) -> str:
-        """Describe one value."""
+        """The text of one value."""
         if isinstance(value, np.ndarray):
             return f"<array of shape {value.shape}>"
         if isinstance(value, Enum):
@@ -296,4 +301,4 @@ class _Short(Repr):
         return f"<{len(value)} values>" if is_long else text
 
 
-_short = _Short().repr
+_short_text = _ShortRepr().repr

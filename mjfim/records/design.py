@@ -508,6 +508,7 @@ class Design(ShownRecord):
     def __post_init__(self) -> None:
         if not len(self.sizes):
             object.__setattr__(self, "sizes", np.abs(self.theta))
+        super().__post_init__()
 
     @property
     def wanted(self) -> tuple[int, ...]:

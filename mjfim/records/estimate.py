@@ -602,6 +602,7 @@ class Estimate(ShownRecord):
         for name, value in defaults.items():
             if len(getattr(self, name)) != count:
                 object.__setattr__(self, name, value())
+        super().__post_init__()
 
     @property
     def guess_sizes(self) -> Array:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
+from mjfim.arrays import Array
 from mjfim.records.base import NamedEnum, Record, ShownRecord, record
 from mjfim.records.trajectory import Labels
 
@@ -85,10 +85,6 @@ class MethodResult(Record):
         "min_eigenvalue": "smallest_eigenvalue",
         "worst_relative_std": "worst_relative_sigma",
     }
-
-    def __post_init__(self) -> None:
-        if self.control is not None:
-            freeze(self, "control")
 
     @property
     def sound(self) -> bool:

@@ -1,4 +1,7 @@
-"""Records of trajectories, their derivatives and labels, and measurements along them."""
+"""Records of trajectories: their states and controls, derivatives, labels and measurements.
+
+The plant computes them, and designs, fits and figures use them.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,13 @@ from mjfim.records.base import Record, SavedRecord, record
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return the label of a quantity; only its name where no unit is known.
-
-    Args:
-        name: Name of the quantity.
-        unit: Its unit; may be empty.
-    """
+    """Return the label of a quantity: its name, with the unit if it is not empty."""
     return f"{name} [{unit}]" if unit else name
 
 
 @record
 class Labels(Record):
-    """Labels of all columns that are shown, `<name> [<unit>]` unless stated otherwise.
+    """Labels of the columns of figures and tables, `<name> [<unit>]` unless stated otherwise.
 
     Attributes:
         qpos: nq labels of the numbers of qpos.
@@ -35,8 +33,7 @@ class Labels(Record):
         controls: nu labels of the controls.
         parameters: p names of the parameters, without unit.
         parameter_units: p units of the parameters; empty where a parameter has none.
-        outputs: Labels of the measured columns, by column; others are shown by the name of their
-            column.
+        outputs: Labels of some measured columns by their names; others are in the model's unit.
     """
 
     qpos: tuple[str, ...]
@@ -48,7 +45,6 @@ class Labels(Record):
     outputs: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that every parameter has a unit."""
         names, units = len(self.parameters), len(self.parameter_units)
         if names != units:
             raise MjfimError(
@@ -65,13 +61,10 @@ class Labels(Record):
         return self.outputs.get(column, f"{column} [model unit]")
 
     def check(self, **sizes: int) -> None:
-        """Check the lengths of fields.
+        """Raise MjfimError where a field does not have the length of the data.
 
         Args:
             sizes: Length of the data by the name of the field.
-
-        Raises:
-            MjfimError: A field has another length.
         """
         for name, size in sizes.items():
             have = len(getattr(self, name))
@@ -122,11 +115,7 @@ class Trajectory(SavedRecord):
         return np.concatenate([self.qpos, self.qvel, self.act], axis=1)
 
     def moves_as(self, other: Trajectory) -> bool:
-        """Whether another trajectory is the same to the last digit.
-
-        Args:
-            other: The other trajectory.
-        """
+        """Whether times, controls and states of another trajectory are exactly the same."""
         same_times = np.array_equal(self.t, other.t)
         same_control = same_times and np.array_equal(self.ctrl, other.ctrl)
         return same_control and np.array_equal(self.state, other.state)
@@ -178,11 +167,7 @@ class Sensitivity(Record):
     is_lumped: bool = False
 
     def of_parameters(self, chosen: Sequence[int]) -> Sensitivity:
-        """The derivatives with respect to some of the parameters.
-
-        Args:
-            chosen: Indices of the parameters, in their new order.
-        """
+        """The derivatives with respect to parameters with these indices, in this order."""
         return Sensitivity(psi=self.psi[:, :, chosen], G=self.G[:, :, chosen])
 
 
@@ -219,13 +204,10 @@ class Recording(SavedRecord):
                     f"{self.name}: {name!r} holds truth values (True and False), which are no "
                     "measurement; give an array of numbers"
                 )
+        super().__post_init__()
 
     def first_rows(self, count: int) -> Recording:
-        """The recording without the rows after the first ones.
-
-        Args:
-            count: Number of rows that remain, at least 2; a shorter recording is unchanged.
-        """
+        """The first `count` rows, which are 2 or more; a shorter recording is unchanged."""
         if len(self.t) <= count:
             return self
         return replace(self, t=self.t[:count], ctrl=self.ctrl[: count - 1], y=self.y[:count])
@@ -241,7 +223,7 @@ class Recording(SavedRecord):
 
 @record
 class Playback(Record):
-    """A design at the controller's rate, with M rows of control and the final state.
+    """A design as a controller plays it: M rows at the controller's rate, and the final state.
 
     Attributes:
         t: (M+1,) times [s].

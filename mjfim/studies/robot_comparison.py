@@ -1,8 +1,9 @@
 """Comparison of two estimates: two robots of one kind, or one robot before and after.
 
-Each parameter is tested by Student's test, with the honest standard deviations of both estimates
-and the scatter between recordings, which both robots share; all parameters together by the
-statistic of Wald. The p-values are corrected for the number of tests by the method of Holm (1979).
+Each parameter is tested by Student's test. It uses the honest standard deviations of both estimates
+and the scatter between recordings, which is assumed to be the same for both robots. All parameters
+together are tested by the statistic of Wald. The p-values are corrected for the number of tests by
+the method of Holm (1979). `mjfim compare-robots` calls `compare_estimates`.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from mjfim.records.check import join_names
 from mjfim.records.estimate import Estimate
 from mjfim.records.robots import RobotComparison
 
-# Probability to find any difference where there is none.
+# Probability of finding a difference where there is none.
 LEVEL = 0.05
 
-# Probability with which the stated differences would have been found.
+# Probability of finding a difference that is as large as the detectable one.
 POWER = 0.8
 
-# Degrees of freedom of standard deviations that are as good as known.
-MANY = 1e6
+# Degrees of freedom of standard deviations that count as known.
+MANY_DEGREES = 1e6
 
 # Eigenvalues of a correlation matrix below this share of the largest one count as zero.
 RANK_TOLERANCE = 1e-9
@@ -55,7 +56,7 @@ def compare_estimates(
         Differences of the parameters that both estimates determine, and their significance.
 
     Raises:
-        ExperimentError: The names are not two different ones, the estimates have no parameter in
+        ExperimentError: The two names are not different, or the estimates have no parameter in
             common, or come from the same recordings.
     """
     names = tuple(names)
@@ -82,23 +83,24 @@ def compare_estimates(
     values = np.array([each.theta[place] for each, place in zip(both, index, strict=True)])
     is_single = [(each.sizes == np.abs(each.theta))[k] for each, k in zip(both, index, strict=True)]
 
-    # Both robots scatter alike: few recordings of one say little about it.
+    # Both robots share one variance between recordings, because a few recordings of one robot
+    # determine it poorly.
     tau2, freedom, numbers = np.stack([_scatter(each, compared) for each in both], axis=1)
     total = freedom.sum(axis=0)
     between = (freedom * tau2).sum(axis=0) / np.maximum(total, 1.0) / numbers
     honest = [honest_std(each)[place] for each, place in zip(both, index, strict=True)]
     std = np.sqrt(np.array(honest) ** 2 + between)
 
-    # The scatter between recordings is known from few of them.
+    # Few recordings determine this variance, so the degrees of freedom of Student's test are few.
     difference = values[1] - values[0]
     width = np.hypot(*std)
     known = np.where(width > 0.0, width, 1.0)
-    degrees = satterthwaite(between.sum(axis=0) / known**2, MANY, total)
+    degrees = satterthwaite(between.sum(axis=0) / known**2, MANY_DEGREES, total)
     p = 2.0 * scipy.special.stdtr(degrees, -np.abs(difference) / known)
     t = scipy.special.stdtrit(degrees, 0.975)
     found = scipy.special.stdtrit(degrees, 1.0 - 0.5 * LEVEL / (len(compared) + 1))
     covariance = sum(_covariance(*each) for each in zip(both, index, std, strict=True))
-    middle = float(np.median(degrees)) if compared else MANY
+    middle = float(np.median(degrees)) if compared else MANY_DEGREES
     corrected = holm(np.append(p, f_tail(*_wald(difference, np.asarray(covariance)), middle)))
 
     return RobotComparison(
@@ -123,12 +125,9 @@ def compare_estimates(
 
 
 def honest_std(estimate: Estimate) -> Array:
-    """(p,) standard deviations of estimates, without the scatter between recordings [theta-unit].
+    """(p,) standard deviations of an estimate, without the scatter between recordings [theta-unit].
 
-    They are those of the 95 % intervals, which allow for autocorrelated residuals.
-
-    Args:
-        estimate: The estimate.
+    They are those of its 95 % intervals, which allow for autocorrelated residuals.
     """
     low, high = estimate.interval.T
     below, above = estimate.theta - low, high - estimate.theta
@@ -136,20 +135,20 @@ def honest_std(estimate: Estimate) -> Array:
     half_width = np.where(at_bound, np.maximum(below, above), 0.5 * (high - low))
     without_scatter = np.maximum(estimate.std, estimate.std_sandwich)
 
-    # An interval that allows for recordings that disagree contains their scatter already.
-    is_apart = (estimate.between_recordings > 0.0) & (estimate.recording_comparison is not None)
-    widened = np.where(is_apart, 0.0, half_width / NORMAL_95)
+    # Where recordings disagree, the interval already contains their scatter.
+    disagrees = (estimate.between_recordings > 0.0) & (estimate.recording_comparison is not None)
+    widened = np.where(disagrees, 0.0, half_width / NORMAL_95)
     return np.asarray(np.maximum(without_scatter, widened))
 
 
 def _covariance(estimate: Estimate, index: Sequence[int], std: Array) -> Array:
     """(q, q) covariance of some parameters, which agrees with their standard deviations.
 
-    Combinations that are known better than the single parameters stay so.
+    Combinations that the estimate knows better than single parameters remain so.
 
     Args:
         estimate: The estimate.
-        index: Indices of the q parameters, which it determines.
+        index: Indices of the q parameters.
         std: (q,) their standard deviations [theta-unit].
     """
     place = np.ix_(index, index)
@@ -166,8 +165,8 @@ def _scatter(estimate: Estimate, parameters: Sequence[str]) -> Array:
     """Scatter of q parameters between the recordings of one robot.
 
     Returns:
-        (3, q) variances between recordings [theta-unit²], degrees of freedom with which they are
-        known, and effective numbers of recordings of the weighted means, at least 1.
+        (3, q) variances between recordings [theta-unit²], their degrees of freedom, and effective
+        numbers of recordings in the weighted means, at least 1.
     """
     found = np.zeros((3, len(parameters)))
     found[2] = 1.0
@@ -192,13 +191,13 @@ def _scatter(estimate: Estimate, parameters: Sequence[str]) -> Array:
 
 
 def holm(p: Array) -> Array:
-    """Correct p-values for their number, so that any false finding is as rare as stated.
+    """Correct p-values for the number of tests (Holm 1979).
 
     Args:
         p: (q,) p-values.
 
     Returns:
-        (q,) corrected p-values (Holm 1979).
+        (q,) corrected p-values. With probability 1 - L, none of those below L is a false finding.
     """
     order = np.argsort(p, kind="stable")
     factors = np.arange(len(p), 0, -1)
@@ -208,7 +207,7 @@ def holm(p: Array) -> Array:
 
 
 def _wald(difference: Array, covariance: Array) -> tuple[float, int]:
-    """Squared length of a difference in its covariance, and the rank of the covariance."""
+    """Wald's statistic of a difference with a covariance, and the rank of the covariance."""
     if not len(difference):
         return 0.0, 0
     std = np.sqrt(np.diag(covariance))
@@ -223,7 +222,7 @@ def _wald(difference: Array, covariance: Array) -> tuple[float, int]:
 
 
 def _why_not_compared(name: str, first: Estimate, second: Estimate, names: Sequence[str]) -> str:
-    """Why a parameter of both estimates cannot be compared; empty where it can."""
+    """Reason why a parameter of both estimates is not compared; empty where it is."""
     if name.startswith(INITIAL_STATE_PREFIX):
         return "it belongs to a recording"
     units = [estimate.units[estimate.parameters.index(name)] for estimate in (first, second)]
@@ -240,7 +239,7 @@ def _why_not_compared(name: str, first: Estimate, second: Estimate, names: Seque
 def _remarks(
     first: Estimate, second: Estimate, names: Sequence[str], common: Sequence[str]
 ) -> Iterator[str]:
-    """Sentences that limit a comparison, the most serious ones first."""
+    """Sentences that limit the comparison, the most serious ones first."""
     both = list(zip(names, (first, second), strict=True))
     for robot, estimate in both:
         if not estimate.success:
@@ -253,8 +252,11 @@ def _remarks(
 
     yield from _remarks_on_recordings(first, second, names)
     for (robot, estimate), (other, another) in (both, both[::-1]):
-        missing = [name for name in estimate.parameters if name not in another.parameters]
-        missing = [name for name in missing if not name.startswith(INITIAL_STATE_PREFIX)]
+        missing = [
+            name
+            for name in estimate.parameters
+            if name not in another.parameters and not name.startswith(INITIAL_STATE_PREFIX)
+        ]
         if missing:
             yield (
                 f"{first_ones(missing)}: a parameter of {robot}, but fixed for {other}, which can "
@@ -266,7 +268,7 @@ def _remarks(
 def _remarks_on_recordings(
     first: Estimate, second: Estimate, names: Sequence[str]
 ) -> Iterator[str]:
-    """Sentences on recordings that both estimates contain, and on single ones."""
+    """Sentences on recordings that both estimates contain, and on robots with one recording."""
     shared = _shared_recordings(first, second)
     if shared:
         yield (
@@ -294,10 +296,11 @@ def _remarks_on_parameters(
         if why and not name.startswith(INITIAL_STATE_PREFIX):
             yield f"{name} is not compared: {why}"
 
-    index = ((name, [each.parameters.index(name) for each in (first, second)]) for name in common)
-    with_prior = [
-        name for name, (i, j) in index if first.prior[i, i] > 0.0 and second.prior[j, j] > 0.0
-    ]
+    with_prior = []
+    for name in common:
+        index = [each.parameters.index(name) for each in (first, second)]
+        if first.prior[index[0], index[0]] > 0.0 and second.prior[index[1], index[1]] > 0.0:
+            with_prior.append(name)
     if with_prior:
         yield (
             f"{first_ones(with_prior)}: the priors of both estimates draw them to one value, so "

@@ -16,7 +16,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.shortest_horizon import (
     OutOfReachError,
-    fitted,
+    fit_control,
     largest_ratio_to_target,
     target_accuracies,
 )
@@ -207,7 +207,9 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
 
     def made(samples: int, **tables: object) -> list[float]:
         return (
-            fitted(DesignTask.resolve(STUDY.replace(horizon=samples / 100.0, **tables)), control)
+            fit_control(
+                DesignTask.resolve(STUDY.replace(horizon=samples / 100.0, **tables)), control
+            )
             .ravel()
             .tolist()
         )

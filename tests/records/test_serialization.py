@@ -226,7 +226,7 @@ def test_the_files_of_the_design_verb_are_loaded(
     loaded = Design.load(tmp_path)
     assert_same(loaded, design)
     assert loaded.success == design.success and loaded.wanted == design.wanted
-    assert not loaded.theta.flags.writeable
+    assert not loaded.theta.flags.writeable and not design.theta.flags.writeable
 
 
 def test_a_design_goes_on_from_its_file(design: Design, task: DesignTask, tmp_path: Path) -> None:
@@ -239,6 +239,7 @@ def test_a_design_goes_on_from_its_file(design: Design, task: DesignTask, tmp_pa
 def test_an_estimate_is_loaded_as_it_was(estimate: Estimate, tmp_path: Path) -> None:
     """With recordings, predictions, tests of residuals, units and priors."""
     assert estimate.predictions and estimate.whiteness and estimate.motion is not None
+    assert not (estimate.theta.flags.writeable or estimate.interval.flags.writeable)
     round_trip(estimate, tmp_path)
 
 

@@ -1,6 +1,7 @@
-"""Base class of the physical terms of the library: fields with units and sizes, and elements.
+"""Base class of the physical terms that an experiment can add to a model, such as friction.
 
-Terms extend an MjSpec, with its keyframes and the layout of its state.
+`friction`, `drives` and `library` define the kinds. `mjfim.model.loading` adds the terms of an
+experiment to the MjSpec of its model, and extends its keyframes and its state.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from mjfim.model.units import actuator_gear, commanded_joint, joint_unit
 # Significant digits of numbers that the library chooses.
 CHOSEN_DIGITS = 3
 
-# Mass and inertia of a body that a term adds for its geometry alone, over those of the link.
+# Mass and inertia, relative to those of the link, of a body that matters only by its position.
 NEGLIGIBLE = 1e-6
 
 # Keys of a table `[terms.<name>]` that name the element on which the term acts.
 ELEMENT_KEYS = ("joint", "actuator", "body")
 
-# Values of some fields of a term, and the names of those that a fit estimates.
+# Values of some fields with which a test looks for a term, and the names of those that it fits.
 Shape = tuple[dict[str, float], tuple[str, ...]]
 
-# Range of a number that physics keeps from being negative.
+# Range of a number that cannot be negative in physics.
 NON_NEGATIVE = (0.0, np.inf)
 
 # Types of dynamics whose activation follows the control, so that it equals the control at rest.
@@ -51,7 +52,7 @@ class FieldDescription:
     Attributes:
         name: Name of the field in paths `term/<name>:<field>`.
         description: What the number is, with its letter in the equation.
-        unit: Its unit, for a hinge where it depends on the joint.
+        unit: Its unit; where it depends on the joint, that at a hinge.
     """
 
     name: str
@@ -65,7 +66,7 @@ class TermQuantity:
 
     Attributes:
         value: Value in the model where no parameter sets it [unit].
-        unit: Unit of the number; empty where it has none or where it is not evident.
+        unit: Unit of the number; empty where it has none or where it is not known.
         size: Natural size with which a change of the number is compared [unit].
         bounds: Smallest and largest physical value [unit].
         numbers: Parameter paths of the numbers in the extended model that it determines, each with
@@ -85,7 +86,7 @@ class TermTable:
 
     Attributes:
         name: Name of the term.
-        element: Names of the elements on which it acts, by the keys of `ELEMENT_KEYS`.
+        element: Keys of `ELEMENT_KEYS`, each with the name of the element on which the term acts.
         values: Values of fields that the table states [unit of the field].
         encoder: Side of an elastic joint on which the joint's sensors are: `motor` or `link`.
     """
@@ -105,15 +106,15 @@ class Term(ABC):
         description: One sentence about the physics.
         equation: The force or torque, in the letters of `fields`.
         elements: MuJoCo's elements of which the term consists.
-        acts_on: Key of the table that names the element on which it acts; empty for the base.
+        acts_on: Key of the table that names its element; empty for a term of the base.
         fields: Its fields.
         sources: Publications that describe it.
         is_written_as_a_whole: Whether some number of the model depends on several fields.
-        words: What a model lacks, with `{}` for the element; empty where no test looks for it.
-        size: Field that is zero, or hardly anything, without the term.
-        beside: Field of the joint that has to act there as well; empty for none.
-        alone: Whether other terms are tested without it, which it would disturb.
-        screened: Whether simulations with some sizes look for it in place of a linear test.
+        words: What a model without it lacks, with `{}` for the element; empty if nothing tests it.
+        size: Field that is zero, or almost zero, without the term.
+        beside: Field of the joint without which no test looks for the term; empty for none.
+        alone: Whether it would disturb tests of other terms, so that they leave it out.
+        screened: Whether simulations with some sizes look for it instead of a linear test.
         name: Name of the term, and of the elements that it adds.
         quantities: Its fields, resolved against the model, by name.
     """
@@ -159,8 +160,8 @@ class Term(ABC):
             speed: Typical speed of its joint [m/s or rad/s].
 
         Returns:
-            Values of some fields, and the names of those that a fit estimates besides the size;
-            none where the term has no effect.
+            Pairs of values of some fields, and the names of the fields that a fit estimates besides
+            the size; none where the term has no effect.
         """
         return [({}, ())]
 
@@ -191,7 +192,7 @@ class Term(ABC):
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Write all fields into a model that the caller owns, in place.
 
-        Only terms whose fields are not single numbers of the model need it.
+        Only terms with `is_written_as_a_whole` need it.
 
         Args:
             model: The extended model.
@@ -228,8 +229,8 @@ def named_element(table: TermTable, key: str, model: Any, kind: str) -> tuple[st
         kind: Kind of the term, for messages.
 
     Raises:
-        ExperimentError: The table does not name the element, names another one besides it, or the
-            model has no such element.
+        ExperimentError: The table does not name the element, the model does not have it, or the
+            table names an element by another key.
     """
     stated = dict(table.element)
     for other in stated:
@@ -247,13 +248,7 @@ def named_element(table: TermTable, key: str, model: Any, kind: str) -> tuple[st
 
 
 def require_free_name(model: Any, kind: str, name: str) -> None:
-    """Raise ExperimentError where the model has an element of a kind and a name already.
-
-    Args:
-        model: The stated model.
-        kind: Kind of the element that a term would add.
-        name: Its name.
-    """
+    """Raise ExperimentError where the model already has an element of this kind and name."""
     if identifier(model, kind, name) >= 0:
         raise ExperimentError(
             f"the model has {'an' if kind == 'actuator' else 'a'} {kind} {name!r} already; give "
@@ -285,7 +280,7 @@ class JointSizes:
 
     @staticmethod
     def of(table: TermTable, model: Any, period: float, kind: str) -> JointSizes:
-        """Sizes at the joint that a table names; ExperimentError for ball and free joints."""
+        """Sizes at the joint that a table names; ExperimentError at ball and free joints."""
         name, number = named_element(table, "joint", model, kind)
         scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
         if int(model.jnt_type[number]) not in scalar:
@@ -308,7 +303,7 @@ class JointSizes:
 
 
 def rounded(number: float) -> float:
-    """A number that the library chooses, with as many digits as matter."""
+    """A number that the library chooses, with `CHOSEN_DIGITS` digits."""
     return float(f"{number:.{CHOSEN_DIGITS}g}")
 
 
@@ -319,7 +314,7 @@ def joint_inertia(model: Any, joint: int) -> float:
 
 
 def motors_at(model: Any, joint: int) -> dict[str, int]:
-    """Names and numbers of the actuators with a control at a joint.
+    """Names and numbers of the actuators at a joint, without those that have no control.
 
     Raises:
         ExperimentError: One of them has no name; the message is a clause.
@@ -333,7 +328,7 @@ def motors_at(model: Any, joint: int) -> dict[str, int]:
 
 
 def move_to_tendon(spec: Any, motors: Iterable[str], tendon: str) -> None:
-    """Let actuators of an MjSpec act on a tendon in place of their joint."""
+    """Let actuators of an MjSpec act on a tendon instead of their joint."""
     for name in motors:
         actuator = spec.actuator(name)
         actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
@@ -356,7 +351,7 @@ def light_body(model: Any, body: int, inertia: float) -> tuple[float, float]:
 
 
 def add_body(parent: Any, name: str, mass: float, inertia: float, com: Any) -> Any:
-    """Add a body to another one of an MjSpec, with an inertia that is equal about all axes."""
+    """Add a body with equal inertia about all axes to another body of an MjSpec."""
     body = parent.add_body(name=name)
     body.mass = mass
     body.ipos = np.array(com)
@@ -366,7 +361,7 @@ def add_body(parent: Any, name: str, mass: float, inertia: float, com: Any) -> A
 
 
 def add_plain_joint(body: Any, name: str, axis: Any, place: Any, *, slides: bool) -> Any:
-    """Add a slide or hinge to a body of an MjSpec, on which nothing acts whatever its class is."""
+    """Add a slide or hinge without forces to a body of an MjSpec, whatever its default class."""
     kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
     joint = body.add_joint(name=name, type=kind, axis=axis, pos=place)
     joint.stiffness = np.zeros(np.size(joint.stiffness))
@@ -388,7 +383,7 @@ def with_first(polynomial: Any, value: float) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateLayout:
-    """Where the state of the stated model is in that of the extended one.
+    """Addresses of the stated model's state in the state of the extended model.
 
     Attributes:
         qpos: (nq,) addresses of the stated positions in the extended ones.
@@ -436,7 +431,7 @@ class StateLayout:
         return frozenset(range(size)) - stated
 
     def positions(self, stated: Any) -> Array:
-        """(nq,) extended positions: those of the stated model, and references of added joints."""
+        """(nq,) extended positions; added joints are at their references."""
         positions = np.array(self.model.qpos0)
         positions[self.qpos] = stated
         return positions
@@ -453,8 +448,8 @@ class StateLayout:
         Args:
             stated: (na,) activations of the stated model.
             qpos: (nq,) positions of the extended model.
-            ctrl: (nu,) control at rest; None where none is stated. Then a position servo holds its
-                joint, and other controls are zero.
+            ctrl: (nu,) control at rest. Without one, position servos hold their joints, and other
+                controls are zero.
         """
         activations = np.zeros(self.model.na)
         added = np.setdiff1d(np.arange(self.model.na), self.act)
@@ -467,7 +462,7 @@ class StateLayout:
         return activations
 
     def _resting_control(self, actuator: int, qpos: Array, ctrl: Array | None) -> float:
-        """Control of an actuator with one control at rest."""
+        """Control at rest of an actuator that has one control."""
         if ctrl is not None:
             return float(ctrl[self.model.actuator_ctrladr[actuator]])
         joint = commanded_joint(self.model, actuator)
@@ -496,7 +491,8 @@ def extended_spec(
     for term in terms:
         term.edit(extended)
 
-    # Keyframes have the sizes of the state, which the terms may change.
+    # Terms may change the size of the state. The spec compiles only if its keyframes have that size
+    # or are empty.
     numbers = [
         [np.array(each) for each in (key.qpos, key.qvel, key.act, key.ctrl)]
         for key in extended.keys
@@ -521,8 +517,8 @@ def _write_key(key: Any, numbers: Sequence[Array], layout: StateLayout) -> None:
 
     Args:
         key: The keyframe.
-        numbers: Positions, velocities, activations and control that the keyframe of the stated
-            model has; empty where it states none.
+        numbers: Positions, velocities, activations and control in the keyframe of the stated model;
+            each is empty where the keyframe does not state it.
         layout: The layout of the extended state.
     """
     positions, velocities, activations, ctrl = numbers

@@ -221,8 +221,8 @@ def comparison_page(comparison: Comparison) -> Page:
     )
     parts += [Text(f"{legend} {BEST_CASE}", Emphasis.WEAK), _std_table(comparison)]
     steps: tuple[str, ...] = (
-        "Rehearse a design before a robot plays it: `mjfim design EXPERIMENT -o FOLDER`. No control "
-        "of this comparison was rehearsed; each is a table beside this file.",
+        "Rehearse a design before a robot plays it: `mjfim design EXPERIMENT -o FOLDER`. No "
+        "control of this comparison was rehearsed; each is a table beside this file.",
     )
     if comparison.beating:
         name = comparison.beating[0].title
