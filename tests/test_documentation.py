@@ -23,6 +23,7 @@ from typing import Any
 import pytest
 
 import mjfim
+from mjfim.cli import design as design_verb
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment import System
@@ -175,8 +176,9 @@ def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
 @pytest.mark.parametrize(
     "path", [path for path in DOCUMENTS if runnable(path, "sh")], ids=lambda path: path.name
 )
-def test_shell_blocks_run(path: Path, checkout: Path) -> None:
+def test_shell_blocks_run(path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are made, and not rendered."""
+    monkeypatch.setattr(design_verb, "DEFAULT_SECONDS", 5.0)
     for block in runnable(path, "sh"):
         for line, code in commands(block):
             run_line(quicker(line), checkout, code)
