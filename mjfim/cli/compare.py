@@ -11,12 +11,17 @@ from mjfim.cli.common import ExperimentFile, Run, verb
 from mjfim.cli.progress import progress
 from mjfim.errors import NoResultError
 
+# Longest time of a method [s]: a week.
+MAX_SECONDS = 604_800.0
+
 
 @verb()
 def compare(
     experiment: ExperimentFile,
     run: Run,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Time of each method in seconds.")] = 60.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, max=MAX_SECONDS, help="Time of each method in seconds.")
+    ] = 60.0,
     methods: Annotated[
         str | None,
         typer.Option(

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError, shortened, unknown
 from mjfim.model.control_laws import FIELDS as LAW_FIELDS
 from mjfim.model.control_laws import controllers_of, law_field, law_unit
 from mjfim.model.coordinates import (
@@ -150,7 +150,7 @@ class ParameterPath:
         match = PATH_PATTERN.match(text)
         if match is None:
             raise ExperimentError(
-                f"parameter path {text!r} is not of the form kind/name:field[index]"
+                f"parameter path {shortened(repr(text))} is not of the form kind/name:field[index]"
             )
         return cls(
             text=text,
@@ -178,7 +178,7 @@ class ParameterPath:
 
     def error(self, fault: str) -> ExperimentError:
         """Exception that names the path and says what is wrong with it."""
-        return ExperimentError(f"in parameter path {self.text!r}: {fault}")
+        return ExperimentError(f"in parameter path {shortened(repr(self.text))}: {fault}")
 
 
 def fields_of(kind: str) -> list[str]:
