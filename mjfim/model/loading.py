@@ -52,7 +52,7 @@ def load_spec(path: Path, files: Any = None, packages: Mapping[str, str] = NO_PA
         )
     name = str(path) if files is None else path.as_posix()
     if files is None:
-        files_of_model(path)  # refuses pipes before MuJoCo waits for their ends
+        files_of_model(path)  # refuses pipes and circles before MuJoCo follows them without end
     try:
         with collected_warnings(of_reader=True) as found:
             spec = mujoco.MjSpec.from_file(name, vfs=files)

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -85,9 +86,13 @@ def files_of_model(path: Path) -> tuple[Path, ...]:
     Returns:
         Existing files that MuJoCo may read for the model, the model first. Where a name fits
         several files, all of them are listed.
+
+    Raises:
+        ModelError: A file is a pipe or a device, or a model attaches itself.
     """
     found = dict.fromkeys([path])
     mains = [path]
+    attached: dict[Path, set[Path]] = {}
     # The list of models grows while it is read.
     for main in mains:
         places, folders = {main.parent}, {Path()}
@@ -107,6 +112,13 @@ def files_of_model(path: Path) -> tuple[Path, ...]:
             files = _existing(name, places, folders) if in_package is None else [in_package]
             found.update(dict.fromkeys(files))
             mains += [file for file in files if is_model and file not in mains]
+            if is_model and (main.parent / name).is_file():
+                attached.setdefault(main.resolve(), set()).add((main.parent / name).resolve())
+    try:
+        TopologicalSorter(attached).prepare()
+    except CycleError as error:
+        names = ", ".join(file.name for file in error.args[1])
+        raise ModelError(f"{path}: a model attaches itself ({names})") from None
     return tuple(found)
 
 

@@ -73,6 +73,16 @@ def test_a_pipe_in_the_tree_of_a_model_is_refused(place: str, tmp_path: Path) ->
         load_spec(tmp_path / "model.xml")
 
 
+@pytest.mark.parametrize("other", ["model.xml", "other.xml"])
+def test_a_model_that_attaches_itself_is_refused(other: str, tmp_path: Path) -> None:
+    """MuJoCo would follow the circle until its stack overflows."""
+    text = '<mujoco><asset><model name="m" file="{}"/></asset></mujoco>'
+    (tmp_path / "other.xml").write_text(text.format("model.xml"), encoding="utf-8")
+    (tmp_path / "model.xml").write_text(text.format(other), encoding="utf-8")
+    with pytest.raises(ModelError, match=r"model.xml: a model attaches itself \("):
+        load_spec(tmp_path / "model.xml")
+
+
 # A link whose mesh is a file of a ROS package.
 PACKAGED = """
 <robot name="one">
