@@ -117,8 +117,8 @@ def files_of_model(path: Path) -> tuple[Path, ...]:
     try:
         TopologicalSorter(attached).prepare()
     except CycleError as error:
-        names = ", ".join(file.name for file in error.args[1])
-        raise ModelError(f"{path}: a model attaches itself ({names})") from None
+        circle = ", ".join(file.name for file in error.args[1])
+        raise ModelError(f"{path}: a model attaches itself ({circle})") from None
     return tuple(found)
 
 
