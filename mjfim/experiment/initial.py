@@ -17,7 +17,9 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import by_name
 from mjfim.experiment.system_tables import Initial, Signal
-from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.coordinates import joint_names
+from mjfim.model.elements import names_of
+from mjfim.model.limited_elements import quaternion_address, quaternion_joints
 from mjfim.model.terms.term import StateLayout
 
 # Degree of the splines.
@@ -262,10 +264,9 @@ def keyframe(model: Any, key: str, name: str | None) -> Any:
     if name is None:
         return None
 
-    kind = mujoco.mjtObj.mjOBJ_KEY
-    names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(model.nkey)]
+    names = names_of(model, "key")
     if name not in names:
-        raise ExperimentError(f"{key}: {unknown('keyframe', name, [n for n in names if n])}")
+        raise ExperimentError(f"{key}: {unknown('keyframe', name, names)}")
     return model.key(name)
 
 
@@ -331,15 +332,11 @@ def _completed(
 
 def _require_rotations(model: Any, qpos: Array) -> None:
     """Raise ExperimentError if a quaternion in qpos: (nq,) is zero."""
-    for j, name in enumerate(joint_names(model)):
-        if joint_dofs(model, j) == 1:
-            continue
-
-        # The quaternion of a free joint follows its position.
-        is_free = int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE
-        first = int(model.jnt_qposadr[j]) + (3 if is_free else 0)
+    names = joint_names(model)
+    for joint in quaternion_joints(model):
+        first = quaternion_address(model, joint)
         if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
             raise ExperimentError(
-                f"initial.qpos: the quaternion of joint {name!r} (numbers {first} to {first + 3}) "
-                "is zero; the identity rotation is 1, 0, 0, 0"
+                f"initial.qpos: the quaternion of joint {names[joint]!r} (numbers {first} to "
+                f"{first + 3}) is zero; the identity rotation is 1, 0, 0, 0"
             )

@@ -15,7 +15,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.model.units import acts_at_joint
 
-# MuJoCo's object type of every kind of element that a parameter path can name.
+# MuJoCo's object type of every kind of element that has a name.
 OBJECT_TYPES = {
     "body": mujoco.mjtObj.mjOBJ_BODY,
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
@@ -25,6 +25,7 @@ OBJECT_TYPES = {
     "site": mujoco.mjtObj.mjOBJ_SITE,
     "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
+    "key": mujoco.mjtObj.mjOBJ_KEY,
 }
 
 # Field of MjModel that counts the elements of a kind, where it is not called `n<kind>`.

@@ -32,21 +32,6 @@ from mjfim.model.units import (
 
 Range = tuple[float, float]
 
-# Kinds of limits, in the order in which they are listed.
-KINDS = (
-    "position",
-    "tilt",
-    "velocity",
-    "angular_velocity",
-    "acceleration",
-    "control",
-    "control_rate",
-    "force",
-    "joint_force",
-    "tendon_force",
-    "tendon_length",
-)
-
 # What each kind limits: the element that has a name, and its elements in words.
 OWNERS: dict[str, tuple[Literal["joint", "actuator", "tendon"], str]] = {
     "position": ("joint", "slides, hinges, ball joints and free joints"),
@@ -62,16 +47,19 @@ OWNERS: dict[str, tuple[Literal["joint", "actuator", "tendon"], str]] = {
     "tendon_length": ("tendon", "tendons"),
 }
 
+# Kinds of limits, in the order in which they are listed.
+KINDS = tuple(OWNERS)
+
+BALL = int(mujoco.mjtJoint.mjJNT_BALL)
+FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+
 # Joints in words.
 JOINT_WORDS = {
     int(mujoco.mjtJoint.mjJNT_SLIDE): "a slide",
     int(mujoco.mjtJoint.mjJNT_HINGE): "a hinge",
-    int(mujoco.mjtJoint.mjJNT_BALL): "a ball joint",
-    int(mujoco.mjtJoint.mjJNT_FREE): "a free joint",
+    BALL: "a ball joint",
+    FREE: "a free joint",
 }
-
-BALL = int(mujoco.mjtJoint.mjJNT_BALL)
-FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 # Number of numbers that describe the tilt: both components of a rotation that tilt the body.
 TILT_COMPONENTS = 2
@@ -316,10 +304,7 @@ def _range(limited: Any, ranges: Any, index: int) -> Range | None:
 
 
 # Kinds of joints whose position holds a quaternion, with the place of the quaternion in it.
-QUATERNION_PLACE = {
-    int(mujoco.mjtJoint.mjJNT_BALL): 0,
-    int(mujoco.mjtJoint.mjJNT_FREE): 3,
-}
+QUATERNION_PLACE = {BALL: 0, FREE: 3}
 
 
 def upward(model: Any) -> Array:

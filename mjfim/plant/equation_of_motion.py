@@ -141,7 +141,8 @@ class AffineForces:
         deviation = np.abs(total - sum(fields[name] for name in FORCE_FIELDS))
         agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
 
-        slopes = self._slopes(acts, self._applied(ctrl)[1])
+        # Passive forces do not depend on the controls.
+        slopes = self.springs[:, 1:] + self.moments.T @ self._actuator_slopes(acts, ctrl)
         return slopes, self._damping(slopes), agree
 
     def change(self, states: Array, ctrl: Array, acceleration: Array, by: ParameterChange) -> Array:
@@ -184,8 +185,11 @@ class AffineForces:
             states: (n, 2 nv) states.
             ctrl: (n, nu) controls.
         """
-        _, acts = self._clamped(self._points(states, ctrl))
-        _, is_free = self._applied(ctrl)
+        return self._actuator_slopes(self._clamped(self._points(states, ctrl))[1], ctrl)
+
+    def _actuator_slopes(self, acts: np.ndarray, ctrl: Array) -> Array:
+        """The same where the forces of actuators act: (n, actuators), and are not clamped."""
+        is_free = self._applied(ctrl)[1]
         slopes = acts[..., None] * self.actuators[:, 1:]
         slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
         return np.asarray(slopes)
@@ -219,17 +223,6 @@ class AffineForces:
         high = np.where(limited, limits[:, 1], np.inf)
         clamped = np.clip(force, low, high)
         return clamped, clamped == force
-
-    def _slopes(self, acts: np.ndarray, is_free: np.ndarray) -> Array:
-        """(n, nv, 2 nv + nu) derivatives.
-
-        Args:
-            acts: (n, actuators) True where the force of an actuator is not clamped.
-            is_free: (n, nu) True where a control is not clamped.
-        """
-        slopes = self.springs[:, 1:] + (self.moments.T * acts[:, None]) @ self.actuators[:, 1:]
-        slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
-        return np.asarray(slopes)
 
     def _damping(self, slopes: Array) -> Array:
         """(n, nv, nv) damping that the integrator takes at the end of an engine step."""
