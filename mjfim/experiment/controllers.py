@@ -13,6 +13,7 @@ from mjfim.experiment.system_tables import ControllerSpec
 from mjfim.experiment.time_grid import parts_of, whole_number
 from mjfim.model.control_laws import (
     KINDS,
+    NUMBERS,
     ControlLaw,
     ControlLaws,
     InputColumn,
@@ -132,21 +133,13 @@ def _numbers(
     elif model.actuator_ctrllimited[control]:
         low, high = model.actuator_ctrlrange[control].tolist()
 
+    stated = {name: getattr(spec, name) for name in NUMBERS if not name.startswith("saturation_")}
     return {
+        **{name: np.inf if number is None else number for name, number in stated.items()},
         "joint": float(joint.joint),
         "kind": float(KINDS.index(spec.kind)),
-        "kp": spec.kp,
-        "kd": spec.kd,
-        "ki": spec.ki,
-        "integral": spec.integral,
-        "integral_limit": np.inf if spec.integral_limit is None else spec.integral_limit,
         "saturation_low": low,
         "saturation_high": high,
-        "slew": np.inf if spec.slew is None else spec.slew,
-        "latency": spec.latency,
-        "time_constant": spec.time_constant,
-        "feedback_latency": spec.feedback_latency,
-        "velocity_time_constant": spec.velocity_time_constant,
     }
 
 

@@ -432,23 +432,17 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
     kp sets gainprm[0] and biasprm[1]. kv sets biasprm[2], and gainprm[0] of a velocity servo.
     """
     rows = (actuator,)
-
+    column = {"kp": 1, "kv": 2}[path.field]
+    kind = servo_kind(model, actuator)
     # The gain of a PID actuator is its integral gain; kp and kv are entries of its bias.
-    if int(model.actuator_gaintype[actuator]) == mujoco.mjtGain.mjGAIN_PID:
-        column = {"kp": 1, "kv": 2}[path.field]
+    is_pid = int(model.actuator_gaintype[actuator]) == mujoco.mjtGain.mjGAIN_PID
+    if is_pid or (path.field == "kv" and kind == "position"):
         return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
 
-    kind = servo_kind(model, actuator)
     has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
-    if path.field == "kp" and kind == "position" and has_gain:
-        follower = ("actuator_biasprm", actuator, 1, -1.0)
+    if has_gain and kind == {"kp": "position", "kv": "velocity"}[path.field]:
+        follower = ("actuator_biasprm", actuator, column, -1.0)
         return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
-    if path.field == "kv" and kind == "velocity":
-        follower = ("actuator_biasprm", actuator, 2, -1.0)
-        return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
-    if path.field == "kv" and kind == "position":
-        return ModelField(array="actuator_biasprm", rows=rows, column=2, factor=-1.0)
-
     wanted = "position" if path.field == "kp" else "position or velocity"
     raise path.error(f"the actuator is no {wanted} servo; use gainprm[i] and biasprm[i]")
 

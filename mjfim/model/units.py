@@ -63,32 +63,18 @@ FIELD_UNITS = {
     "delay": "s",
 }
 
-# Units of sensors whose unit does not depend on a joint. Sensors that are absent here have no unit
-# or one that depends on the model.
+# Units of sensors, by MuJoCo's names. Sensors that are absent here have no unit or one that depends
+# on the model.
 SENSOR_UNITS = {
-    mujoco.mjtSensor.mjSENS_TENDONPOS: "m",
-    mujoco.mjtSensor.mjSENS_RANGEFINDER: "m",
-    mujoco.mjtSensor.mjSENS_FRAMEPOS: "m",
-    mujoco.mjtSensor.mjSENS_SUBTREECOM: "m",
-    mujoco.mjtSensor.mjSENS_VELOCIMETER: "m/s",
-    mujoco.mjtSensor.mjSENS_TENDONVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_FRAMELINVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_SUBTREELINVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_ACCELEROMETER: "m/s²",
-    mujoco.mjtSensor.mjSENS_FRAMELINACC: "m/s²",
-    mujoco.mjtSensor.mjSENS_GYRO: "rad/s",
-    mujoco.mjtSensor.mjSENS_FRAMEANGVEL: "rad/s",
-    mujoco.mjtSensor.mjSENS_BALLANGVEL: "rad/s",
-    mujoco.mjtSensor.mjSENS_FRAMEANGACC: "rad/s²",
-    mujoco.mjtSensor.mjSENS_FORCE: "N",
-    mujoco.mjtSensor.mjSENS_TOUCH: "N",
-    mujoco.mjtSensor.mjSENS_TORQUE: "N m",
-    mujoco.mjtSensor.mjSENS_MAGNETOMETER: "T",
+    **dict.fromkeys(("TENDONPOS", "RANGEFINDER", "FRAMEPOS", "SUBTREECOM"), "m"),
+    **dict.fromkeys(("VELOCIMETER", "TENDONVEL", "FRAMELINVEL", "SUBTREELINVEL"), "m/s"),
+    **dict.fromkeys(("ACCELEROMETER", "FRAMELINACC"), "m/s²"),
+    **dict.fromkeys(("GYRO", "FRAMEANGVEL", "BALLANGVEL"), "rad/s"),
+    "FRAMEANGACC": "rad/s²",
+    **dict.fromkeys(("FORCE", "TOUCH"), "N"),
+    "TORQUE": "N m",
+    "MAGNETOMETER": "T",
 }
-
-# Sensors that measure the coordinate of a joint, and those that measure its velocity.
-JOINT_POSITION_SENSORS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTLIMITPOS)
-JOINT_VELOCITY_SENSORS = (mujoco.mjtSensor.mjSENS_JOINTVEL, mujoco.mjtSensor.mjSENS_JOINTLIMITVEL)
 
 
 def per_second(unit: str) -> str:
@@ -120,14 +106,11 @@ def sensor_unit(model: Any, sensor: int) -> str:
     Returns:
         The unit; empty where the sensor is dimensionless or its unit depends on the model.
     """
-    kind = mujoco.mjtSensor(int(model.sensor_type[sensor]))
-
-    if kind in JOINT_POSITION_SENSORS:
-        return joint_unit(model, int(model.sensor_objid[sensor]))
-    if kind in JOINT_VELOCITY_SENSORS:
-        return per_second(joint_unit(model, int(model.sensor_objid[sensor])))
-
-    return SENSOR_UNITS.get(kind, "")
+    name = mujoco.mjtSensor(int(model.sensor_type[sensor])).name.removeprefix("mjSENS_")
+    if name not in ("JOINTPOS", "JOINTLIMITPOS", "JOINTVEL", "JOINTLIMITVEL"):
+        return SENSOR_UNITS.get(name, "")
+    unit = joint_unit(model, int(model.sensor_objid[sensor]))
+    return per_second(unit) if name.endswith("VEL") else unit
 
 
 def force_unit(model: Any, actuator: int) -> str:
