@@ -32,7 +32,6 @@ from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import (
     ScalarJoint,
     control_labels,
-    dof_names,
     output_label,
     state_components,
     tangent_components,
@@ -624,15 +623,11 @@ def labels_of_model(model: mujoco.MjModel) -> Labels:
     """
     state = state_components(model)[: model.nq]
     tangent = tangent_components(model)[: model.nv]
-    names = dof_names(model)
-
+    units = {c.name.removeprefix("qpos:"): c.unit for c in tangent}
     return Labels(
         qpos=tuple(f"{c.name.removeprefix('qpos:')} [{c.unit or '1'}]" for c in state),
-        positions=tuple(f"{name} [{c.unit}]" for name, c in zip(names, tangent, strict=True)),
-        velocities=tuple(
-            f"{name} velocity [{per_second(c.unit)}]"
-            for name, c in zip(names, tangent, strict=True)
-        ),
+        positions=tuple(f"{name} [{unit}]" for name, unit in units.items()),
+        velocities=tuple(f"{name} velocity [{per_second(unit)}]" for name, unit in units.items()),
         controls=control_labels(model),
     )
 

@@ -267,45 +267,24 @@ def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
 
 def state_components(model: Any) -> tuple[StateComponent, ...]:
     """The nq + nv numbers of the state without activations: all of qpos, then all of qvel."""
-    positions: list[StateComponent] = []
-    velocities: list[StateComponent] = []
-
-    for j, name in enumerate(joint_names(model)):
-        q = int(model.jnt_qposadr[j])
-        v = model.nq + int(model.jnt_dofadr[j])
-        parts = tangent_parts(model, j)
-
-        if not parts:
-            unit = joint_unit(model, j)
-            positions.append(StateComponent(name=f"qpos:{name}", address=q, unit=unit))
-            velocities.append(StateComponent(name=f"qvel:{name}", address=v, unit=per_second(unit)))
-            continue
-
-        translation = tuple(part for part in parts if part in TRANSLATION)
-        positions += _joint_components(f"qpos:{name}", (*translation, *QUATERNION), q)
-        velocities += _joint_components(f"qvel:{name}", parts, v)
-
-    return (*positions, *velocities)
-
-
-def _joint_components(
-    joint_column: str, parts: Sequence[str], first_address: int
-) -> list[StateComponent]:
-    """Components of a ball or free joint. joint_column: `qpos:<joint>` or `qvel:<joint>`."""
-    found = []
-    for k, part in enumerate(parts):
-        group = "pos" if part in TRANSLATION else "rot"
-        unit = PART_UNITS[part]
-        found.append(
-            StateComponent(
-                name=f"{joint_column}.{part}",
-                groups=(f"{joint_column}.{group}", joint_column),
-                address=first_address + k,
-                unit=per_second(unit) if joint_column.startswith("qvel:") else unit,
-                sigma_factor=QUATERNION_SIGMA_FACTOR if part in QUATERNION else 1.0,
-            )
-        )
-    return found
+    found: list[StateComponent] = []
+    for field, firsts in (("qpos", model.jnt_qposadr), ("qvel", model.nq + model.jnt_dofadr)):
+        for j, name in enumerate(joint_names(model)):
+            column, parts = f"{field}:{name}", tangent_parts(model, j)
+            if parts and field == "qpos":
+                parts = (*(part for part in parts if part in TRANSLATION), *QUATERNION)
+            for k, part in enumerate(parts or ("",)):
+                unit = PART_UNITS[part] if part else joint_unit(model, j)
+                group = "pos" if part in TRANSLATION else "rot"
+                component = StateComponent(
+                    name=f"{column}.{part}" if part else column,
+                    groups=(f"{column}.{group}", column) if part else (),
+                    address=int(firsts[j]) + k,
+                    unit=unit if field == "qpos" else per_second(unit),
+                    sigma_factor=QUATERNION_SIGMA_FACTOR if part in QUATERNION else 1.0,
+                )
+                found.append(component)
+    return tuple(found)
 
 
 def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
@@ -406,8 +385,7 @@ def sensor_components(model: Any) -> tuple[SensorComponent, ...]:
 
 def measurable_columns(model: Any) -> tuple[str, ...]:
     """Columns that a recording may hold: components of the state, then sensors."""
-    state = [component.name for component in state_components(model)]
-    return (*state, *(component.name for component in sensor_components(model)))
+    return ModelCoordinates.of(model).measurable
 
 
 def output_label(model: Any, output: str) -> str:

@@ -104,7 +104,6 @@ class ActuatorLag(Term):
 
     Attributes:
         actuator: Name of the actuator.
-        explicit: Whether the integrator is RK4, which takes the lag through its stages.
     """
 
     kind = "actuator_lag"
@@ -123,7 +122,6 @@ class ActuatorLag(Term):
     size = "time_constant"
 
     actuator: str
-    explicit: bool
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> ActuatorLag:
@@ -134,8 +132,7 @@ class ActuatorLag(Term):
         # With `actearly` the actuator acts within the same step, so that a vanishing lag would be
         # the actuator without it. RK4 takes the activation through its stages.
         timestep = model.opt.timestep
-        explicit = is_rk4(model)
-        least = (LEAST_LAG_RK4 if explicit else LEAST_LAG) * timestep
+        least = (LEAST_LAG_RK4 if is_rk4(model) else LEAST_LAG) * timestep
         lag = TermQuantity(
             value=SHORT_LAG * timestep,
             unit="s",
@@ -150,19 +147,16 @@ class ActuatorLag(Term):
                 f"values.time_constant: {stated.value:g} s is too short to have an effect; state "
                 f"at least {least:g} s"
             )
-        return cls(
-            name=table.name,
-            actuator=name,
-            explicit=explicit,
-            quantities=quantities,
-        )
+        return cls(name=table.name, actuator=name, quantities=quantities)
 
     def edit(self, spec: Any) -> None:
         """Give the actuator an activation."""
         actuator = spec.actuator(self.actuator)
+        # RK4 takes the lag through its stages.
+        is_explicit = spec.option.integrator == mujoco.mjtIntegrator.mjINT_RK4
         filters = (mujoco.mjtDyn.mjDYN_FILTEREXACT, mujoco.mjtDyn.mjDYN_FILTER)
-        actuator.dyntype = filters[self.explicit]
-        actuator.actearly = not self.explicit
+        actuator.dyntype = filters[is_explicit]
+        actuator.actearly = not is_explicit
 
         dynamics = np.array(actuator.dynprm)
         dynamics[0] = self.value("time_constant")

@@ -393,8 +393,6 @@ class LoadDependentFriction(Term):
         radius: Radius of the ball [m].
         armature: Armature of the slide [kg].
         carrier: Mass [kg] and inertia [kg m²] of the ball.
-        contact_time: Time constant of the contacts [s].
-        enables_contacts: Whether the model disables contacts, which this term needs.
     """
 
     kind = "load_dependent_friction"
@@ -430,14 +428,13 @@ class LoadDependentFriction(Term):
     radius: float
     armature: float
     carrier: tuple[float, float]
-    contact_time: float
-    enables_contacts: bool
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> LoadDependentFriction:
         """Resolve the term for a direct drive at a hinge."""
         name, number = named_element(table, "actuator", model, cls.kind)
         joint = _driven_hinge(model, name, number)
+
         for kind, suffix in (("joint", ""), ("body", ""), ("tendon", ""), ("geom", "_ball")):
             require_free_name(model, kind, f"{table.name}{suffix}")
 
@@ -473,6 +470,7 @@ class LoadDependentFriction(Term):
             bounds=(least, np.inf),
             numbers=tuple((path, radius) for path in pairs),
         )
+        _require_contacts(model)
         return cls(
             name=table.name,
             motors=tuple(motors),
@@ -488,15 +486,12 @@ class LoadDependentFriction(Term):
             radius=radius,
             armature=rounded(ARMATURE_SHARE * inertia / radius**2),
             carrier=light_body(model, body, inertia),
-            contact_time=CONTACT_TIME * model.opt.timestep,
-            enables_contacts=_enables_contacts(model),
             quantities=stated_quantities(cls.kind, table, {"coefficient": quantity}),
         )
 
     def edit(self, spec: Any) -> None:
         """Add the ball, the buffers, their contacts and the tendon."""
-        if self.enables_contacts:
-            spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         ball = add_body(spec.body(self.link), self.name, *self.carrier, np.zeros(3))
         ball.pos = self.place
         slide = add_plain_joint(ball, self.name, self.axis, np.zeros(3), slides=True)
@@ -509,7 +504,7 @@ class LoadDependentFriction(Term):
             pair.geomname1, pair.geomname2 = f"{self.name}_ball", f"{self.name}_{side}"
             pair.condim = 4
             pair.friction = [0.0, 0.0, self.radius * self.value("coefficient"), 0.0, 0.0]
-            pair.solref = [self.contact_time, 1.0]
+            pair.solref = [CONTACT_TIME * spec.option.timestep, 1.0]
             pair.solimp = IMPEDANCE
 
         tendon = spec.add_tendon(name=self.name)
@@ -541,14 +536,12 @@ def _driven_hinge(model: Any, name: str, actuator: int) -> int:
     return joint
 
 
-def _enables_contacts(model: Any) -> bool:
-    """Whether contacts are disabled; ExperimentError where geoms would then begin to collide."""
-    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        return False
+def _require_contacts(model: Any) -> None:
+    """Raise ExperimentError where contacts are disabled and geoms would begin to collide."""
+    is_disabled = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     collide = np.any(model.geom_contype) and np.any(model.geom_conaffinity)
-    if collide or model.npair:
+    if is_disabled and (collide or model.npair):
         raise ExperimentError(
             "kind: the term needs contacts, which the MJCF disables although its geoms would "
             'collide; state contype="0" conaffinity="0" for them'
         )
-    return True
