@@ -183,7 +183,7 @@ class System:
         Returns:
             A system whose plant is not calibrated yet.
         """
-        relaxation = relaxation if variant.relaxed else None
+        removed = (relaxation if variant.relaxed else None) or Relaxation()
         grid = self.stated_grid.with_variant(variant)
 
         def plant(speeds: tuple[float, ...], smooth: Plant | None) -> Plant:
@@ -191,14 +191,11 @@ class System:
 
             smooth: Plant that computes its derivatives; None where it computes them itself.
             """
-            relaxed = relaxation
-            if speeds:
-                relaxed = replace(relaxation or Relaxation(), smoothing_speeds=speeds)
             model = self._plant_model(
                 sensors=self.outputs.needs_sensors,
                 friction=self.parameters.changes_friction,
                 timestep_factor=variant.sample_factor * variant.timestep_factor,
-                relaxation=relaxed,
+                relaxation=replace(removed, smoothing_speeds=speeds),
             )
             return Plant(
                 source=model,

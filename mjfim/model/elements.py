@@ -286,7 +286,7 @@ def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     for actuator in bristle_actuators(model):
         stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
         under_force = _actuator_force_size(model, actuator, time) / stiffness
-        way = _transmission_size(model, actuator) / time * model.opt.timestep
+        way = _transmission(model, actuator)[0] / time * model.opt.timestep
         found[int(model.actuator_actadr[actuator])] = max(under_force, way)
     return found
 
@@ -299,7 +299,7 @@ def _control_size(model: Any, actuator: int, control: int, time: float) -> float
 
     gain = abs(float(model.actuator_gainprm[actuator, 0])) or 1.0
     bias = np.abs(model.actuator_biasprm[actuator])
-    length = _transmission_size(model, actuator)
+    length, _ = _transmission(model, actuator)
 
     # A servo for positions or velocities.
     if bias[1] > 0.0:
@@ -316,20 +316,8 @@ def _actuator_force_size(model: Any, actuator: int, time: float) -> float:
     if stated > 0.0 and model.actuator_ctrlnum[actuator]:
         return stated
 
-    output = int(model.actuator_outadr[actuator])
-    length = _transmission_size(model, actuator)
-    return length / time**2 / (_acceleration(model, actuator, output) or 1.0)
-
-
-def _acceleration(model: Any, actuator: int, output: int) -> float:
-    """Acceleration that a unit force of an actuator causes, 0 without any [1/s² per unit force]."""
-    if not acts_at_joint(model, actuator):
-        return float(model.actuator_acc0[output])
-
-    # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
-    gear = float(np.abs(model.actuator_gear[output]).max())
-    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
-    return gear * float(model.dof_invweight0[dof])
+    length, acceleration = _transmission(model, actuator)
+    return length / time**2 / (acceleration or 1.0)
 
 
 def _largest_finite(bounds: Array) -> float:
@@ -337,12 +325,19 @@ def _largest_finite(bounds: Array) -> float:
     return float(np.abs(bounds[np.isfinite(bounds)]).max(initial=0.0))
 
 
-def _transmission_size(model: Any, actuator: int) -> float:
-    """Natural size of the length that an actuator acts on [m or rad, times the gear]."""
-    if not acts_at_joint(model, actuator):
-        return model_length(model)
+def _transmission(model: Any, actuator: int) -> tuple[float, float]:
+    """Natural size of the length that an actuator acts on, and what accelerates it.
 
+    Returns:
+        The length [m or rad, times the gear], and the acceleration that a unit force of the
+        actuator causes, 0 without any [1/s² per unit force].
+    """
     output = int(model.actuator_outadr[actuator])
-    gear = float(np.abs(model.actuator_gear[output]).max()) or 1.0
+    if not acts_at_joint(model, actuator):
+        return model_length(model), float(model.actuator_acc0[output])
+
+    # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
+    gear = float(np.abs(model.actuator_gear[output]).max())
     dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
-    return gear * float(position_sizes(model)[dof])
+    length = (gear or 1.0) * float(position_sizes(model)[dof])
+    return length, gear * float(model.dof_invweight0[dof])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -121,11 +121,11 @@ class SubstepObservations:
     joint_forces: np.ndarray
     derivative_substeps: tuple[int, ...]
     timestep: float
+    turns: np.ndarray
+    turn_weights: Array
+    tendon_forces: tuple[tuple[int, ...], ...]
+    tendon_lengths: np.ndarray
     force_rows: tuple[int, ...] = ()
-    turns: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.intp))
-    turn_weights: Array = field(default_factory=lambda: np.zeros((0, 4)))
-    tendon_forces: tuple[tuple[int, ...], ...] = ()
-    tendon_lengths: np.ndarray = field(default_factory=lambda: np.zeros(0, np.intp))
 
     def of_single_steps(self) -> SubstepObservations:
         """Return the same observations of samples that last one engine step.

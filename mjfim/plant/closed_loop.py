@@ -49,25 +49,15 @@ class ClosedLoopSimulator(BatchSimulator):
 
     is_open_loop: ClassVar[bool] = False
 
-    def __init__(
-        self,
-        model: Any,
-        laws: ControlLaws,
-        *,
-        substeps: int = 1,
-        sensors: bool = False,
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, model: Any, laws: ControlLaws, **options: Any) -> None:
         """Build the simulator.
 
         Args:
             model: Model copy that no other code changes, with the numbers of the laws.
             laws: The laws.
-            substeps: `mj_step` calls per sample.
-            sensors: True if sensor data are requested.
-            threads: Number of threads; None takes all cores.
+            **options: Options of `BatchSimulator`.
         """
-        super().__init__(model, substeps=substeps, sensors=sensors, threads=threads)
+        super().__init__(model, **options)
         self.laws = laws
 
     def lead(self, models: Sequence[Any]) -> int:
