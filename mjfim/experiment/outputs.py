@@ -98,18 +98,12 @@ def resolve_outputs(
         Output(
             name=components[i].name,
             sigma=float(np.sqrt(covariance[i, i])),
-            **_place(components[i]),
+            unit=getattr(components[i], "unit", ""),
+            **{"state" if i < len(coordinates.state) else "sensor": components[i].address},
         )
         for i in kept
     )
     return Outputs(outputs=outputs, space=space), noise
-
-
-def _place(component: StateComponent | SensorComponent) -> dict[str, Any]:
-    """Where an output is read: in the state, with its unit, or in the data of the sensors."""
-    if isinstance(component, StateComponent):
-        return {"unit": component.unit, "state": component.address}
-    return {"sensor": component.address}
 
 
 def _correlated_columns(

@@ -31,7 +31,7 @@ from mjfim.model.elements import (
 )
 from mjfim.model.units import (
     PART_UNITS,
-    control_unit,
+    control_units,
     joint_unit,
     per_second,
     sensor_unit,
@@ -217,14 +217,11 @@ def control_labels(model: Any) -> tuple[str, ...]:
 
     A label ends with the unit where the model determines it, else with `(control)`.
     """
-    labels: list[str] = []
-    for i, name in enumerate(actuator_names(model)):
-        count = int(model.actuator_ctrlnum[i])
-        unit = control_unit(model, i)
-        suffix = f"[{unit}]" if unit else "(control)"
-
-        labels += [f"{control} {suffix}" for control in _indexed(name, count)]
-    return tuple(labels)
+    units = control_units(model)
+    return tuple(
+        f"{name} [{unit}]" if unit else f"{name} (control)"
+        for name, unit in zip(control_names(model), units, strict=True)
+    )
 
 
 def scalar_joints(model: Any) -> tuple[ScalarJoint, ...]:

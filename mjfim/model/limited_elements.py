@@ -24,7 +24,7 @@ from mjfim.model.units import (
     ANGLE,
     FORCE_UNITS,
     LENGTH,
-    control_unit,
+    control_units,
     force_unit,
     joint_unit,
     per_second,
@@ -140,9 +140,8 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
             )
 
     widths = control_sizes(model, time)
-    actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
-    for i, name in enumerate(controls):
-        size, unit = float(widths[i]), control_unit(model, actuators[i])
+    for i, (name, unit) in enumerate(zip(controls, control_units(model), strict=True)):
+        size = float(widths[i])
         found.by_kind["control"][name] = LimitedElement(
             index=i,
             unit=unit,

@@ -195,6 +195,12 @@ def control_unit(model: Any, actuator: int) -> str:
     return per_second(unit) if unit and is_integrated(model, actuator) else unit
 
 
+def control_units(model: Any) -> list[str]:
+    """Units of the nu controls, see `control_unit`."""
+    counts = model.actuator_ctrlnum.tolist()
+    return [unit for i, n in enumerate(counts) for unit in n * [control_unit(model, i)]]
+
+
 Servo = Literal["position", "velocity"]
 
 # Types of bias whose entries 1 and 2 multiply the position and the velocity.

@@ -88,10 +88,8 @@ def first_active_constraint(
         The sample and descriptions of everything that acts there, or None if nothing ever acts.
     """
     for k, data in forward_samples(model, trajectory, range(trajectory.samples)):
-        constraints = sorted(set(acting_constraints(model, data)))
-        clamps = _force_ranges(model, clamped_actuators(model, data))
-        if constraints or clamps:
-            return k, (*constraints, *clamps)
+        if acting := _descriptions(model, [data]):
+            return k, acting
     return None
 
 
@@ -127,11 +125,18 @@ def active_constraints(
     Returns:
         Descriptions, each once.
     """
+    return _descriptions(model, (data for _, data in forward_samples(model, trajectory, samples)))
+
+
+def _descriptions(model: Any, states: Iterable[Any]) -> tuple[str, ...]:
+    """Constraints that act at some of these states, each once, then force ranges that clamp."""
     constraints, clamped = set[str](), set[int]()
-    for _, data in forward_samples(model, trajectory, samples):
+    for data in states:
         constraints.update(acting_constraints(model, data))
         clamped.update(clamped_actuators(model, data))
-    return (*sorted(constraints), *_force_ranges(model, clamped))
+    names = actuator_names(model) if clamped else ()
+    ranges = [f"force range of {names[actuator]}" for actuator in sorted(clamped)]
+    return (*sorted(constraints), *ranges)
 
 
 def _is_clamped(model: Any, data: Any, actuator: int) -> bool:
@@ -146,12 +151,6 @@ def _is_clamped(model: Any, data: Any, actuator: int) -> bool:
     if count == 1:
         return bool(force[0] <= low or force[0] >= high)
     return bool(np.linalg.norm(force) >= high * (1.0 - CLAMP_TOLERANCE))
-
-
-def _force_ranges(model: Any, actuators: Iterable[int]) -> list[str]:
-    """Descriptions of the force ranges of actuators."""
-    names = actuator_names(model)
-    return [f"force range of {names[actuator]}" for actuator in sorted(actuators)]
 
 
 def acting_constraints(model: Any, data: Any) -> Iterator[str]:
