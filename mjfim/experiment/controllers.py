@@ -94,9 +94,9 @@ def _joint(source: ModelSource, actuator: str, spec: ControllerSpec) -> ScalarJo
         raise ExperimentError(f"controllers: {unknown('actuator', actuator, names)}")
 
     number = names.index(actuator)
-    if int(model.actuator_ctrlnum[number]) != 1:
+    if model.actuator_ctrlnum[number] != 1:
         raise ExperimentError(
-            f"{key}: the actuator has {int(model.actuator_ctrlnum[number])} controls, and a law "
+            f"{key}: the actuator has {model.actuator_ctrlnum[number]} controls, and a law "
             "computes one; its own gains in the MJCF are its law"
         )
 
@@ -112,7 +112,7 @@ def _joint(source: ModelSource, actuator: str, spec: ControllerSpec) -> ScalarJo
         joint
         for joint in joints.values()
         if int(model.actuator_trntype[number]) in [int(kind) for kind in AT_JOINT]
-        and joint.joint == int(model.actuator_trnid[number, 0])
+        and joint.joint == model.actuator_trnid[number, 0]
     ]
     if not driven:
         raise ExperimentError(

@@ -183,7 +183,7 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
     body = identifier(model, "body", body_name)
     if body < 0:
         raise ExperimentError(f"{key}: {unknown('body', body_name, names_of(model, 'body'))}")
-    if not float(model.body_mass[body]) > 0.0:
+    if not model.body_mass[body] > 0.0:
         raise ExperimentError(f"{key}: body {body_name!r} has no mass")
     inertia = body_inertia(model, body)
     try:

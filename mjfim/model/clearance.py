@@ -85,7 +85,7 @@ def farthest_points(kind: int, size: Array, direction: Array) -> Array:
         (n, 3) points in the frame of the geom [m].
     """
     if kind == BOX:
-        return np.asarray(size * np.sign(direction))
+        return size * np.sign(direction)
 
     if kind == ELLIPSOID:
         stretched = np.linalg.norm(size * direction, axis=1, keepdims=True)
@@ -173,7 +173,7 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
         if frozenset(pair) in ignored:
             continue
         for geom in (first, second):
-            refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
+            refused = REFUSED_TYPES.get(model.geom_type[geom])
             if refused is not None:
                 raise ExperimentError(
                     f"clearance: {labels[geom]} is a {refused}, for which MuJoCo has no reliable "
@@ -456,7 +456,7 @@ class GeomDistances:
             if self._exact[p]:
                 frame = frames[:, first]
                 downwards = -np.einsum("nij,ni->nj", frame, normal)
-                kind, size = int(self._model.geom_type[first]), self._model.geom_size[first]
+                kind, size = self._model.geom_type[first], self._model.geom_size[first]
                 local = farthest_points(kind, size, downwards)
                 points[:, i] += np.einsum("nij,nj->ni", frame, local)
             height = points[:, i] - positions[:, second]

@@ -207,7 +207,7 @@ def control_names(model: Any) -> tuple[str, ...]:
     """Names of the nu controls; an actuator with several controls names them `<actuator>[<i>]`."""
     names: list[str] = []
     for i, name in enumerate(actuator_names(model)):
-        count = int(model.actuator_ctrlnum[i])
+        count = model.actuator_ctrlnum[i]
         names += _indexed(name, count)
     return tuple(names)
 
@@ -254,7 +254,7 @@ def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
     Returns:
         The parts; none for slide and hinge joints.
     """
-    kind = int(model.jnt_type[joint])
+    kind = model.jnt_type[joint]
     if kind == mujoco.mjtJoint.mjJNT_FREE:
         return (*TRANSLATION, *ROTATION_VECTOR)
     if kind == mujoco.mjtJoint.mjJNT_BALL:
@@ -310,7 +310,7 @@ def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
     found: dict[int, TangentComponent] = {}
     for i, name in enumerate(actuator_names(model)):
         first = int(model.actuator_actadr[i])
-        count = int(model.actuator_actnum[i])
+        count = model.actuator_actnum[i]
         named = element_name(model, "actuator", i) != ""
         columns = _indexed(f"act:{name}", count)
         paths = _indexed(f"initial/{name}:act", count)

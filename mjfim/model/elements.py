@@ -139,7 +139,7 @@ def is_rk4(model: Any) -> bool:
     Args:
         model: The compiled model (`mujoco.MjModel`).
     """
-    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+    return bool(model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def model_length(model: Any) -> float:
@@ -157,15 +157,15 @@ def model_length(model: Any) -> float:
     for body in range(1, model.nbody):
         if not model.body_weldid[body]:
             continue
-        parent = int(model.body_parentid[body])
+        parent = model.body_parentid[body]
         if model.body_weldid[parent]:
-            offset = float(np.linalg.norm(model.body_pos[body]))
+            offset = np.linalg.norm(model.body_pos[body])
             from_root[body] = from_root[parent] + offset
 
-        mass = float(model.body_mass[body])
+        mass = model.body_mass[body]
         if mass > 0.0:
-            gyration = float(np.sqrt(model.body_inertia[body].max() / mass))
-            centre = float(np.linalg.norm(model.body_ipos[body]))
+            gyration = np.sqrt(model.body_inertia[body].max() / mass)
+            centre = np.linalg.norm(model.body_ipos[body])
             longest = max(longest, from_root[body] + centre + gyration)
 
     # MuJoCo's extent is the size of the geoms and sites, where nothing that moves has a mass.
@@ -180,8 +180,8 @@ def translations(model: Any) -> np.ndarray:
     """
     found = np.zeros(model.nv, dtype=bool)
     for joint in range(model.njnt):
-        first = int(model.jnt_dofadr[joint])
-        kind = int(model.jnt_type[joint])
+        first = model.jnt_dofadr[joint]
+        kind = model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_SLIDE:
             found[first] = True
         elif kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -216,8 +216,8 @@ def control_sizes(model: Any, time: float) -> Array:
     """
     sizes = np.ones(model.nu)
     for actuator in range(model.nactuator):
-        control = int(model.actuator_ctrladr[actuator])
-        count = int(model.actuator_ctrlnum[actuator])
+        control = model.actuator_ctrladr[actuator]
+        count = model.actuator_ctrlnum[actuator]
         if count:
             sizes[control : control + count] = _control_size(model, actuator, control, time)
     return sizes
@@ -253,7 +253,7 @@ def actuator_force_sizes(model: Any, time: float) -> Array:
     """
     sizes = np.ones(len(model.actuator_acc0))
     for actuator in range(model.nactuator):
-        first, count = int(model.actuator_outadr[actuator]), int(model.actuator_outnum[actuator])
+        first, count = model.actuator_outadr[actuator], model.actuator_outnum[actuator]
         sizes[first : first + count] = _actuator_force_size(model, actuator, time)
     return sizes
 
@@ -264,7 +264,7 @@ def bristle_actuators(model: Any) -> list[int]:
     Args:
         model: The compiled model (`mujoco.MjModel`).
     """
-    has_bristle = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_DCMOTOR)
+    has_bristle = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
     has_bristle = has_bristle & (model.actuator_dynprm[:, BRISTLE_STIFFNESS_COLUMN] > 0.0)
     has_bristle &= (model.actuator_ctrlnum == 0) & (model.actuator_actnum == 1)
     return [int(actuator) for actuator in np.flatnonzero(has_bristle)]
@@ -284,7 +284,7 @@ def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     """
     found = {}
     for actuator in bristle_actuators(model):
-        stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
+        stiffness = model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN]
         under_force = _actuator_force_size(model, actuator, time) / stiffness
         way = _transmission(model, actuator)[0] / time * model.opt.timestep
         found[int(model.actuator_actadr[actuator])] = max(under_force, way)
@@ -297,7 +297,7 @@ def _control_size(model: Any, actuator: int, control: int, time: float) -> float
     if stated > 0.0:
         return stated
 
-    gain = abs(float(model.actuator_gainprm[actuator, 0])) or 1.0
+    gain = abs(model.actuator_gainprm[actuator, 0]) or 1.0
     bias = np.abs(model.actuator_biasprm[actuator])
     length, _ = _transmission(model, actuator)
 
@@ -332,12 +332,12 @@ def _transmission(model: Any, actuator: int) -> tuple[float, float]:
         The length [m or rad, times the gear], and the acceleration that a unit force of the
         actuator causes, 0 without any [1/s² per unit force].
     """
-    output = int(model.actuator_outadr[actuator])
+    output = model.actuator_outadr[actuator]
     if not acts_at_joint(model, actuator):
         return model_length(model), float(model.actuator_acc0[output])
 
     # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
     gear = float(np.abs(model.actuator_gear[output]).max())
-    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
+    dof = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
     length = (gear or 1.0) * float(position_sizes(model)[dof])
     return length, gear * float(model.dof_invweight0[dof])

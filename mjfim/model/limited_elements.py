@@ -130,7 +130,7 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
     forces = force_sizes(model, time)
     for joint, name in enumerate(names):
         _add_joint(found, model, joint, name, sizes, time)
-        if int(model.jnt_type[joint]) not in (BALL, FREE):
+        if model.jnt_type[joint] not in (BALL, FREE):
             dof = int(model.jnt_dofadr[joint])
             found.by_kind["joint_force"][name] = LimitedElement(
                 index=dof,
@@ -163,7 +163,7 @@ def actuators_of_tendon(model: Any, tendon: int) -> tuple[int, ...]:
         model: MjModel.
         tendon: Number of the tendon.
     """
-    pulls = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    pulls = model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
     pulling = np.flatnonzero(pulls & (model.actuator_trnid[:, 0] == tendon))
     return tuple(int(model.actuator_outadr[i]) for i in pulling)
 
@@ -182,7 +182,7 @@ def _add_joint(
         time: Natural time of a motion [s].
     """
     kinds = found.by_kind
-    kind = int(model.jnt_type[joint])
+    kind = model.jnt_type[joint]
     q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
     stated = _range(model.jnt_limited, model.jnt_range, joint)
     size = float(sizes[v])
@@ -275,17 +275,17 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
 
 def _force_unit(model: Any, actuator: int) -> str:
     """Unit of the force of an actuator; empty for one with several forces or on a free joint."""
-    joint = int(model.actuator_trnid[actuator, 0])
-    acts_on_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
-    if not acts_on_joint or int(model.jnt_type[joint]) in (BALL, FREE):
+    joint = model.actuator_trnid[actuator, 0]
+    acts_on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+    if not acts_on_joint or model.jnt_type[joint] in (BALL, FREE):
         return ""
     return force_unit(model, actuator)
 
 
 def _is_spatial(model: Any, tendon: int) -> bool:
     """Whether a tendon is a path in space, and not a sum of joint coordinates."""
-    first = int(model.tendon_adr[tendon])
-    return int(model.wrap_type[first]) != int(mujoco.mjtWrap.mjWRAP_JOINT)
+    first = model.tendon_adr[tendon]
+    return bool(model.wrap_type[first] != mujoco.mjtWrap.mjWRAP_JOINT)
 
 
 def _range(limited: Any, ranges: Any, index: int) -> Range | None:

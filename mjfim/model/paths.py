@@ -276,7 +276,7 @@ def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:
         joint = identifier(model, "joint", path.name)
         # One number holds for all coordinates of a ball or free joint; it gets the unit for a
         # rotation.
-        slides = int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
+        slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         return joint_field_unit(field, LENGTH if slides else ANGLE, path.component)
 
     if field in SERVO_FIELDS:
@@ -377,7 +377,7 @@ def _initial_state_field(model: Any, path: ParameterPath) -> InitialStateField:
 def _initial_activation_field(model: Any, path: ParameterPath) -> InitialStateField:
     """Deviation of an activation of the initial state."""
     actuator = identifier(model, "actuator", path.name)
-    count = int(model.actuator_actnum[actuator]) if actuator >= 0 else 0
+    count = model.actuator_actnum[actuator] if actuator >= 0 else 0
     if count == 0:
         with_state = [
             name
@@ -404,7 +404,7 @@ def _element_field(model: Any, path: ParameterPath, decoration: Collection[str])
 
     if field in INERTIAL_FIELDS:
         parametrisation, first, width = INERTIAL_FIELDS[field]
-        if not float(model.body_mass[number]) > 0.0:
+        if not model.body_mass[number] > 0.0:
             raise path.error(f"body {path.name!r} has no mass")
         return InertiaField(number, parametrisation, first + path.component_of(width))
 
@@ -414,7 +414,7 @@ def _element_field(model: Any, path: ParameterPath, decoration: Collection[str])
     if field in COMPILED_FIELDS.get(path.kind, ()):
         # Place, size, mass or density of a geom need a compile unless the geom is decoration.
         index = path.component_of(3 if field in ("size", "pos") else 1)
-        if field == "size" and int(model.geom_dataid[number]) >= 0:
+        if field == "size" and model.geom_dataid[number] >= 0:
             raise path.error("the size of a mesh or height field is not a number of the geom")
         if field in ("size", "pos") and path.name in decoration:
             return ModelField(array=f"geom_{field}", rows=(number,), column=index)
@@ -435,11 +435,11 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
     column = {"kp": 1, "kv": 2}[path.field]
     kind = servo_kind(model, actuator)
     # The gain of a PID actuator is its integral gain; kp and kv are entries of its bias.
-    is_pid = int(model.actuator_gaintype[actuator]) == mujoco.mjtGain.mjGAIN_PID
+    is_pid = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_PID
     if is_pid or (path.field == "kv" and kind == "position"):
         return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
 
-    has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
+    has_gain = model.actuator_gainprm[actuator, 0] != 0.0
     if has_gain and kind == {"kp": "position", "kv": "velocity"}[path.field]:
         follower = ("actuator_biasprm", actuator, column, -1.0)
         return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))

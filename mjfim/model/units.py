@@ -109,7 +109,7 @@ def sensor_unit(model: Any, sensor: int) -> str:
     name = mujoco.mjtSensor(int(model.sensor_type[sensor])).name.removeprefix("mjSENS_")
     if name not in ("JOINTPOS", "JOINTLIMITPOS", "JOINTVEL", "JOINTLIMITVEL"):
         return SENSOR_UNITS.get(name, "")
-    unit = joint_unit(model, int(model.sensor_objid[sensor]))
+    unit = joint_unit(model, model.sensor_objid[sensor])
     return per_second(unit) if name.endswith("VEL") else unit
 
 
@@ -123,9 +123,9 @@ def force_unit(model: Any, actuator: int) -> str:
     Returns:
         The unit; empty where the actuator does not act on a joint.
     """
-    if int(model.actuator_trntype[actuator]) != mujoco.mjtTrn.mjTRN_JOINT:
+    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
         return ""
-    return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
+    return FORCE_UNITS[joint_unit(model, model.actuator_trnid[actuator, 0])]
 
 
 def gain_unit(model: Any, actuator: int, field: str) -> str:
@@ -180,14 +180,14 @@ def control_unit(model: Any, actuator: int) -> str:
         The unit; empty where it is not evident from the model.
     """
     gear = actuator_gear(model, actuator)
-    at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
-    if not at_joint or gear != 1 or int(model.actuator_ctrlnum[actuator]) != 1:
+    at_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+    if not at_joint or gear != 1 or model.actuator_ctrlnum[actuator] != 1:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])
     coordinate = joint_unit(model, joint)
-    gain = float(model.actuator_gainprm[actuator, 0])
-    if int(model.actuator_biastype[actuator]) == mujoco.mjtBias.mjBIAS_NONE:
+    gain = model.actuator_gainprm[actuator, 0]
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE:
         unit = FORCE_UNITS[coordinate] if gain == 1.0 else ""
     else:
         units = {"position": coordinate, "velocity": per_second(coordinate)}
@@ -224,7 +224,7 @@ def servo_kind(model: Any, actuator: int) -> Servo | None:
     if int(model.actuator_biastype[actuator]) not in AFFINE:
         return None
 
-    gain = float(model.actuator_gainprm[actuator, 0])
+    gain = model.actuator_gainprm[actuator, 0]
     bias = model.actuator_biasprm[actuator]
     if bias[1] == -gain:
         return "position"
@@ -240,7 +240,7 @@ def is_integrated(model: Any, actuator: int) -> bool:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    return int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+    return bool(model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_INTEGRATOR)
 
 
 def acts_at_joint(model: Any, actuator: int) -> bool:
@@ -263,14 +263,14 @@ def commanded_joint(model: Any, actuator: int) -> int | None:
     Returns:
         Number of the joint; None for all but position servos with one control at such a joint.
     """
-    if not acts_at_joint(model, actuator) or int(model.actuator_ctrlnum[actuator]) != 1:
+    if not acts_at_joint(model, actuator) or model.actuator_ctrlnum[actuator] != 1:
         return None
     if is_integrated(model, actuator) or servo_kind(model, actuator) != "position":
         return None
 
     joint = int(model.actuator_trnid[actuator, 0])
     is_scalar = int(model.jnt_type[joint]) in SCALAR_JOINTS
-    has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
+    has_gain = model.actuator_gainprm[actuator, 0] != 0.0
     return joint if is_scalar and has_gain and actuator_gear(model, actuator) != 0.0 else None
 
 

@@ -144,8 +144,8 @@ def _is_clamped(model: Any, data: Any, actuator: int) -> bool:
 
     It limits the force of the actuator, or the norm of its forces where it has several.
     """
-    first = int(model.actuator_outadr[actuator])
-    count = int(model.actuator_outnum[actuator])
+    first = model.actuator_outadr[actuator]
+    count = model.actuator_outnum[actuator]
     force = data.actuator_force[first : first + count]
     low, high = model.actuator_forcerange[actuator]
     if count == 1:
@@ -168,9 +168,9 @@ def acting_constraints(model: Any, data: Any) -> Iterator[str]:
         int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON),
     )
     for kind, ident in zip(data.efc_type, data.efc_id, strict=True):
-        if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF):
+        if kind == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF:
             yield f"dry friction of {joints[model.dof_jntid[ident]]}"
-        elif kind == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT):
+        elif kind == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT:
             yield f"limit of {joints[ident]}"
         elif kind in tendon_kinds:
             tendon = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, ident) or ident

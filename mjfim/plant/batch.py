@@ -540,7 +540,7 @@ class BatchSimulator:
         found = observations.values(qpos, qvel, qvel_before, lambda name: out[name][:, :end])
         observed = found.reshape(m, N, self.substeps, found.shape[-1])
         if not observations.force_rows:
-            return np.asarray(observed)
+            return observed
 
         # Further rows have the forces at the beginning of the engine steps, and at the end of the
         # samples.

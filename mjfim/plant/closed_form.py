@@ -124,12 +124,12 @@ def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree 
     # stays at rest, shows nothing.
     is_affine = (
         np.isin(model.actuator_trntype, [int(each) for each in direct]).all()
-        and (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)).all()
+        and (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
         and np.isin(model.actuator_biastype, [int(each) for each in biases]).all()
         and model.nu == model.nactuator == model.nout
         and (model.actuator_ctrlnum == 1).all()
         # A tendon of joints has constant moment arms; one over sites has not.
-        and (model.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)).all()
+        and (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT).all()
         and not _any(model, OTHER_FORCES)
         and not _any(model.opt, ("density", "viscosity"))
     )
@@ -319,7 +319,7 @@ def by_state_and_control(slopes: Array, AB: Array) -> Array:
     nx = AB.shape[1]
     total = np.ascontiguousarray(slopes[..., :nx]) @ AB
     total[..., nx:] += slopes[..., nx:]
-    return np.asarray(total)
+    return total
 
 
 def advance(derivative: Array, acceleration: Array, timestep: float) -> None:

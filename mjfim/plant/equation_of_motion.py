@@ -192,7 +192,7 @@ class AffineForces:
         is_free = self._applied(ctrl)[1]
         slopes = acts[..., None] * self.actuators[:, 1:]
         slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
-        return np.asarray(slopes)
+        return slopes
 
     def clamped(self, states: Array, ctrl: Array) -> np.ndarray:
         """(n, actuators) True where the force of an actuator is clamped.
@@ -492,13 +492,13 @@ class EquationOfMotion:
         # The speeds of a tendon below which its friction is viscous are those of its joints.
         values = self._fields(model, points, ["ten_J"])["ten_J"]
         for tendon in np.flatnonzero(model.tendon_frictionloss).tolist():
-            first, count = int(model.ten_J_rowadr[tendon]), int(model.ten_J_rownnz[tendon])
+            first, count = model.ten_J_rowadr[tendon], model.ten_J_rownnz[tendon]
             arms = values.reshape(len(speed), -1)[:, first : first + count]
             dofs = np.reshape(model.ten_J_colind, -1)[first : first + count]
             slow = np.abs(arms) @ self.friction_speeds[dofs]
             rate = np.sum(arms * speed[:, dofs], axis=1)
             along = np.clip(rate / np.maximum(slow, np.finfo(float).tiny), -1.0, 1.0)
-            force = float(model.tendon_frictionloss[tendon]) * along
+            force = model.tendon_frictionloss[tendon] * along
             friction[:, dofs] -= arms * force[:, None]
         return np.asarray(friction)
 

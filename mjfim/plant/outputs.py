@@ -195,11 +195,11 @@ def outputs_by_state(model: Any, outputs: Outputs) -> dict[int, int]:
     # Address in sensordata -> address in the state vector.
     sensors = {}
     for s in range(model.nsensor):
-        joint = int(model.sensor_objid[s])
-        kind = int(model.sensor_type[s])
-        if kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
+        joint = model.sensor_objid[s]
+        kind = model.sensor_type[s]
+        if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
             sensors[int(model.sensor_adr[s])] = int(model.jnt_qposadr[joint])
-        elif kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL):
+        elif kind == mujoco.mjtSensor.mjSENS_JOINTVEL:
             sensors[int(model.sensor_adr[s])] = model.nq + int(model.jnt_dofadr[joint])
 
     # A component that is measured directly takes precedence over a sensor of it.

@@ -176,7 +176,7 @@ class Derivatives(MixedDerivatives):
         moves = np.concatenate([found.psi, found.G], axis=1) * self.plant.parameters.magnitude
         effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
         factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effect, TINY), 1.0, MAX_STEP_FACTOR)
-        return np.asarray(factors if wanted is None else np.where(wanted, factors, 1.0))
+        return factors if wanted is None else np.where(wanted, factors, 1.0)
 
     def _rollout_differences(
         self,

@@ -344,7 +344,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 def _cross_matrix(a: Array) -> Array:
     """(..., 3, 3) matrix of the cross product with a: (..., 3)."""
-    return np.asarray((a @ CROSS_PRODUCTS).reshape(*a.shape, 3))
+    return (a @ CROSS_PRODUCTS).reshape(*a.shape, 3)
 
 
 def _product(matrix: Array, vector: Array) -> Array:
@@ -399,9 +399,9 @@ class JointTree:
         Returns:
             The tree; None where a joint is neither a hinge nor a slide.
         """
-        kinds = np.asarray(model.jnt_type)
-        is_hinge = kinds == int(mujoco.mjtJoint.mjJNT_HINGE)
-        if not (is_hinge | (kinds == int(mujoco.mjtJoint.mjJNT_SLIDE))).all():
+        kinds = model.jnt_type
+        is_hinge = kinds == mujoco.mjtJoint.mjJNT_HINGE
+        if not (is_hinge | (kinds == mujoco.mjtJoint.mjJNT_SLIDE)).all():
             return None
 
         # Parents have lower numbers than their children.

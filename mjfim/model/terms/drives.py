@@ -195,9 +195,8 @@ class BackEmf(Term):
         """Resolve the term for a direct drive."""
         name, number = named_element(table, "actuator", model, cls.kind)
         _require_plain(model, name, number, cls.kind)
-        fixed, none = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
-        is_direct = int(model.actuator_gaintype[number]) == fixed
-        if not is_direct or int(model.actuator_biastype[number]) != none:
+        has_gain = model.actuator_gaintype[number] == mujoco.mjtGain.mjGAIN_FIXED
+        if not has_gain or model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_NONE:
             raise ExperimentError(
                 f"actuator: {name!r} is no direct drive (constant gain, no bias); a servo has its "
                 "own damping, `actuator/<name>:kv`"
@@ -235,10 +234,10 @@ class BackEmf(Term):
 
 def _require_plain(model: Any, name: str, number: int, kind: str) -> None:
     """Raise ExperimentError for an actuator with dynamics, or with a gain of another type."""
-    has_dynamics = int(model.actuator_dyntype[number]) != mujoco.mjtDyn.mjDYN_NONE
+    has_dynamics = model.actuator_dyntype[number] != mujoco.mjtDyn.mjDYN_NONE
     is_plain = int(model.actuator_gaintype[number]) in [int(gain) for gain in PLAIN_GAINS]
     has_bias = int(model.actuator_biastype[number]) in [int(bias) for bias in PLAIN_BIASES]
-    if has_dynamics or not (is_plain and has_bias) or int(model.actuator_ctrlnum[number]) != 1:
+    if has_dynamics or not (is_plain and has_bias) or model.actuator_ctrlnum[number] != 1:
         raise ExperimentError(
             f"actuator: {name!r} has dynamics or a gain of its own; a term of kind {kind!r} needs "
             "an actuator without dynamics, such as <motor>, <position> or <velocity>"
@@ -314,8 +313,8 @@ class JointElasticity(Term):
     def of(cls, table: TermTable, model: Any, period: float) -> Self:
         """Resolve the term at the last joint of a body."""
         at = JointSizes.of(table, model, period, cls.kind)
-        body = int(model.jnt_bodyid[at.number])
-        last = int(model.body_jntadr[body]) + int(model.body_jntnum[body]) - 1
+        body = model.jnt_bodyid[at.number]
+        last = model.body_jntadr[body] + model.body_jntnum[body] - 1
         if at.number != last:
             raise ExperimentError(
                 f"joint: {at.joint!r} is not the last joint of its body, so that no second joint "

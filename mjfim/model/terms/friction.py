@@ -438,10 +438,10 @@ class LoadDependentFriction(Term):
         for kind, suffix in (("joint", ""), ("body", ""), ("tendon", ""), ("geom", "_ball")):
             require_free_name(model, kind, f"{table.name}{suffix}")
 
-        body = int(model.jnt_bodyid[joint])
-        parent = int(model.body_parentid[body])
+        body = model.jnt_bodyid[joint]
+        parent = model.body_parentid[body]
         link, base = (element_name(model, "body", each) for each in (body, parent))
-        if not (link and base) or int(model.body_jntnum[body]) != 1:
+        if not (link and base) or model.body_jntnum[body] != 1:
             raise ExperimentError(
                 f"actuator: the body of the joint of {name!r} and its parent need names, and the "
                 "body no other joint"
@@ -524,10 +524,10 @@ class LoadDependentFriction(Term):
 
 def _driven_hinge(model: Any, name: str, actuator: int) -> int:
     """Number of the hinge that a direct drive acts on; ExperimentError for other actuators."""
-    is_at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
+    is_at_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
     joint = int(model.actuator_trnid[actuator, 0])
-    is_hinge = is_at_joint and int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_HINGE
-    has_bias = int(model.actuator_biastype[actuator]) != mujoco.mjtBias.mjBIAS_NONE
+    is_hinge = is_at_joint and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    has_bias = model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE
     if not is_hinge or has_bias or not element_name(model, "joint", joint):
         raise ExperimentError(
             f"actuator: {name!r} is no direct drive at a hinge with a name; the feedback of a "

@@ -152,7 +152,7 @@ class Payload(Term):
         """Resolve the term for a body that moves."""
         name, number = named_element(table, "body", model, cls.kind)
         require_free_name(model, "body", table.name)
-        if name == WORLD or int(model.body_weldid[number]) == 0:
+        if name == WORLD or model.body_weldid[number] == 0:
             raise ExperimentError(f"body: {name!r} does not move, so that a load has no effect")
 
         load, length = f"body/{table.name}", model_length(model)
@@ -186,7 +186,7 @@ class Payload(Term):
         """Places on a line through the centre of mass of a body that carries no moving one."""
         body = model.body(element).id
         is_last = not any(
-            int(model.body_weldid[model.body_parentid[other]]) == body
+            model.body_weldid[model.body_parentid[other]] == body
             for other in np.flatnonzero(model.body_jntnum)
         )
         if not model.body_jntnum[body] or not is_last:
