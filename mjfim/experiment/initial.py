@@ -105,11 +105,7 @@ def fourier_basis(
     omega: Array = 2.0 * np.pi * frequency * np.arange(1.0, harmonics + 1.0)
     waves = _wave_derivatives(t, omega, 0)
 
-    times = []
-    if starts_at_rest:
-        times.append(0.0)
-    if ends_at_rest:
-        times.append(horizon)
+    times = starts_at_rest * [0.0] + ends_at_rest * [horizon]
     if not times:
         return waves
 
@@ -310,7 +306,14 @@ def initial_state(stated: Initial, model: Any, key: Any, layout: StateLayout | N
             lambda numbers: own.activations(numbers, qpos, None),
         )
 
-    _require_rotations(model, qpos)
+    names = joint_names(model)
+    for joint in quaternion_joints(model):
+        first = quaternion_address(model, joint)
+        if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
+            raise ExperimentError(
+                f"initial.qpos: the quaternion of joint {names[joint]!r} (numbers {first} to "
+                f"{first + 3}) is zero; the identity rotation is 1, 0, 0, 0"
+            )
     mujoco.mj_normalizeQuat(model, qpos)
     return np.concatenate([qpos, qvel, act])
 
@@ -328,15 +331,3 @@ def _completed(
     if len(numbers) != count:
         raise ExperimentError(f"initial.{name}: {len(numbers)} numbers; this model needs {count}")
     return np.array(numbers, dtype=np.float64)
-
-
-def _require_rotations(model: Any, qpos: Array) -> None:
-    """Raise ExperimentError if a quaternion in qpos: (nq,) is zero."""
-    names = joint_names(model)
-    for joint in quaternion_joints(model):
-        first = quaternion_address(model, joint)
-        if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
-            raise ExperimentError(
-                f"initial.qpos: the quaternion of joint {names[joint]!r} (numbers {first} to "
-                f"{first + 3}) is zero; the identity rotation is 1, 0, 0, 0"
-            )

@@ -39,7 +39,7 @@ from mjfim.model.coordinates import (
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameter_writer import MOMENT_ROUNDING, ParameterWriter
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.terms.library import resolve_terms
+from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
 from mjfim.model.units import per_second
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
@@ -479,8 +479,16 @@ def _require_supported(source: ModelSource) -> None:
 
 
 def _terms_of(experiment: Experiment, stated: ModelSource) -> tuple[Term, ...]:
-    """Physical terms of an experiment, in their order in the file."""
-    tables = []
+    """Physical terms of an experiment, in their order in the file.
+
+    Args:
+        experiment: The experiment.
+        stated: Its model without terms.
+
+    Raises:
+        ExperimentError: A table does not fit the model; the message names its key.
+    """
+    terms = []
     for name, spec in experiment.terms.items():
         elements = ((key, getattr(spec, key)) for key in ELEMENT_KEYS)
         table = TermTable(
@@ -489,8 +497,11 @@ def _terms_of(experiment: Experiment, stated: ModelSource) -> tuple[Term, ...]:
             encoder=spec.encoder,
             values=tuple((field, float(value)) for field, value in spec.values.items()),
         )
-        tables.append((spec.kind, table))
-    return resolve_terms(tables, stated.model, 1.0 / experiment.rate)
+        try:
+            terms.append(KINDS[spec.kind].of(table, stated.model, 1.0 / experiment.rate))
+        except ExperimentError as error:
+            raise ExperimentError(f"terms.{name}: {error}") from None
+    return tuple(terms)
 
 
 def simulate(

@@ -205,11 +205,8 @@ def actuator_names(model: Any) -> tuple[str, ...]:
 
 def control_names(model: Any) -> tuple[str, ...]:
     """Names of the nu controls; an actuator with several controls names them `<actuator>[<i>]`."""
-    names: list[str] = []
-    for i, name in enumerate(actuator_names(model)):
-        count = model.actuator_ctrlnum[i]
-        names += _indexed(name, count)
-    return tuple(names)
+    counts = zip(actuator_names(model), model.actuator_ctrlnum, strict=True)
+    return tuple(control for name, count in counts for control in _indexed(name, count))
 
 
 def control_labels(model: Any) -> tuple[str, ...]:
@@ -307,20 +304,18 @@ def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
 
 def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
     """The na activations by their address: `act:<actuator>`, with `[i]` if there are several."""
-    found: dict[int, TangentComponent] = {}
+    found: list[TangentComponent] = []
     for i, name in enumerate(actuator_names(model)):
-        first = int(model.actuator_actadr[i])
+        first = 2 * model.nv + int(model.actuator_actadr[i])
         count = model.actuator_actnum[i]
         named = element_name(model, "actuator", i) != ""
         columns = _indexed(f"act:{name}", count)
         paths = _indexed(f"initial/{name}:act", count)
-
-        for k in range(count):
-            address = 2 * model.nv + first + k
-            found[address] = TangentComponent(
-                name=columns[k], path=paths[k] if named else "", address=address, unit=""
-            )
-    return tuple(found[address] for address in sorted(found))
+        found += [
+            TangentComponent(name=column, path=path if named else "", address=first + k, unit="")
+            for k, (column, path) in enumerate(zip(columns, paths, strict=True))
+        ]
+    return tuple(sorted(found, key=lambda component: component.address))
 
 
 def dof_names(model: Any) -> tuple[str, ...]:
@@ -350,10 +345,8 @@ def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
     Returns:
         nu * nx names `gain:<control>:<component of the deviation>`.
     """
-    names: list[str] = []
-    for control in controls:
-        names += [f"gain:{control}:{component}" for component in tangent_names(model)]
-    return tuple(names)
+    deviations = tangent_names(model)
+    return tuple(f"gain:{control}:{each}" for control in controls for each in deviations)
 
 
 def sensor_columns(model: Any, sensor: str) -> list[str]:

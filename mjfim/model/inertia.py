@@ -75,16 +75,8 @@ class BodyInertia:
         moments = moments[::-1]
         R = np.ascontiguousarray(R[:, ::-1])
 
-        # The triple product of the axes is negative where they are left-handed.
-        x, y, z = R.T.tolist()
-        cross = (
-            x[1] * y[2] - x[2] * y[1],
-            x[2] * y[0] - x[0] * y[2],
-            x[0] * y[1] - x[1] * y[0],
-        )
-        if cross[0] * z[0] + cross[1] * z[1] + cross[2] * z[2] < 0.0:
+        if np.linalg.det(R) < 0.0:
             R[:, 2] *= -1.0
-
         # MuJoCo's own function takes a hundredth of the time of SciPy's.
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())

@@ -239,10 +239,14 @@ def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:
         if not model.actuator_ctrlnum[i]:
             continue
         first, count = int(model.actuator_outadr[i]), int(model.actuator_outnum[i])
+        unit = force_unit(model, i)
+        # The forces on a ball or free joint have several units.
+        if unit and model.jnt_type[model.actuator_trnid[i, 0]] in (BALL, FREE):
+            unit = ""
         forces[name] = LimitedElement(
             index=first,
             count=count,
-            unit=_force_unit(model, i),
+            unit=unit,
             size=float(sizes[first]),
             stated=_range(model.actuator_forcelimited, model.actuator_forcerange, i),
         )
@@ -257,9 +261,11 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
     """Enter the lengths of the tendons, and the sums of the forces of their actuators."""
     sizes = actuator_force_sizes(model, time)
     for i, name in enumerate(unique_names(model, "tendon")):
+        # A tendon is a path in space, or a sum of joint coordinates.
+        is_spatial = model.wrap_type[model.tendon_adr[i]] != mujoco.mjtWrap.mjWRAP_JOINT
         found.by_kind["tendon_length"][name] = LimitedElement(
             index=i,
-            unit=LENGTH if _is_spatial(model, i) else "",
+            unit=LENGTH if is_spatial else "",
             size=float(abs(model.tendon_length0[i])) or model_length(model),
             stated=_range(model.tendon_limited, model.tendon_range, i),
         )
@@ -267,25 +273,10 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
         if pulling:
             found.by_kind["tendon_force"][name] = LimitedElement(
                 index=i,
-                unit=FORCE_UNITS[LENGTH] if _is_spatial(model, i) else "",
+                unit=FORCE_UNITS[LENGTH] if is_spatial else "",
                 size=float(sizes[list(pulling)].max()),
                 stated=_range(model.tendon_actfrclimited, model.tendon_actfrcrange, i),
             )
-
-
-def _force_unit(model: Any, actuator: int) -> str:
-    """Unit of the force of an actuator; empty for one with several forces or on a free joint."""
-    joint = model.actuator_trnid[actuator, 0]
-    acts_on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
-    if not acts_on_joint or model.jnt_type[joint] in (BALL, FREE):
-        return ""
-    return force_unit(model, actuator)
-
-
-def _is_spatial(model: Any, tendon: int) -> bool:
-    """Whether a tendon is a path in space, and not a sum of joint coordinates."""
-    first = model.tendon_adr[tendon]
-    return bool(model.wrap_type[first] != mujoco.mjtWrap.mjWRAP_JOINT)
 
 
 def _range(limited: Any, ranges: Any, index: int) -> Range | None:
@@ -304,20 +295,6 @@ def _range(limited: Any, ranges: Any, index: int) -> Range | None:
 
 # Kinds of joints whose position holds a quaternion, with the place of the quaternion in it.
 QUATERNION_PLACE = {BALL: 0, FREE: 3}
-
-
-def upward(model: Any) -> Array:
-    """Direction against gravity in the world; the z axis without gravity.
-
-    Args:
-        model: The compiled model (`mujoco.MjModel`).
-
-    Returns:
-        (3,) unit vector.
-    """
-    gravity = np.array(model.opt.gravity)
-    size = float(np.linalg.norm(gravity))
-    return -gravity / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
 
 
 def turn_weights(model: Any, joint: int) -> Array:
@@ -363,8 +340,8 @@ def tilt_weights(model: Any, joint: int) -> Array:
 
     # The upward direction in the frame of the body, and two directions perpendicular to it.
     rotation = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
-    up = rotation.T @ upward(model)
-    _, _, directions = np.linalg.svd(up[None])
+    up = -model.opt.gravity if model.opt.gravity.any() else np.array([0.0, 0.0, 1.0])
+    _, _, directions = np.linalg.svd((rotation.T @ up / np.linalg.norm(up))[None])
     return directions[1:] @ turn_weights(model, joint)
 
 

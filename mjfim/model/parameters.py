@@ -533,14 +533,8 @@ def physical_bounds(targets: Iterable[Target]) -> tuple[float, float]:
     """
     low, high = -np.inf, np.inf
     for target in targets:
-        # Values of the parameter at which the target is at its bounds.
-        ends = [
-            (bound - target.offset) / target.scale + 0.0 if np.isfinite(bound) else bound
-            for bound in _bounds_of(target)
-        ]
-        if target.scale < 0.0:
-            infinite = [-end if np.isinf(end) else end for end in ends]
-            ends = infinite[::-1]
+        # Values of the parameter at which the target is at its bounds; 0.0 makes no -0.0 of them.
+        ends = sorted((bound - target.offset) / target.scale + 0.0 for bound in _bounds_of(target))
         low, high = max(low, ends[0]), min(high, ends[1])
     return low, high
 

@@ -148,7 +148,7 @@ def gain_unit(model: Any, actuator: int, field: str) -> str:
     return JOINT_FIELD_UNITS[FIELD_OF_GAIN[field]][joint_unit(model, joint)]
 
 
-def joint_field_unit(field: str, coordinate: str, order: int = 0) -> str:
+def joint_field_unit(field: str, coordinate: str, order: int) -> str:
     """Unit of a field of a joint.
 
     Args:

@@ -169,11 +169,14 @@ class Relaxation:
 
     def apply(self, model: Any) -> None:
         """Change a model that the caller owns, in place."""
-        model.jnt_limited[list(self.joints)] = 0
-        model.jnt_actfrclimited[list(self.joint_forces)] = 0
-        model.actuator_forcelimited[list(self.actuators)] = 0
-        model.tendon_limited[list(self.tendons)] = 0
-        model.tendon_actfrclimited[list(self.tendon_forces)] = 0
+        for is_limited, freed in (
+            (model.jnt_limited, self.joints),
+            (model.jnt_actfrclimited, self.joint_forces),
+            (model.actuator_forcelimited, self.actuators),
+            (model.tendon_limited, self.tendons),
+            (model.tendon_actfrclimited, self.tendon_forces),
+        ):
+            is_limited[list(freed)] = 0
         if self.controls:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:

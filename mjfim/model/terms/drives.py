@@ -114,9 +114,7 @@ class ActuatorLag(Term):
     equation = "force = gain · a + bias, ȧ = (control - a)/time_constant"
     elements = "dyntype filterexact and actearly of the actuator; with RK4 dyntype filter"
     acts_on = "actuator"
-    fields = (
-        FieldDescription(name="time_constant", description="time constant of the lag", unit="s"),
-    )
+    fields = (FieldDescription("time_constant", "time constant of the lag", "s"),)
     sources = (KRAUSE_2013,)
     words = "a lag of {}"
     size = "time_constant"
@@ -179,11 +177,7 @@ class BackEmf(Term):
     equation = "force = gain · (control - constant · actuator velocity)"
     elements = "biastype affine of the actuator, biasprm[2] = -gain · constant"
     acts_on = "actuator"
-    fields = (
-        FieldDescription(
-            name="constant", description="back-EMF constant K [control · s/rad]", unit="V s/rad"
-        ),
-    )
+    fields = (FieldDescription("constant", "back-EMF constant K [control · s/rad]", "V s/rad"),)
     sources = (KRAUSE_2013, MUJOCO_DCMOTOR)
     # The damping depends on the gain, which may be a parameter as well.
     is_written_as_a_whole = True
@@ -278,10 +272,8 @@ class JointElasticity(Term):
     )
     acts_on = "joint"
     fields: ClassVar[tuple[FieldDescription, ...]] = (
-        FieldDescription(
-            name="compliance", description="deflection per torque, 1/K", unit="rad/(N m)"
-        ),
-        FieldDescription(name="damping", description="damping of the deflection", unit="N m s/rad"),
+        FieldDescription("compliance", "deflection per torque, 1/K", "rad/(N m)"),
+        FieldDescription("damping", "damping of the deflection", "N m s/rad"),
     )
     sources = (SPONG_1987,)
     words = "elasticity of {}"
@@ -425,13 +417,9 @@ class Backlash(JointElasticity):
     )
     acts_on = "joint"
     fields = (
-        FieldDescription(name="gap", description="width of the gap", unit="rad"),
-        FieldDescription(
-            name="compliance", description="deflection of the flanks per torque", unit="rad/(N m)"
-        ),
-        FieldDescription(
-            name="damping", description="damping between motor and link", unit="N m s/rad"
-        ),
+        FieldDescription("gap", "width of the gap", "rad"),
+        FieldDescription("compliance", "deflection of the flanks per torque", "rad/(N m)"),
+        FieldDescription("damping", "damping between motor and link", "N m s/rad"),
     )
     sources = (NORDIN_2002,)
     words = "backlash of {}"

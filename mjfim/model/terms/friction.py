@@ -240,10 +240,8 @@ class Stribeck(_PassiveDevice):
     elements = 'actuator/dcmotor with input="none" and lugre, beside the joint\'s frictionloss'
     acts_on = "joint"
     fields = (
-        FieldDescription(
-            name="excess", description="static friction minus Coulomb friction", unit="N m"
-        ),
-        FieldDescription(name="speed", description="Stribeck speed", unit="rad/s"),
+        FieldDescription("excess", "static friction minus Coulomb friction", "N m"),
+        FieldDescription("speed", "Stribeck speed", "rad/s"),
     )
     sources = (DE_WIT_1995, ARMSTRONG_1994)
     places: ClassVar[Places] = {"excess": ("biasprm[4]",), "speed": ("biasprm[5]",)}
@@ -283,13 +281,11 @@ class LuGre(_PassiveDevice):
     elements = 'actuator/dcmotor with input="none" and lugre'
     acts_on = "joint"
     fields = (
-        FieldDescription(name="coulomb", description="Coulomb friction", unit="N m"),
-        FieldDescription(
-            name="excess", description="static friction minus Coulomb friction", unit="N m"
-        ),
-        FieldDescription(name="speed", description="Stribeck speed", unit="rad/s"),
-        FieldDescription(name="stiffness", description="stiffness of the bristle", unit="N m/rad"),
-        FieldDescription(name="damping", description="damping of the bristle", unit="N m s/rad"),
+        FieldDescription("coulomb", "Coulomb friction", "N m"),
+        FieldDescription("excess", "static friction minus Coulomb friction", "N m"),
+        FieldDescription("speed", "Stribeck speed", "rad/s"),
+        FieldDescription("stiffness", "stiffness of the bristle", "N m/rad"),
+        FieldDescription("damping", "damping of the bristle", "N m s/rad"),
     )
     sources = (DE_WIT_1995, OLSSON_1998)
     is_written_as_a_whole = True
@@ -345,9 +341,9 @@ class AsymmetricFriction(_PassiveDevice):
     acts_on = "joint"
     fields = (
         FieldDescription(
-            name="offset",
-            description="half of the friction backwards minus that forwards",
-            unit="N m",
+            "offset",
+            "half of the friction backwards minus that forwards",
+            "N m",
         ),
     )
     sources = (ARMSTRONG_1994,)
@@ -406,11 +402,7 @@ class LoadDependentFriction(Term):
         "against two buffers; contact/pair with torsional friction"
     )
     acts_on = "actuator"
-    fields = (
-        FieldDescription(
-            name="coefficient", description="friction per torque of the motor", unit=""
-        ),
-    )
+    fields = (FieldDescription("coefficient", "friction per torque of the motor", ""),)
     sources = (DUCLAUSAUD_2025, GARCIA_2002)
     words = "friction that grows with the torque of {}"
     size = "coefficient"

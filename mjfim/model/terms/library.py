@@ -5,7 +5,7 @@ The terms of a base that is not level and of a payload are here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError
 from mjfim.model.elements import model_length
 from mjfim.model.terms import drives, friction
 from mjfim.model.terms.term import (
@@ -71,8 +71,7 @@ class Tilt(Term):
     elements = "option/gravity"
     acts_on = ""
     fields = tuple(
-        FieldDescription(name=axis, description=f"rotation about the world's {axis}", unit="rad")
-        for axis in AXES
+        FieldDescription(axis, f"rotation about the world's {axis}", "rad") for axis in AXES
     )
     sources = (SWEVERS_2007,)
     # All components of gravity depend on all components of the rotation.
@@ -130,14 +129,9 @@ class Payload(Term):
     elements = "body without joints, with an inertial"
     acts_on = "body"
     fields = (
-        FieldDescription(name="mass", description="mass of the load", unit="kg"),
-        *(
-            FieldDescription(name=axis, description=f"{axis} in the frame of the body", unit="m")
-            for axis in AXES
-        ),
-        FieldDescription(
-            name="inertia", description="rotational inertia of the load", unit="kg m²"
-        ),
+        FieldDescription("mass", "mass of the load", "kg"),
+        *(FieldDescription(axis, f"{axis} in the frame of the body", "m") for axis in AXES),
+        FieldDescription("inertia", "rotational inertia of the load", "kg m²"),
     )
     sources = (ATKESON_1986,)
     words = "a payload at {}"
@@ -250,27 +244,3 @@ KINDS: dict[str, type[Term]] = {
         Payload,
     )
 }
-
-
-def resolve_terms(
-    tables: Iterable[tuple[str, TermTable]], model: Any, period: float
-) -> tuple[Term, ...]:
-    """Resolve the terms of an experiment.
-
-    Args:
-        tables: Kind and table of each term.
-        model: The stated model without terms (`mujoco.MjModel`).
-        period: Sample period of the experiment [s].
-
-    Raises:
-        ExperimentError: A table does not fit the model; the message names its key.
-    """
-    terms = []
-    for kind, table in tables:
-        if kind not in KINDS:
-            raise ExperimentError(f"terms.{table.name}.kind: {unknown('kind', kind, list(KINDS))}")
-        try:
-            terms.append(KINDS[kind].of(table, model, period))
-        except ExperimentError as error:
-            raise ExperimentError(f"terms.{table.name}: {error}") from None
-    return tuple(terms)

@@ -45,7 +45,7 @@ NON_NEGATIVE = (0.0, np.inf)
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FieldDescription:
     """A field of a kind of term, in words.
 
@@ -409,13 +409,8 @@ class StateLayout:
             joints: Number in the extended model of each joint of the stated one.
             actuators: Number in the extended model of each actuator of the stated one.
         """
-        qpos, qvel = np.zeros(stated.nq, dtype=np.intp), np.zeros(stated.nv, dtype=np.intp)
-        for old, new in enumerate(joints):
-            positions = _range(stated.jnt_qposadr, old, stated.nq)
-            qpos[positions] = extended.jnt_qposadr[new] + np.arange(len(positions))
-            velocities = _range(stated.jnt_dofadr, old, stated.nv)
-            qvel[velocities] = extended.jnt_dofadr[new] + np.arange(len(velocities))
-
+        qpos = _moved_addresses(stated.jnt_qposadr, extended.jnt_qposadr, joints, stated.nq)
+        qvel = _moved_addresses(stated.jnt_dofadr, extended.jnt_dofadr, joints, stated.nv)
         act = np.zeros(stated.na, dtype=np.intp)
         for old, new in enumerate(actuators):
             count = stated.actuator_actnum[old]
@@ -533,7 +528,16 @@ def _write_key(key: Any, numbers: Sequence[Array], layout: StateLayout) -> None:
         key.act = layout.activations(stated, qpos, ctrl if len(ctrl) else None)
 
 
-def _range(addresses: Any, element: int, end: int) -> np.ndarray:
-    """Addresses that belong to an element, up to the first one of the next element or the end."""
-    following = addresses[element + 1] if element + 1 < len(addresses) else end
-    return np.arange(int(addresses[element]), int(following))
+def _moved_addresses(
+    stated: np.ndarray, extended: np.ndarray, joints: Sequence[int], size: int
+) -> np.ndarray:
+    """(size,) extended addresses of the stated numbers of joints.
+
+    Args:
+        stated: First address of each joint in the stated model.
+        extended: First address of each joint in the extended model.
+        joints: Number in the extended model of each joint of the stated one.
+        size: Number of stated addresses.
+    """
+    counts = np.diff(stated, append=size)
+    return np.asarray(np.arange(size) + np.repeat(extended[list(joints)] - stated, counts))
