@@ -24,7 +24,7 @@ from mjfim.model.control_laws import (
 )
 from mjfim.model.coordinates import ScalarJoint, actuator_names
 from mjfim.model.loading import ModelSource
-from mjfim.model.units import AT_JOINT, per_second
+from mjfim.model.units import acts_at_joint, per_second
 
 # Numbers of a law that give it an integral if they are parameters.
 INTEGRAL_NUMBERS = ("ki", "integral")
@@ -111,8 +111,7 @@ def _joint(source: ModelSource, actuator: str, spec: ControllerSpec) -> ScalarJo
     driven = [
         joint
         for joint in joints.values()
-        if int(model.actuator_trntype[number]) in [int(kind) for kind in AT_JOINT]
-        and joint.joint == model.actuator_trnid[number, 0]
+        if acts_at_joint(model, number) and joint.joint == model.actuator_trnid[number, 0]
     ]
     if not driven:
         raise ExperimentError(

@@ -199,9 +199,8 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
         cad_prior = CAD_PRIOR
     fields = BARYCENTRIC_FIELDS if kind == "barycentric" else LOGCHOLESKY_FIELDS
 
-    for i, coordinate in enumerate(parametrisation.names):
-        value = float(values[i])
-        magnitude = float(magnitudes[i])
+    numbers = zip(parametrisation.names, values.tolist(), magnitudes.tolist(), strict=True)
+    for i, (coordinate, value, magnitude) in enumerate(numbers):
         scale = abs(value) if spec.scale == "guess" else magnitude
         if scale == 0.0:
             raise ExperimentError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -188,44 +188,42 @@ def _add_joint(
     size = float(sizes[v])
     count = 3 if kind in (BALL, FREE) else 1
 
+    # The range of a ball joint in the MJCF is its largest angle of rotation. It is no limit where
+    # it is half a turn or more.
+    if kind == BALL and stated is not None and stated[1] >= np.pi:
+        stated = None
     unit = joint_unit(model, joint)
-    rates = {
-        "velocity": (per_second(unit), size / time),
-        "acceleration": (f"{per_second(unit)}²", size / time**2),
-    }
-
+    rate = per_second(unit)
     # The velocity of a free joint is that of its translation.
-    for rate, (per_time, typical) in rates.items():
-        kinds[rate][name] = LimitedElement(index=v, count=count, unit=per_time, size=typical)
-
-    if kind == FREE:
-        for i, part in enumerate(TRANSLATION):
-            each = f"{name}.{part}"
-            place = LimitedElement(index=q + i, unit=unit, size=size, is_part=True)
-            kinds["position"][each] = place
-            for rate, (per_time, typical) in rates.items():
-                moving = LimitedElement(index=v + i, unit=per_time, size=typical, is_part=True)
-                kinds[rate][each] = moving
-    else:
-        # The range of a ball joint in the MJCF is its largest angle of rotation, which is no limit
-        # where it is half a turn or more.
-        if kind == BALL and stated is not None and stated[1] >= np.pi:
-            stated = None
-        kinds["position"][name] = LimitedElement(
-            index=q, count=count, unit=unit, size=size, stated=stated
-        )
+    speed = LimitedElement(index=v, count=count, unit=rate, size=size / time)
+    motion = {
+        "position": LimitedElement(index=q, count=count, unit=unit, size=size, stated=stated),
+        "velocity": speed,
+        "acceleration": replace(speed, unit=f"{rate}²", size=size / time**2),
+    }
+    for limited, whole in motion.items():
+        # The coordinates of a free joint have ranges, its position as a whole has none.
+        if kind != FREE or limited != "position":
+            kinds[limited][name] = whole
+        if kind == FREE:
+            kinds[limited] |= _parts(whole, name, TRANSLATION)
 
     if kind not in (BALL, FREE):
         return
-    first = v + (3 if kind == FREE else 0)
-    speed = LimitedElement(index=first, count=3, unit=per_second(ANGLE), size=1.0 / time)
-    kinds["angular_velocity"][name] = speed
-    for i, part in enumerate(ROTATION_VECTOR):
-        about = replace(speed, index=first + i, count=1, is_part=True)
-        kinds["angular_velocity"][f"{name}.{part}"] = about
-
+    first = v + QUATERNION_PLACE[kind]
+    turn = LimitedElement(index=first, count=3, unit=per_second(ANGLE), size=1.0 / time)
+    kinds["angular_velocity"][name] = turn
+    kinds["angular_velocity"] |= _parts(turn, name, ROTATION_VECTOR)
     address = quaternion_address(model, joint)
     kinds["tilt"][name] = LimitedElement(index=address, count=TILT_COMPONENTS, unit=ANGLE)
+
+
+def _parts(whole: LimitedElement, name: str, parts: Sequence[str]) -> dict[str, LimitedElement]:
+    """The single coordinates of a vector of a joint, by `<joint>.<part>`."""
+    return {
+        f"{name}.{part}": replace(whole, index=whole.index + i, count=1, is_part=True)
+        for i, part in enumerate(parts)
+    }
 
 
 def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:

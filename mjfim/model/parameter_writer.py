@@ -252,17 +252,17 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None, round
 
     if values is not None:
         moments = np.linalg.eigvalsh(INERTIA_PARAMETRISATIONS[kind].inertia(values).inertia)
-    excess = float(moments[2] - moments[0] - moments[1])
-    if moments[0] >= least and (not moments[2] or excess / moments[2] <= rounding):
+    excess = moments[2] - moments[0] - moments[1]
+    if not moments[0] >= least:
+        wanted = "all must be > 0"
+    elif not moments[2] or excess / moments[2] <= rounding:
         return ""
-
-    listed = ", ".join(f"{moment:.4g}" for moment in moments)
-    wanted = "all must be > 0"
-    if moments[0] >= least:
+    else:
         wanted = (
             "the sum of the smaller two must be at least the largest (its pseudo-inertia is not "
             "positive semidefinite)"
         )
+    listed = ", ".join(f"{moment:.4g}" for moment in moments)
     return f"principal moments of inertia {listed} kg m²; {wanted}"
 
 

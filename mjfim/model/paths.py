@@ -6,7 +6,7 @@ The names of the fields are MuJoCo's.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -100,8 +100,8 @@ INERTIAL_FIELDS = {
     "logcholesky": ("logcholesky", 0, 10),
 }
 
-# Fields from which the compiler derives others, so that a change needs a compile.
-COMPILED_FIELDS = {"geom": ("size", "pos", "mass", "density")}
+# Fields of a geom from which the compiler derives others, so that a change needs a compile.
+COMPILED_FIELDS = ("size", "pos", "mass", "density")
 
 # Fields of an actuator that stand for the gains of a position or velocity servo.
 SERVO_FIELDS = ("kp", "kv")
@@ -183,16 +183,16 @@ class ParameterPath:
 
 def fields_of(kind: str) -> list[str]:
     """Fields that a path of this kind may name."""
-    further = {
-        "body": [*INERTIAL_FIELDS, "rot"],
-        "site": ["rot"],
-        "geom": list(COMPILED_FIELDS["geom"]),
-        "actuator": list(SERVO_FIELDS),
-        "controller": list(LAW_FIELDS),
-        "initial": list(INITIAL_STATE_FIELDS),
-        "output": list(OUTPUT_FIELDS),
+    further: dict[str, Iterable[str]] = {
+        "body": (*INERTIAL_FIELDS, "rot"),
+        "site": ("rot",),
+        "geom": COMPILED_FIELDS,
+        "actuator": SERVO_FIELDS,
+        "controller": LAW_FIELDS,
+        "initial": INITIAL_STATE_FIELDS,
+        "output": OUTPUT_FIELDS,
     }
-    return [*MODEL_ARRAYS.get(kind, {}), *further.get(kind, [])]
+    return [*MODEL_ARRAYS.get(kind, ()), *further.get(kind, ())]
 
 
 def resolve(
@@ -411,7 +411,7 @@ def _element_field(model: Any, path: ParameterPath, decoration: Collection[str])
     if field == "rot":
         return RotationField(f"{path.kind}_quat", number, path.component_of(3))
 
-    if field in COMPILED_FIELDS.get(path.kind, ()):
+    if path.kind == "geom" and field in COMPILED_FIELDS:
         # Place, size, mass or density of a geom need a compile unless the geom is decoration.
         index = path.component_of(3 if field in ("size", "pos") else 1)
         if field == "size" and model.geom_dataid[number] >= 0:

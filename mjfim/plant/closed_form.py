@@ -123,9 +123,9 @@ def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree 
     # each engine step compares forces, not their slopes: a force that stays zero, or a robot that
     # stays at rest, shows nothing.
     is_affine = (
-        np.isin(model.actuator_trntype, [int(each) for each in direct]).all()
+        np.isin(model.actuator_trntype, direct).all()
         and (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
-        and np.isin(model.actuator_biastype, [int(each) for each in biases]).all()
+        and np.isin(model.actuator_biastype, biases).all()
         and model.nu == model.nactuator == model.nout
         and (model.actuator_ctrlnum == 1).all()
         # A tendon of joints has constant moment arms; one over sites has not.
@@ -231,7 +231,7 @@ class ClosedForm:
 
         count = 0 if change is None else change.count
         by_theta: Array = np.zeros((N * substeps, nv, count))
-        if change is not None and count:
+        if change is not None:
             # Less the derivatives of the forces that the motion needs.
             bodies = self.tree.bodies
             axes = fields["xmat"].reshape(len(motion.speed), -1, 3, 3)

@@ -54,10 +54,7 @@ FORCE_ARRAYS = (
 )
 
 # Integrators that take the damping of all forces at the end of the step.
-IMPLICIT = (
-    int(mujoco.mjtIntegrator.mjINT_IMPLICIT),
-    int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
-)
+IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 # Factor by which the inertia of the joints is larger where only activations are to move.
 HELD_INERTIA = 1e9

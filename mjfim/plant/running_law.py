@@ -82,7 +82,7 @@ class LawNumbers:
             laws: The c laws.
             count: Number m of simulations.
         """
-        places = np.array([[law.first + i for law in laws] for i in range(len(NUMBERS))])
+        places = np.add.outer(np.arange(len(NUMBERS)), [law.first for law in laws])
         rows: list[Array] = []
         for i, model in enumerate(models):
             known = i > 0 and model is models[i - 1]

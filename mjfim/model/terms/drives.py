@@ -229,8 +229,8 @@ class BackEmf(Term):
 def _require_plain(model: Any, name: str, number: int, kind: str) -> None:
     """Raise ExperimentError for an actuator with dynamics, or with a gain of another type."""
     has_dynamics = model.actuator_dyntype[number] != mujoco.mjtDyn.mjDYN_NONE
-    is_plain = int(model.actuator_gaintype[number]) in [int(gain) for gain in PLAIN_GAINS]
-    has_bias = int(model.actuator_biastype[number]) in [int(bias) for bias in PLAIN_BIASES]
+    is_plain = int(model.actuator_gaintype[number]) in PLAIN_GAINS
+    has_bias = int(model.actuator_biastype[number]) in PLAIN_BIASES
     if has_dynamics or not (is_plain and has_bias) or model.actuator_ctrlnum[number] != 1:
         raise ExperimentError(
             f"actuator: {name!r} has dynamics or a gain of its own; a term of kind {kind!r} needs "
@@ -283,8 +283,8 @@ class JointElasticity(Term):
     estimated: ClassVar[tuple[str, ...]] = ("damping",)
     # MuJoCo keeps the stiffness, the inverse of the compliance.
     is_written_as_a_whole = True
-    damping_ratio: ClassVar[float] = 0.1
-    spring: ClassVar[str] = "joint/{}"
+    damping_ratio = 0.1
+    spring = "joint/{}"
 
     joint: str
     body: str
@@ -424,7 +424,7 @@ class Backlash(JointElasticity):
     sources = (NORDIN_2002,)
     words = "backlash of {}"
     size = "gap"
-    estimated: ClassVar[tuple[str, ...]] = ()
+    estimated = ()
     damping_ratio = 0.05
     spring = "tendon/{}_gap"
 

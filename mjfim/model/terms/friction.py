@@ -68,7 +68,7 @@ STRIBECK_SHARE = 0.1
 LEAST_STRIBECK_SHARE = 1e-3
 
 # Phase of a cogging torque that does not depend on the angle, so that it is its amplitude [rad].
-CONSTANT_PHASE = float(np.pi / 2.0)
+CONSTANT_PHASE = np.pi / 2.0
 
 # Force range of a passive device, so small that MuJoCo's implicit integrators do not take the
 # damping of the bristle for damping of the joint, which would act like an inertia [N or N m]. It
@@ -416,7 +416,7 @@ class LoadDependentFriction(Term):
     base: str
     axis: tuple[float, ...]
     place: tuple[float, ...]
-    buffers: tuple[tuple[float, ...], tuple[float, ...]]
+    buffers: tuple[tuple[float, ...], ...]
     radius: float
     armature: float
     carrier: tuple[float, float]
@@ -471,9 +471,8 @@ class LoadDependentFriction(Term):
             base=base,
             axis=tuple(axis.tolist()),
             place=tuple(place.tolist()),
-            buffers=(
-                tuple((centre + 2.0 * radius * direction).tolist()),
-                tuple((centre - 2.0 * radius * direction).tolist()),
+            buffers=tuple(
+                tuple((centre + way * direction).tolist()) for way in (2.0 * radius, -2.0 * radius)
             ),
             radius=radius,
             armature=rounded(ARMATURE_SHARE * inertia / radius**2),

@@ -77,7 +77,7 @@ class Tilt(Term):
     # All components of gravity depend on all components of the rotation.
     is_written_as_a_whole = True
 
-    gravity: tuple[float, float, float]
+    gravity: tuple[float, ...]
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> Tilt:
@@ -93,8 +93,8 @@ class Tilt(Term):
             value=0.0, unit="rad", size=1.0, bounds=(-np.pi, np.pi), numbers=numbers
         )
         quantities = stated_quantities(cls.kind, table, dict.fromkeys(AXES, angle))
-        x, y, z = (float(number) for number in model.opt.gravity)
-        return cls(name=table.name, gravity=(x, y, z), quantities=quantities)
+        gravity = tuple(model.opt.gravity.tolist())
+        return cls(name=table.name, gravity=gravity, quantities=quantities)
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Turn gravity."""

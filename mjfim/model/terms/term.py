@@ -24,7 +24,7 @@ from mjfim.model.elements import (
     names_of,
     position_sizes,
 )
-from mjfim.model.units import actuator_gear, commanded_joint, joint_unit
+from mjfim.model.units import SCALAR_JOINTS, actuator_gear, commanded_joint, joint_unit
 
 # Significant digits of numbers that the library chooses.
 CHOSEN_DIGITS = 3
@@ -282,8 +282,7 @@ class JointSizes:
     def of(table: TermTable, model: Any, period: float, kind: str) -> JointSizes:
         """Sizes at the joint that a table names; ExperimentError at ball and free joints."""
         name, number = named_element(table, "joint", model, kind)
-        scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-        if model.jnt_type[number] not in scalar:
+        if int(model.jnt_type[number]) not in SCALAR_JOINTS:
             raise ExperimentError(
                 f"joint: {name!r} is a ball or free joint; a term of kind {kind!r} acts on slides "
                 "and hinges"
