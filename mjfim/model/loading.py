@@ -272,7 +272,7 @@ class ModelSource:
         # Where MuJoCo treats none of them as simple, another compile would give the same model. A
         # body without a number was merged with its parent.
         model = self.model
-        simple = {model.body(i).name: bool(model.body_simple[i]) for i in range(1, model.nbody)}
+        simple = {model.body(i).name: model.body_simple[i] for i in range(1, model.nbody)}
         moved = simple if moved_bodies is None else moved_bodies
         if not any(simple.get(name, True) for name in moved):
             return self.model

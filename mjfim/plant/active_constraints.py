@@ -106,7 +106,7 @@ def nothing_acts_along(model: Any, trajectory: Trajectory, substeps: int) -> boo
         return False
 
     # Between two samples, a contact may open and close again, and a force be clamped.
-    may_act = not unconstrained(model) or bool(model.actuator_forcelimited.any())
+    may_act = not unconstrained(model) or model.actuator_forcelimited.any()
     if may_act and substeps > 1:
         return False
     return first_active_constraint(model, trajectory) is None

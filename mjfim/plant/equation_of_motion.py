@@ -211,15 +211,9 @@ class AffineForces:
         Args:
             points: (n, 1 + 2 nv + nu) ones, states and controls.
         """
+        model = self.model
         force = points @ self.actuators.T
-        if not self.model.actuator_forcelimited.any():
-            return force, np.ones(force.shape, dtype=bool)
-
-        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
-        low = np.where(limited, limits[:, 0], -np.inf)
-        high = np.where(limited, limits[:, 1], np.inf)
-        clamped = np.clip(force, low, high)
-        return clamped, clamped == force
+        return _within(force, model.actuator_forcelimited, model.actuator_forcerange)
 
     def _damping(self, slopes: Array) -> Array:
         """(n, nv, nv) damping that the integrator takes at the end of an engine step."""
@@ -247,10 +241,17 @@ class AffineForces:
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
             return ctrl, np.ones(ctrl.shape, dtype=bool)
 
-        low = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 0], -np.inf)
-        high = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], np.inf)
-        applied = np.clip(ctrl, low, high)
-        return applied, applied == ctrl
+        return _within(ctrl, model.actuator_ctrllimited, model.actuator_ctrlrange)
+
+
+def _within(values: Array, limited: Array, ranges: Array) -> tuple[Array, np.ndarray]:
+    """(n, k) values clipped to those of k ranges: (k, 2) that limit them, and True where inside."""
+    if not limited.any():
+        return values, np.ones(values.shape, dtype=bool)
+    low = np.where(limited, ranges[:, 0], -np.inf)
+    high = np.where(limited, ranges[:, 1], np.inf)
+    clipped = np.clip(values, low, high)
+    return clipped, clipped == values
 
 
 def _affine(forces: Array, about: Array, moves: Array) -> Array:
