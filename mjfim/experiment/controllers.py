@@ -13,6 +13,7 @@ from mjfim.experiment.system_tables import ControllerSpec
 from mjfim.experiment.time_grid import parts_of, whole_number
 from mjfim.model.control_laws import (
     KINDS,
+    NUMBERS,
     ControlLaw,
     ControlLaws,
     InputColumn,
@@ -23,7 +24,7 @@ from mjfim.model.control_laws import (
 )
 from mjfim.model.coordinates import ScalarJoint, actuator_names
 from mjfim.model.loading import ModelSource
-from mjfim.model.units import AT_JOINT, per_second
+from mjfim.model.units import acts_at_joint, per_second
 
 # Numbers of a law that give it an integral if they are parameters.
 INTEGRAL_NUMBERS = ("ki", "integral")
@@ -93,9 +94,9 @@ def _joint(source: ModelSource, actuator: str, spec: ControllerSpec) -> ScalarJo
         raise ExperimentError(f"controllers: {unknown('actuator', actuator, names)}")
 
     number = names.index(actuator)
-    if int(model.actuator_ctrlnum[number]) != 1:
+    if model.actuator_ctrlnum[number] != 1:
         raise ExperimentError(
-            f"{key}: the actuator has {int(model.actuator_ctrlnum[number])} controls, and a law "
+            f"{key}: the actuator has {model.actuator_ctrlnum[number]} controls, and a law "
             "computes one; its own gains in the MJCF are its law"
         )
 
@@ -110,8 +111,7 @@ def _joint(source: ModelSource, actuator: str, spec: ControllerSpec) -> ScalarJo
     driven = [
         joint
         for joint in joints.values()
-        if int(model.actuator_trntype[number]) in [int(kind) for kind in AT_JOINT]
-        and joint.joint == int(model.actuator_trnid[number, 0])
+        if acts_at_joint(model, number) and joint.joint == model.actuator_trnid[number, 0]
     ]
     if not driven:
         raise ExperimentError(
@@ -132,21 +132,13 @@ def _numbers(
     elif model.actuator_ctrllimited[control]:
         low, high = model.actuator_ctrlrange[control].tolist()
 
+    stated = {name: getattr(spec, name) for name in NUMBERS if not name.startswith("saturation_")}
     return {
+        **{name: np.inf if number is None else number for name, number in stated.items()},
         "joint": float(joint.joint),
         "kind": float(KINDS.index(spec.kind)),
-        "kp": spec.kp,
-        "kd": spec.kd,
-        "ki": spec.ki,
-        "integral": spec.integral,
-        "integral_limit": np.inf if spec.integral_limit is None else spec.integral_limit,
         "saturation_low": low,
         "saturation_high": high,
-        "slew": np.inf if spec.slew is None else spec.slew,
-        "latency": spec.latency,
-        "time_constant": spec.time_constant,
-        "feedback_latency": spec.feedback_latency,
-        "velocity_time_constant": spec.velocity_time_constant,
     }
 
 

@@ -17,7 +17,9 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import by_name
 from mjfim.experiment.system_tables import Initial, Signal
-from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.coordinates import joint_names
+from mjfim.model.elements import names_of
+from mjfim.model.limited_elements import quaternion_address, quaternion_joints
 from mjfim.model.terms.term import StateLayout
 
 # Degree of the splines.
@@ -103,11 +105,7 @@ def fourier_basis(
     omega: Array = 2.0 * np.pi * frequency * np.arange(1.0, harmonics + 1.0)
     waves = _wave_derivatives(t, omega, 0)
 
-    times = []
-    if starts_at_rest:
-        times.append(0.0)
-    if ends_at_rest:
-        times.append(horizon)
+    times = starts_at_rest * [0.0] + ends_at_rest * [horizon]
     if not times:
         return waves
 
@@ -262,10 +260,9 @@ def keyframe(model: Any, key: str, name: str | None) -> Any:
     if name is None:
         return None
 
-    kind = mujoco.mjtObj.mjOBJ_KEY
-    names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(model.nkey)]
+    names = names_of(model, "key")
     if name not in names:
-        raise ExperimentError(f"{key}: {unknown('keyframe', name, [n for n in names if n])}")
+        raise ExperimentError(f"{key}: {unknown('keyframe', name, names)}")
     return model.key(name)
 
 
@@ -309,7 +306,14 @@ def initial_state(stated: Initial, model: Any, key: Any, layout: StateLayout | N
             lambda numbers: own.activations(numbers, qpos, None),
         )
 
-    _require_rotations(model, qpos)
+    names = joint_names(model)
+    for joint in quaternion_joints(model):
+        first = quaternion_address(model, joint)
+        if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
+            raise ExperimentError(
+                f"initial.qpos: the quaternion of joint {names[joint]!r} (numbers {first} to "
+                f"{first + 3}) is zero; the identity rotation is 1, 0, 0, 0"
+            )
     mujoco.mj_normalizeQuat(model, qpos)
     return np.concatenate([qpos, qvel, act])
 
@@ -327,19 +331,3 @@ def _completed(
     if len(numbers) != count:
         raise ExperimentError(f"initial.{name}: {len(numbers)} numbers; this model needs {count}")
     return np.array(numbers, dtype=np.float64)
-
-
-def _require_rotations(model: Any, qpos: Array) -> None:
-    """Raise ExperimentError if a quaternion in qpos: (nq,) is zero."""
-    for j, name in enumerate(joint_names(model)):
-        if joint_dofs(model, j) == 1:
-            continue
-
-        # The quaternion of a free joint follows its position.
-        is_free = int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE
-        first = int(model.jnt_qposadr[j]) + (3 if is_free else 0)
-        if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
-            raise ExperimentError(
-                f"initial.qpos: the quaternion of joint {name!r} (numbers {first} to {first + 3}) "
-                "is zero; the identity rotation is 1, 0, 0, 0"
-            )

@@ -62,7 +62,8 @@ def resolve_outputs(
                 f"noise: {unknown_coordinate('sensor', key, list(columns_of_key))}"
             )
 
-    columns = list(coordinates.measurable)
+    components: list[StateComponent | SensorComponent] = [*coordinates.state, *coordinates.sensors]
+    columns = [component.name for component in components]
     covariance = np.zeros((len(columns), len(columns)))
     strides = np.full(len(columns), stride)
     measured: set[int] = set()
@@ -76,8 +77,7 @@ def resolve_outputs(
             )
         covariance[rows] = 0.0
         covariance[:, rows] = 0.0
-        factors = [coordinates.state[i].sigma_factor for i in rows if i < len(coordinates.state)]
-        factors += [1.0] * (len(rows) - len(factors))
+        factors = [getattr(components[i], "sigma_factor", 1.0) for i in rows]
         covariance[np.ix_(rows, rows)] = _key_covariance(
             f"noise.{key}", stated[key], np.array(factors)
         )
@@ -93,23 +93,17 @@ def resolve_outputs(
 
     kept = sorted(measured)
     noise = Noise(covariance=covariance[np.ix_(kept, kept)], strides=strides[kept])
-    components: list[StateComponent | SensorComponent] = [*coordinates.state, *coordinates.sensors]
+
     outputs = tuple(
         Output(
-            name=components[i].name,
+            name=columns[i],
             sigma=float(np.sqrt(covariance[i, i])),
-            **_place(components[i]),
+            unit=getattr(components[i], "unit", ""),
+            **{"state" if i < len(coordinates.state) else "sensor": components[i].address},
         )
         for i in kept
     )
     return Outputs(outputs=outputs, space=space), noise
-
-
-def _place(component: StateComponent | SensorComponent) -> dict[str, Any]:
-    """Where an output is read: in the state, with its unit, or in the data of the sensors."""
-    if isinstance(component, StateComponent):
-        return {"unit": component.unit, "state": component.address}
-    return {"sensor": component.address}
 
 
 def _correlated_columns(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from mjfim.errors import ModelError
@@ -29,15 +29,12 @@ def input_files(experiment: Experiment, further: Iterable[Path | None] = ()) -> 
     return tuple(files)
 
 
-def for_workers(
-    experiment: Experiment, source: ModelSource, further: Iterable[Path] = ()
-) -> Experiment:
+def for_workers(experiment: Experiment, source: ModelSource) -> Experiment:
     """Make a packed copy for orders, of which each worker process receives the files once.
 
     Args:
         experiment: The experiment.
         source: Its model, whose files are read once.
-        further: Further files that the orders need; `opened_file` gives them by their paths.
 
     Returns:
         The copy, which is pickled with the hash of its files. It is for orders of workers only.
@@ -47,7 +44,7 @@ def for_workers(
     """
     before = experiment.files or PackedFiles.of(source.stated.contents)
     tables = [experiment.directory / name for name in experiment.tables]
-    files = PackedFiles.read([*map(Path, before.contents), *tables, *further], before)
+    files = PackedFiles.read([*map(Path, before.contents), *tables], before)
     return experiment.model_copy(update={"files": files.shared()})
 
 
@@ -83,14 +80,13 @@ def model_of(experiment: Experiment) -> ModelSource:
     return packed_model(files, experiment.directory / experiment.model)
 
 
-def opened(experiment: Experiment, name: str) -> AbstractContextManager[Path]:
-    """Give a file by its path as the experiment states it. See `opened_file`."""
-    return opened_file(experiment, experiment.directory / name)
-
-
 @contextmanager
-def opened_file(experiment: Experiment, path: Path) -> Iterator[Path]:
-    """Give a file that may be packed in an experiment; then it exists inside the block only."""
+def opened(experiment: Experiment, name: str) -> Iterator[Path]:
+    """Give a file by its path as the experiment states it.
+
+    It may be packed in the experiment; then it exists inside the block only.
+    """
+    path = experiment.directory / name
     content = None if experiment.files is None else experiment.files.content(path)
     if content is None:
         yield path

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Nuisance, ParameterSpec, TargetSpec
@@ -180,12 +179,28 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
     key = f"parameters.{name}.inertial"
     kind = spec.coordinates or "logcholesky"
     parametrisation = INERTIA_PARAMETRISATIONS[kind]
-    body, values, magnitudes = _inertia_coordinates(key, spec.inertial or "", kind, model)
+    body_name = spec.inertial or ""
+    body = identifier(model, "body", body_name)
+    if body < 0:
+        raise ExperimentError(f"{key}: {unknown('body', body_name, names_of(model, 'body'))}")
+    if not model.body_mass[body] > 0.0:
+        raise ExperimentError(f"{key}: body {body_name!r} has no mass")
+    inertia = body_inertia(model, body)
+    try:
+        values = parametrisation.coordinates(inertia)
+    except ValueError as error:
+        raise ExperimentError(
+            f'{key}: body {body_name!r}: {error}; use coordinates = "barycentric"'
+        ) from None
+    magnitudes = parametrisation.magnitudes(inertia)
+    # The inertia of the model is knowledge where the file states no other.
+    cad_prior = spec.cad_prior
+    if cad_prior is None and spec.prior is None:
+        cad_prior = CAD_PRIOR
     fields = BARYCENTRIC_FIELDS if kind == "barycentric" else LOGCHOLESKY_FIELDS
 
-    for i, coordinate in enumerate(parametrisation.names):
-        value = float(values[i])
-        magnitude = float(magnitudes[i])
+    numbers = zip(parametrisation.names, values.tolist(), magnitudes.tolist(), strict=True)
+    for i, (coordinate, value, magnitude) in enumerate(numbers):
         scale = abs(value) if spec.scale == "guess" else magnitude
         if scale == 0.0:
             raise ExperimentError(
@@ -195,7 +210,7 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
         yield Parameter(
             name=f"{name}.{coordinate}",
             targets=(
-                Target(path=f"body/{spec.inertial}:{fields[i]}", field=InertiaField(body, kind, i)),
+                Target(path=f"body/{body_name}:{fields[i]}", field=InertiaField(body, kind, i)),
             ),
             guess=value,
             scale=scale,
@@ -205,40 +220,8 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
             nuisance=spec.nuisance,
             group=name,
             per_recording=spec.per_recording,
-            cad_prior=_cad_prior(spec),
+            cad_prior=float(cad_prior) if cad_prior else None,
         )
-
-
-def _cad_prior(spec: ParameterSpec) -> float | None:
-    """Standard deviation of the logarithm of an inertia relative to the model's, or None."""
-    if spec.cad_prior is None:
-        return CAD_PRIOR if spec.prior is None else None
-    return None if spec.cad_prior is False else float(spec.cad_prior)
-
-
-def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[int, Array, Array]:
-    """Number of a body, and the (10,) coordinates of its inertia with their (10,) magnitudes.
-
-    Args:
-        key: Key that names the body, for messages.
-        name: Name of the body.
-        kind: Name of the parametrisation, a key of INERTIA_PARAMETRISATIONS.
-        model: The compiled model.
-    """
-    body = identifier(model, "body", name)
-    if body < 0:
-        raise ExperimentError(f"{key}: {unknown('body', name, names_of(model, 'body'))}")
-    if not float(model.body_mass[body]) > 0.0:
-        raise ExperimentError(f"{key}: body {name!r} has no mass")
-
-    inertia = body_inertia(model, body)
-    parametrisation = INERTIA_PARAMETRISATIONS[kind]
-    try:
-        return body, parametrisation.coordinates(inertia), parametrisation.magnitudes(inertia)
-    except ValueError as error:
-        raise ExperimentError(
-            f'{key}: body {name!r}: {error}; use coordinates = "barycentric"'
-        ) from None
 
 
 def _nuisance(

@@ -32,7 +32,7 @@ from mjfim.experiment.task_tables import (
     RehearsalSpec,
     Robust,
 )
-from mjfim.model.model_files import PackedFiles
+from mjfim.model.model_files import PackedFiles, files_of_model
 from mjfim.recordings.section import (
     Hertz,
     PositiveWithUnit,
@@ -198,7 +198,22 @@ class Experiment(Section):
             ExperimentError: The file cannot be read, or a key or a value in it is not valid.
         """
         path = Path(path)
-        values = _read_tables(path)
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ExperimentError(
+                f"{path}: cannot read the experiment file: {error.strerror}"
+            ) from None
+        except (ValueError, RecursionError) as error:
+            fault = f"not valid TOML: {error}"
+            if path.suffix.lower() in MODEL_ENDINGS:
+                fault = (
+                    "a model, but an experiment file (TOML) is needed, which states the model; "
+                    f"`mjfim init {path}` writes a first one"
+                )
+            if path.suffix.lower() in LOG_ENDINGS:
+                fault = "a log, but an experiment file (TOML) is needed; it comes before the logs"
+            raise ExperimentError(f"{path}: {fault}") from None
         for key in Experiment.only_in_python:
             if key in values:
                 raise ExperimentError(f"{path}: {unknown('key', key, Experiment.valid_keys())}")
@@ -261,9 +276,6 @@ class Experiment(Section):
             ExperimentError: A file cannot be read.
             ModelError: There is no such model file.
         """
-        # The model is not needed where an experiment is only read.
-        from mjfim.model.model_files import files_of_model
-
         before = self.files or PackedFiles.of({})
         model = self.directory / self.model
         tables = [self.directory / name for name in self.tables]
@@ -283,26 +295,6 @@ class Experiment(Section):
         control = self.initial.control
         files = [control] if isinstance(control, str) else []
         return tuple(dict.fromkeys([*self.descent.previous, *self.earlier, *files]))
-
-
-def _read_tables(path: Path) -> dict[str, Any]:
-    """The keys and tables of an experiment file, which are not checked yet."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ExperimentError(
-            f"{path}: cannot read the experiment file: {error.strerror}"
-        ) from None
-    except (ValueError, RecursionError) as error:
-        fault = f"not valid TOML: {error}"
-        if path.suffix.lower() in MODEL_ENDINGS:
-            fault = (
-                "a model, but an experiment file (TOML) is needed, which states the model; "
-                f"`mjfim init {path}` writes a first one"
-            )
-        if path.suffix.lower() in LOG_ENDINGS:
-            fault = "a log, but an experiment file (TOML) is needed; it comes before the logs"
-        raise ExperimentError(f"{path}: {fault}") from None
 
 
 def json_schema() -> dict[str, Any]:

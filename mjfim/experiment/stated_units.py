@@ -18,10 +18,10 @@ from mjfim.experiment.outputs import columns_of_keys
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import ParameterSpec
 from mjfim.model.elements import identifier
-from mjfim.model.limited_elements import limited_elements
+from mjfim.model.limited_elements import LimitedElement, limited_elements
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import unit_of
-from mjfim.model.units import ANGLE, control_unit, per_second, sensor_unit
+from mjfim.model.units import ANGLE, control_units, per_second, sensor_unit
 from mjfim.recordings.quantities import Quantity, Unit, wrong_unit
 
 # Angles beyond TURNS turns look like degrees if they are multiples of ROUND_DEGREES.
@@ -151,28 +151,20 @@ class _Units:
 
     def ranges(self, keys: Keys) -> tuple[Range, ...] | None:
         """Range of a position in the MJCF, if there is one; None for a number of another kind."""
-        model, coordinates = self.source.model, self.source.coordinates
-        joints = {joint.name: joint.joint for joint in coordinates.scalar_joints}
-        controls = {name: i for i, name in enumerate(coordinates.controls)}
-        limited, bounds, number = model.jnt_limited, model.jnt_range, None
         match keys:
             case ("initial", "qpos", i):
-                number = joints.get(self._component("qpos", i)[0].removeprefix("qpos:"))
-            case ("limits", "position", str(name), *_):
-                number = joints.get(name)
-            case ("initial", "control", "amplitude" | "offset", str(name)) | (
-                "limits",
-                "control",
-                str(name),
-                *_,
-            ):
-                number = controls.get(name)
-                limited, bounds = model.actuator_ctrllimited, model.actuator_ctrlrange
+                kind, name = "position", self._component("qpos", i)[0].removeprefix("qpos:")
+            case ("limits", "position" | "control" as kind, str(name), *_):
+                pass
+            case ("initial", "control" as kind, "amplitude" | "offset", str(name)):
+                pass
             case _:
                 return None
-        if number is None or not limited[number]:
+        element = self.elements[kind].get(name)
+        # The range of a ball joint is that of an angle, not of a coordinate.
+        if element is None or element.count > 1 or element.stated is None:
             return ()
-        return ((float(bounds[number, 0]), float(bounds[number, 1])),)
+        return (element.stated,)
 
     def _component(self, kind: str, i: int) -> tuple[str, str]:
         """Name and unit of an entry of `initial.qpos` or `initial.qvel`."""
@@ -187,14 +179,17 @@ class _Units:
         return parts.get(address, ("", ""))
 
     @cached_property
+    def elements(self) -> dict[str, dict[str, LimitedElement]]:
+        """What the model can limit, by kind and name."""
+        controls = self.source.coordinates.controls
+        period = 1.0 / self.experiment.rate
+        return limited_elements(self.source.model, controls, period).by_kind
+
+    @cached_property
     def tables(self) -> dict[Keys, dict[str, str]]:
         """Units by name for the keys that state one number for all names, or numbers by name."""
         model, coordinates = self.source.model, self.source.coordinates
-        actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
-        controls = {
-            name: control_unit(model, i)
-            for name, i in zip(coordinates.controls, actuators, strict=True)
-        }
+        controls = dict(zip(coordinates.controls, control_units(model), strict=True))
         deviations = {c.name: c.unit for c in coordinates.deviations}
         tables: dict[Keys, dict[str, str]] = {
             ("initial", "control", "amplitude"): controls,
@@ -204,8 +199,7 @@ class _Units:
             ("nuisance", "initial"): deviations,
             ("nuisance", "bias"): self.outputs,
         }
-        elements = limited_elements(model, coordinates.controls, 1.0 / self.experiment.rate)
-        for kind, limited in elements.by_kind.items():
+        for kind, limited in self.elements.items():
             units = {name: element.unit for name, element in limited.items()}
             # A free joint is stated by its name, with the ranges of its coordinates.
             boxes = {name.removesuffix(".x"): units[name] for name in units if name.endswith(".x")}

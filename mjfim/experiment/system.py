@@ -32,7 +32,6 @@ from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import (
     ScalarJoint,
     control_labels,
-    dof_names,
     output_label,
     state_components,
     tangent_components,
@@ -40,7 +39,7 @@ from mjfim.model.coordinates import (
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameter_writer import MOMENT_ROUNDING, ParameterWriter
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.terms.library import resolve_terms
+from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
 from mjfim.model.units import per_second
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
@@ -184,7 +183,7 @@ class System:
         Returns:
             A system whose plant is not calibrated yet.
         """
-        relaxation = relaxation if variant.relaxed else None
+        removed = (relaxation if variant.relaxed else None) or Relaxation()
         grid = self.stated_grid.with_variant(variant)
 
         def plant(speeds: tuple[float, ...], smooth: Plant | None) -> Plant:
@@ -192,14 +191,11 @@ class System:
 
             smooth: Plant that computes its derivatives; None where it computes them itself.
             """
-            relaxed = relaxation
-            if speeds:
-                relaxed = replace(relaxation or Relaxation(), smoothing_speeds=speeds)
             model = self._plant_model(
                 sensors=self.outputs.needs_sensors,
                 friction=self.parameters.changes_friction,
                 timestep_factor=variant.sample_factor * variant.timestep_factor,
-                relaxation=relaxed,
+                relaxation=replace(removed, smoothing_speeds=speeds),
             )
             return Plant(
                 source=model,
@@ -483,8 +479,16 @@ def _require_supported(source: ModelSource) -> None:
 
 
 def _terms_of(experiment: Experiment, stated: ModelSource) -> tuple[Term, ...]:
-    """Physical terms of an experiment, in their order in the file."""
-    tables = []
+    """Physical terms of an experiment, in their order in the file.
+
+    Args:
+        experiment: The experiment.
+        stated: Its model without terms.
+
+    Raises:
+        ExperimentError: A table does not fit the model; the message names its key.
+    """
+    terms = []
     for name, spec in experiment.terms.items():
         elements = ((key, getattr(spec, key)) for key in ELEMENT_KEYS)
         table = TermTable(
@@ -493,8 +497,11 @@ def _terms_of(experiment: Experiment, stated: ModelSource) -> tuple[Term, ...]:
             encoder=spec.encoder,
             values=tuple((field, float(value)) for field, value in spec.values.items()),
         )
-        tables.append((spec.kind, table))
-    return resolve_terms(tables, stated.model, 1.0 / experiment.rate)
+        try:
+            terms.append(KINDS[spec.kind].of(table, stated.model, 1.0 / experiment.rate))
+        except ExperimentError as error:
+            raise ExperimentError(f"terms.{name}: {error}") from None
+    return tuple(terms)
 
 
 def simulate(
@@ -624,15 +631,11 @@ def labels_of_model(model: mujoco.MjModel) -> Labels:
     """
     state = state_components(model)[: model.nq]
     tangent = tangent_components(model)[: model.nv]
-    names = dof_names(model)
-
+    units = {c.name.removeprefix("qpos:"): c.unit for c in tangent}
     return Labels(
         qpos=tuple(f"{c.name.removeprefix('qpos:')} [{c.unit or '1'}]" for c in state),
-        positions=tuple(f"{name} [{c.unit}]" for name, c in zip(names, tangent, strict=True)),
-        velocities=tuple(
-            f"{name} velocity [{per_second(c.unit)}]"
-            for name, c in zip(names, tangent, strict=True)
-        ),
+        positions=tuple(f"{name} [{unit}]" for name, unit in units.items()),
+        velocities=tuple(f"{name} velocity [{per_second(unit)}]" for name, unit in units.items()),
         controls=control_labels(model),
     )
 

@@ -31,6 +31,9 @@ from mjfim.recordings.section import (
 # A time that may be zero.
 Delay = Annotated[NonNegative, WithUnit("s")]
 
+# One number for all names, or numbers by name.
+NumberOrTable = FiniteWithUnit | dict[str, FiniteWithUnit]
+
 # Rows of a matrix.
 Matrix = tuple[tuple[Finite, ...], ...]
 
@@ -53,6 +56,7 @@ MAX_HARMONICS = 10_000
 
 # Standard deviation of a nuisance before the experiment; True where nothing is known about it.
 PriorOrUnknown = PositiveWithUnit | Literal[True]
+PriorsByName = PriorOrUnknown | dict[str, PriorOrUnknown]
 
 
 class ControllerSpec(Section):
@@ -197,13 +201,13 @@ class Signal(Section):
             "with random phases."
         )
     )
-    amplitude: FiniteWithUnit | dict[str, FiniteWithUnit] = Field(
+    amplitude: NumberOrTable = Field(
         default=1.0,
         description=(
             "Amplitude [actuator unit], one number for all actuators or a table by actuator name."
         ),
     )
-    offset: FiniteWithUnit | dict[str, FiniteWithUnit] | None = Field(
+    offset: NumberOrTable | None = Field(
         default=None,
         description=(
             "Constant that is added [actuator unit], one number or a table by actuator name. "
@@ -563,7 +567,7 @@ class Nuisance(Section):
     experiment, or `true` if nothing is known about it.
     """
 
-    initial: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
+    initial: PriorsByName | None = Field(
         default=None,
         description=(
             "Deviation of the initial state [m, rad, m/s or rad/s]: one value for all of qpos and "
@@ -571,7 +575,7 @@ class Nuisance(Section):
             "`.x .y .z .rx .ry .rz` of ball and free joints. Default: the initial state is known."
         ),
     )
-    bias: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
+    bias: PriorsByName | None = Field(
         default=None,
         description=(
             "Constant bias of the outputs [output unit]: one value for all of them or a table by "

@@ -17,6 +17,7 @@ from mjfim.errors import (
     MAX_STARTS,
     MAX_WRONG,
 )
+from mjfim.experiment.system_tables import NumberOrTable
 from mjfim.recordings.section import (
     Boolean,
     Finite,
@@ -52,6 +53,9 @@ LimitKind = Literal[
     "tendon_length",
     "clearance",
 ]
+
+# One size for all names, or a size or range by name.
+SizeOrRanges = PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit]
 
 # Ranges of the three coordinates of a place.
 Box = tuple[RangeWithUnit, RangeWithUnit, RangeWithUnit]
@@ -95,7 +99,7 @@ class Cost(Section):
             "name. 0 is allowed where a hard limit bounds the control."
         ),
     )
-    control_about: FiniteWithUnit | dict[str, FiniteWithUnit] | None = Field(
+    control_about: NumberOrTable | None = Field(
         default=None,
         description=(
             "Control that costs nothing [actuator unit], one number or a table by actuator name. "
@@ -262,7 +266,7 @@ class Limits(Section):
         ),
         examples=[{"hinge": [-1.0, 1.0]}],
     )
-    tilt: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    tilt: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Largest tilt of the free and ball joints [rad]: the angle between the upward "
@@ -271,7 +275,7 @@ class Limits(Section):
             "parent. A rotation about the upward direction is free."
         ),
     )
-    velocity: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    velocity: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Limit of the joint velocities [m/s or rad/s]. For a free joint it is the linear "
@@ -279,14 +283,14 @@ class Limits(Section):
             'of the world has the name of the coordinate, `"base.z" = [-0.5, 1.0]`.'
         ),
     )
-    angular_velocity: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    angular_velocity: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Largest angular speed of the free and ball joints [rad/s]. The angular velocity "
             'about one axis of the body has the name of the coordinate, `"base.rz" = 1.0`.'
         ),
     )
-    acceleration: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    acceleration: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Limit of the joint accelerations [m/s² or rad/s²]: the change of the velocity over "
@@ -299,7 +303,7 @@ class Limits(Section):
         description="Range of a control by actuator name [actuator unit].",
         examples=[{"motor": [-5.0, 5.0]}],
     )
-    control_rate: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    control_rate: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Limit of the change of the controls from one row of design.csv to the next, over the "
@@ -307,7 +311,7 @@ class Limits(Section):
             "of k times `rate` divides the allowed change from sample to sample by k."
         ),
     )
-    force: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    force: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Limit of the actuator forces [N or N m], at the beginning and at the end of each "
@@ -315,14 +319,14 @@ class Limits(Section):
             "it is their norm; one of them has the name `actuator[i]`."
         ),
     )
-    joint_force: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    joint_force: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Limit of the sum of all actuator forces on a joint [N or N m], as the MJCF's "
             "actuatorfrcrange of joints."
         ),
     )
-    tendon_force: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+    tendon_force: SizeOrRanges = Field(
         default_factory=dict,
         description=(
             "Limit of the sum of all actuator forces on a tendon [N or N m], as the MJCF's "

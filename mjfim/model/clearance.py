@@ -17,7 +17,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import mujoco
@@ -74,192 +73,6 @@ REFUSED_TYPES = {
 MAX_BOUNDS_AT_ONCE = 1 << 18
 
 
-class PairDistances:
-    """Distances of p pairs of geoms at poses of all geoms.
-
-    Attributes:
-        first: (p,) numbers of the first geoms.
-        second: (p,) numbers of the second geoms.
-        planes: Numbers of the pairs whose second geom is a plane.
-        exact: (p,) True where `lower_bounds` gives the distance itself: a primitive over a plane.
-        infinite: Distance that is larger than any between geoms [m].
-    """
-
-    def __init__(self, model: Any, pairs: Sequence[GeomPair]) -> None:
-        """Prepare the computation for pairs of geoms of a model, which is copied."""
-        self._model = copy.copy(model)
-        self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
-        self._length = model_length(model)
-        self.infinite = INFINITE_DISTANCE * self._length
-        tolerance = CCD_TOLERANCE * self._length
-        self._model.opt.ccd_tolerance = min(self._model.opt.ccd_tolerance, tolerance)
-        self._model.opt.ccd_iterations = max(self._model.opt.ccd_iterations, CCD_ITERATIONS)
-        self._data = mujoco.MjData(self._model)
-
-        self.first = np.array([pair.first for pair in pairs])
-        self.second = np.array([pair.second for pair in pairs])
-
-        # (2, p) types of the geoms.
-        types = self._model.geom_type
-        kinds = np.stack([types[self.first], types[self.second]])
-
-        self.planes = np.flatnonzero(kinds[1] == PLANE)
-        self.exact = (kinds[1] == PLANE) & np.isin(kinds[0], PRIMITIVES)
-        bounding_radii = self._model.geom_rbound
-        self._radii = bounding_radii[self.first] + bounding_radii[self.second]
-
-        # Between a capsule and a box, MuJoCo measures the distance of the capsule's axis, from
-        # which the radius is subtracted.
-        by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
-        capsule = np.where(kinds[0] == CAPSULE, self.first, self.second)
-        self._axis_offset = np.where(by_axis, self._model.geom_size[capsule, 0], 0.0)
-        axis_model = copy.copy(self._model)
-        capsules = axis_model.geom_type == CAPSULE
-        axis_model.geom_type[capsules] = CYLINDER
-        axis_model.geom_size[capsules, 0] = AXIS_RADIUS * self._length
-
-        # Arguments of MuJoCo's function, pair by pair.
-        self._calls = [
-            (axis_model if axis else self._model, pair.first, pair.second, float(offset))
-            for pair, axis, offset in zip(pairs, by_axis, self._axis_offset, strict=True)
-        ]
-
-    def lower_bounds(self, positions: Array, frames: Array) -> tuple[Array, Array]:
-        """Lower bounds of the distances, from bounding spheres.
-
-        For `exact` pairs these are the distances themselves.
-
-        Args:
-            positions: (n, ngeom, 3) positions of the geoms [m].
-            frames: (n, ngeom, 3, 3) frames of the geoms.
-
-        Returns:
-            (n, p) bounds [m], and (n, number of planes, 3) points of the first geoms nearest to the
-            planes [m].
-        """
-        between = positions[:, self.second] - positions[:, self.first]
-        bounds = np.sqrt(np.einsum("npi,npi->np", between, between)) - self._radii
-
-        size = self._model.geom_size
-        kind = self._model.geom_type
-        points = np.empty((len(positions), len(self.planes), 3))
-        for i, p in enumerate(self.planes):
-            first = self.first[p]
-            second = self.second[p]
-            normal = frames[:, second, :, 2]
-            frame = frames[:, first]
-
-            points[:, i] = positions[:, first]
-            if self.exact[p]:
-                downwards = -np.einsum("nij,ni->nj", frame, normal)
-                local = farthest_points(int(kind[first]), size[first], downwards)
-                points[:, i] += np.einsum("nij,nj->ni", frame, local)
-
-            height = points[:, i] - positions[:, second]
-            bounds[:, p] = np.einsum("ni,ni->n", height, normal)
-            if not self.exact[p]:
-                bounds[:, p] -= self._radii[p]
-        return bounds, points
-
-    def set_pose(self, positions: Array, frames: Array) -> None:
-        """Set the pose of all geoms in which `distance` measures.
-
-        Args:
-            positions: (ngeom, 3) positions of the geoms [m].
-            frames: (ngeom, 3, 3) frames of the geoms.
-        """
-        self._data.geom_xpos[:] = positions
-        self._data.geom_xmat[:] = frames.reshape(-1, 9)
-
-    def distance(self, p: int, limit: float, segment: Array | None = None) -> float:
-        """Distance of one pair in the pose set by `set_pose`.
-
-        Args:
-            p: Number of the pair.
-            limit: Distance beyond which MuJoCo does not search [m].
-            segment: (6,) overwritten by the nearest points of the first and of the second geom [m].
-
-        Returns:
-            The distance [m] if it is below `limit`, else some number that is at least `limit`.
-        """
-        model, first, second, offset = self._calls[p]
-        found = mujoco.mj_geomDistance(model, self._data, first, second, limit + offset, segment)
-        return float(found) - offset
-
-    def measure(
-        self, rows: Indices, pairs: Indices, positions: Array, frames: Array, reach: float
-    ) -> tuple[Array, Array]:
-        """Distances of h pairs, each in one of n poses.
-
-        Args:
-            rows: (h,) numbers of the poses, ascending.
-            pairs: (h,) numbers of the pairs.
-            positions: (n, ngeom, 3) positions of the geoms [m].
-            frames: (n, ngeom, 3, 3) frames of the geoms.
-            reach: Distance beyond which nothing is measured [m].
-
-        Returns:
-            (h,) distances, at most reach [m], and (h, 6) the nearest points of the geoms [m].
-        """
-        found = np.full(len(rows), reach)
-        segments = np.zeros((len(rows), 6))
-        data = self._data
-        posed = -1
-
-        for i, (k, p) in enumerate(zip(rows.tolist(), pairs.tolist(), strict=True)):
-            if k != posed:
-                self.set_pose(positions[k], frames[k])
-                posed = k
-            model, first, second, offset = self._calls[p]
-            limit = reach + offset
-            distance = mujoco.mj_geomDistance(model, data, first, second, limit, segments[i])
-            if distance < limit:
-                found[i] = distance - offset
-        return found, segments
-
-    def normals(
-        self,
-        rows: Indices,
-        pairs: Indices,
-        *,
-        distances: Array,
-        segments: Array,
-        positions: Array,
-        frames: Array,
-        reach: float,
-    ) -> Array:
-        """Unit vectors (h, 3) from the first to the second geoms, along the measured distances.
-
-        Args:
-            rows: (h,) numbers of the poses.
-            pairs: (h,) numbers of the pairs.
-            distances: (h,) distances by `measure` [m].
-            segments: (h, 6) nearest points by `measure` [m].
-            positions: (n, ngeom, 3) positions of the geoms [m].
-            frames: (n, ngeom, 3, 3) frames of the geoms.
-            reach: Distance beyond which nothing is measured [m].
-        """
-        signed = distances + self._axis_offset[pairs]
-        sign = np.where(signed < 0.0, -1.0, 1.0)
-        normals = (segments[:, 3:] - segments[:, :3]) * sign[:, None]
-
-        for i in np.flatnonzero(np.abs(signed) < TOUCHING_DISTANCE * self._length):
-            # Geoms that touch are moved apart a little.
-            model, first, second, offset = self._calls[pairs[i]]
-            parted = positions[rows[i]].copy()
-            between = parted[second] - parted[first]
-            apart = PARTING_DISTANCE * self._length
-            parted[second] += apart * between / (np.linalg.norm(between) or 1.0)
-            self.set_pose(parted, frames[rows[i]])
-            segment = np.zeros(6)
-            limit = reach + offset
-            distance = mujoco.mj_geomDistance(model, self._data, first, second, limit, segment)
-            normals[i] = (segment[3:] - segment[:3]) * (-1.0 if distance < 0.0 else 1.0)
-
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return normals / np.where(length > 0.0, length, 1.0)
-
-
 def farthest_points(kind: int, size: Array, direction: Array) -> Array:
     """Points of a primitive that lie farthest along given directions.
 
@@ -272,7 +85,7 @@ def farthest_points(kind: int, size: Array, direction: Array) -> Array:
         (n, 3) points in the frame of the geom [m].
     """
     if kind == BOX:
-        return np.asarray(size * np.sign(direction))
+        return size * np.sign(direction)
 
     if kind == ELLIPSOID:
         stretched = np.linalg.norm(size * direction, axis=1, keepdims=True)
@@ -353,17 +166,14 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
                 f"ignored: {sorted(names)} is no pair of bodies; needs two different names"
             )
 
-    selection = _Selection(model)
     body_of = [bodies[body] for body in model.geom_bodyid.tolist()]
     found = []
-    for one, other in combinations(range(model.ngeom), 2):
-        first, second = (one, other) if selection.can_move(one) else (other, one)
+    for first, second in _pairs_that_may_collide(model):
         pair = (body_of[first], body_of[second])
-        if frozenset(pair) in ignored or not selection.can_come_near(first, second):
+        if frozenset(pair) in ignored:
             continue
-
         for geom in (first, second):
-            refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
+            refused = REFUSED_TYPES.get(model.geom_type[geom])
             if refused is not None:
                 raise ExperimentError(
                     f"clearance: {labels[geom]} is a {refused}, for which MuJoCo has no reliable "
@@ -381,57 +191,39 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
     return tuple(found)
 
 
-class _Selection:
-    """MuJoCo's selection of pairs of geoms that may collide."""
+def _pairs_that_may_collide(model: Any) -> list[list[int]]:
+    """Numbers of two geoms each that move relative to each other and may collide by MuJoCo's rules.
 
-    def __init__(self, model: Any) -> None:
-        """Read from a model the properties on which the selection depends."""
-        self._model = model
-        self._body = model.geom_bodyid.tolist()
-        self._tree = model.body_treeid.tolist()
-        self._weld = model.body_weldid.tolist()
-        self._parent_weld = model.body_weldid[model.body_parentid].tolist()
-        self._contype = model.geom_contype.tolist()
-        self._conaffinity = model.geom_conaffinity.tolist()
+    Where only one of them can move, it is the first one.
+    """
+    body, weld = model.geom_bodyid, model.body_weldid
+    can_move = model.body_treeid[body] >= 0
+    pairs = np.stack(np.triu_indices(model.ngeom, 1))
+    pairs = np.where(can_move[pairs[0]], pairs, pairs[::-1])
+    first, second = pairs
+    # Every geom that moves has a distance to a floor that only an experiment states.
+    chosen = second == mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, FLOOR)
+    chosen |= np.isin(_codes(pairs), _codes(np.stack([model.pair_geom1, model.pair_geom2])))
+    # Parent and child do not collide; a body that is fixed in the world is no parent.
+    weld_a, weld_b = weld[body[pairs]]
+    parent = weld[model.body_parentid]
+    may_collide = (weld_a != parent[weld_b]) & (weld_b != parent[weld_a])
+    may_collide |= (weld_a == 0) | (weld_b == 0)
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        may_collide[:] = True
+    # The signature of an <exclude> holds the numbers of both bodies, 16 bits each.
+    excluded = np.stack(divmod(model.exclude_signature, 1 << 16))
+    may_collide &= ~np.isin(_codes(body[pairs]), _codes(excluded))
+    types, affinities = model.geom_contype[pairs], model.geom_conaffinity[pairs[::-1]]
+    chosen |= may_collide & (types & affinities).any(axis=0)
+    found: list[list[int]] = pairs[:, chosen & can_move[first] & (weld_a != weld_b)].T.tolist()
+    return found
 
-        # Every geom that moves has a distance to a floor that only an experiment states.
-        self._floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, FLOOR)
 
-        explicit = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-        self._explicit = {frozenset(pair) for pair in explicit}
-
-        # The signature of an <exclude> holds the numbers of both bodies, 16 bits each.
-        signatures = model.exclude_signature.tolist()
-        self._excluded = {frozenset(divmod(signature, 1 << 16)) for signature in signatures}
-
-        filterparent_off = int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
-        self._filters_parents = not model.opt.disableflags & filterparent_off
-
-    def can_move(self, geom: int) -> bool:
-        """Whether a geom belongs to a kinematic tree."""
-        return bool(self._tree[self._body[geom]] >= 0)
-
-    def can_come_near(self, first: int, second: int) -> bool:
-        """Whether two geoms move relative to each other and may collide.
-
-        Where only one of them can move, it is the first one.
-        """
-        a = self._body[first]
-        b = self._body[second]
-        if not self.can_move(first) or self._weld[a] == self._weld[b]:
-            return False
-        if frozenset((first, second)) in self._explicit or second == self._floor:
-            return True
-
-        # Parent and child do not collide; a body that is fixed in the world is no parent.
-        weld_a, weld_b = self._weld[a], self._weld[b]
-        related = weld_a == self._parent_weld[weld_b] or weld_b == self._parent_weld[weld_a]
-        is_filtered = self._filters_parents and weld_a and weld_b and related
-        if frozenset((a, b)) in self._excluded or is_filtered:
-            return False
-        forward = self._contype[first] & self._conaffinity[second]
-        backward = self._contype[second] & self._conaffinity[first]
-        return bool(forward or backward)
+def _codes(pairs: Indices) -> Indices:
+    """(n,) one number for each pair of numbers (2, n), whatever their order."""
+    low, high = np.sort(pairs.astype(np.int64), axis=0)
+    return np.asarray(low << 32 | high)
 
 
 # Signed distances at n configurations, in m columns: (n, m) distances [m], negative in penetration,
@@ -507,13 +299,49 @@ class GeomDistances:
         second_bodies = body[[p.second for p in leaders]]
         self._dof_sign = moved[second_bodies] - moved[first_bodies]
 
-        self._model = copy.copy(model)
-        self._data = mujoco.MjData(self._model)
-        self._distances = PairDistances(self._model, self.pairs)
-        if not 0.0 < reach < self._distances.infinite:
+        self._length = model_length(model)
+        self._infinite = INFINITE_DISTANCE * self._length
+        if not 0.0 < reach < self._infinite:
             raise ExperimentError(
                 f"clearance: reach {reach:g} m; needs a positive, finite distance"
             )
+        self._model = copy.copy(model)
+        options = self._model.opt
+        options.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+        options.ccd_tolerance = min(options.ccd_tolerance, CCD_TOLERANCE * self._length)
+        options.ccd_iterations = max(options.ccd_iterations, CCD_ITERATIONS)
+        self._data = mujoco.MjData(self._model)
+        # The poses in which distances are measured.
+        self._posed = mujoco.MjData(self._model)
+        self._prepare_pairs()
+
+    def _prepare_pairs(self) -> None:
+        """Set what the distance of each pair needs."""
+        model = self._model
+        self._first = np.array([pair.first for pair in self.pairs])
+        self._second = np.array([pair.second for pair in self.pairs])
+        # (2, p) types of the geoms.
+        kinds = model.geom_type[np.stack([self._first, self._second])]
+        # Numbers of the pairs whose second geom is a plane, and (p,) True for a primitive over a
+        # plane, whose lower bound is the distance itself.
+        self._planes = np.flatnonzero(kinds[1] == PLANE)
+        self._exact = (kinds[1] == PLANE) & np.isin(kinds[0], PRIMITIVES)
+        radii = model.geom_rbound[self._first] + model.geom_rbound[self._second]
+        self._radii = np.where(self._exact, 0.0, radii)
+        # Between a capsule and a box, MuJoCo measures the distance of the capsule's axis, from
+        # which the radius is subtracted.
+        by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
+        capsule = np.where(kinds[0] == CAPSULE, self._first, self._second)
+        self._axis_offset = np.where(by_axis, model.geom_size[capsule, 0], 0.0)
+        axis_model = copy.copy(model)
+        capsules = axis_model.geom_type == CAPSULE
+        axis_model.geom_type[capsules] = CYLINDER
+        axis_model.geom_size[capsules, 0] = AXIS_RADIUS * self._length
+        # Arguments of MuJoCo's function, pair by pair.
+        self._calls = [
+            (axis_model if axis else model, pair.first, pair.second, float(offset))
+            for pair, axis, offset in zip(self.pairs, by_axis, self._axis_offset, strict=True)
+        ]
 
     def __call__(self, qpos: Array, slopes: bool) -> SignedDistances:
         """Distances of every column at every configuration.
@@ -549,7 +377,7 @@ class GeomDistances:
             )
 
         positions, frames, _ = self._poses(qpos, False)
-        bounds, _ = self._distances.lower_bounds(positions, frames)
+        bounds, _ = self._lower_bounds(positions, frames)
         best, row, pair = np.inf, 0, self.pairs[0]
 
         # Measure in ascending order of the bounds. Stop at the first bound that exceeds the
@@ -559,9 +387,9 @@ class GeomDistances:
             distance = float(bounds[k, p])
             if distance >= best:
                 break
-            if not self._distances.exact[p]:
-                self._distances.set_pose(positions[k], frames[k])
-                distance = self._distances.distance(p, min(best, self._distances.infinite))
+            if not self._exact[p]:
+                self._set_pose(positions[k], frames[k])
+                distance = self._distance(p, min(best, self._infinite), None)
             if distance < best:
                 best, row, pair = distance, int(k), self.pairs[p]
         return best, row, pair
@@ -573,76 +401,29 @@ class GeomDistances:
         positions, frames, screws = self._poses(safe, slopes)
 
         # Bounds of all pairs, replaced by the distance where they are within reach.
-        distances = self._distances
-        every, points = distances.lower_bounds(positions, frames)
+        every, points = self._lower_bounds(positions, frames)
         every[every >= self.reach] = self.reach
         near = every < self.reach
-        rows, pairs = np.nonzero(near & ~distances.exact)
-        found, segments = distances.measure(rows, pairs, positions, frames, self.reach)
-        every[rows, pairs] = found
+        rows, pairs = np.nonzero(near & ~self._exact)
+        distances, segments = self._measured(rows, pairs, positions, frames)
+        every[rows, pairs] = distances
         every[~finite] = np.nan
         d = np.minimum.reduceat(every, self._first_of_column, axis=1)
         if screws is None:
             return d, None
-
-        plane_rows, plane_pairs = np.nonzero(near & distances.exact)
-        slope = self._slopes(
-            d,
-            every,
-            measured=(rows, pairs, found, segments),
-            exact=(plane_rows, plane_pairs, points),
-            poses=(positions, frames, screws),
-        )
-        return d, slope
-
-    def _slopes(
-        self,
-        d: Array,
-        every: Array,
-        *,
-        measured: tuple[Indices, Indices, Array, Array],
-        exact: tuple[Indices, Indices, Array],
-        poses: tuple[Array, Array, Array],
-    ) -> Array:
-        """Slopes of the distances of all columns.
-
-        The slope of a column is that of its nearest pair.
-
-        Args:
-            d: (n, m) distances of the columns [m].
-            every: (n, p) distances of the pairs [m].
-            measured: Rows and pairs (h,) that MuJoCo measured, their distances (h,) and nearest
-                points (h, 6).
-            exact: Rows and pairs (e,) over planes, and points (n, number of planes, 3) nearest to
-                the planes.
-            poses: Positions, frames and screws by `_poses`.
-
-        Returns:
-            (n, m, nv) slopes [m / tangent unit of qpos].
-        """
-        positions, frames, screws = poses
-        rows, pairs, found, segments = measured
-        plane_rows, plane_pairs, plane_points = exact
-
         # Normals, and nearest points of the first geoms: measured pairs first, then pairs over
         # planes.
-        normals = self._distances.normals(
-            rows,
-            pairs,
-            distances=found,
-            segments=segments,
-            positions=positions,
-            frames=frames,
-            reach=self.reach,
+        plane_rows, plane_pairs = np.nonzero(near & self._exact)
+        normals = np.concatenate(
+            [
+                self._normals(rows, pairs, distances, segments, (positions, frames)),
+                -frames[plane_rows, self._second[plane_pairs], :, 2],
+            ]
         )
-        planes = self._distances.second[plane_pairs]
-        plane_normals = -frames[plane_rows, planes, :, 2]
-        plane_places = np.searchsorted(self._distances.planes, plane_pairs)
-        normals = np.concatenate([normals, plane_normals])
-        nearest_points = np.concatenate([segments[:, :3], plane_points[plane_rows, plane_places]])
+        places = np.searchsorted(self._planes, plane_pairs)
+        nearest_points = np.concatenate([segments[:, :3], points[plane_rows, places]])
         rows = np.concatenate([rows, plane_rows])
         pairs = np.concatenate([pairs, plane_pairs])
-
         # Which of these pairs are the nearest of their column, and within reach.
         column = self._column[pairs]
         value = every[rows, pairs]
@@ -653,7 +434,114 @@ class GeomDistances:
         lines = np.zeros((*d.shape, 6))
         lines[rows[least], column[least], :3] = np.cross(nearest_points[least], normals[least])
         lines[rows[least], column[least], 3:] = normals[least]
-        return np.asarray((lines @ screws.transpose(0, 2, 1)) * self._dof_sign)
+        return d, np.asarray((lines @ screws.transpose(0, 2, 1)) * self._dof_sign)
+
+    def _lower_bounds(self, positions: Array, frames: Array) -> tuple[Array, Array]:
+        """Lower bounds of the distances, from bounding spheres; for `_exact` pairs the distances.
+
+        Args:
+            positions: (n, ngeom, 3) positions of the geoms [m].
+            frames: (n, ngeom, 3, 3) frames of the geoms.
+
+        Returns:
+            (n, p) bounds [m], and (n, number of planes, 3) points of the first geoms nearest to the
+            planes [m].
+        """
+        between = positions[:, self._second] - positions[:, self._first]
+        bounds = np.sqrt(np.einsum("npi,npi->np", between, between)) - self._radii
+        points = positions[:, self._first[self._planes]]
+        for i, p in enumerate(self._planes):
+            first, second = self._first[p], self._second[p]
+            normal = frames[:, second, :, 2]
+            if self._exact[p]:
+                frame = frames[:, first]
+                downwards = -np.einsum("nij,ni->nj", frame, normal)
+                kind, size = self._model.geom_type[first], self._model.geom_size[first]
+                local = farthest_points(kind, size, downwards)
+                points[:, i] += np.einsum("nij,nj->ni", frame, local)
+            height = points[:, i] - positions[:, second]
+            bounds[:, p] = np.einsum("ni,ni->n", height, normal) - self._radii[p]
+        return bounds, points
+
+    def _set_pose(self, positions: Array, frames: Array) -> None:
+        """Set the positions (ngeom, 3) and frames (ngeom, 3, 3) in which `_distance` measures."""
+        self._posed.geom_xpos[:] = positions
+        self._posed.geom_xmat[:] = frames.reshape(-1, 9)
+
+    def _distance(self, p: int, limit: float, segment: Array | None) -> float:
+        """Distance of one pair in the pose set by `_set_pose`.
+
+        Args:
+            p: Number of the pair.
+            limit: Distance beyond which MuJoCo does not search [m].
+            segment: (6,) overwritten by the nearest points of the first and of the second geom [m].
+
+        Returns:
+            The distance [m] if it is below `limit`, else some number that is at least `limit`.
+        """
+        model, first, second, offset = self._calls[p]
+        found = mujoco.mj_geomDistance(model, self._posed, first, second, limit + offset, segment)
+        return float(found) - offset
+
+    def _measured(
+        self, rows: Indices, pairs: Indices, positions: Array, frames: Array
+    ) -> tuple[Array, Array]:
+        """Distances of h pairs, each in one of n poses.
+
+        Args:
+            rows: (h,) numbers of the poses, ascending.
+            pairs: (h,) numbers of the pairs.
+            positions: (n, ngeom, 3) positions of the geoms [m].
+            frames: (n, ngeom, 3, 3) frames of the geoms.
+
+        Returns:
+            (h,) distances, at most the reach [m], and (h, 6) the nearest points of the geoms [m].
+        """
+        found = np.empty(len(rows))
+        segments = np.zeros((len(rows), 6))
+        posed = -1
+        for i, (k, p) in enumerate(zip(rows.tolist(), pairs.tolist(), strict=True)):
+            if k != posed:
+                self._set_pose(positions[k], frames[k])
+                posed = k
+            found[i] = min(self._distance(p, self.reach, segments[i]), self.reach)
+        return found, segments
+
+    def _normals(
+        self,
+        rows: Indices,
+        pairs: Indices,
+        distances: Array,
+        segments: Array,
+        poses: tuple[Array, Array],
+    ) -> Array:
+        """Unit vectors (h, 3) from the first to the second geoms, along the measured distances.
+
+        Args:
+            rows: (h,) numbers of the poses.
+            pairs: (h,) numbers of the pairs.
+            distances: (h,) distances by `_measured` [m].
+            segments: (h, 6) nearest points by `_measured` [m].
+            poses: (n, ngeom, 3) positions of the geoms [m], and (n, ngeom, 3, 3) their frames.
+        """
+        positions, frames = poses
+        segments = segments.copy()
+        signed = distances + self._axis_offset[pairs]
+        for i in np.flatnonzero(np.abs(signed) < TOUCHING_DISTANCE * self._length):
+            # Geoms that touch are moved apart a little.
+            p = pairs[i]
+            first, second = self._first[p], self._second[p]
+            parted = positions[rows[i]].copy()
+            between = parted[second] - parted[first]
+            apart = PARTING_DISTANCE * self._length
+            parted[second] += apart * between / (np.linalg.norm(between) or 1.0)
+            self._set_pose(parted, frames[rows[i]])
+            segments[i] = 0.0
+            signed[i] = self._distance(p, self.reach, segments[i]) + self._axis_offset[p]
+        sign = np.where(signed < 0.0, -1.0, 1.0)
+        normals = (segments[:, 3:] - segments[:, :3]) * sign[:, None]
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return normals / np.where(length > 0.0, length, 1.0)
 
     def _poses(self, qpos: Array, slopes: bool) -> tuple[Array, Array, Array | None]:
         """Poses of all geoms, and motions of the degrees of freedom, at configurations.

@@ -194,10 +194,8 @@ class ControlLaws:
     @cached_property
     def by_tick(self) -> tuple[tuple[ControlLaw, ...], ...]:
         """The laws, grouped by the period of their evaluation."""
-        groups: dict[int, list[ControlLaw]] = {}
-        for law in self.laws:
-            groups.setdefault(law.tick, []).append(law)
-        return tuple(tuple(group) for group in groups.values())
+        ticks = dict.fromkeys(law.tick for law in self.laws)
+        return tuple(tuple(law for law in self.laws if law.tick == tick) for tick in ticks)
 
 
 def number_name(actuator: str) -> str:

@@ -31,7 +31,7 @@ from mjfim.model.elements import (
 )
 from mjfim.model.units import (
     PART_UNITS,
-    control_unit,
+    control_units,
     joint_unit,
     per_second,
     sensor_unit,
@@ -205,11 +205,8 @@ def actuator_names(model: Any) -> tuple[str, ...]:
 
 def control_names(model: Any) -> tuple[str, ...]:
     """Names of the nu controls; an actuator with several controls names them `<actuator>[<i>]`."""
-    names: list[str] = []
-    for i, name in enumerate(actuator_names(model)):
-        count = int(model.actuator_ctrlnum[i])
-        names += _indexed(name, count)
-    return tuple(names)
+    counts = zip(actuator_names(model), model.actuator_ctrlnum, strict=True)
+    return tuple(control for name, count in counts for control in _indexed(name, count))
 
 
 def control_labels(model: Any) -> tuple[str, ...]:
@@ -217,14 +214,11 @@ def control_labels(model: Any) -> tuple[str, ...]:
 
     A label ends with the unit where the model determines it, else with `(control)`.
     """
-    labels: list[str] = []
-    for i, name in enumerate(actuator_names(model)):
-        count = int(model.actuator_ctrlnum[i])
-        unit = control_unit(model, i)
-        suffix = f"[{unit}]" if unit else "(control)"
-
-        labels += [f"{control} {suffix}" for control in _indexed(name, count)]
-    return tuple(labels)
+    units = control_units(model)
+    return tuple(
+        f"{name} [{unit}]" if unit else f"{name} (control)"
+        for name, unit in zip(control_names(model), units, strict=True)
+    )
 
 
 def scalar_joints(model: Any) -> tuple[ScalarJoint, ...]:
@@ -257,7 +251,7 @@ def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
     Returns:
         The parts; none for slide and hinge joints.
     """
-    kind = int(model.jnt_type[joint])
+    kind = model.jnt_type[joint]
     if kind == mujoco.mjtJoint.mjJNT_FREE:
         return (*TRANSLATION, *ROTATION_VECTOR)
     if kind == mujoco.mjtJoint.mjJNT_BALL:
@@ -267,45 +261,24 @@ def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
 
 def state_components(model: Any) -> tuple[StateComponent, ...]:
     """The nq + nv numbers of the state without activations: all of qpos, then all of qvel."""
-    positions: list[StateComponent] = []
-    velocities: list[StateComponent] = []
-
-    for j, name in enumerate(joint_names(model)):
-        q = int(model.jnt_qposadr[j])
-        v = model.nq + int(model.jnt_dofadr[j])
-        parts = tangent_parts(model, j)
-
-        if not parts:
-            unit = joint_unit(model, j)
-            positions.append(StateComponent(name=f"qpos:{name}", address=q, unit=unit))
-            velocities.append(StateComponent(name=f"qvel:{name}", address=v, unit=per_second(unit)))
-            continue
-
-        translation = tuple(part for part in parts if part in TRANSLATION)
-        positions += _joint_components(f"qpos:{name}", (*translation, *QUATERNION), q)
-        velocities += _joint_components(f"qvel:{name}", parts, v)
-
-    return (*positions, *velocities)
-
-
-def _joint_components(
-    joint_column: str, parts: Sequence[str], first_address: int
-) -> list[StateComponent]:
-    """Components of a ball or free joint. joint_column: `qpos:<joint>` or `qvel:<joint>`."""
-    found = []
-    for k, part in enumerate(parts):
-        group = "pos" if part in TRANSLATION else "rot"
-        unit = PART_UNITS[part]
-        found.append(
-            StateComponent(
-                name=f"{joint_column}.{part}",
-                groups=(f"{joint_column}.{group}", joint_column),
-                address=first_address + k,
-                unit=per_second(unit) if joint_column.startswith("qvel:") else unit,
-                sigma_factor=QUATERNION_SIGMA_FACTOR if part in QUATERNION else 1.0,
-            )
-        )
-    return found
+    found: list[StateComponent] = []
+    for field, firsts in (("qpos", model.jnt_qposadr), ("qvel", model.nq + model.jnt_dofadr)):
+        for j, name in enumerate(joint_names(model)):
+            column, parts = f"{field}:{name}", tangent_parts(model, j)
+            if parts and field == "qpos":
+                parts = (*(part for part in parts if part in TRANSLATION), *QUATERNION)
+            for k, part in enumerate(parts or ("",)):
+                unit = PART_UNITS[part] if part else joint_unit(model, j)
+                group = "pos" if part in TRANSLATION else "rot"
+                component = StateComponent(
+                    name=f"{column}.{part}" if part else column,
+                    groups=(f"{column}.{group}", column) if part else (),
+                    address=int(firsts[j]) + k,
+                    unit=unit if field == "qpos" else per_second(unit),
+                    sigma_factor=QUATERNION_SIGMA_FACTOR if part in QUATERNION else 1.0,
+                )
+                found.append(component)
+    return tuple(found)
 
 
 def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
@@ -331,20 +304,18 @@ def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
 
 def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
     """The na activations by their address: `act:<actuator>`, with `[i]` if there are several."""
-    found: dict[int, TangentComponent] = {}
+    found: list[TangentComponent] = []
     for i, name in enumerate(actuator_names(model)):
-        first = int(model.actuator_actadr[i])
-        count = int(model.actuator_actnum[i])
+        first = 2 * model.nv + int(model.actuator_actadr[i])
+        count = model.actuator_actnum[i]
         named = element_name(model, "actuator", i) != ""
         columns = _indexed(f"act:{name}", count)
         paths = _indexed(f"initial/{name}:act", count)
-
-        for k in range(count):
-            address = 2 * model.nv + first + k
-            found[address] = TangentComponent(
-                name=columns[k], path=paths[k] if named else "", address=address, unit=""
-            )
-    return tuple(found[address] for address in sorted(found))
+        found += [
+            TangentComponent(name=column, path=path if named else "", address=first + k, unit="")
+            for k, (column, path) in enumerate(zip(columns, paths, strict=True))
+        ]
+    return tuple(sorted(found, key=lambda component: component.address))
 
 
 def dof_names(model: Any) -> tuple[str, ...]:
@@ -374,10 +345,8 @@ def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
     Returns:
         nu * nx names `gain:<control>:<component of the deviation>`.
     """
-    names: list[str] = []
-    for control in controls:
-        names += [f"gain:{control}:{component}" for component in tangent_names(model)]
-    return tuple(names)
+    deviations = tangent_names(model)
+    return tuple(f"gain:{control}:{each}" for control in controls for each in deviations)
 
 
 def sensor_columns(model: Any, sensor: str) -> list[str]:
@@ -406,8 +375,7 @@ def sensor_components(model: Any) -> tuple[SensorComponent, ...]:
 
 def measurable_columns(model: Any) -> tuple[str, ...]:
     """Columns that a recording may hold: components of the state, then sensors."""
-    state = [component.name for component in state_components(model)]
-    return (*state, *(component.name for component in sensor_components(model)))
+    return ModelCoordinates.of(model).measurable
 
 
 def output_label(model: Any, output: str) -> str:

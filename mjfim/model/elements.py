@@ -15,7 +15,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.model.units import acts_at_joint
 
-# MuJoCo's object type of every kind of element that a parameter path can name.
+# MuJoCo's object type of every kind of element that has a name.
 OBJECT_TYPES = {
     "body": mujoco.mjtObj.mjOBJ_BODY,
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
@@ -25,6 +25,7 @@ OBJECT_TYPES = {
     "site": mujoco.mjtObj.mjOBJ_SITE,
     "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
+    "key": mujoco.mjtObj.mjOBJ_KEY,
 }
 
 # Field of MjModel that counts the elements of a kind, where it is not called `n<kind>`.
@@ -138,7 +139,7 @@ def is_rk4(model: Any) -> bool:
     Args:
         model: The compiled model (`mujoco.MjModel`).
     """
-    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+    return bool(model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def model_length(model: Any) -> float:
@@ -156,15 +157,15 @@ def model_length(model: Any) -> float:
     for body in range(1, model.nbody):
         if not model.body_weldid[body]:
             continue
-        parent = int(model.body_parentid[body])
+        parent = model.body_parentid[body]
         if model.body_weldid[parent]:
-            offset = float(np.linalg.norm(model.body_pos[body]))
+            offset = np.linalg.norm(model.body_pos[body])
             from_root[body] = from_root[parent] + offset
 
-        mass = float(model.body_mass[body])
+        mass = model.body_mass[body]
         if mass > 0.0:
-            gyration = float(np.sqrt(model.body_inertia[body].max() / mass))
-            centre = float(np.linalg.norm(model.body_ipos[body]))
+            gyration = np.sqrt(model.body_inertia[body].max() / mass)
+            centre = np.linalg.norm(model.body_ipos[body])
             longest = max(longest, from_root[body] + centre + gyration)
 
     # MuJoCo's extent is the size of the geoms and sites, where nothing that moves has a mass.
@@ -179,8 +180,8 @@ def translations(model: Any) -> np.ndarray:
     """
     found = np.zeros(model.nv, dtype=bool)
     for joint in range(model.njnt):
-        first = int(model.jnt_dofadr[joint])
-        kind = int(model.jnt_type[joint])
+        first = model.jnt_dofadr[joint]
+        kind = model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_SLIDE:
             found[first] = True
         elif kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -215,8 +216,8 @@ def control_sizes(model: Any, time: float) -> Array:
     """
     sizes = np.ones(model.nu)
     for actuator in range(model.nactuator):
-        control = int(model.actuator_ctrladr[actuator])
-        count = int(model.actuator_ctrlnum[actuator])
+        control = model.actuator_ctrladr[actuator]
+        count = model.actuator_ctrlnum[actuator]
         if count:
             sizes[control : control + count] = _control_size(model, actuator, control, time)
     return sizes
@@ -252,7 +253,7 @@ def actuator_force_sizes(model: Any, time: float) -> Array:
     """
     sizes = np.ones(len(model.actuator_acc0))
     for actuator in range(model.nactuator):
-        first, count = int(model.actuator_outadr[actuator]), int(model.actuator_outnum[actuator])
+        first, count = model.actuator_outadr[actuator], model.actuator_outnum[actuator]
         sizes[first : first + count] = _actuator_force_size(model, actuator, time)
     return sizes
 
@@ -263,7 +264,7 @@ def bristle_actuators(model: Any) -> list[int]:
     Args:
         model: The compiled model (`mujoco.MjModel`).
     """
-    has_bristle = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_DCMOTOR)
+    has_bristle = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
     has_bristle = has_bristle & (model.actuator_dynprm[:, BRISTLE_STIFFNESS_COLUMN] > 0.0)
     has_bristle &= (model.actuator_ctrlnum == 0) & (model.actuator_actnum == 1)
     return [int(actuator) for actuator in np.flatnonzero(has_bristle)]
@@ -283,9 +284,9 @@ def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     """
     found = {}
     for actuator in bristle_actuators(model):
-        stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
+        stiffness = model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN]
         under_force = _actuator_force_size(model, actuator, time) / stiffness
-        way = _transmission_size(model, actuator) / time * model.opt.timestep
+        way = _transmission(model, actuator)[0] / time * model.opt.timestep
         found[int(model.actuator_actadr[actuator])] = max(under_force, way)
     return found
 
@@ -296,9 +297,9 @@ def _control_size(model: Any, actuator: int, control: int, time: float) -> float
     if stated > 0.0:
         return stated
 
-    gain = abs(float(model.actuator_gainprm[actuator, 0])) or 1.0
+    gain = abs(model.actuator_gainprm[actuator, 0]) or 1.0
     bias = np.abs(model.actuator_biasprm[actuator])
-    length = _transmission_size(model, actuator)
+    length, _ = _transmission(model, actuator)
 
     # A servo for positions or velocities.
     if bias[1] > 0.0:
@@ -315,20 +316,8 @@ def _actuator_force_size(model: Any, actuator: int, time: float) -> float:
     if stated > 0.0 and model.actuator_ctrlnum[actuator]:
         return stated
 
-    output = int(model.actuator_outadr[actuator])
-    length = _transmission_size(model, actuator)
-    return length / time**2 / (_acceleration(model, actuator, output) or 1.0)
-
-
-def _acceleration(model: Any, actuator: int, output: int) -> float:
-    """Acceleration that a unit force of an actuator causes, 0 without any [1/s² per unit force]."""
-    if not acts_at_joint(model, actuator):
-        return float(model.actuator_acc0[output])
-
-    # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
-    gear = float(np.abs(model.actuator_gear[output]).max())
-    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
-    return gear * float(model.dof_invweight0[dof])
+    length, acceleration = _transmission(model, actuator)
+    return length / time**2 / (acceleration or 1.0)
 
 
 def _largest_finite(bounds: Array) -> float:
@@ -336,12 +325,19 @@ def _largest_finite(bounds: Array) -> float:
     return float(np.abs(bounds[np.isfinite(bounds)]).max(initial=0.0))
 
 
-def _transmission_size(model: Any, actuator: int) -> float:
-    """Natural size of the length that an actuator acts on [m or rad, times the gear]."""
-    if not acts_at_joint(model, actuator):
-        return model_length(model)
+def _transmission(model: Any, actuator: int) -> tuple[float, float]:
+    """Natural size of the length that an actuator acts on, and what accelerates it.
 
-    output = int(model.actuator_outadr[actuator])
-    gear = float(np.abs(model.actuator_gear[output]).max()) or 1.0
-    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
-    return gear * float(position_sizes(model)[dof])
+    Returns:
+        The length [m or rad, times the gear], and the acceleration that a unit force of the
+        actuator causes, 0 without any [1/s² per unit force].
+    """
+    output = model.actuator_outadr[actuator]
+    if not acts_at_joint(model, actuator):
+        return model_length(model), float(model.actuator_acc0[output])
+
+    # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
+    gear = float(np.abs(model.actuator_gear[output]).max())
+    dof = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
+    length = (gear or 1.0) * float(position_sizes(model)[dof])
+    return length, gear * float(model.dof_invweight0[dof])

@@ -75,16 +75,8 @@ class BodyInertia:
         moments = moments[::-1]
         R = np.ascontiguousarray(R[:, ::-1])
 
-        # The triple product of the axes is negative where they are left-handed.
-        x, y, z = R.T.tolist()
-        cross = (
-            x[1] * y[2] - x[2] * y[1],
-            x[2] * y[0] - x[0] * y[2],
-            x[0] * y[1] - x[1] * y[0],
-        )
-        if cross[0] * z[0] + cross[1] * z[1] + cross[2] * z[2] < 0.0:
+        if np.linalg.det(R) < 0.0:
             R[:, 2] *= -1.0
-
         # MuJoCo's own function takes a hundredth of the time of SciPy's.
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
@@ -171,10 +163,7 @@ def to_logcholesky(body: BodyInertia) -> Array:
 
 def from_logcholesky(values: Array) -> BodyInertia:
     """Inverse of `to_logcholesky`; the result is physical for any values: (10,)."""
-    U = np.diag(np.exp(values[1:4]))
-    U[0, 1] = values[4]
-    U[1, 2] = values[5]
-    U[0, 2] = values[6]
+    U = _unit_factor(values)[:3, :3]
 
     # U is scaled by e^alpha, so that the mass is e^(2 alpha).
     mass = float(np.exp(2.0 * values[0]))
@@ -289,11 +278,15 @@ def logcholesky_factor(values: Array) -> Array:
     Returns:
         (4, 4) upper triangular factor.
     """
-    alpha, d, (s12, s23, s13), t = values[0], values[1:4], values[4:7], values[7:]
-    U = np.diag([*np.exp(d), 1.0])
-    U[0, 1], U[1, 2], U[0, 2] = s12, s23, s13
-    U[:3, 3] = t
-    return np.asarray(np.exp(alpha) * U)
+    return np.asarray(np.exp(values[0]) * _unit_factor(values))
+
+
+def _unit_factor(values: Array) -> Array:
+    """(4, 4) the factor of a body with the mass 1."""
+    U = np.diag([*np.exp(values[1:4]), 1.0])
+    U[0, 1], U[1, 2], U[0, 2] = values[4:7]
+    U[:3, 3] = values[7:]
+    return U
 
 
 def logcholesky_derivatives(values: Array) -> Array:

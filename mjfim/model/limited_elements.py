@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -24,28 +24,13 @@ from mjfim.model.units import (
     ANGLE,
     FORCE_UNITS,
     LENGTH,
-    control_unit,
+    control_units,
     force_unit,
     joint_unit,
     per_second,
 )
 
 Range = tuple[float, float]
-
-# Kinds of limits, in the order in which they are listed.
-KINDS = (
-    "position",
-    "tilt",
-    "velocity",
-    "angular_velocity",
-    "acceleration",
-    "control",
-    "control_rate",
-    "force",
-    "joint_force",
-    "tendon_force",
-    "tendon_length",
-)
 
 # What each kind limits: the element that has a name, and its elements in words.
 OWNERS: dict[str, tuple[Literal["joint", "actuator", "tendon"], str]] = {
@@ -62,16 +47,19 @@ OWNERS: dict[str, tuple[Literal["joint", "actuator", "tendon"], str]] = {
     "tendon_length": ("tendon", "tendons"),
 }
 
+# Kinds of limits, in the order in which they are listed.
+KINDS = tuple(OWNERS)
+
+BALL = int(mujoco.mjtJoint.mjJNT_BALL)
+FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+
 # Joints in words.
 JOINT_WORDS = {
     int(mujoco.mjtJoint.mjJNT_SLIDE): "a slide",
     int(mujoco.mjtJoint.mjJNT_HINGE): "a hinge",
-    int(mujoco.mjtJoint.mjJNT_BALL): "a ball joint",
-    int(mujoco.mjtJoint.mjJNT_FREE): "a free joint",
+    BALL: "a ball joint",
+    FREE: "a free joint",
 }
-
-BALL = int(mujoco.mjtJoint.mjJNT_BALL)
-FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 # Number of numbers that describe the tilt: both components of a rotation that tilt the body.
 TILT_COMPONENTS = 2
@@ -142,7 +130,7 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
     forces = force_sizes(model, time)
     for joint, name in enumerate(names):
         _add_joint(found, model, joint, name, sizes, time)
-        if int(model.jnt_type[joint]) not in (BALL, FREE):
+        if model.jnt_type[joint] not in (BALL, FREE):
             dof = int(model.jnt_dofadr[joint])
             found.by_kind["joint_force"][name] = LimitedElement(
                 index=dof,
@@ -152,9 +140,8 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
             )
 
     widths = control_sizes(model, time)
-    actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
-    for i, name in enumerate(controls):
-        size, unit = float(widths[i]), control_unit(model, actuators[i])
+    for i, (name, unit) in enumerate(zip(controls, control_units(model), strict=True)):
+        size = float(widths[i])
         found.by_kind["control"][name] = LimitedElement(
             index=i,
             unit=unit,
@@ -176,7 +163,7 @@ def actuators_of_tendon(model: Any, tendon: int) -> tuple[int, ...]:
         model: MjModel.
         tendon: Number of the tendon.
     """
-    pulls = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    pulls = model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
     pulling = np.flatnonzero(pulls & (model.actuator_trnid[:, 0] == tendon))
     return tuple(int(model.actuator_outadr[i]) for i in pulling)
 
@@ -195,50 +182,48 @@ def _add_joint(
         time: Natural time of a motion [s].
     """
     kinds = found.by_kind
-    kind = int(model.jnt_type[joint])
+    kind = model.jnt_type[joint]
     q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
     stated = _range(model.jnt_limited, model.jnt_range, joint)
     size = float(sizes[v])
     count = 3 if kind in (BALL, FREE) else 1
 
+    # The range of a ball joint in the MJCF is its largest angle of rotation. It is no limit where
+    # it is half a turn or more.
+    if kind == BALL and stated is not None and stated[1] >= np.pi:
+        stated = None
     unit = joint_unit(model, joint)
-    rates = {
-        "velocity": (per_second(unit), size / time),
-        "acceleration": (f"{per_second(unit)}²", size / time**2),
-    }
-
+    rate = per_second(unit)
     # The velocity of a free joint is that of its translation.
-    for rate, (per_time, typical) in rates.items():
-        kinds[rate][name] = LimitedElement(index=v, count=count, unit=per_time, size=typical)
-
-    if kind == FREE:
-        for i, part in enumerate(TRANSLATION):
-            each = f"{name}.{part}"
-            place = LimitedElement(index=q + i, unit=unit, size=size, is_part=True)
-            kinds["position"][each] = place
-            for rate, (per_time, typical) in rates.items():
-                moving = LimitedElement(index=v + i, unit=per_time, size=typical, is_part=True)
-                kinds[rate][each] = moving
-    else:
-        # The range of a ball joint in the MJCF is its largest angle of rotation, which is no limit
-        # where it is half a turn or more.
-        if kind == BALL and stated is not None and stated[1] >= np.pi:
-            stated = None
-        kinds["position"][name] = LimitedElement(
-            index=q, count=count, unit=unit, size=size, stated=stated
-        )
+    speed = LimitedElement(index=v, count=count, unit=rate, size=size / time)
+    motion = {
+        "position": LimitedElement(index=q, count=count, unit=unit, size=size, stated=stated),
+        "velocity": speed,
+        "acceleration": replace(speed, unit=f"{rate}²", size=size / time**2),
+    }
+    for limited, whole in motion.items():
+        # The coordinates of a free joint have ranges, its position as a whole has none.
+        if kind != FREE or limited != "position":
+            kinds[limited][name] = whole
+        if kind == FREE:
+            kinds[limited] |= _parts(whole, name, TRANSLATION)
 
     if kind not in (BALL, FREE):
         return
-    first = v + (3 if kind == FREE else 0)
-    speed = LimitedElement(index=first, count=3, unit=per_second(ANGLE), size=1.0 / time)
-    kinds["angular_velocity"][name] = speed
-    for i, part in enumerate(ROTATION_VECTOR):
-        about = replace(speed, index=first + i, count=1, is_part=True)
-        kinds["angular_velocity"][f"{name}.{part}"] = about
-
+    first = v + QUATERNION_PLACE[kind]
+    turn = LimitedElement(index=first, count=3, unit=per_second(ANGLE), size=1.0 / time)
+    kinds["angular_velocity"][name] = turn
+    kinds["angular_velocity"] |= _parts(turn, name, ROTATION_VECTOR)
     address = quaternion_address(model, joint)
     kinds["tilt"][name] = LimitedElement(index=address, count=TILT_COMPONENTS, unit=ANGLE)
+
+
+def _parts(whole: LimitedElement, name: str, parts: Sequence[str]) -> dict[str, LimitedElement]:
+    """The single coordinates of a vector of a joint, by `<joint>.<part>`."""
+    return {
+        f"{name}.{part}": replace(whole, index=whole.index + i, count=1, is_part=True)
+        for i, part in enumerate(parts)
+    }
 
 
 def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:
@@ -252,10 +237,14 @@ def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:
         if not model.actuator_ctrlnum[i]:
             continue
         first, count = int(model.actuator_outadr[i]), int(model.actuator_outnum[i])
+        unit = force_unit(model, i)
+        # The forces on a ball or free joint have several units.
+        if unit and model.jnt_type[model.actuator_trnid[i, 0]] in (BALL, FREE):
+            unit = ""
         forces[name] = LimitedElement(
             index=first,
             count=count,
-            unit=_force_unit(model, i),
+            unit=unit,
             size=float(sizes[first]),
             stated=_range(model.actuator_forcelimited, model.actuator_forcerange, i),
         )
@@ -270,9 +259,11 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
     """Enter the lengths of the tendons, and the sums of the forces of their actuators."""
     sizes = actuator_force_sizes(model, time)
     for i, name in enumerate(unique_names(model, "tendon")):
+        # A tendon is a path in space, or a sum of joint coordinates.
+        is_spatial = model.wrap_type[model.tendon_adr[i]] != mujoco.mjtWrap.mjWRAP_JOINT
         found.by_kind["tendon_length"][name] = LimitedElement(
             index=i,
-            unit=LENGTH if _is_spatial(model, i) else "",
+            unit=LENGTH if is_spatial else "",
             size=float(abs(model.tendon_length0[i])) or model_length(model),
             stated=_range(model.tendon_limited, model.tendon_range, i),
         )
@@ -280,25 +271,10 @@ def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
         if pulling:
             found.by_kind["tendon_force"][name] = LimitedElement(
                 index=i,
-                unit=FORCE_UNITS[LENGTH] if _is_spatial(model, i) else "",
+                unit=FORCE_UNITS[LENGTH] if is_spatial else "",
                 size=float(sizes[list(pulling)].max()),
                 stated=_range(model.tendon_actfrclimited, model.tendon_actfrcrange, i),
             )
-
-
-def _force_unit(model: Any, actuator: int) -> str:
-    """Unit of the force of an actuator; empty for one with several forces or on a free joint."""
-    joint = int(model.actuator_trnid[actuator, 0])
-    acts_on_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
-    if not acts_on_joint or int(model.jnt_type[joint]) in (BALL, FREE):
-        return ""
-    return force_unit(model, actuator)
-
-
-def _is_spatial(model: Any, tendon: int) -> bool:
-    """Whether a tendon is a path in space, and not a sum of joint coordinates."""
-    first = int(model.tendon_adr[tendon])
-    return int(model.wrap_type[first]) != int(mujoco.mjtWrap.mjWRAP_JOINT)
 
 
 def _range(limited: Any, ranges: Any, index: int) -> Range | None:
@@ -316,24 +292,7 @@ def _range(limited: Any, ranges: Any, index: int) -> Range | None:
 
 
 # Kinds of joints whose position holds a quaternion, with the place of the quaternion in it.
-QUATERNION_PLACE = {
-    int(mujoco.mjtJoint.mjJNT_BALL): 0,
-    int(mujoco.mjtJoint.mjJNT_FREE): 3,
-}
-
-
-def upward(model: Any) -> Array:
-    """Direction against gravity in the world; the z axis without gravity.
-
-    Args:
-        model: The compiled model (`mujoco.MjModel`).
-
-    Returns:
-        (3,) unit vector.
-    """
-    gravity = np.array(model.opt.gravity)
-    size = float(np.linalg.norm(gravity))
-    return -gravity / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
+QUATERNION_PLACE = {BALL: 0, FREE: 3}
 
 
 def turn_weights(model: Any, joint: int) -> Array:
@@ -379,8 +338,8 @@ def tilt_weights(model: Any, joint: int) -> Array:
 
     # The upward direction in the frame of the body, and two directions perpendicular to it.
     rotation = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
-    up = rotation.T @ upward(model)
-    _, _, directions = np.linalg.svd(up[None])
+    up = -model.opt.gravity if model.opt.gravity.any() else np.array([0.0, 0.0, 1.0])
+    _, _, directions = np.linalg.svd((rotation.T @ up / np.linalg.norm(up))[None])
     return directions[1:] @ turn_weights(model, joint)
 
 

@@ -272,7 +272,7 @@ class ModelSource:
         # Where MuJoCo treats none of them as simple, another compile would give the same model. A
         # body without a number was merged with its parent.
         model = self.model
-        simple = {model.body(i).name: bool(model.body_simple[i]) for i in range(1, model.nbody)}
+        simple = {model.body(i).name: model.body_simple[i] for i in range(1, model.nbody)}
         moved = simple if moved_bodies is None else moved_bodies
         if not any(simple.get(name, True) for name in moved):
             return self.model
@@ -441,20 +441,17 @@ def packed_model(files: PackedFiles, path: Path) -> ModelSource:
         """Parse and compile the model, from the disk where these files are there."""
         contents = {Path(name): content for name, content in files.contents.items()}
         are_here = all(file.is_file() and file.read_bytes() == contents[file] for file in contents)
-        source = ModelSource(path, files=None if are_here else _file_system(files))
+        system = None
+        if not are_here:
+            system = mujoco.MjVfs()
+            for name, content in files.contents.items():
+                system[name] = content
+        source = ModelSource(path, files=system)
         source.contents = contents
         return source
 
     with _packed_lock:
         return _models.get(key, load)
-
-
-def _file_system(files: PackedFiles) -> Any:
-    """Packed files as a virtual file system of MuJoCo (MjVfs)."""
-    system = mujoco.MjVfs()
-    for name, content in files.contents.items():
-        system[name] = content
-    return system
 
 
 # The latest packed models of this process, by the hash of their files and their name.

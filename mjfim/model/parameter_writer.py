@@ -8,6 +8,7 @@ Tests compare both ways.
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -29,12 +30,11 @@ from mjfim.model.variants import PlantModel
 MOMENT_ROUNDING = 1e-6
 
 
+@dataclass(frozen=True, eq=False)
 class ParameterWriter:
     """Writes values theta: (p,) of a set of parameters into models."""
 
-    def __init__(self, parameters: ParameterSet) -> None:
-        """Set the parameters."""
-        self._parameters = parameters
+    parameters: ParameterSet
 
     def model(self, base: PlantModel | Any, theta: Array) -> Any:
         """A private copy of the base model with theta written into it.
@@ -59,7 +59,7 @@ class ParameterWriter:
         if not isinstance(source, PlantModel):
             return source
 
-        needs_compile = self._parameters.needs_compile
+        needs_compile = self.parameters.needs_compile
         if not needs_compile.any():
             return source.model
 
@@ -72,7 +72,7 @@ class ParameterWriter:
         MuJoCo's derived constants are computed anew. Values that need a compile are not written
         here, but by `model`.
         """
-        mocap = self._parameters.mocap
+        mocap = self.parameters.mocap
 
         # MuJoCo derives constants from the compiled poses of mocap bodies.
         if mocap is not None:
@@ -84,7 +84,7 @@ class ParameterWriter:
                 # A body or site is turned from its nominal orientation. MuJoCo skips the
                 # orientation of sites whose frame coincides with their body's.
                 turns = scipy.spatial.transform.Rotation
-                nominal = turns.from_quat(self._parameters.nominal[kind, row], scalar_first=True)
+                nominal = turns.from_quat(self.parameters.nominal[kind, row], scalar_first=True)
                 turned = nominal * turns.from_rotvec(values)
                 getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
                 if kind == "site_quat":
@@ -100,7 +100,7 @@ class ParameterWriter:
                 model.body_ipos[row] = inertia.com
             model.body_sameframe[row] = same_frame
 
-        workspace = self._parameters.workspace
+        workspace = self.parameters.workspace
         if not workspace:
             workspace.append(mujoco.MjData(model))
         with silence_mujoco_log():
@@ -129,7 +129,7 @@ class ParameterWriter:
         """
         columns_of_body: dict[int, list[int]] = {}
         of_moments = set[int]()
-        for j, parameter in enumerate(self._parameters.parameters):
+        for j, parameter in enumerate(self.parameters.parameters):
             for target in parameter.targets:
                 field = target.field
                 if isinstance(field, InertiaField):
@@ -159,7 +159,7 @@ class ParameterWriter:
 
     def require_physical_bodies(self, base: PlantModel) -> None:
         """Raise ExperimentError if the guess or the true values make an inertia unphysical."""
-        p = self._parameters
+        p = self.parameters
         for key, theta in (("guess", p.guess), ("true", p.true)):
             for columns, fault in self.unphysical_bodies(base, theta):
                 involved = [p.parameters[j] for j in columns]
@@ -178,7 +178,7 @@ class ParameterWriter:
             Values that are written as a whole: (10,) coordinates of inertias by (parametrisation,
             body), and (3,) rotation vectors by (array, row).
         """
-        p = self._parameters
+        p = self.parameters
         whole: dict[tuple[str, int], Array] = {}
         terms = {term.name: term.values for term in p.whole_terms}
 
@@ -204,7 +204,7 @@ class ParameterWriter:
 
     def _edit(self, spec: Any, source: PlantModel, theta: Array) -> None:
         """Write into an MjSpec, in place, what needs a compile."""
-        p = self._parameters
+        p = self.parameters
         for j in np.flatnonzero(p.needs_compile):
             parameter = p.parameters[j]
             if parameter.function is not None:
@@ -252,17 +252,17 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None, round
 
     if values is not None:
         moments = np.linalg.eigvalsh(INERTIA_PARAMETRISATIONS[kind].inertia(values).inertia)
-    excess = float(moments[2] - moments[0] - moments[1])
-    if moments[0] >= least and (not moments[2] or excess / moments[2] <= rounding):
+    excess = moments[2] - moments[0] - moments[1]
+    if not moments[0] >= least:
+        wanted = "all must be > 0"
+    elif not moments[2] or excess / moments[2] <= rounding:
         return ""
-
-    listed = ", ".join(f"{moment:.4g}" for moment in moments)
-    wanted = "all must be > 0"
-    if moments[0] >= least:
+    else:
         wanted = (
             "the sum of the smaller two must be at least the largest (its pseudo-inertia is not "
             "positive semidefinite)"
         )
+    listed = ", ".join(f"{moment:.4g}" for moment in moments)
     return f"principal moments of inertia {listed} kg m²; {wanted}"
 
 

@@ -141,18 +141,18 @@ class Parameter:
     cad_prior: float | None = None
 
 
-def moved_bodies(parameters: Sequence[Parameter]) -> set[str]:
+def moved_bodies(parameters: Sequence[Parameter]) -> frozenset[str]:
     """Names of bodies whose inertial frame a parameter may move.
 
     These bodies must not be compiled as "simple".
     """
     targets = [target for parameter in parameters for target in parameter.targets]
     paths = [ParameterPath.parse(text) for target in targets for text in target.plain_paths]
-    return {
+    return frozenset(
         path.name
         for path in paths
         if path.kind == "body" and path.field in FRAME_FIELDS and path.name
-    }
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +347,7 @@ class ParameterSet:
         return np.asarray(self._is_function | self._has_field(SpecField))
 
     @cached_property
-    def moved_bodies(self) -> set[str] | None:
+    def moved_bodies(self) -> frozenset[str] | None:
         """Bodies whose inertial frame parameters move; None where a parameter may move any."""
         return None if self.needs_compile.any() else moved_bodies(self.parameters)
 
@@ -533,14 +533,8 @@ def physical_bounds(targets: Iterable[Target]) -> tuple[float, float]:
     """
     low, high = -np.inf, np.inf
     for target in targets:
-        # Values of the parameter at which the target is at its bounds.
-        ends = [
-            (bound - target.offset) / target.scale + 0.0 if np.isfinite(bound) else bound
-            for bound in _bounds_of(target)
-        ]
-        if target.scale < 0.0:
-            infinite = [-end if np.isinf(end) else end for end in ends]
-            ends = infinite[::-1]
+        # Values of the parameter at which the target is at its bounds; 0.0 makes no -0.0 of them.
+        ends = sorted((bound - target.offset) / target.scale + 0.0 for bound in _bounds_of(target))
         low, high = max(low, ends[0]), min(high, ends[1])
     return low, high
 

@@ -6,7 +6,7 @@ The names of the fields are MuJoCo's.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -100,8 +100,8 @@ INERTIAL_FIELDS = {
     "logcholesky": ("logcholesky", 0, 10),
 }
 
-# Fields from which the compiler derives others, so that a change needs a compile.
-COMPILED_FIELDS = {"geom": ("size", "pos", "mass", "density")}
+# Fields of a geom from which the compiler derives others, so that a change needs a compile.
+COMPILED_FIELDS = ("size", "pos", "mass", "density")
 
 # Fields of an actuator that stand for the gains of a position or velocity servo.
 SERVO_FIELDS = ("kp", "kv")
@@ -183,16 +183,16 @@ class ParameterPath:
 
 def fields_of(kind: str) -> list[str]:
     """Fields that a path of this kind may name."""
-    further = {
-        "body": [*INERTIAL_FIELDS, "rot"],
-        "site": ["rot"],
-        "geom": list(COMPILED_FIELDS["geom"]),
-        "actuator": list(SERVO_FIELDS),
-        "controller": list(LAW_FIELDS),
-        "initial": list(INITIAL_STATE_FIELDS),
-        "output": list(OUTPUT_FIELDS),
+    further: dict[str, Iterable[str]] = {
+        "body": (*INERTIAL_FIELDS, "rot"),
+        "site": ("rot",),
+        "geom": COMPILED_FIELDS,
+        "actuator": SERVO_FIELDS,
+        "controller": LAW_FIELDS,
+        "initial": INITIAL_STATE_FIELDS,
+        "output": OUTPUT_FIELDS,
     }
-    return [*MODEL_ARRAYS.get(kind, {}), *further.get(kind, [])]
+    return [*MODEL_ARRAYS.get(kind, ()), *further.get(kind, ())]
 
 
 def resolve(
@@ -276,7 +276,7 @@ def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:
         joint = identifier(model, "joint", path.name)
         # One number holds for all coordinates of a ball or free joint; it gets the unit for a
         # rotation.
-        slides = int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
+        slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         return joint_field_unit(field, LENGTH if slides else ANGLE, path.component)
 
     if field in SERVO_FIELDS:
@@ -377,7 +377,7 @@ def _initial_state_field(model: Any, path: ParameterPath) -> InitialStateField:
 def _initial_activation_field(model: Any, path: ParameterPath) -> InitialStateField:
     """Deviation of an activation of the initial state."""
     actuator = identifier(model, "actuator", path.name)
-    count = int(model.actuator_actnum[actuator]) if actuator >= 0 else 0
+    count = model.actuator_actnum[actuator] if actuator >= 0 else 0
     if count == 0:
         with_state = [
             name
@@ -404,17 +404,17 @@ def _element_field(model: Any, path: ParameterPath, decoration: Collection[str])
 
     if field in INERTIAL_FIELDS:
         parametrisation, first, width = INERTIAL_FIELDS[field]
-        if not float(model.body_mass[number]) > 0.0:
+        if not model.body_mass[number] > 0.0:
             raise path.error(f"body {path.name!r} has no mass")
         return InertiaField(number, parametrisation, first + path.component_of(width))
 
     if field == "rot":
         return RotationField(f"{path.kind}_quat", number, path.component_of(3))
 
-    if field in COMPILED_FIELDS.get(path.kind, ()):
+    if path.kind == "geom" and field in COMPILED_FIELDS:
         # Place, size, mass or density of a geom need a compile unless the geom is decoration.
         index = path.component_of(3 if field in ("size", "pos") else 1)
-        if field == "size" and int(model.geom_dataid[number]) >= 0:
+        if field == "size" and model.geom_dataid[number] >= 0:
             raise path.error("the size of a mesh or height field is not a number of the geom")
         if field in ("size", "pos") and path.name in decoration:
             return ModelField(array=f"geom_{field}", rows=(number,), column=index)
@@ -432,23 +432,17 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
     kp sets gainprm[0] and biasprm[1]. kv sets biasprm[2], and gainprm[0] of a velocity servo.
     """
     rows = (actuator,)
-
+    column = {"kp": 1, "kv": 2}[path.field]
+    kind = servo_kind(model, actuator)
     # The gain of a PID actuator is its integral gain; kp and kv are entries of its bias.
-    if int(model.actuator_gaintype[actuator]) == mujoco.mjtGain.mjGAIN_PID:
-        column = {"kp": 1, "kv": 2}[path.field]
+    is_pid = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_PID
+    if is_pid or (path.field == "kv" and kind == "position"):
         return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
 
-    kind = servo_kind(model, actuator)
-    has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
-    if path.field == "kp" and kind == "position" and has_gain:
-        follower = ("actuator_biasprm", actuator, 1, -1.0)
+    has_gain = model.actuator_gainprm[actuator, 0] != 0.0
+    if has_gain and kind == {"kp": "position", "kv": "velocity"}[path.field]:
+        follower = ("actuator_biasprm", actuator, column, -1.0)
         return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
-    if path.field == "kv" and kind == "velocity":
-        follower = ("actuator_biasprm", actuator, 2, -1.0)
-        return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
-    if path.field == "kv" and kind == "position":
-        return ModelField(array="actuator_biasprm", rows=rows, column=2, factor=-1.0)
-
     wanted = "position" if path.field == "kp" else "position or velocity"
     raise path.error(f"the actuator is no {wanted} servo; use gainprm[i] and biasprm[i]")
 

@@ -83,7 +83,7 @@ class ModelField:
         position of a geom.
         """
         row = self.rows[0]
-        if self.array == "body_ipos" and float(model.body_mass[row]) > 0.0:
+        if self.array == "body_ipos" and model.body_mass[row] > 0.0:
             return body_inertia(model, row).gyration_radius
         if self.array == "geom_pos":
             return float(model.geom_rbound[row])

@@ -63,32 +63,18 @@ FIELD_UNITS = {
     "delay": "s",
 }
 
-# Units of sensors whose unit does not depend on a joint. Sensors that are absent here have no unit
-# or one that depends on the model.
+# Units of sensors, by MuJoCo's names. Sensors that are absent here have no unit or one that depends
+# on the model.
 SENSOR_UNITS = {
-    mujoco.mjtSensor.mjSENS_TENDONPOS: "m",
-    mujoco.mjtSensor.mjSENS_RANGEFINDER: "m",
-    mujoco.mjtSensor.mjSENS_FRAMEPOS: "m",
-    mujoco.mjtSensor.mjSENS_SUBTREECOM: "m",
-    mujoco.mjtSensor.mjSENS_VELOCIMETER: "m/s",
-    mujoco.mjtSensor.mjSENS_TENDONVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_FRAMELINVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_SUBTREELINVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_ACCELEROMETER: "m/s²",
-    mujoco.mjtSensor.mjSENS_FRAMELINACC: "m/s²",
-    mujoco.mjtSensor.mjSENS_GYRO: "rad/s",
-    mujoco.mjtSensor.mjSENS_FRAMEANGVEL: "rad/s",
-    mujoco.mjtSensor.mjSENS_BALLANGVEL: "rad/s",
-    mujoco.mjtSensor.mjSENS_FRAMEANGACC: "rad/s²",
-    mujoco.mjtSensor.mjSENS_FORCE: "N",
-    mujoco.mjtSensor.mjSENS_TOUCH: "N",
-    mujoco.mjtSensor.mjSENS_TORQUE: "N m",
-    mujoco.mjtSensor.mjSENS_MAGNETOMETER: "T",
+    **dict.fromkeys(("TENDONPOS", "RANGEFINDER", "FRAMEPOS", "SUBTREECOM"), "m"),
+    **dict.fromkeys(("VELOCIMETER", "TENDONVEL", "FRAMELINVEL", "SUBTREELINVEL"), "m/s"),
+    **dict.fromkeys(("ACCELEROMETER", "FRAMELINACC"), "m/s²"),
+    **dict.fromkeys(("GYRO", "FRAMEANGVEL", "BALLANGVEL"), "rad/s"),
+    "FRAMEANGACC": "rad/s²",
+    **dict.fromkeys(("FORCE", "TOUCH"), "N"),
+    "TORQUE": "N m",
+    "MAGNETOMETER": "T",
 }
-
-# Sensors that measure the coordinate of a joint, and those that measure its velocity.
-JOINT_POSITION_SENSORS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTLIMITPOS)
-JOINT_VELOCITY_SENSORS = (mujoco.mjtSensor.mjSENS_JOINTVEL, mujoco.mjtSensor.mjSENS_JOINTLIMITVEL)
 
 
 def per_second(unit: str) -> str:
@@ -120,14 +106,11 @@ def sensor_unit(model: Any, sensor: int) -> str:
     Returns:
         The unit; empty where the sensor is dimensionless or its unit depends on the model.
     """
-    kind = mujoco.mjtSensor(int(model.sensor_type[sensor]))
-
-    if kind in JOINT_POSITION_SENSORS:
-        return joint_unit(model, int(model.sensor_objid[sensor]))
-    if kind in JOINT_VELOCITY_SENSORS:
-        return per_second(joint_unit(model, int(model.sensor_objid[sensor])))
-
-    return SENSOR_UNITS.get(kind, "")
+    name = mujoco.mjtSensor(int(model.sensor_type[sensor])).name.removeprefix("mjSENS_")
+    if name not in ("JOINTPOS", "JOINTLIMITPOS", "JOINTVEL", "JOINTLIMITVEL"):
+        return SENSOR_UNITS.get(name, "")
+    unit = joint_unit(model, model.sensor_objid[sensor])
+    return per_second(unit) if name.endswith("VEL") else unit
 
 
 def force_unit(model: Any, actuator: int) -> str:
@@ -140,9 +123,9 @@ def force_unit(model: Any, actuator: int) -> str:
     Returns:
         The unit; empty where the actuator does not act on a joint.
     """
-    if int(model.actuator_trntype[actuator]) != mujoco.mjtTrn.mjTRN_JOINT:
+    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
         return ""
-    return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
+    return FORCE_UNITS[joint_unit(model, model.actuator_trnid[actuator, 0])]
 
 
 def gain_unit(model: Any, actuator: int, field: str) -> str:
@@ -165,7 +148,7 @@ def gain_unit(model: Any, actuator: int, field: str) -> str:
     return JOINT_FIELD_UNITS[FIELD_OF_GAIN[field]][joint_unit(model, joint)]
 
 
-def joint_field_unit(field: str, coordinate: str, order: int = 0) -> str:
+def joint_field_unit(field: str, coordinate: str, order: int) -> str:
     """Unit of a field of a joint.
 
     Args:
@@ -197,19 +180,25 @@ def control_unit(model: Any, actuator: int) -> str:
         The unit; empty where it is not evident from the model.
     """
     gear = actuator_gear(model, actuator)
-    at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
-    if not at_joint or gear != 1 or int(model.actuator_ctrlnum[actuator]) != 1:
+    at_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+    if not at_joint or gear != 1 or model.actuator_ctrlnum[actuator] != 1:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])
     coordinate = joint_unit(model, joint)
-    gain = float(model.actuator_gainprm[actuator, 0])
-    if int(model.actuator_biastype[actuator]) == mujoco.mjtBias.mjBIAS_NONE:
+    gain = model.actuator_gainprm[actuator, 0]
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE:
         unit = FORCE_UNITS[coordinate] if gain == 1.0 else ""
     else:
         units = {"position": coordinate, "velocity": per_second(coordinate)}
         unit = units.get(servo_kind(model, actuator) or "", "")
     return per_second(unit) if unit and is_integrated(model, actuator) else unit
+
+
+def control_units(model: Any) -> list[str]:
+    """Units of the nu controls, see `control_unit`."""
+    counts = model.actuator_ctrlnum.tolist()
+    return [unit for i, n in enumerate(counts) for unit in n * [control_unit(model, i)]]
 
 
 Servo = Literal["position", "velocity"]
@@ -235,7 +224,7 @@ def servo_kind(model: Any, actuator: int) -> Servo | None:
     if int(model.actuator_biastype[actuator]) not in AFFINE:
         return None
 
-    gain = float(model.actuator_gainprm[actuator, 0])
+    gain = model.actuator_gainprm[actuator, 0]
     bias = model.actuator_biasprm[actuator]
     if bias[1] == -gain:
         return "position"
@@ -251,7 +240,7 @@ def is_integrated(model: Any, actuator: int) -> bool:
         model: The compiled model (`mujoco.MjModel`).
         actuator: Number of the actuator.
     """
-    return int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+    return bool(model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_INTEGRATOR)
 
 
 def acts_at_joint(model: Any, actuator: int) -> bool:
@@ -274,14 +263,14 @@ def commanded_joint(model: Any, actuator: int) -> int | None:
     Returns:
         Number of the joint; None for all but position servos with one control at such a joint.
     """
-    if not acts_at_joint(model, actuator) or int(model.actuator_ctrlnum[actuator]) != 1:
+    if not acts_at_joint(model, actuator) or model.actuator_ctrlnum[actuator] != 1:
         return None
     if is_integrated(model, actuator) or servo_kind(model, actuator) != "position":
         return None
 
     joint = int(model.actuator_trnid[actuator, 0])
     is_scalar = int(model.jnt_type[joint]) in SCALAR_JOINTS
-    has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
+    has_gain = model.actuator_gainprm[actuator, 0] != 0.0
     return joint if is_scalar and has_gain and actuator_gear(model, actuator) != 0.0 else None
 
 

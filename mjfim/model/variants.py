@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -168,11 +169,14 @@ class Relaxation:
 
     def apply(self, model: Any) -> None:
         """Change a model that the caller owns, in place."""
-        model.jnt_limited[list(self.joints)] = 0
-        model.jnt_actfrclimited[list(self.joint_forces)] = 0
-        model.actuator_forcelimited[list(self.actuators)] = 0
-        model.tendon_limited[list(self.tendons)] = 0
-        model.tendon_actfrclimited[list(self.tendon_forces)] = 0
+        for is_limited, freed in (
+            (model.jnt_limited, self.joints),
+            (model.jnt_actfrclimited, self.joint_forces),
+            (model.actuator_forcelimited, self.actuators),
+            (model.tendon_limited, self.tendons),
+            (model.tendon_actfrclimited, self.tendon_forces),
+        ):
+            is_limited[list(freed)] = 0
         if self.controls:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:
@@ -185,49 +189,43 @@ class Relaxation:
                 model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
 
 
+@dataclass(frozen=True, eq=False)
 class PlantModel:
     """The compiled model that a plant steps: a copy of the user's model with other settings.
 
-    Args:
+    Attributes:
         source: The user's model.
         moved_bodies: Bodies whose inertial frame parameters change, None where any of them may.
         sensors: Whether sensor data is wanted; MuJoCo skips the computation otherwise.
         friction: Whether a parameter is a frictionloss, so that the constraint solver must stay on.
         timestep_factor: Factor by which the timestep is longer than stated.
         mocap: Initial poses of mocap bodies; None for the compiled poses.
-        relaxation: Clamps, stops and friction that are changed in the copy; None for no change.
-
-    Attributes:
-        model: The compiled copy (MjModel).
+        relaxation: Clamps, stops and friction that are changed in the copy.
     """
 
-    def __init__(
-        self,
-        source: ModelSource,
-        *,
-        moved_bodies: Collection[str] | None,
-        sensors: bool,
-        friction: bool,
-        timestep_factor: int = 1,
-        mocap: MocapPlacement | None = None,
-        relaxation: Relaxation | None = None,
-    ) -> None:
-        self._source = source
-        self._moved_bodies = None if moved_bodies is None else frozenset(moved_bodies)
-        self._sensors = sensors
-        self._friction = friction
-        self._timestep_factor = timestep_factor
-        self._mocap = mocap
-        self._relaxation = relaxation
-        self._edited: dict[bytes, Any] = {}
+    source: ModelSource
+    _: KW_ONLY
+    moved_bodies: frozenset[str] | None
+    sensors: bool
+    friction: bool
+    timestep_factor: int = 1
+    mocap: MocapPlacement | None = None
+    relaxation: Relaxation = Relaxation()
 
-        compiled = source.compiled(self._moved_bodies)
-        self.model = self._adapted(compiled)
+    @cached_property
+    def model(self) -> Any:
+        """The compiled copy (MjModel)."""
+        return self._adapted(self.source.compiled(self.moved_bodies))
+
+    @cached_property
+    def _edited(self) -> dict[bytes, Any]:
+        """The latest models of edited specs."""
+        return {}
 
     @property
     def smoothing_speeds(self) -> tuple[float, ...]:
         """Speeds below which its dry friction is viscous; empty for the friction of the engine."""
-        return () if self._relaxation is None else self._relaxation.smoothing_speeds
+        return self.relaxation.smoothing_speeds
 
     def edited(self, key: bytes, edit: Callable[[Any], None]) -> Any:
         """The model of an edited spec, kept under a key.
@@ -243,7 +241,7 @@ class PlantModel:
         if key not in self._edited:
             if len(self._edited) >= MAX_EDITED_MODELS:
                 self._edited.clear()
-            compiled = self._source.edited(self._moved_bodies, key, edit)
+            compiled = self.source.edited(self.moved_bodies, key, edit)
             self._require_layout(compiled)
             self._edited[key] = self._adapted(compiled)
         return self._edited[key]
@@ -263,7 +261,7 @@ class PlantModel:
 
     def _require_layout(self, compiled: Any) -> None:
         """Raise where an edited model has other sizes or another timestep than the user's."""
-        path, stated = self._source.path, self._source.compiled(self._moved_bodies)
+        path, stated = self.source.path, self.source.compiled(self.moved_bodies)
 
         for size in LAYOUT:
             if getattr(compiled, size) != getattr(stated, size):
@@ -283,13 +281,12 @@ class PlantModel:
         """A copy of a compiled model with the settings of this variant."""
         model = copy.copy(compiled)
 
-        if self._relaxation is not None:
-            self._relaxation.apply(model)
+        self.relaxation.apply(model)
 
         # Work that cannot matter is switched off.
-        if not self._sensors:
+        if not self.sensors:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-        if not self._friction and unconstrained(model):
+        if not self.friction and unconstrained(model):
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         if forms_one_island(model):
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
@@ -299,15 +296,15 @@ class PlantModel:
         if has_at_most_one_row(model):
             model.opt.solver = mujoco.mjtSolver.mjSOL_PGS
 
-        model.opt.timestep *= self._timestep_factor
+        model.opt.timestep *= self.timestep_factor
 
         # Differences between steps must depend neither on the initial guess of the solver nor on
         # its remaining error.
         model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
 
-        if self._mocap is not None:
-            self._mocap.put(model, self._mocap.start)
+        if self.mocap is not None:
+            self.mocap.put(model, self.mocap.start)
         return self.refresh(model)
 
 

@@ -88,10 +88,8 @@ def first_active_constraint(
         The sample and descriptions of everything that acts there, or None if nothing ever acts.
     """
     for k, data in forward_samples(model, trajectory, range(trajectory.samples)):
-        constraints = sorted(set(acting_constraints(model, data)))
-        clamps = _force_ranges(model, clamped_actuators(model, data))
-        if constraints or clamps:
-            return k, (*constraints, *clamps)
+        if acting := _descriptions(model, [data]):
+            return k, acting
     return None
 
 
@@ -108,7 +106,7 @@ def nothing_acts_along(model: Any, trajectory: Trajectory, substeps: int) -> boo
         return False
 
     # Between two samples, a contact may open and close again, and a force be clamped.
-    may_act = not unconstrained(model) or bool(model.actuator_forcelimited.any())
+    may_act = not unconstrained(model) or model.actuator_forcelimited.any()
     if may_act and substeps > 1:
         return False
     return first_active_constraint(model, trajectory) is None
@@ -127,11 +125,18 @@ def active_constraints(
     Returns:
         Descriptions, each once.
     """
+    return _descriptions(model, (data for _, data in forward_samples(model, trajectory, samples)))
+
+
+def _descriptions(model: Any, states: Iterable[Any]) -> tuple[str, ...]:
+    """Constraints that act at some of these states, each once, then force ranges that clamp."""
     constraints, clamped = set[str](), set[int]()
-    for _, data in forward_samples(model, trajectory, samples):
+    for data in states:
         constraints.update(acting_constraints(model, data))
         clamped.update(clamped_actuators(model, data))
-    return (*sorted(constraints), *_force_ranges(model, clamped))
+    names = actuator_names(model) if clamped else ()
+    ranges = [f"force range of {names[actuator]}" for actuator in sorted(clamped)]
+    return (*sorted(constraints), *ranges)
 
 
 def _is_clamped(model: Any, data: Any, actuator: int) -> bool:
@@ -139,19 +144,13 @@ def _is_clamped(model: Any, data: Any, actuator: int) -> bool:
 
     It limits the force of the actuator, or the norm of its forces where it has several.
     """
-    first = int(model.actuator_outadr[actuator])
-    count = int(model.actuator_outnum[actuator])
+    first = model.actuator_outadr[actuator]
+    count = model.actuator_outnum[actuator]
     force = data.actuator_force[first : first + count]
     low, high = model.actuator_forcerange[actuator]
     if count == 1:
         return bool(force[0] <= low or force[0] >= high)
     return bool(np.linalg.norm(force) >= high * (1.0 - CLAMP_TOLERANCE))
-
-
-def _force_ranges(model: Any, actuators: Iterable[int]) -> list[str]:
-    """Descriptions of the force ranges of actuators."""
-    names = actuator_names(model)
-    return [f"force range of {names[actuator]}" for actuator in sorted(actuators)]
 
 
 def acting_constraints(model: Any, data: Any) -> Iterator[str]:
@@ -169,9 +168,9 @@ def acting_constraints(model: Any, data: Any) -> Iterator[str]:
         int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON),
     )
     for kind, ident in zip(data.efc_type, data.efc_id, strict=True):
-        if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF):
+        if kind == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF:
             yield f"dry friction of {joints[model.dof_jntid[ident]]}"
-        elif kind == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT):
+        elif kind == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT:
             yield f"limit of {joints[ident]}"
         elif kind in tendon_kinds:
             tendon = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, ident) or ident

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -16,6 +16,11 @@ import numpy as np
 from mujoco.batch import Batch
 
 from mjfim.arrays import Array
+from mjfim.model.limited_elements import (
+    QUATERNION_PLACE,
+    quaternion_address,
+    quaternion_joints,
+)
 from mjfim.model.loading import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.running_law import InputContext, LawMemory
@@ -54,28 +59,23 @@ def state_space(model: Any) -> StateSpace:
     Returns:
         The layout.
     """
-    scalar_q, scalar_v, quaternions = [], [], []
-    for j in range(model.njnt):
-        q = int(model.jnt_qposadr[j])
-        v = int(model.jnt_dofadr[j])
-        kind = int(model.jnt_type[j])
-        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
-            scalar_q += [q, q + 1, q + 2]
-            scalar_v += [v, v + 1, v + 2]
-            quaternions.append((q + 3, v + 3))
-        elif kind == int(mujoco.mjtJoint.mjJNT_BALL):
-            quaternions.append((q, v))
-        else:
-            scalar_q.append(q)
-            scalar_v.append(v)
-
+    # The place of a quaternion in the position of a joint is that of its rotation in the velocity.
+    quaternions = tuple(
+        (
+            quaternion_address(model, joint),
+            int(model.jnt_dofadr[joint]) + QUATERNION_PLACE[model.jnt_type[joint]],
+        )
+        for joint in quaternion_joints(model)
+    )
+    in_quaternions = [q + i for q, _ in quaternions for i in range(4)]
+    rotations = [v + i for _, v in quaternions for i in range(3)]
     return StateSpace(
         nq=model.nq,
         nv=model.nv,
         na=model.na,
-        scalar_q=np.array(scalar_q, np.intp),
-        scalar_v=np.array(scalar_v, np.intp),
-        quaternions=tuple(quaternions),
+        scalar_q=np.setdiff1d(np.arange(model.nq), in_quaternions),
+        scalar_v=np.setdiff1d(np.arange(model.nv), rotations),
+        quaternions=quaternions,
     )
 
 
@@ -121,11 +121,11 @@ class SubstepObservations:
     joint_forces: np.ndarray
     derivative_substeps: tuple[int, ...]
     timestep: float
+    turns: np.ndarray
+    turn_weights: Array
+    tendon_forces: tuple[tuple[int, ...], ...]
+    tendon_lengths: np.ndarray
     force_rows: tuple[int, ...] = ()
-    turns: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.intp))
-    turn_weights: Array = field(default_factory=lambda: np.zeros((0, 4)))
-    tendon_forces: tuple[tuple[int, ...], ...] = ()
-    tendon_lengths: np.ndarray = field(default_factory=lambda: np.zeros(0, np.intp))
 
     def of_single_steps(self) -> SubstepObservations:
         """Return the same observations of samples that last one engine step.
@@ -476,7 +476,7 @@ class BatchSimulator:
         finite = (
             np.isfinite(states).all()
             and is_accepted(used).all()
-            and self._on_time(np.array(data.time), N * substeps, model)
+            and self._on_time(np.array(data.time), N * substeps)
         )
         return states, used, bool(finite)
 
@@ -540,7 +540,7 @@ class BatchSimulator:
         found = observations.values(qpos, qvel, qvel_before, lambda name: out[name][:, :end])
         observed = found.reshape(m, N, self.substeps, found.shape[-1])
         if not observations.force_rows:
-            return np.asarray(observed)
+            return observed
 
         # Further rows have the forces at the beginning of the engine steps, and at the end of the
         # samples.
@@ -571,13 +571,12 @@ class BatchSimulator:
         copied[..., self._clocks] -= START_TIME
         return copied
 
-    def _on_time(self, time: Array, engine_steps: int, model: Any = None) -> np.ndarray:
+    def _on_time(self, time: Array, engine_steps: int) -> np.ndarray:
         """True where a simulation ends at the expected time.
 
         MuJoCo resets the time of a simulation that diverges.
         """
-        stepped = self.model if model is None else model
-        timestep = float(stepped.opt.timestep)
+        timestep = float(self.model.opt.timestep)
 
         duration = engine_steps * timestep
         error = np.abs(time - START_TIME - duration)

@@ -55,6 +55,34 @@ STEPS_AT_ONCE = 500
 MODEL_STEP = 1e-5
 
 
+# Fields of MjModel that are zero where no spring and no damper has a force of higher order.
+POLYNOMIAL_FORCES = (
+    "jnt_stiffnesspoly",
+    "tendon_stiffnesspoly",
+    "dof_dampingpoly",
+    "tendon_dampingpoly",
+    "actuator_dampingpoly",
+)
+
+# Fields of MjModel that are zero where no other force makes the equation of motion another one.
+OTHER_FORCES = (
+    *POLYNOMIAL_FORCES,
+    "na",
+    "neq",
+    "nflex",
+    "nhistory",
+    "nplugin",
+    "nplastic",
+    "dof_frictionloss",
+    "tendon_frictionloss",
+    "tendon_actfrclimited",
+    "tendon_armature",
+    "body_gravcomp",
+    "actuator_armature",
+    "actuator_damping",
+)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleJacobians:
     """First derivatives of N samples.
@@ -89,71 +117,30 @@ def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree 
         joints make steps of the engine quicker.
     """
     integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-    other_forces = (
-        model.na > 0
-        or model.neq > 0
-        or model.nflex > 0
-        or model.dof_frictionloss.any()
-        or model.tendon_frictionloss.any()
-        or model.body_gravcomp.any()
-        or model.opt.density != 0.0
-        or model.opt.viscosity != 0.0
+    direct = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_TENDON)
+    biases = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+    # Moment arms have to be constant, and forces affine in (q, v, u), in all states. The check of
+    # each engine step compares forces, not their slopes: a force that stays zero, or a robot that
+    # stays at rest, shows nothing.
+    is_affine = (
+        np.isin(model.actuator_trntype, direct).all()
+        and (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
+        and np.isin(model.actuator_biastype, biases).all()
+        and model.nu == model.nactuator == model.nout
+        and (model.actuator_ctrlnum == 1).all()
+        # A tendon of joints has constant moment arms; one over sites has not.
+        and (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT).all()
+        and not _any(model, OTHER_FORCES)
+        and not _any(model.opt, ("density", "viscosity"))
     )
-    if (
-        not _has_affine_forces(model)
-        or model.nv < least_joints
-        or model.opt.integrator not in integrators
-        or other_forces
-    ):
+    if not is_affine or model.nv < least_joints or model.opt.integrator not in integrators:
         return None
-
     return JointTree.of(model)
 
 
-def _has_affine_forces(model: Any) -> bool:
-    """Whether moment arms are constant, and forces affine in (q, v, u), in all states.
-
-    The check of each engine step compares forces, not their slopes: a force that stays zero, or a
-    robot that stays at rest, shows nothing.
-    """
-    direct = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_TENDON)
-    biases = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
-    has_affine_actuators = (
-        np.isin(model.actuator_trntype, [int(each) for each in direct]).all()
-        and (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)).all()
-        and np.isin(model.actuator_biastype, [int(each) for each in biases]).all()
-        and model.nu == model.nactuator == model.nout
-        and (model.actuator_ctrlnum == 1).all()
-    )
-
-    # A tendon of joints has constant moment arms; one over sites has not.
-    has_constant_arms = (model.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)).all()
-    other_elements = (
-        model.nhistory > 0
-        or model.nplugin > 0
-        or model.nplastic > 0
-        or model.tendon_actfrclimited.any()
-        or model.tendon_armature.any()
-        or model.actuator_armature.any()
-        or model.actuator_damping.any()
-    )
-    return bool(has_affine_actuators and has_constant_arms) and not (
-        other_elements or _has_polynomial_forces(model)
-    )
-
-
-def _has_polynomial_forces(model: Any) -> bool:
-    """Whether a spring or a damper has a force of higher order."""
-    return any(
-        getattr(model, name).any()
-        for name in (
-            "jnt_stiffnesspoly",
-            "tendon_stiffnesspoly",
-            "dof_dampingpoly",
-            "tendon_dampingpoly",
-            "actuator_dampingpoly",
-        )
-    )
+def _any(holder: Any, names: Sequence[str]) -> bool:
+    """Whether a number of these fields of MjModel or of its options is not zero."""
+    return any(np.any(getattr(holder, name)) for name in names)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -185,7 +172,7 @@ class ClosedForm:
             The derivatives; None where the samples have another equation of motion.
         """
         # Parameters may give a polynomial force to a model that has none at its nominal values.
-        if _has_polynomial_forces(model):
+        if _any(model, POLYNOMIAL_FORCES):
             return None
 
         forces = AffineForces.measured(self.simulator, model, states[0], ctrl[0], self.sizes)
@@ -244,7 +231,7 @@ class ClosedForm:
 
         count = 0 if change is None else change.count
         by_theta: Array = np.zeros((N * substeps, nv, count))
-        if change is not None and count:
+        if change is not None:
             # Less the derivatives of the forces that the motion needs.
             bodies = self.tree.bodies
             axes = fields["xmat"].reshape(len(motion.speed), -1, 3, 3)
@@ -332,7 +319,7 @@ def by_state_and_control(slopes: Array, AB: Array) -> Array:
     nx = AB.shape[1]
     total = np.ascontiguousarray(slopes[..., :nx]) @ AB
     total[..., nx:] += slopes[..., nx:]
-    return np.asarray(total)
+    return total
 
 
 def advance(derivative: Array, acceleration: Array, timestep: float) -> None:

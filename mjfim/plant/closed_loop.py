@@ -6,7 +6,7 @@ MuJoCo steps them up to the next tick.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -37,133 +37,6 @@ from mjfim.plant.state_space import StateSizes
 KEPT_BATCHES = 6
 
 
-class LawLoop:
-    """Simulation of m curves from one tick to the next.
-
-    Args:
-        laws: All laws, and the inputs.
-        batch: The m simulations, with the initial states.
-        ctrl: (m, N, w) inputs.
-        groups: The laws in the loop, grouped by their periods.
-        substeps: Engine steps of a sample.
-        sensors: True if sensor data are wanted. A step after the last sample gives its data.
-
-    Attributes:
-        end: Engine steps of all samples.
-        total: Engine steps that are taken.
-        states: (m, N+1, ns) states.
-        sensor_data: (m, N+1, nsensordata) sensor data that belong to the states, or None.
-        time: (m,) time of each simulation at the end of the samples [s].
-        largest: (m,) largest magnitudes of the controls so far [u-unit].
-        controls: (m, N, nu) controls at the begin of every sample [u-unit].
-        is_clipped: (m, N, laws) True where the range or the largest change of a control has clipped
-            it.
-        memory: Memory of the laws at the end of the curves, by groups.
-    """
-
-    def __init__(
-        self,
-        *,
-        laws: ControlLaws,
-        batch: Batch,
-        ctrl: Array,
-        groups: Sequence[RunningLaws],
-        substeps: int,
-        sensors: bool,
-    ) -> None:
-        self._laws = laws
-        self._batch = batch
-        self._ctrl = ctrl
-        self._groups = groups
-        self._places = [[laws.laws.index(law) for law in group.laws] for group in groups]
-        self._substeps = substeps
-
-        count, samples = ctrl.shape[:2]
-        self.end = samples * substeps
-        self.total = self.end + int(sensors)
-
-        # Time, qpos, qvel and act are the first numbers of MuJoCo's state.
-        model = batch.model
-        self._recorded = batch.state[:, 1 : 1 + model.nq + model.nv + model.na]
-        self._applied = batch.bind("ctrl")
-        self._sensed = batch.bind("sensordata") if sensors else None
-
-        self.states = np.zeros((count, samples + 1, self._recorded.shape[1]))
-        self.sensor_data = None
-        if self._sensed is not None:
-            self.sensor_data = np.zeros((count, samples + 1, self._sensed.shape[1]))
-        self.time = np.zeros(count)
-        self.largest = np.zeros(count)
-
-        self.controls = np.zeros((count, samples, model.nu))
-        self.is_clipped = np.zeros((count, samples, len(laws.laws)), dtype=bool)
-        self.memory: tuple[LawMemory, ...] = ()
-
-    def run(self) -> None:
-        """Simulate the curves, and note what the laws do."""
-        qpos, qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        for group in self._groups:
-            self._applied[:, group.controls] = group.held
-
-        for length, sample, due in self._plan():
-            if sample is not None:
-                self._begin(sample)
-            for group in due:
-                positions, velocities = qpos[:, group.positions], qvel[:, group.velocities]
-                control = group.evaluate(positions, velocities)
-                self.largest = np.maximum(self.largest, np.abs(control).max(axis=1))
-                self._applied[:, group.controls] = control
-            if sample is not None:
-                self._note(sample)
-            if length:
-                self._batch.step(None, nstep=length)
-            if sample is not None and self.sensor_data is not None:
-                self.sensor_data[:, sample] = self._sensed
-
-    def _plan(self) -> Iterator[tuple[int, int | None, list[RunningLaws]]]:
-        """Everything that happens between engine steps.
-
-        Yields:
-            Number of steps up to the next event, the sample that begins now or None, and the laws
-            that are evaluated now.
-        """
-        begins = np.arange(0, self.end + 1, self._substeps)
-        stops = [begins, np.array([self.total])]
-        stops += [np.arange(0, self.total, g.period) for g in self._groups]
-
-        # The first step of a sample computes the sensor data that belong to its begin.
-        if self._sensed is not None:
-            stops.append(begins + 1)
-        steps = np.unique(np.concatenate(stops))
-        for step, length in zip(steps.tolist(), [*np.diff(steps).tolist(), 0], strict=True):
-            sample, inside = divmod(step, self._substeps)
-            due = [g for g in self._groups if step % g.period == 0]
-            is_over = step >= self.total
-            is_begin = inside == 0 and step <= self.end
-            yield length, sample if is_begin else None, [] if is_over else due
-
-    def _begin(self, sample: int) -> None:
-        """Record the states at the begin of a sample, and set the controls without a law."""
-        self.states[:, sample] = self._recorded
-        last = self._ctrl.shape[1] - 1
-        if sample > last:
-            self.time[:] = self._batch.bind("time")
-            self.memory = tuple(group.memory for group in self._groups)
-
-        inputs, direct = self._laws.direct
-        if len(direct):
-            self._applied[:, direct] = self._ctrl[:, min(sample, last), inputs]
-
-    def _note(self, sample: int) -> None:
-        """Note the controls of a sample, once they are known."""
-        if sample == self._ctrl.shape[1]:
-            return
-        self.controls[:, sample] = self._applied
-        for group, places in zip(self._groups, self._places, strict=True):
-            if group.has_limits:
-                self.is_clipped[:, sample, places] = group.is_clipped
-
-
 class ClosedLoopSimulator(BatchSimulator):
     """Steps many simulations under control laws, whose numbers are those of each model.
 
@@ -176,25 +49,15 @@ class ClosedLoopSimulator(BatchSimulator):
 
     is_open_loop: ClassVar[bool] = False
 
-    def __init__(
-        self,
-        model: Any,
-        laws: ControlLaws,
-        *,
-        substeps: int = 1,
-        sensors: bool = False,
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, model: Any, laws: ControlLaws, **options: Any) -> None:
         """Build the simulator.
 
         Args:
             model: Model copy that no other code changes, with the numbers of the laws.
             laws: The laws.
-            substeps: `mj_step` calls per sample.
-            sensors: True if sensor data are requested.
-            threads: Number of threads; None takes all cores.
+            **options: Options of `BatchSimulator`.
         """
-        super().__init__(model, substeps=substeps, sensors=sensors, threads=threads)
+        super().__init__(model, **options)
         self.laws = laws
 
     def lead(self, models: Sequence[Any]) -> int:
@@ -238,30 +101,80 @@ class ClosedLoopSimulator(BatchSimulator):
         batch = self._batch_of(len(ctrl))
         batch.set_models(models[0] if len(models) == 1 else list(models))
         self._load(batch, start, models)
-        loop = LawLoop(
-            laws=self.laws,
-            batch=batch,
-            ctrl=ctrl,
-            groups=[
-                self._group(i, models, start, ctrl, context) for i in range(len(self.laws.by_tick))
-            ],
-            substeps=self.substeps,
-            sensors=self.sensors,
-        )
+        groups = [
+            self._group(i, models, start, ctrl, context) for i in range(len(self.laws.by_tick))
+        ]
+        for group in groups:
+            batch.bind("ctrl")[:, group.controls] = group.held
         with silence_mujoco_log(), np.errstate(over="ignore", invalid="ignore"):
-            loop.run()
-        self._count.steps += len(ctrl) * loop.total
+            return self._run(batch, ctrl, groups)
 
-        finite = self._on_time(loop.time, loop.end)
-        finite &= np.isfinite(loop.states).all(axis=(1, 2)) & is_accepted(loop.largest)
-        sensors = None if loop.sensor_data is None else self._sensor_data(loop.sensor_data)
+    def _run(self, batch: Batch, ctrl: Array, groups: Sequence[RunningLaws]) -> Rollouts:
+        """Simulate curves from one tick to the next.
+
+        Args:
+            batch: The m simulations, with the initial states.
+            ctrl: (m, N, w) inputs.
+            groups: The laws in the loop, grouped by their periods.
+        """
+        space, substeps = self.space, self.substeps
+        count, samples = ctrl.shape[:2]
+        end = samples * substeps
+        # A step after the last sample gives its sensor data.
+        total = end + int(self.sensors)
+        # Time, qpos, qvel and act are the first numbers of MuJoCo's state.
+        recorded = batch.state[:, 1 : 1 + space.nq + space.nv + space.na]
+        qpos, qvel, applied = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        sensed = batch.bind("sensordata") if self.sensors else np.zeros((count, 0))
+        states = np.zeros((count, samples + 1, recorded.shape[1]))
+        sensor_data = np.zeros((count, samples + 1, sensed.shape[1]))
+        controls = np.zeros((count, samples, applied.shape[1]))
+        is_clipped = np.zeros((count, samples, len(self.laws.laws)), dtype=bool)
+        places = [[self.laws.laws.index(law) for law in group.laws] for group in groups]
+        inputs, direct = self.laws.direct
+        time, largest = np.zeros(count), np.zeros(count)
+        memory: tuple[LawMemory, ...] = ()
+
+        # Engine steps before which something happens. The first step of a sample computes the
+        # sensor data that belong to its begin.
+        begins = np.arange(0, end + 1, substeps)
+        ticks = [np.arange(0, total, group.period) for group in groups]
+        stops = np.unique(np.concatenate([begins, begins + int(self.sensors), *ticks]))
+        for step, length in zip(stops.tolist(), [*np.diff(stops).tolist(), 0], strict=True):
+            sample, inside = divmod(step, substeps)
+            is_begin = inside == 0 and step <= end
+            if is_begin:
+                states[:, sample] = recorded
+                # Controls without a law.
+                applied[:, direct] = ctrl[:, min(sample, samples - 1), inputs]
+            if step == end:
+                time[:] = batch.bind("time")
+                memory = tuple(group.memory for group in groups)
+            for group in groups:
+                if step < total and step % group.period == 0:
+                    control = group.evaluate(qpos[:, group.positions], qvel[:, group.velocities])
+                    largest = np.maximum(largest, np.abs(control).max(axis=1))
+                    applied[:, group.controls] = control
+            # The controls of a sample are known now.
+            if is_begin and step < end:
+                controls[:, sample] = applied
+                for group, place in zip(groups, places, strict=True):
+                    is_clipped[:, sample, place] = group.is_clipped
+            if length:
+                batch.step(None, nstep=length)
+            if is_begin:
+                sensor_data[:, sample] = sensed
+        self._count.steps += count * total
+
+        finite = self._on_time(time, end)
+        finite &= np.isfinite(states).all(axis=(1, 2)) & is_accepted(largest)
         return Rollouts(
-            states=loop.states,
-            sensors=sensors,
+            states=states,
+            sensors=self._sensor_data(sensor_data) if self.sensors else None,
             finite=finite,
-            controls=loop.controls,
-            is_clipped=loop.is_clipped,
-            memory=loop.memory,
+            controls=controls,
+            is_clipped=is_clipped,
+            memory=memory,
         )
 
     def _recorded(

@@ -54,10 +54,7 @@ FORCE_ARRAYS = (
 )
 
 # Integrators that take the damping of all forces at the end of the step.
-IMPLICIT = (
-    int(mujoco.mjtIntegrator.mjINT_IMPLICIT),
-    int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
-)
+IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 # Factor by which the inertia of the joints is larger where only activations are to move.
 HELD_INERTIA = 1e9
@@ -141,7 +138,8 @@ class AffineForces:
         deviation = np.abs(total - sum(fields[name] for name in FORCE_FIELDS))
         agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
 
-        slopes = self._slopes(acts, self._applied(ctrl)[1])
+        # Passive forces do not depend on the controls.
+        slopes = self.springs[:, 1:] + self.moments.T @ self._actuator_slopes(acts, ctrl)
         return slopes, self._damping(slopes), agree
 
     def change(self, states: Array, ctrl: Array, acceleration: Array, by: ParameterChange) -> Array:
@@ -184,11 +182,14 @@ class AffineForces:
             states: (n, 2 nv) states.
             ctrl: (n, nu) controls.
         """
-        _, acts = self._clamped(self._points(states, ctrl))
-        _, is_free = self._applied(ctrl)
+        return self._actuator_slopes(self._clamped(self._points(states, ctrl))[1], ctrl)
+
+    def _actuator_slopes(self, acts: np.ndarray, ctrl: Array) -> Array:
+        """The same where the forces of actuators act: (n, actuators), and are not clamped."""
+        is_free = self._applied(ctrl)[1]
         slopes = acts[..., None] * self.actuators[:, 1:]
         slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
-        return np.asarray(slopes)
+        return slopes
 
     def clamped(self, states: Array, ctrl: Array) -> np.ndarray:
         """(n, actuators) True where the force of an actuator is clamped.
@@ -210,26 +211,9 @@ class AffineForces:
         Args:
             points: (n, 1 + 2 nv + nu) ones, states and controls.
         """
+        model = self.model
         force = points @ self.actuators.T
-        if not self.model.actuator_forcelimited.any():
-            return force, np.ones(force.shape, dtype=bool)
-
-        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
-        low = np.where(limited, limits[:, 0], -np.inf)
-        high = np.where(limited, limits[:, 1], np.inf)
-        clamped = np.clip(force, low, high)
-        return clamped, clamped == force
-
-    def _slopes(self, acts: np.ndarray, is_free: np.ndarray) -> Array:
-        """(n, nv, 2 nv + nu) derivatives.
-
-        Args:
-            acts: (n, actuators) True where the force of an actuator is not clamped.
-            is_free: (n, nu) True where a control is not clamped.
-        """
-        slopes = self.springs[:, 1:] + (self.moments.T * acts[:, None]) @ self.actuators[:, 1:]
-        slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
-        return np.asarray(slopes)
+        return _within(force, model.actuator_forcelimited, model.actuator_forcerange)
 
     def _damping(self, slopes: Array) -> Array:
         """(n, nv, nv) damping that the integrator takes at the end of an engine step."""
@@ -257,10 +241,17 @@ class AffineForces:
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
             return ctrl, np.ones(ctrl.shape, dtype=bool)
 
-        low = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 0], -np.inf)
-        high = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], np.inf)
-        applied = np.clip(ctrl, low, high)
-        return applied, applied == ctrl
+        return _within(ctrl, model.actuator_ctrllimited, model.actuator_ctrlrange)
+
+
+def _within(values: Array, limited: Array, ranges: Array) -> tuple[Array, np.ndarray]:
+    """(n, k) values clipped to those of k ranges: (k, 2) that limit them, and True where inside."""
+    if not limited.any():
+        return values, np.ones(values.shape, dtype=bool)
+    low = np.where(limited, ranges[:, 0], -np.inf)
+    high = np.where(limited, ranges[:, 1], np.inf)
+    clipped = np.clip(values, low, high)
+    return clipped, clipped == values
 
 
 def _affine(forces: Array, about: Array, moves: Array) -> Array:
@@ -499,13 +490,13 @@ class EquationOfMotion:
         # The speeds of a tendon below which its friction is viscous are those of its joints.
         values = self._fields(model, points, ["ten_J"])["ten_J"]
         for tendon in np.flatnonzero(model.tendon_frictionloss).tolist():
-            first, count = int(model.ten_J_rowadr[tendon]), int(model.ten_J_rownnz[tendon])
+            first, count = model.ten_J_rowadr[tendon], model.ten_J_rownnz[tendon]
             arms = values.reshape(len(speed), -1)[:, first : first + count]
             dofs = np.reshape(model.ten_J_colind, -1)[first : first + count]
             slow = np.abs(arms) @ self.friction_speeds[dofs]
             rate = np.sum(arms * speed[:, dofs], axis=1)
             along = np.clip(rate / np.maximum(slow, np.finfo(float).tiny), -1.0, 1.0)
-            force = float(model.tendon_frictionloss[tendon]) * along
+            force = model.tendon_frictionloss[tendon] * along
             friction[:, dofs] -= arms * force[:, None]
         return np.asarray(friction)
 

@@ -46,7 +46,6 @@ class MovedSamples:
     or a single zero move.
 
     Attributes:
-        trajectory_states: (n, ns) states that are not moved.
         states: (m*n, ns) moved states.
         ctrl: (m*n, nu) moved controls.
         batch_shape: (m, n).
@@ -54,7 +53,6 @@ class MovedSamples:
             u-unit].
     """
 
-    trajectory_states: Array
     states: Array
     ctrl: Array
     batch_shape: tuple[int, int]
@@ -292,15 +290,12 @@ class FirstDerivatives:
         memory.changes[key] = ParameterChange.joined(changes)
         return memory.changes[key]
 
-    def linearize(
-        self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
-    ) -> Linearization:
+    def linearize(self, theta: Array, trajectory: Trajectory) -> Linearization:
         """First derivatives A, B, C, D, E and H along a trajectory, by two-sided differences.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: The trajectory.
-            step: Difference step relative to `difference_sizes` and `parameter_scale`.
 
         Returns:
             The first derivatives.
@@ -310,9 +305,11 @@ class FirstDerivatives:
         """
         outputs = self.plant.outputs
         states, ctrl = all_samples(trajectory)
-        A, B, C, D = self.jacobians(theta, trajectory, step)
+        A, B, C, D = self.jacobians(theta, trajectory)
 
-        by_theta, sensors_by_theta = self._one_step_by_theta(theta, states, ctrl, step)
+        by_theta, sensors_by_theta = self._one_step_by_theta(
+            theta, states, ctrl, FIRST_DERIVATIVE_STEP
+        )
         E = np.moveaxis(_require_finite(by_theta[:, :-1]), 0, 2)
         no_move = np.zeros((len(theta), len(states), self.plant.space.nx))
         H = np.moveaxis(outputs.tangent(states, no_move, sensors_by_theta), 0, 2)
@@ -324,15 +321,12 @@ class FirstDerivatives:
         H = calibration.by_theta(outputs(states, sensors), H, theta)
         return Linearization(A=A, B=B, E=E, C=C, D=D, H=H)
 
-    def jacobians(
-        self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
-    ) -> tuple[Array, Array, Array, Array]:
+    def jacobians(self, theta: Array, trajectory: Trajectory) -> tuple[Array, Array, Array, Array]:
         """Derivatives of F and h by state and control along a trajectory, by two-sided differences.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: The trajectory.
-            step: Difference step relative to `difference_sizes`.
 
         Returns:
             A: (N, nx, nx), B: (N, nx, nu), C: (N+1, ny, nx) and D: (N+1, ny, nu), see
@@ -343,7 +337,9 @@ class FirstDerivatives:
         """
         plant, nx = self.plant, self.plant.space.nx
         moved = self._move_samples(
-            *all_samples(trajectory), step * self.difference_sizes(trajectory), True
+            *all_samples(trajectory),
+            FIRST_DERIVATIVE_STEP * self.difference_sizes(trajectory),
+            True,
         )
         models = [plant.model(theta)]
         by_z, sensors_by_z = self._central_quotients(models, moved.states, moved.ctrl, moved.widths)
@@ -358,7 +354,6 @@ class FirstDerivatives:
         theta: Array,
         trajectory: Trajectory,
         observations: SubstepObservations,
-        step: float = FIRST_DERIVATIVE_STEP,
     ) -> tuple[Array, Array, Array]:
         """Derivatives of F and of observations by state and control.
 
@@ -368,7 +363,6 @@ class FirstDerivatives:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: The trajectory.
             observations: The w observed quantities.
-            step: Difference step relative to `difference_sizes`.
 
         Returns:
             A: (N, nx, nx), B: (N, nx, nu), and (N, S, w, nx+nu) derivative of the
@@ -385,8 +379,8 @@ class FirstDerivatives:
                 return origin.A, origin.B, observed
 
         plant, nx = self.plant, self.plant.space.nx
-        sizes = self.difference_sizes(trajectory)
-        moved = self._move_samples(trajectory.state[:-1], trajectory.ctrl, step * sizes, False)
+        steps = FIRST_DERIVATIVE_STEP * self.difference_sizes(trajectory)
+        moved = self._move_samples(trajectory.state[:-1], trajectory.ctrl, steps, False)
         model = plant.model(theta)
         after, _, seen = plant.simulator.step([model], moved.states, moved.ctrl, observations)
         assert seen is not None
@@ -473,13 +467,35 @@ class FirstDerivatives:
             or None without sensors.
         """
         after, sensors, _ = self.plant.simulator.step(models, states, ctrl)
-        pair = after.reshape(2, len(widths), -1, states.shape[1])
-        dx = self.plant.space.minus(pair[0], pair[1]) / widths
-        if sensors is None:
-            return dx, None
+        moves = 2 * len(widths)
+        if sensors is not None:
+            sensors = sensors.reshape(moves, -1, sensors.shape[1])
+        return self._quotients(after.reshape(moves, -1, after.shape[1]), sensors, widths)
 
-        forward, backward = sensors.reshape(2, len(widths), -1, sensors.shape[1])
-        return dx, (forward - backward) / widths
+    def _quotients(
+        self,
+        states: Array,
+        sensors: Array | None,
+        widths: Array,
+        origin: tuple[Array, Any] | None = None,
+    ) -> tuple[Array, Array | None]:
+        """Difference quotients of states and of sensor data.
+
+        Args:
+            states: (q, ..., ns) states of forward moves, or (2 q, ..., ns) with backward ones.
+            sensors: Their sensor data, or None.
+            widths: q distances of the moves that are compared.
+            origin: States and sensor data without a move; None where there are backward moves.
+
+        Returns:
+            (q, ..., nx) quotients of the states, and (q, ..., nsensordata) of the sensors, or None
+            without sensors.
+        """
+        q = len(widths)
+        width = widths.reshape(-1, *[1] * (states.ndim - 1))
+        other: tuple[Array, Any] = origin or (states[q:], None if sensors is None else sensors[q:])
+        dx = self.plant.space.minus(states[:q], other[0]) / width
+        return dx, None if sensors is None else (sensors[:q] - other[1]) / width
 
     def _move_samples(
         self, states: Array, ctrl: Array, steps: Array, central: bool
@@ -498,7 +514,6 @@ class FirstDerivatives:
         moved_states = plant.space.plus(states[None], moves[:, None, :nx])
         moved_ctrl = ctrl[None] + moves[:, None, nx:]
         return MovedSamples(
-            trajectory_states=states,
             states=moved_states.reshape(-1, states.shape[1]),
             ctrl=moved_ctrl.reshape(len(moves) * len(states), plant.nu),
             batch_shape=(len(moves), len(states)),

@@ -182,7 +182,7 @@ class MixedDerivatives(FirstDerivatives):
         sensors = [_mean_change(moved, each) for _, each, _ in near if each is not None]
         return self._bilinear_from(
             theta,
-            moved.trajectory_states,
+            trajectory.state,
             psi,
             directions,
             first=np.mean([each / moved.widths for each in by_z], axis=0),

@@ -195,11 +195,11 @@ def outputs_by_state(model: Any, outputs: Outputs) -> dict[int, int]:
     # Address in sensordata -> address in the state vector.
     sensors = {}
     for s in range(model.nsensor):
-        joint = int(model.sensor_objid[s])
-        kind = int(model.sensor_type[s])
-        if kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
+        joint = model.sensor_objid[s]
+        kind = model.sensor_type[s]
+        if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
             sensors[int(model.sensor_adr[s])] = int(model.jnt_qposadr[joint])
-        elif kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL):
+        elif kind == mujoco.mjtSensor.mjSENS_JOINTVEL:
             sensors[int(model.sensor_adr[s])] = model.nq + int(model.jnt_dofadr[joint])
 
     # A component that is measured directly takes precedence over a sensor of it.
@@ -434,38 +434,13 @@ class OutputDelay:
     value is held, after the last sample the last one.
 
     Attributes:
-        nodes: (M, n) ascending indices of the samples that each value is made of; M = N+1 if values
-            are wanted at the samples themselves.
-        node_weights: (M, n) interpolation weights of these samples.
-        node_slopes: (M, n) derivative of the weights by d [1/s].
-        samples: Number of samples N+1.
+        weights: (M, N+1) sparse interpolation weights; M = N+1 if values are wanted at the samples
+            themselves.
+        weight_slopes: (M, N+1) sparse derivative of the weights by d [1/s].
     """
 
-    nodes: np.ndarray
-    node_weights: Array
-    node_slopes: Array
-    samples: int
-
-    @cached_property
-    def weights(self) -> Any:
-        """(M, N+1) sparse interpolation weights."""
-        return self._sparse(self.node_weights)
-
-    @cached_property
-    def weight_slopes(self) -> Any:
-        """(M, N+1) sparse derivative of the weights by d [1/s]."""
-        return self._sparse(self.node_slopes)
-
-    def _sparse(self, of_nodes: Array) -> Any:
-        """(M, N+1) sparse operator with these numbers at the nodes: (M, n).
-
-        All rows have the same number of nodes, so that the operator needs no sorting.
-        """
-        rows, count = of_nodes.shape
-        row_starts = np.arange(rows + 1) * count
-        return scipy.sparse.csr_array(
-            (of_nodes.ravel(), self.nodes.ravel(), row_starts), shape=(rows, self.samples)
-        )
+    weights: Any
+    weight_slopes: Any
 
     @staticmethod
     def on_grid(samples: int, delay: float, dt: float) -> OutputDelay:
@@ -508,7 +483,15 @@ class OutputDelay:
         inside = (wanted >= 0.0) & (wanted <= samples - 1.0)
         slope *= np.where(inside, -1.0 / dt, 0.0)[:, None]
 
-        return OutputDelay(nodes=nodes, node_weights=value, node_slopes=slope, samples=samples)
+        # All rows have the same number of nodes, so that the operators need no sorting.
+        row_starts = np.arange(len(place) + 1) * count
+        weights, slopes = (
+            scipy.sparse.csr_array(
+                (of_nodes.ravel(), nodes.ravel(), row_starts), shape=(len(place), samples)
+            )
+            for of_nodes in (value, slope)
+        )
+        return OutputDelay(weights=weights, weight_slopes=slopes)
 
     def apply(self, values: Array) -> Array:
         """Delayed values.

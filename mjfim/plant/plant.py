@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import scipy
@@ -176,7 +176,7 @@ class Derivatives(MixedDerivatives):
         moves = np.concatenate([found.psi, found.G], axis=1) * self.plant.parameters.magnitude
         effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
         factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effect, TINY), 1.0, MAX_STEP_FACTOR)
-        return np.asarray(factors if wanted is None else np.where(wanted, factors, 1.0))
+        return factors if wanted is None else np.where(wanted, factors, 1.0)
 
     def _rollout_differences(
         self,
@@ -240,13 +240,13 @@ class Derivatives(MixedDerivatives):
         G = np.zeros((len(widths), len(origin), len(plant.outputs)))
         if out is not None:
             first = len(begin)
-            psi[rolled], G[rolled] = self._quotients(
+            psi[rolled], by_sensors = self._quotients(
                 out.states[first:],
                 None if out.sensors is None else out.sensors[first:],
-                (origin, sensors),
                 widths[rolled] * (2.0 if central else 1.0),
-                central,
+                None if central else (origin, sensors),
             )
+            G[rolled] = plant.outputs.tangent(origin, psi[rolled], by_sensors)
         if known is not None:
             psi[~rolled] = known[1]
             G[~rolled] = plant.outputs.tangent(origin, known[1], None)
@@ -308,34 +308,6 @@ class Derivatives(MixedDerivatives):
         is_moved[lumped.lumped] = False
         directions = np.concatenate([np.eye(len(h))[is_moved], lumped.probe[None]])
         return is_moved, directions, np.append(h[is_moved], 1.0 / np.abs(lumped.probe / h).max())
-
-    def _quotients(
-        self,
-        states: Array,
-        sensors: Array | None,
-        origin: tuple[Array, Any],
-        widths: Array,
-        central: bool,
-    ) -> tuple[Array, Array]:
-        """Difference quotients of states and outputs.
-
-        Args:
-            states: (q, ..., ns) states of forward moves, or (2 q, ..., ns) with backward ones.
-            sensors: Their sensor data, or None.
-            origin: States and sensor data without a move.
-            widths: (q,) distances of the moves that are compared.
-            central: True where there are backward moves.
-
-        Returns:
-            (q, ..., nx) quotients of the states, and (q, ..., ny) of the outputs.
-        """
-        q = len(widths)
-        width = widths.reshape(-1, *[1] * (states.ndim - 1))
-        dx = self.plant.space.minus(states[:q], states[q:] if central else origin[0]) / width
-        ds = None
-        if sensors is not None:
-            ds = (sensors[:q] - (sensors[q:] if central else origin[1])) / width
-        return dx, self.plant.outputs.tangent(origin[0], dx, ds)
 
     def responses(
         self,
@@ -440,8 +412,8 @@ class Derivatives(MixedDerivatives):
                 continue
 
             moved = None if sensors is None else sensors[1:]
-            _, by_move = self._quotients(states[1:], moved, still, widths, central)
-            G = np.moveaxis(by_move, 0, 3)
+            moves = self._quotients(states[1:], moved, widths, None if central else still)
+            G = np.moveaxis(plant.outputs.tangent(states[0], *moves), 0, 3)
             common = np.zeros((*y.shape, len(theta)))
             common[..., moving] = G[..., : len(moving)]
             yield Response(

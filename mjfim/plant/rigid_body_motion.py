@@ -16,12 +16,16 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS
 
 # Fields of MjData from which a motion is made.
 MOTION_FIELDS = ("xanchor", "xaxis", "xipos", "ximat")
+
+# (3, 9) matrices of the cross products with the three unit vectors.
+CROSS_PRODUCTS = np.cross(np.eye(3), np.eye(3)[:, None]).reshape(3, 9)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -269,17 +273,9 @@ def barycentric_inertias(model: Any, bodies: np.ndarray) -> Array:
         bodies: (b,) ids of the bodies.
     """
     mass, centre = model.body_mass[bodies], model.body_ipos[bodies]
-    w, x, y, z = model.body_iquat[bodies].T
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    spatial = _spatial_inertia(
-        mass, centre[None], np.moveaxis(R, 2, 0)[None], model.body_inertia[bodies]
-    )[0]
+    turns = scipy.spatial.transform.Rotation
+    axes = turns.from_quat(model.body_iquat[bodies], scalar_first=True).as_matrix()
+    spatial = _spatial_inertia(mass, centre[None], axes[None], model.body_inertia[bodies])[0]
     entries = spatial[:, INERTIA_ROWS, INERTIA_COLUMNS]
     return np.concatenate([mass[:, None], mass[:, None] * centre, entries], axis=1)
 
@@ -348,14 +344,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 def _cross_matrix(a: Array) -> Array:
     """(..., 3, 3) matrix of the cross product with a: (..., 3)."""
-    matrix = np.zeros((*a.shape, 3))
-    matrix[..., 2, 1] = a[..., 0]
-    matrix[..., 1, 2] = -a[..., 0]
-    matrix[..., 0, 2] = a[..., 1]
-    matrix[..., 2, 0] = -a[..., 1]
-    matrix[..., 1, 0] = a[..., 2]
-    matrix[..., 0, 1] = -a[..., 2]
-    return matrix
+    return (a @ CROSS_PRODUCTS).reshape(*a.shape, 3)
 
 
 def _product(matrix: Array, vector: Array) -> Array:
@@ -373,11 +362,8 @@ def _moved_motion(v: Array, motion: Array) -> Array:
 
 def _moved_force(v: Array, force: Array) -> Array:
     """Change per time of a force (..., 6) that is fixed to a body with the motion v: (..., 6)."""
-    moment, linear = force[..., :3], force[..., 3:]
-    return np.concatenate(
-        [_cross(v[..., :3], moment) + _cross(v[..., 3:], linear), _cross(v[..., :3], linear)],
-        axis=-1,
-    )
+    # The rule is that of motions, with the moment and the force exchanged.
+    return np.roll(_moved_motion(v, np.roll(force, 3, axis=-1)), 3, axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -413,9 +399,9 @@ class JointTree:
         Returns:
             The tree; None where a joint is neither a hinge nor a slide.
         """
-        kinds = np.asarray(model.jnt_type)
-        is_hinge = kinds == int(mujoco.mjtJoint.mjJNT_HINGE)
-        if not (is_hinge | (kinds == int(mujoco.mjtJoint.mjJNT_SLIDE))).all():
+        kinds = model.jnt_type
+        is_hinge = kinds == mujoco.mjtJoint.mjJNT_HINGE
+        if not (is_hinge | (kinds == mujoco.mjtJoint.mjJNT_SLIDE)).all():
             return None
 
         # Parents have lower numbers than their children.

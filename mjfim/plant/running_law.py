@@ -82,7 +82,7 @@ class LawNumbers:
             laws: The c laws.
             count: Number m of simulations.
         """
-        places = np.array([[law.first + i for law in laws] for i in range(len(NUMBERS))])
+        places = np.add.outer(np.arange(len(NUMBERS)), [law.first for law in laws])
         rows: list[Array] = []
         for i, model in enumerate(models):
             known = i > 0 and model is models[i - 1]
@@ -201,13 +201,13 @@ class LawCommands:
         kept_back = ticks.seconds * (1.0 - shares) / shares
         latest = reference[max(ticks.before - 1, 0)]
 
-        enabled = columns.at_once("enable", 1.0)
+        enabled = columns.at_once("enable")
         return cls(
             before=ticks.before,
             reference=reference,
             reference_velocity=velocity,
             feedforward=columns.late("feedforward", latency),
-            gain=columns.at_once("gain", 1.0),
+            gain=columns.at_once("gain"),
             enabled=None if enabled is None else np.where(enabled >= ON, 1.0, 0.0),
             lag=numbers.latency * middle[0] + kept_back * latest,
             lag_time=numbers.latency + kept_back,
@@ -251,8 +251,8 @@ class _Columns:
         W = self.window.shape[1]
         place = np.clip(places, 0.0, W - 1.0)
         sample = np.floor(place).astype(np.intp)
-        values = self._values(quantity, sample)
-        following = self._values(quantity, np.minimum(sample + 1, W - 1))
+        values = self._values(quantity, sample, 0.0)
+        following = self._values(quantity, np.minimum(sample + 1, W - 1), 0.0)
 
         # Share of the mean that lies in the following sample.
         widths = self.widths
@@ -265,36 +265,26 @@ class _Columns:
             return None
         return self.at(quantity, self.places - latency)
 
-    def at_once(self, quantity: Quantity, otherwise: float) -> Array | None:
-        """(K, m, c) quantity of the samples of the ticks, without latency.
+    def at_once(self, quantity: Quantity) -> Array | None:
+        """(K, m, c) quantity at the ticks, without latency, 1 for laws that do not read it.
 
-        Args:
-            quantity: The quantity.
-            otherwise: Value for laws that do not read it.
-
-        Returns:
-            The values; None where no law reads it.
+        None where no law reads it.
         """
         if not any(quantity in law.columns for law in self.laws):
             return None
         last = self.window.shape[1] - 1
         sample = np.clip(np.floor(self.places), 0, last).astype(np.intp)
-        values = self._values(quantity, np.broadcast_to(sample, (len(sample), *self._shape)))
-        reads = np.array([quantity in law.columns for law in self.laws])
-        return np.where(reads, values, otherwise)
+        return self._values(quantity, sample, 1.0)
 
-    @property
-    def _shape(self) -> tuple[int, int]:
-        """(m, c)."""
-        return len(self.window), len(self.laws)
+    def _values(self, quantity: Quantity, sample: np.ndarray, otherwise: float) -> Array:
+        """(K, m, c) values of a quantity in samples: (K, m, c) or (K, 1, 1).
 
-    def _values(self, quantity: Quantity, sample: np.ndarray) -> Array:
-        """(K, m, c) values of a quantity in samples (K, m, c), 0 for laws that do not read it."""
+        Laws that do not read it have the value `otherwise`.
+        """
         curves = np.arange(len(self.window))[:, None]
         columns = np.array([law.columns.get(quantity, 0) for law in self.laws])
         reads = np.array([quantity in law.columns for law in self.laws])
-        found = self.window[curves, sample, columns]
-        return np.where(reads, found, 0.0)
+        return np.where(reads, self.window[curves, sample, columns], otherwise)
 
 
 def lead_time(numbers: LawNumbers, period: float) -> float:
@@ -436,7 +426,6 @@ class RunningLaws:
     Attributes:
         held: (m, c) controls that the laws hold now [u-unit].
         is_clipped: (m, c) True where the range or the largest change has clipped them.
-        has_limits: True where something may clip them.
         laws: The c laws.
         period: Engine steps from one evaluation to the next.
         controls: (c,) addresses of their controls in ctrl.
@@ -495,7 +484,7 @@ class RunningLaws:
         # Parts of the law without an effect are left out of the loop.
         self._integrates = bool(numbers.ki.any() or memory.integral.any())
         limits = (numbers.saturation_low, numbers.saturation_high, numbers.slew)
-        self.has_limits = any(bool(np.isfinite(limit).any()) for limit in limits)
+        self._has_limits = any(bool(np.isfinite(limit).any()) for limit in limits)
         self._is_slow = bool(np.isfinite(numbers.slew).any())
         self._filters = bool((self._velocity_share < 1.0).any())
         self._is_late = bool(numbers.feedback_latency.any())
@@ -547,7 +536,7 @@ class RunningLaws:
             limit = numbers.integral_limit
             self._integral = _clipped(self._integral + step, -limit, limit)
             control += self._integral
-        if self.has_limits:
+        if self._has_limits:
             limited = _clipped(control, numbers.saturation_low, numbers.saturation_high)
             if self._is_slow and self._has_held:
                 change = self._largest_change
@@ -644,47 +633,30 @@ def memory_at_begin(
     latency, period = numbers.feedback_latency, ticks.seconds
     size = int(np.floor(latency.max(initial=0.0) / period)) + 2
     times = -period * np.arange(1, size + 1)
-
+    integral = numbers.integral
+    if sums is not None:
+        # The log holds neither the late reference nor the late measurement, whose effects on the
+        # sum are known: latency and filter keep back an integral of the reference, and a late
+        # measurement one of the position. They are accurate to the second order of the latency,
+        # where the reference was at rest at the begin of the sum; a step of it between two ticks
+        # counts with an error of up to half a period.
+        errors, reference, position, share = np.moveaxis(sums, -1, 0)
+        kept_back = commands.lag - commands.lag_time * reference
+        measured_late = latency * (q - 0.5 * (latency + period) * v - position)
+        late = numbers.ki * (measured_late - kept_back)
+        if commands.gain is not None:
+            late = late * commands.gain[commands.before]
+        total = share * integral + numbers.ki * errors + late
+        limited = _clipped(total, -numbers.integral_limit, numbers.integral_limit)
+        integral = np.where(np.isnan(share), integral, limited)
     return LawMemory(
         held=np.zeros_like(q),
-        integral=_integral_at_begin(numbers, commands, state, sums, period),
+        integral=integral,
         velocity=v,
         measured=q - v * (period + latency),
         positions=q + v * times[:, None, None],
         velocities=np.repeat(v[None], size, axis=0),
     )
-
-
-def _integral_at_begin(
-    numbers: LawNumbers,
-    commands: LawCommands,
-    state: tuple[Array, Array],
-    sums: Array | None,
-    period: float,
-) -> Array:
-    """(m, c) integrals before the first tick, from the errors that were measured before it.
-
-    The log holds neither the late reference nor the late measurement, whose effects on the sum are
-    known: latency and filter keep back an integral of the reference, and a late measurement one of
-    the position. They are accurate to the second order of the latency, where the reference was at
-    rest at the begin of the sum; a step of it between two ticks counts with an error of up to half
-    a period.
-    """
-    if sums is None:
-        return numbers.integral
-
-    q, v = state
-    errors, reference, position, share = np.moveaxis(sums, -1, 0)
-    latency = numbers.feedback_latency
-    kept_back = commands.lag - commands.lag_time * reference
-    measured_late = latency * (q - 0.5 * (latency + period) * v - position)
-
-    late = numbers.ki * (measured_late - kept_back)
-    if commands.gain is not None:
-        late = late * commands.gain[commands.before]
-    integral = share * numbers.integral + numbers.ki * errors + late
-    limited = _clipped(integral, -numbers.integral_limit, numbers.integral_limit)
-    return np.where(np.isnan(share), numbers.integral, limited)
 
 
 def _clipped(values: Array, low: Array, high: Array) -> Array:

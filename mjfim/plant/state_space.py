@@ -237,11 +237,9 @@ class StateSizes:
         for address, size in bristle_sizes(model, dt / LEAST_MOVE_PER_SAMPLE).items():
             activation[address] = size
         for actuator in range(model.nactuator):
-            first, count = (
-                int(model.actuator_actadr[actuator]),
-                int(model.actuator_actnum[actuator]),
-            )
-            if first >= 0 and int(model.actuator_ctrlnum[actuator]):
+            first = model.actuator_actadr[actuator]
+            count = model.actuator_actnum[actuator]
+            if first >= 0 and model.actuator_ctrlnum[actuator]:
                 activation[first : first + count] = control[model.actuator_ctrladr[actuator]]
 
         position = position_sizes(model)

@@ -479,7 +479,7 @@ def test_geoms_that_change_the_dynamics_are_compiled_anew(
     assert resolved.needs_compile.tolist() == resolved.changes_model.tolist() == [True]
     source = PlantModel(
         ModelSource(Path("model.xml"), spec),
-        moved_bodies=[b.name for b in spec.bodies[1:]],
+        moved_bodies=frozenset(b.name for b in spec.bodies[1:]),
         sensors=True,
         friction=True,
     )
@@ -625,7 +625,10 @@ def test_a_mesh_moves_from_its_compiled_place() -> None:
     parameters = [one("geom/h:pos[2]")]
     spec, base = compiled(MESHED, parameters)
     source = PlantModel(
-        ModelSource(Path("model.xml"), spec), moved_bodies=["a", "b"], sensors=True, friction=True
+        ModelSource(Path("model.xml"), spec),
+        moved_bodies=frozenset("ab"),
+        sensors=True,
+        friction=True,
     )
     resolved = parameter_set(parameters, base, decoration=decoration(spec, base))
     now = resolved.parameters[0].targets[0].field.read(base)

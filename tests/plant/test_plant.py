@@ -447,7 +447,7 @@ def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_b
     plain, lean = (
         compile_spec(spec, path),
         PlantModel(
-            ModelSource(path, spec), moved_bodies=["bob"], sensors=False, friction=False
+            ModelSource(path, spec), moved_bodies=frozenset(["bob"]), sensors=False, friction=False
         ).model,
     )
     assert (bits(plain), bits(lean)) == ((False, False), (True, True))
@@ -496,7 +496,9 @@ def test_the_solver_stays_on_where_a_constraint_can_act(case: str, tmp_path) -> 
     spec, path = written(tmp_path, FREE_OF_CONSTRAINTS.replace(old, new))
     assert not unconstrained(compile_spec(spec, path))
     assert bits(
-        PlantModel(ModelSource(path, spec), moved_bodies=[], sensors=True, friction=False).model
+        PlantModel(
+            ModelSource(path, spec), moved_bodies=frozenset(), sensors=True, friction=False
+        ).model
     ) == (False, False)
 
 
@@ -534,7 +536,9 @@ def stated_and_lean(folder: Path, **parts: Any) -> tuple[Any, Any]:
     plain = compile_spec(spec, path)
     plain.opt.tolerance = 1e-14
     plain.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
-    lean = PlantModel(ModelSource(path, spec), moved_bodies=[], sensors=False, friction=True).model
+    lean = PlantModel(
+        ModelSource(path, spec), moved_bodies=frozenset(), sensors=False, friction=True
+    ).model
     return plain, lean
 
 

@@ -104,7 +104,6 @@ class ActuatorLag(Term):
 
     Attributes:
         actuator: Name of the actuator.
-        explicit: Whether the integrator is RK4, which takes the lag through its stages.
     """
 
     kind = "actuator_lag"
@@ -115,15 +114,12 @@ class ActuatorLag(Term):
     equation = "force = gain · a + bias, ȧ = (control - a)/time_constant"
     elements = "dyntype filterexact and actearly of the actuator; with RK4 dyntype filter"
     acts_on = "actuator"
-    fields = (
-        FieldDescription(name="time_constant", description="time constant of the lag", unit="s"),
-    )
+    fields = (FieldDescription("time_constant", "time constant of the lag", "s"),)
     sources = (KRAUSE_2013,)
     words = "a lag of {}"
     size = "time_constant"
 
     actuator: str
-    explicit: bool
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> ActuatorLag:
@@ -134,8 +130,7 @@ class ActuatorLag(Term):
         # With `actearly` the actuator acts within the same step, so that a vanishing lag would be
         # the actuator without it. RK4 takes the activation through its stages.
         timestep = model.opt.timestep
-        explicit = is_rk4(model)
-        least = (LEAST_LAG_RK4 if explicit else LEAST_LAG) * timestep
+        least = (LEAST_LAG_RK4 if is_rk4(model) else LEAST_LAG) * timestep
         lag = TermQuantity(
             value=SHORT_LAG * timestep,
             unit="s",
@@ -150,19 +145,16 @@ class ActuatorLag(Term):
                 f"values.time_constant: {stated.value:g} s is too short to have an effect; state "
                 f"at least {least:g} s"
             )
-        return cls(
-            name=table.name,
-            actuator=name,
-            explicit=explicit,
-            quantities=quantities,
-        )
+        return cls(name=table.name, actuator=name, quantities=quantities)
 
     def edit(self, spec: Any) -> None:
         """Give the actuator an activation."""
         actuator = spec.actuator(self.actuator)
+        # RK4 takes the lag through its stages.
+        is_explicit = spec.option.integrator == mujoco.mjtIntegrator.mjINT_RK4
         filters = (mujoco.mjtDyn.mjDYN_FILTEREXACT, mujoco.mjtDyn.mjDYN_FILTER)
-        actuator.dyntype = filters[self.explicit]
-        actuator.actearly = not self.explicit
+        actuator.dyntype = filters[is_explicit]
+        actuator.actearly = not is_explicit
 
         dynamics = np.array(actuator.dynprm)
         dynamics[0] = self.value("time_constant")
@@ -185,11 +177,7 @@ class BackEmf(Term):
     equation = "force = gain · (control - constant · actuator velocity)"
     elements = "biastype affine of the actuator, biasprm[2] = -gain · constant"
     acts_on = "actuator"
-    fields = (
-        FieldDescription(
-            name="constant", description="back-EMF constant K [control · s/rad]", unit="V s/rad"
-        ),
-    )
+    fields = (FieldDescription("constant", "back-EMF constant K [control · s/rad]", "V s/rad"),)
     sources = (KRAUSE_2013, MUJOCO_DCMOTOR)
     # The damping depends on the gain, which may be a parameter as well.
     is_written_as_a_whole = True
@@ -201,9 +189,8 @@ class BackEmf(Term):
         """Resolve the term for a direct drive."""
         name, number = named_element(table, "actuator", model, cls.kind)
         _require_plain(model, name, number, cls.kind)
-        fixed, none = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
-        is_direct = int(model.actuator_gaintype[number]) == fixed
-        if not is_direct or int(model.actuator_biastype[number]) != none:
+        has_gain = model.actuator_gaintype[number] == mujoco.mjtGain.mjGAIN_FIXED
+        if not has_gain or model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_NONE:
             raise ExperimentError(
                 f"actuator: {name!r} is no direct drive (constant gain, no bias); a servo has its "
                 "own damping, `actuator/<name>:kv`"
@@ -241,10 +228,10 @@ class BackEmf(Term):
 
 def _require_plain(model: Any, name: str, number: int, kind: str) -> None:
     """Raise ExperimentError for an actuator with dynamics, or with a gain of another type."""
-    has_dynamics = int(model.actuator_dyntype[number]) != mujoco.mjtDyn.mjDYN_NONE
-    is_plain = int(model.actuator_gaintype[number]) in [int(gain) for gain in PLAIN_GAINS]
-    has_bias = int(model.actuator_biastype[number]) in [int(bias) for bias in PLAIN_BIASES]
-    if has_dynamics or not (is_plain and has_bias) or int(model.actuator_ctrlnum[number]) != 1:
+    has_dynamics = model.actuator_dyntype[number] != mujoco.mjtDyn.mjDYN_NONE
+    is_plain = int(model.actuator_gaintype[number]) in PLAIN_GAINS
+    has_bias = int(model.actuator_biastype[number]) in PLAIN_BIASES
+    if has_dynamics or not (is_plain and has_bias) or model.actuator_ctrlnum[number] != 1:
         raise ExperimentError(
             f"actuator: {name!r} has dynamics or a gain of its own; a term of kind {kind!r} needs "
             "an actuator without dynamics, such as <motor>, <position> or <velocity>"
@@ -285,10 +272,8 @@ class JointElasticity(Term):
     )
     acts_on = "joint"
     fields: ClassVar[tuple[FieldDescription, ...]] = (
-        FieldDescription(
-            name="compliance", description="deflection per torque, 1/K", unit="rad/(N m)"
-        ),
-        FieldDescription(name="damping", description="damping of the deflection", unit="N m s/rad"),
+        FieldDescription("compliance", "deflection per torque, 1/K", "rad/(N m)"),
+        FieldDescription("damping", "damping of the deflection", "N m s/rad"),
     )
     sources = (SPONG_1987,)
     words = "elasticity of {}"
@@ -298,8 +283,8 @@ class JointElasticity(Term):
     estimated: ClassVar[tuple[str, ...]] = ("damping",)
     # MuJoCo keeps the stiffness, the inverse of the compliance.
     is_written_as_a_whole = True
-    damping_ratio: ClassVar[float] = 0.1
-    spring: ClassVar[str] = "joint/{}"
+    damping_ratio = 0.1
+    spring = "joint/{}"
 
     joint: str
     body: str
@@ -320,8 +305,8 @@ class JointElasticity(Term):
     def of(cls, table: TermTable, model: Any, period: float) -> Self:
         """Resolve the term at the last joint of a body."""
         at = JointSizes.of(table, model, period, cls.kind)
-        body = int(model.jnt_bodyid[at.number])
-        last = int(model.body_jntadr[body]) + int(model.body_jntnum[body]) - 1
+        body = model.jnt_bodyid[at.number]
+        last = model.body_jntadr[body] + model.body_jntnum[body] - 1
         if at.number != last:
             raise ExperimentError(
                 f"joint: {at.joint!r} is not the last joint of its body, so that no second joint "
@@ -432,18 +417,14 @@ class Backlash(JointElasticity):
     )
     acts_on = "joint"
     fields = (
-        FieldDescription(name="gap", description="width of the gap", unit="rad"),
-        FieldDescription(
-            name="compliance", description="deflection of the flanks per torque", unit="rad/(N m)"
-        ),
-        FieldDescription(
-            name="damping", description="damping between motor and link", unit="N m s/rad"
-        ),
+        FieldDescription("gap", "width of the gap", "rad"),
+        FieldDescription("compliance", "deflection of the flanks per torque", "rad/(N m)"),
+        FieldDescription("damping", "damping between motor and link", "N m s/rad"),
     )
     sources = (NORDIN_2002,)
     words = "backlash of {}"
     size = "gap"
-    estimated: ClassVar[tuple[str, ...]] = ()
+    estimated = ()
     damping_ratio = 0.05
     spring = "tendon/{}_gap"
 

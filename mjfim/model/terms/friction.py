@@ -68,7 +68,7 @@ STRIBECK_SHARE = 0.1
 LEAST_STRIBECK_SHARE = 1e-3
 
 # Phase of a cogging torque that does not depend on the angle, so that it is its amplitude [rad].
-CONSTANT_PHASE = float(np.pi / 2.0)
+CONSTANT_PHASE = np.pi / 2.0
 
 # Force range of a passive device, so small that MuJoCo's implicit integrators do not take the
 # damping of the bristle for damping of the joint, which would act like an inertia [N or N m]. It
@@ -240,10 +240,8 @@ class Stribeck(_PassiveDevice):
     elements = 'actuator/dcmotor with input="none" and lugre, beside the joint\'s frictionloss'
     acts_on = "joint"
     fields = (
-        FieldDescription(
-            name="excess", description="static friction minus Coulomb friction", unit="N m"
-        ),
-        FieldDescription(name="speed", description="Stribeck speed", unit="rad/s"),
+        FieldDescription("excess", "static friction minus Coulomb friction", "N m"),
+        FieldDescription("speed", "Stribeck speed", "rad/s"),
     )
     sources = (DE_WIT_1995, ARMSTRONG_1994)
     places: ClassVar[Places] = {"excess": ("biasprm[4]",), "speed": ("biasprm[5]",)}
@@ -283,13 +281,11 @@ class LuGre(_PassiveDevice):
     elements = 'actuator/dcmotor with input="none" and lugre'
     acts_on = "joint"
     fields = (
-        FieldDescription(name="coulomb", description="Coulomb friction", unit="N m"),
-        FieldDescription(
-            name="excess", description="static friction minus Coulomb friction", unit="N m"
-        ),
-        FieldDescription(name="speed", description="Stribeck speed", unit="rad/s"),
-        FieldDescription(name="stiffness", description="stiffness of the bristle", unit="N m/rad"),
-        FieldDescription(name="damping", description="damping of the bristle", unit="N m s/rad"),
+        FieldDescription("coulomb", "Coulomb friction", "N m"),
+        FieldDescription("excess", "static friction minus Coulomb friction", "N m"),
+        FieldDescription("speed", "Stribeck speed", "rad/s"),
+        FieldDescription("stiffness", "stiffness of the bristle", "N m/rad"),
+        FieldDescription("damping", "damping of the bristle", "N m s/rad"),
     )
     sources = (DE_WIT_1995, OLSSON_1998)
     is_written_as_a_whole = True
@@ -345,9 +341,9 @@ class AsymmetricFriction(_PassiveDevice):
     acts_on = "joint"
     fields = (
         FieldDescription(
-            name="offset",
-            description="half of the friction backwards minus that forwards",
-            unit="N m",
+            "offset",
+            "half of the friction backwards minus that forwards",
+            "N m",
         ),
     )
     sources = (ARMSTRONG_1994,)
@@ -393,8 +389,6 @@ class LoadDependentFriction(Term):
         radius: Radius of the ball [m].
         armature: Armature of the slide [kg].
         carrier: Mass [kg] and inertia [kg m²] of the ball.
-        contact_time: Time constant of the contacts [s].
-        enables_contacts: Whether the model disables contacts, which this term needs.
     """
 
     kind = "load_dependent_friction"
@@ -408,11 +402,7 @@ class LoadDependentFriction(Term):
         "against two buffers; contact/pair with torsional friction"
     )
     acts_on = "actuator"
-    fields = (
-        FieldDescription(
-            name="coefficient", description="friction per torque of the motor", unit=""
-        ),
-    )
+    fields = (FieldDescription("coefficient", "friction per torque of the motor", ""),)
     sources = (DUCLAUSAUD_2025, GARCIA_2002)
     words = "friction that grows with the torque of {}"
     size = "coefficient"
@@ -426,25 +416,24 @@ class LoadDependentFriction(Term):
     base: str
     axis: tuple[float, ...]
     place: tuple[float, ...]
-    buffers: tuple[tuple[float, ...], tuple[float, ...]]
+    buffers: tuple[tuple[float, ...], ...]
     radius: float
     armature: float
     carrier: tuple[float, float]
-    contact_time: float
-    enables_contacts: bool
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> LoadDependentFriction:
         """Resolve the term for a direct drive at a hinge."""
         name, number = named_element(table, "actuator", model, cls.kind)
         joint = _driven_hinge(model, name, number)
+
         for kind, suffix in (("joint", ""), ("body", ""), ("tendon", ""), ("geom", "_ball")):
             require_free_name(model, kind, f"{table.name}{suffix}")
 
-        body = int(model.jnt_bodyid[joint])
-        parent = int(model.body_parentid[body])
+        body = model.jnt_bodyid[joint]
+        parent = model.body_parentid[body]
         link, base = (element_name(model, "body", each) for each in (body, parent))
-        if not (link and base) or int(model.body_jntnum[body]) != 1:
+        if not (link and base) or model.body_jntnum[body] != 1:
             raise ExperimentError(
                 f"actuator: the body of the joint of {name!r} and its parent need names, and the "
                 "body no other joint"
@@ -473,6 +462,7 @@ class LoadDependentFriction(Term):
             bounds=(least, np.inf),
             numbers=tuple((path, radius) for path in pairs),
         )
+        _require_contacts(model)
         return cls(
             name=table.name,
             motors=tuple(motors),
@@ -481,22 +471,18 @@ class LoadDependentFriction(Term):
             base=base,
             axis=tuple(axis.tolist()),
             place=tuple(place.tolist()),
-            buffers=(
-                tuple((centre + 2.0 * radius * direction).tolist()),
-                tuple((centre - 2.0 * radius * direction).tolist()),
+            buffers=tuple(
+                tuple((centre + way * direction).tolist()) for way in (2.0 * radius, -2.0 * radius)
             ),
             radius=radius,
             armature=rounded(ARMATURE_SHARE * inertia / radius**2),
             carrier=light_body(model, body, inertia),
-            contact_time=CONTACT_TIME * model.opt.timestep,
-            enables_contacts=_enables_contacts(model),
             quantities=stated_quantities(cls.kind, table, {"coefficient": quantity}),
         )
 
     def edit(self, spec: Any) -> None:
         """Add the ball, the buffers, their contacts and the tendon."""
-        if self.enables_contacts:
-            spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         ball = add_body(spec.body(self.link), self.name, *self.carrier, np.zeros(3))
         ball.pos = self.place
         slide = add_plain_joint(ball, self.name, self.axis, np.zeros(3), slides=True)
@@ -509,7 +495,7 @@ class LoadDependentFriction(Term):
             pair.geomname1, pair.geomname2 = f"{self.name}_ball", f"{self.name}_{side}"
             pair.condim = 4
             pair.friction = [0.0, 0.0, self.radius * self.value("coefficient"), 0.0, 0.0]
-            pair.solref = [self.contact_time, 1.0]
+            pair.solref = [CONTACT_TIME * spec.option.timestep, 1.0]
             pair.solimp = IMPEDANCE
 
         tendon = spec.add_tendon(name=self.name)
@@ -529,10 +515,10 @@ class LoadDependentFriction(Term):
 
 def _driven_hinge(model: Any, name: str, actuator: int) -> int:
     """Number of the hinge that a direct drive acts on; ExperimentError for other actuators."""
-    is_at_joint = int(model.actuator_trntype[actuator]) == mujoco.mjtTrn.mjTRN_JOINT
+    is_at_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
     joint = int(model.actuator_trnid[actuator, 0])
-    is_hinge = is_at_joint and int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_HINGE
-    has_bias = int(model.actuator_biastype[actuator]) != mujoco.mjtBias.mjBIAS_NONE
+    is_hinge = is_at_joint and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    has_bias = model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE
     if not is_hinge or has_bias or not element_name(model, "joint", joint):
         raise ExperimentError(
             f"actuator: {name!r} is no direct drive at a hinge with a name; the feedback of a "
@@ -541,14 +527,12 @@ def _driven_hinge(model: Any, name: str, actuator: int) -> int:
     return joint
 
 
-def _enables_contacts(model: Any) -> bool:
-    """Whether contacts are disabled; ExperimentError where geoms would then begin to collide."""
-    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        return False
+def _require_contacts(model: Any) -> None:
+    """Raise ExperimentError where contacts are disabled and geoms would begin to collide."""
+    is_disabled = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     collide = np.any(model.geom_contype) and np.any(model.geom_conaffinity)
-    if collide or model.npair:
+    if is_disabled and (collide or model.npair):
         raise ExperimentError(
             "kind: the term needs contacts, which the MJCF disables although its geoms would "
             'collide; state contype="0" conaffinity="0" for them'
         )
-    return True

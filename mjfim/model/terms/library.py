@@ -5,7 +5,7 @@ The terms of a base that is not level and of a payload are here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError
 from mjfim.model.elements import model_length
 from mjfim.model.terms import drives, friction
 from mjfim.model.terms.term import (
@@ -71,14 +71,13 @@ class Tilt(Term):
     elements = "option/gravity"
     acts_on = ""
     fields = tuple(
-        FieldDescription(name=axis, description=f"rotation about the world's {axis}", unit="rad")
-        for axis in AXES
+        FieldDescription(axis, f"rotation about the world's {axis}", "rad") for axis in AXES
     )
     sources = (SWEVERS_2007,)
     # All components of gravity depend on all components of the rotation.
     is_written_as_a_whole = True
 
-    gravity: tuple[float, float, float]
+    gravity: tuple[float, ...]
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> Tilt:
@@ -94,8 +93,8 @@ class Tilt(Term):
             value=0.0, unit="rad", size=1.0, bounds=(-np.pi, np.pi), numbers=numbers
         )
         quantities = stated_quantities(cls.kind, table, dict.fromkeys(AXES, angle))
-        x, y, z = (float(number) for number in model.opt.gravity)
-        return cls(name=table.name, gravity=(x, y, z), quantities=quantities)
+        gravity = tuple(model.opt.gravity.tolist())
+        return cls(name=table.name, gravity=gravity, quantities=quantities)
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Turn gravity."""
@@ -130,14 +129,9 @@ class Payload(Term):
     elements = "body without joints, with an inertial"
     acts_on = "body"
     fields = (
-        FieldDescription(name="mass", description="mass of the load", unit="kg"),
-        *(
-            FieldDescription(name=axis, description=f"{axis} in the frame of the body", unit="m")
-            for axis in AXES
-        ),
-        FieldDescription(
-            name="inertia", description="rotational inertia of the load", unit="kg m²"
-        ),
+        FieldDescription("mass", "mass of the load", "kg"),
+        *(FieldDescription(axis, f"{axis} in the frame of the body", "m") for axis in AXES),
+        FieldDescription("inertia", "rotational inertia of the load", "kg m²"),
     )
     sources = (ATKESON_1986,)
     words = "a payload at {}"
@@ -152,7 +146,7 @@ class Payload(Term):
         """Resolve the term for a body that moves."""
         name, number = named_element(table, "body", model, cls.kind)
         require_free_name(model, "body", table.name)
-        if name == WORLD or int(model.body_weldid[number]) == 0:
+        if name == WORLD or model.body_weldid[number] == 0:
             raise ExperimentError(f"body: {name!r} does not move, so that a load has no effect")
 
         load, length = f"body/{table.name}", model_length(model)
@@ -186,7 +180,7 @@ class Payload(Term):
         """Places on a line through the centre of mass of a body that carries no moving one."""
         body = model.body(element).id
         is_last = not any(
-            int(model.body_weldid[model.body_parentid[other]]) == body
+            model.body_weldid[model.body_parentid[other]] == body
             for other in np.flatnonzero(model.body_jntnum)
         )
         if not model.body_jntnum[body] or not is_last:
@@ -250,27 +244,3 @@ KINDS: dict[str, type[Term]] = {
         Payload,
     )
 }
-
-
-def resolve_terms(
-    tables: Iterable[tuple[str, TermTable]], model: Any, period: float
-) -> tuple[Term, ...]:
-    """Resolve the terms of an experiment.
-
-    Args:
-        tables: Kind and table of each term.
-        model: The stated model without terms (`mujoco.MjModel`).
-        period: Sample period of the experiment [s].
-
-    Raises:
-        ExperimentError: A table does not fit the model; the message names its key.
-    """
-    terms = []
-    for kind, table in tables:
-        if kind not in KINDS:
-            raise ExperimentError(f"terms.{table.name}.kind: {unknown('kind', kind, list(KINDS))}")
-        try:
-            terms.append(KINDS[kind].of(table, model, period))
-        except ExperimentError as error:
-            raise ExperimentError(f"terms.{table.name}: {error}") from None
-    return tuple(terms)

@@ -24,7 +24,7 @@ from mjfim.model.elements import (
     names_of,
     position_sizes,
 )
-from mjfim.model.units import actuator_gear, commanded_joint, joint_unit
+from mjfim.model.units import SCALAR_JOINTS, actuator_gear, commanded_joint, joint_unit
 
 # Significant digits of numbers that the library chooses.
 CHOSEN_DIGITS = 3
@@ -45,7 +45,7 @@ NON_NEGATIVE = (0.0, np.inf)
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FieldDescription:
     """A field of a kind of term, in words.
 
@@ -282,8 +282,7 @@ class JointSizes:
     def of(table: TermTable, model: Any, period: float, kind: str) -> JointSizes:
         """Sizes at the joint that a table names; ExperimentError at ball and free joints."""
         name, number = named_element(table, "joint", model, kind)
-        scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-        if int(model.jnt_type[number]) not in scalar:
+        if int(model.jnt_type[number]) not in SCALAR_JOINTS:
             raise ExperimentError(
                 f"joint: {name!r} is a ball or free joint; a term of kind {kind!r} acts on slides "
                 "and hinges"
@@ -309,7 +308,7 @@ def rounded(number: float) -> float:
 
 def joint_inertia(model: Any, joint: int) -> float:
     """Inertia that the force of a joint feels in the reference position [kg or kg m²]."""
-    weight = float(model.dof_invweight0[model.jnt_dofadr[joint]])
+    weight = model.dof_invweight0[model.jnt_dofadr[joint]]
     return 1.0 / weight if weight > 0.0 else 1.0
 
 
@@ -319,7 +318,7 @@ def motors_at(model: Any, joint: int) -> dict[str, int]:
     Raises:
         ExperimentError: One of them has no name; the message is a clause.
     """
-    at_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    at_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     here = at_joint & (model.actuator_trnid[:, 0] == joint) & (model.actuator_ctrlnum > 0)
     found = {element_name(model, "actuator", i): i for i in np.flatnonzero(here).tolist()}
     if "" in found:
@@ -346,7 +345,7 @@ def light_body(model: Any, body: int, inertia: float) -> tuple[float, float]:
     Returns:
         Mass [kg] and inertia [kg m²].
     """
-    mass = float(model.body_mass[body]) or float(model.body_subtreemass[body])
+    mass = model.body_mass[body] or model.body_subtreemass[body]
     return rounded(NEGLIGIBLE * mass), rounded(NEGLIGIBLE * inertia)
 
 
@@ -409,18 +408,13 @@ class StateLayout:
             joints: Number in the extended model of each joint of the stated one.
             actuators: Number in the extended model of each actuator of the stated one.
         """
-        qpos, qvel = np.zeros(stated.nq, dtype=np.intp), np.zeros(stated.nv, dtype=np.intp)
-        for old, new in enumerate(joints):
-            positions = _range(stated.jnt_qposadr, old, stated.nq)
-            qpos[positions] = int(extended.jnt_qposadr[new]) + np.arange(len(positions))
-            velocities = _range(stated.jnt_dofadr, old, stated.nv)
-            qvel[velocities] = int(extended.jnt_dofadr[new]) + np.arange(len(velocities))
-
+        qpos = _moved_addresses(stated.jnt_qposadr, extended.jnt_qposadr, joints, stated.nq)
+        qvel = _moved_addresses(stated.jnt_dofadr, extended.jnt_dofadr, joints, stated.nv)
         act = np.zeros(stated.na, dtype=np.intp)
         for old, new in enumerate(actuators):
-            count = int(stated.actuator_actnum[old])
-            first = int(stated.actuator_actadr[old])
-            act[first : first + count] = int(extended.actuator_actadr[new]) + np.arange(count)
+            count = stated.actuator_actnum[old]
+            first = stated.actuator_actadr[old]
+            act[first : first + count] = extended.actuator_actadr[new] + np.arange(count)
         return cls(qpos=qpos, qvel=qvel, act=act, model=extended)
 
     @property
@@ -454,8 +448,8 @@ class StateLayout:
         activations = np.zeros(self.model.na)
         added = np.setdiff1d(np.arange(self.model.na), self.act)
         for actuator in range(self.model.nactuator):
-            first = int(self.model.actuator_actadr[actuator])
-            if first in added and int(self.model.actuator_dyntype[actuator]) in FILTERS:
+            first = self.model.actuator_actadr[actuator]
+            if first in added and self.model.actuator_dyntype[actuator] in FILTERS:
                 activations[first] = self._resting_control(actuator, qpos, ctrl)
 
         activations[self.act] = stated
@@ -533,7 +527,16 @@ def _write_key(key: Any, numbers: Sequence[Array], layout: StateLayout) -> None:
         key.act = layout.activations(stated, qpos, ctrl if len(ctrl) else None)
 
 
-def _range(addresses: Any, element: int, end: int) -> np.ndarray:
-    """Addresses that belong to an element, up to the first one of the next element or the end."""
-    following = addresses[element + 1] if element + 1 < len(addresses) else end
-    return np.arange(int(addresses[element]), int(following))
+def _moved_addresses(
+    stated: np.ndarray, extended: np.ndarray, joints: Sequence[int], size: int
+) -> np.ndarray:
+    """(size,) extended addresses of the stated numbers of joints.
+
+    Args:
+        stated: First address of each joint in the stated model.
+        extended: First address of each joint in the extended model.
+        joints: Number in the extended model of each joint of the stated one.
+        size: Number of stated addresses.
+    """
+    counts = np.diff(stated, append=size)
+    return np.asarray(np.arange(size) + np.repeat(extended[list(joints)] - stated, counts))
