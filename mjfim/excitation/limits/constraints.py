@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,7 +20,6 @@ from mjfim.excitation.limits.constraint_kinds import (
     ControlRateConstraint,
     EndStateConstraint,
     ExpansionSums,
-    LimitedQuantities,
     SubstepConstraint,
 )
 from mjfim.excitation.limits.limits import Limit, derivative_substeps_of, has_constant_forces
@@ -41,6 +41,7 @@ from mjfim.optimize.cost_models import (
 )
 from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.plant import Plant
 from mjfim.records.trajectory import Trajectory
 
 # Share of the distance of the initial and the final state from a limit that a reserve may take.
@@ -84,19 +85,15 @@ def observed_numbers(
         The observations of a single engine step without further rows, and for each of the n limits
         the places of its numbers among them.
     """
-    sources = [_source(limit) for limit in limits]
-    places: dict[int, tuple[int, ...]] = {}
+    chosen: dict[str, list[Limit]] = {source: [] for source in ORDER}
+    for limit in limits:
+        chosen["turns" if limit.is_angle else SOURCES[limit.kind]].append(limit)
+    places: dict[tuple[str, str], tuple[int, ...]] = {}
     begin = 0
-    for source in ORDER:
-        for i, limit in enumerate(limits):
-            if sources[i] == source:
-                places[i] = tuple(range(begin, begin + limit.count))
-                begin += limit.count
+    for limit in itertools.chain.from_iterable(chosen.values()):
+        places[limit.kind, limit.name] = tuple(range(begin, begin + limit.count))
+        begin += limit.count
 
-    chosen = {
-        source: [limit for limit, each in zip(limits, sources, strict=True) if each == source]
-        for source in ORDER
-    }
     turns = [np.arange(x.index, x.index + 4) for x in chosen["turns"] for _ in range(x.count)]
     weights = [_turn_weights(model, limit) for limit in chosen["turns"]]
     observations = SubstepObservations(
@@ -112,12 +109,7 @@ def observed_numbers(
         derivative_substeps=(1,),
         timestep=float(model.opt.timestep),
     )
-    return observations, tuple(places[i] for i in range(len(limits)))
-
-
-def _source(limit: Limit) -> str:
-    """The attribute of `SubstepObservations` that holds the numbers of a limit."""
-    return "turns" if limit.is_angle else SOURCES[limit.kind]
+    return observations, tuple(places[limit.kind, limit.name] for limit in limits)
 
 
 def _addresses(limits: Iterable[Limit]) -> np.ndarray:
@@ -136,17 +128,15 @@ def _turn_weights(model: Any, limit: Limit) -> Array:
 class CurvatureOfLimits(StepCurvature):
     """The barrier about a trajectory, from which its curvature along steps follows.
 
-    It can be pickled with the state of a search.
-
     Attributes:
-        members: The kinds of limited quantities.
+        members: The kinds of constraints.
         values: The quantities along the trajectory, with their derivatives.
         delta: Relaxation of the barrier, a relative margin.
         nu: Number of controls.
         mu: Weight of the barrier.
     """
 
-    members: tuple[LimitedQuantities, ...]
+    members: tuple[Constraint, ...]
     values: ConstraintValues
     delta: float
     nu: int
@@ -174,10 +164,7 @@ class CurvatureOfLimits(StepCurvature):
         Args:
             factors: Factors of the curvature, by kind; default: 1.
         """
-        jacobian = self.values.observation_jacobian
-        if jacobian is None:
-            raise ValueError("the observations have no derivatives")
-
+        jacobian = self.values.jacobian
         sums = ExpansionSums.zero(len(jacobian), jacobian.shape[-1] - self.nu, self.nu)
         for i, member in enumerate(self.members):
             each = None if factors is None else factors[i]
@@ -266,6 +253,11 @@ class ConstraintSet:
             clearance=None if self.clearance is None else self.clearance.tightened(fractions),
         )
 
+    def along(self, plant: Plant, theta: Array, ctrl: Array) -> ConstraintValues | None:
+        """The constrained quantities along a control, (N, nu); None where the motion diverges."""
+        observed = plant.observe(theta, ctrl, self.observations)
+        return None if observed is None else self.evaluate(*observed, slopes=False)
+
     def evaluate(self, trajectory: Trajectory, observed: Array, slopes: bool) -> ConstraintValues:
         """Collect the constrained quantities along a trajectory.
 
@@ -277,10 +269,9 @@ class ConstraintSet:
         Returns:
             The quantities.
         """
-        if self.clearance is None:
-            return ConstraintValues(trajectory=trajectory, observed=observed)
-
-        distances, by_state = self.clearance.distances(trajectory.qpos[1:], slopes)
+        distances, by_state = None, None
+        if self.clearance is not None:
+            distances, by_state = self.clearance.distances(trajectory.qpos[1:], slopes)
         return ConstraintValues(
             trajectory=trajectory,
             observed=observed,
@@ -324,7 +315,7 @@ class ConstraintSet:
             values: The constrained quantities along a trajectory.
             delta: Relaxation of the barrier, a relative margin.
         """
-        return float(sum(member.barrier(values, delta) for member in self.members))
+        return float(sum(member.barrier(values, delta).value for member in self.members))
 
     def expand(
         self, values: ConstraintValues, observation_jacobian: Array, delta: float
@@ -343,8 +334,7 @@ class ConstraintSet:
         nu = values.trajectory.ctrl.shape[1]
         values = replace(values, observation_jacobian=observation_jacobian)
 
-        members = tuple(member.quantities_between_bounds for member in self.members)
-        curvature = CurvatureOfLimits(members=members, values=values, delta=delta, nu=nu)
+        curvature = CurvatureOfLimits(members=self.members, values=values, delta=delta, nu=nu)
         sums = curvature.sums()
 
         step_scale = np.full(nu, np.inf)
@@ -386,9 +376,12 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         free = np.full(nu, np.inf)
         control = Bounds.from_range(-free, free)
 
-    # Controls without a range have the scale of the initial control.
+    # The scale of a control without a range is its largest initial deviation from rest, or its
+    # natural size where the initial control rests.
     is_free = ~np.isfinite(control.lower) & ~np.isfinite(control.upper)
-    control = replace(control, scale=np.where(is_free, _control_sizes(task), control.scale))
+    sizes = np.abs(task.control - task.system.rest).max(axis=0)
+    sizes = np.where(sizes > 0.0, sizes, task.plant.sizes.control)
+    control = replace(control, scale=np.where(is_free, sizes, control.scale))
 
     # The holding controls are computed even without limits on rates, because a boundary that cannot
     # be kept is an error.
@@ -406,13 +399,19 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         )
 
     substeps = _substep_constraint(task, limits)
-    end = None if boundary.end == "free" else _end_constraint(task)
+    end = None
+    if boundary.end != "free":
+        # Activations are free.
+        nv, na = task.space.nv, task.space.na
+        width = np.repeat([boundary.position, boundary.velocity, np.inf], (nv, nv, na))
+        bounds = Bounds.from_range(-width, width)
+        end = EndStateConstraint(space=task.space, bounds=bounds, target=task.target)
 
     clearance = None
     if stated.clearance is not None and includes_limits:
         length = model_length(task.system.model)
         reach = stated.clearance + max(CLEARANCE_REACH * length, stated.clearance)
-        clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
+        clearance = ClearanceConstraint.of(_distances(task, reach), stated.clearance)
 
     found = ConstraintSet(
         substeps=substeps,
@@ -514,25 +513,11 @@ def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds
     rows = [limit for limit in limits if limit.kind == kind]
     if not rows:
         return None
-
-    lower = np.full(nu, -np.inf)
-    upper = np.full(nu, np.inf)
-    sizes = np.ones(nu)
+    lower, upper, sizes = np.repeat([[-np.inf], [np.inf], [1.0]], nu, axis=1)
     for limit in rows:
-        lower[limit.index] = limit.lower
-        upper[limit.index] = limit.upper
-        sizes[limit.index] = limit.size
+        i = limit.index
+        lower[i], upper[i], sizes[i] = limit.lower, limit.upper, limit.size
     return Bounds.from_range(lower, upper, sizes)
-
-
-def _control_sizes(task: DesignTask) -> Array:
-    """Scales of controls without a range: their largest initial deviation from rest.
-
-    Returns:
-        (nu,) scales [u-unit], the natural sizes where the initial control rests.
-    """
-    size = np.abs(task.control - task.system.rest).max(axis=0)
-    return np.where(size > 0.0, size, task.plant.sizes.control)
 
 
 def _distances(task: DesignTask, reach: float) -> GeomDistances:
@@ -547,18 +532,3 @@ def _distances(task: DesignTask, reach: float) -> GeomDistances:
         return GeomDistances(task.system.model_at(task.theta), pairs, reach)
     except ExperimentError as error:
         raise ExperimentError(f"limits.{error}") from None
-
-
-def _end_constraint(task: DesignTask) -> EndStateConstraint:
-    """The tolerances of the final state that `[boundary]` states; activations are free."""
-    boundary, space = task.experiment.boundary, task.space
-    width = np.concatenate(
-        [
-            np.full(space.nv, boundary.position),
-            np.full(space.nv, boundary.velocity),
-            np.full(space.na, np.inf),
-        ]
-    )
-    return EndStateConstraint(
-        space=space, bounds=Bounds.from_range(-width, width), target=task.target
-    )
