@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -16,8 +16,8 @@ from mjfim.errors import (
     listed,
 )
 from mjfim.excitation.evaluation import (
-    DesignReport,
     Ending,
+    designed,
     identifiability_along,
     point_at_stated_rate,
     require_designable,
@@ -177,9 +177,14 @@ def _searched(
     identifiability: Identifiability | None,
 ) -> Design:
     """Design the control of a task whose reserve is known."""
-    if task.release is not None:
-        return design_release(task, budget, callback, executor)
-    _require_controls(task)
+    if not task.controls and task.release is None:
+        # An example for the first joint whose position is one number.
+        joint = next((joint.position_column for joint in task.system.coordinates), "qpos:<joint>")
+        raise ExperimentError(
+            f"{task.experiment.source}: the model has no actuators, so there is no control to "
+            "design. State in initial.free which initial state a design may choose, for example "
+            f'[initial] free = {{ "{joint}" = [-1.0, 1.0] }}'
+        )
     require_feasible_start(task)
     require_coarse_factor(task)
     steps_before = task.plant.engine_steps
@@ -188,10 +193,14 @@ def _searched(
     begun = budget.seconds_used
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     evaluation_seconds = budget.seconds_used - begun
-    if initial_control is not None:
-        initial_control = _checked_control(task, initial_control)
-    starts = list(initial_controls_of(task, initial_control))
+    starts: list[InitialControl] = []
     begin = first
+    if task.release is not None:
+        initial_control = None
+    else:
+        if initial_control is not None:
+            initial_control = _checked_control(task, initial_control)
+        starts = list(initial_controls_of(task, initial_control))
     if initial_control is not None:
         begin = task.problem.point(
             task.plant.simulate(task.theta, initial_control), CENTRAL_DIFFERENCES
@@ -201,6 +210,20 @@ def _searched(
         require_designable(task, identifiability)
     stage = DescentLevel(task, identifiability.basis)
     first, begin = stage.problem.reevaluated(first), stage.problem.reevaluated(begin)
+    if task.release is not None:
+        point, ending, remarks = design_release(
+            stage, task.release, first, budget, callback, executor
+        )
+        return designed(
+            stage,
+            identifiability,
+            initial=first,
+            final=point,
+            ending=ending,
+            budget=budget,
+            steps=task.plant.engine_steps - steps_before,
+            remarks=remarks,
+        )
 
     search = Search(
         stage=stage,
@@ -216,18 +239,7 @@ def _searched(
     results = consume(search.run([candidate_of(each) for each in starts], further), callback)
     if not search.grounds.is_limited:
         results = _with_stops_evaluated(stage, results)
-    interrupted = budget.stop.requested
     winner, point = _chosen(search, results, [first, begin])
-    steps = steps_before + search.steps
-    begun_names = {result.name for result in results}
-    report = DesignReport(
-        stage=stage,
-        identifiability=identifiability,
-        initial=first,
-        final=point,
-        scaled_start=search.scaled_start,
-        remarks=() if interrupted else _without_time(task, starts, begun_names),
-    )
     ending = Ending(
         name=winner.name,
         status=winner.ended,
@@ -235,7 +247,17 @@ def _searched(
         history=winner.history,
         starts=tuple(result.start_result for result in results),
     )
-    return report.design(ending, budget.seconds_used, steps, interrupted)
+    return designed(
+        stage,
+        identifiability,
+        initial=first,
+        final=point,
+        ending=ending,
+        budget=budget,
+        steps=steps_before + search.steps,
+        remarks=_without_time(task, starts, results) if not budget.stop.requested else (),
+        scaled_start=search.scaled_start,
+    )
 
 
 def _chosen(
@@ -287,9 +309,10 @@ def _with_stops_evaluated(stage: DescentLevel, results: Sequence[Candidate]) -> 
 
 
 def _without_time(
-    task: DesignTask, starts: Sequence[InitialControl], begun: Collection[str]
+    task: DesignTask, starts: Sequence[InitialControl], results: Sequence[Candidate]
 ) -> tuple[str, ...]:
     """Say which initial controls were left out, because the time was too short for them."""
+    begun = {result.name for result in results}
     left = [start.name for start in starts if start.name not in begun]
     seconds = task.experiment.descent.seconds
     if not left or not begun or seconds is None:
@@ -317,20 +340,6 @@ def consume(
     finally:
         # A callback that raises an error ends the search, with all moves in other processes.
         events.close()
-
-
-def _require_controls(task: DesignTask) -> None:
-    """Raise ExperimentError where the model has no actuators, so that there is no control."""
-    if task.controls:
-        return
-
-    # An example for the first joint whose position is one number.
-    joint = next((joint.position_column for joint in task.system.coordinates), "qpos:<joint>")
-    raise ExperimentError(
-        f"{task.experiment.source}: the model has no actuators, so there is no control to design. "
-        "State in initial.free which initial state a design may choose, for example [initial] "
-        f'free = {{ "{joint}" = [-1.0, 1.0] }}'
-    )
 
 
 def _checked_control(task: DesignTask, control: Array) -> Array:

@@ -355,7 +355,8 @@ class SubstepConstraint(Constraint):
     def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
         """See `Constraint.change`."""
         moved = np.concatenate([step.z[:-1], step.v], axis=1)
-        return np.einsum("kswi,ki->ksw", values.jacobian[:, :, self.number_columns], moved)
+        jacobian = values.jacobian[:, :, self.number_columns]
+        return np.asarray(np.einsum("kswi,ki->ksw", jacobian, moved))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """Margins at every engine step, one item per quantity. See `Constraint.margins`."""
@@ -629,7 +630,7 @@ class ClearanceConstraint(Constraint):
     def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
         """See `Constraint.change`."""
         slopes = self._slopes(values)
-        return np.einsum("kmi,ki->km", slopes, step.z[1:, : slopes.shape[2]])
+        return np.asarray(np.einsum("kmi,ki->km", slopes, step.z[1:, : slopes.shape[2]]))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""

@@ -101,21 +101,19 @@ class InteriorProblem:
         Returns:
             The point; `DIVERGED_POINT` where the simulation diverges.
         """
-        observed = self.base.plant.observe(self.base.theta, ctrl, self.constraints.observations)
-        if observed is None:
+        values = self.constraints.along(self.base.plant, self.base.theta, ctrl)
+        if values is None:
             return DIVERGED_POINT
 
-        values = self.constraints.evaluate(*observed, slopes=False)
+        point, merit = None, 0.0
+        if self.with_cost:
+            accuracy = self.base.plant.derivatives.quickest_accuracy
+            point = self.base.point(values.trajectory, accuracy, lumps=lumps)
+            if point is DIVERGED:
+                return DIVERGED_POINT
+            merit = self._merit(point)
         barrier = self.constraints.value(values, self.delta)
-        if not self.with_cost:
-            return InteriorPoint(values=values, point=None, merit=0.0, barrier=barrier)
-
-        accuracy = self.base.plant.derivatives.quickest_accuracy
-        point = self.base.point(values.trajectory, accuracy, lumps=lumps)
-        if point is DIVERGED:
-            return DIVERGED_POINT
-
-        return InteriorPoint(values=values, point=point, merit=self._merit(point), barrier=barrier)
+        return InteriorPoint(values=values, point=point, merit=merit, barrier=barrier)
 
     def reevaluate(self, point: InteriorPoint) -> InteriorPoint:
         """Evaluate a point of another problem without a simulation.
@@ -132,8 +130,8 @@ class InteriorProblem:
             return point
 
         evaluated = self.base.reevaluated(point.point)
-        return InteriorPoint(
-            values=point.values,
+        return replace(
+            point,
             point=evaluated,
             merit=self._merit(evaluated),
             barrier=self.constraints.value(point.values, self.delta),
@@ -190,14 +188,11 @@ class InteriorProblem:
         if not (self.follows_curvature and self.mu <= SHARP_MU):
             barrier = replace(barrier, curvature=None)
 
-        return Expansion(
-            A=expansion.A,
-            B=expansion.B,
+        return replace(
+            expansion,
             a=expansion.a / scale + barrier.a,
             b=expansion.b / scale + barrier.b,
-            extended=None,
             barrier=barrier,
-            eigenvalue_model=expansion.eigenvalue_model,
         )
 
     def _expand_cost(
