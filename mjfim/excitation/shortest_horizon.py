@@ -549,47 +549,31 @@ class _HorizonSearch:
                 executor=self.executor,
                 budget=design_budget(task, self.stop),
             )
-            if design.status is Status.INTERRUPTED:
-                return self._interrupted(samples, design)
-            require_reachable(task, design, self.targets)
+            is_stopped = design.status is Status.INTERRUPTED
+            if not is_stopped:
+                require_reachable(task, design, self.targets)
         except MjfimError as error:
             # An error at the first horizon ends the search; later ones only exclude their horizon.
             if not self.tried:
                 raise
             return Tried(horizon=horizon, ratio=np.inf, why=str(error))
 
+        margins = design.limits.items()
+        violated = [f"{kind} by {-margin:.3g}" for kind, margin in margins if margin < 0.0]
         if design.status is Status.INFEASIBLE:
-            margins = design.limits.items()
-            violated = [f"{kind} by {-margin:.3g}" for kind, margin in margins if margin < 0.0]
             why = f"{design.status.value} ({', '.join(violated)})"
             return Tried(horizon=horizon, ratio=np.inf, why=why)
 
+        # After a stop, a design counts if it keeps the limits, and reaches the targets or is the
+        # first one.
         ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
-        self._keep_better(samples, design, ratio)
-        name = task.parameters.names[parameter]
-        return Tried(horizon=horizon, ratio=ratio, parameter=name)
-
-    def _interrupted(self, samples: int, design: Design) -> Tried | None:
-        """Use the design of a number of samples whose search was stopped, if it is of use.
-
-        Returns:
-            The outcome of a design that keeps the limits and either reaches the targets or is the
-            first one; else None.
-        """
-        is_feasible = all(margin >= 0.0 for margin in design.limits.values())
-        ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
-        if not is_feasible or (not ratio <= 1.0 and self.designs):
+        if is_stopped and (violated or (not ratio <= 1.0 and self.designs)):
             return None
-
-        self._keep_better(samples, design, ratio)
-        name = self.base.parameters.names[parameter]
-        return Tried(horizon=samples / self.experiment.rate, ratio=ratio, parameter=name)
-
-    def _keep_better(self, samples: int, design: Design, ratio: float) -> None:
-        """Keep a design where it has the smallest ratio so far for its number of samples."""
         known = self.designs.get(samples)
         if known is None or ratio < largest_ratio_to_target(known.final.std, self.targets)[0]:
             self.designs[samples] = design
+        name = task.parameters.names[parameter]
+        return Tried(horizon=horizon, ratio=ratio, parameter=name)
 
     def _out_of_reach(self, samples: int) -> OutOfReachError:
         """The error that says how far the longest experiment is from the targets."""

@@ -234,9 +234,8 @@ class Plan:
             self.experiment,
             threads=self.threads,
             added_information=self.added_information,
-            variant=self.variant,
         )
-        return Grounds(task, self.combinations)
+        return Grounds(task.with_variant(self.variant), self.combinations)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
