@@ -456,13 +456,9 @@ def _initial_information(task: DesignTask) -> Array:
         SimulationDivergedError: The simulation diverges along the initial control.
     """
     point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    if point.information is None or point.sensitivity is None:
-        raise SimulationDivergedError(
-            "the simulation diverges when the parameters change slightly along the initial control"
-        )
-
     # The initial control may excite some combinations only; the others carry no information.
-    excited = task.identifiability_test.along(task.initial, point.sensitivity).along_trajectory
+    excited = identifiability_along(task, point).along_trajectory
+    assert point.information is not None
     basis = excited.basis if excited.count else None
     information = replace(task.information, basis=basis)
 

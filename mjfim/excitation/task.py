@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.release_space import ReleaseSpace
@@ -21,6 +21,7 @@ from mjfim.excitation.task_parts import (
     holding_control,
     information_of,
     least_drift_control,
+    named_file,
     parameter_samples_of,
     require_bounded_controls,
     require_design_keys,
@@ -130,12 +131,9 @@ class DesignTask:
             ExperimentError: Something is wrong or missing in the experiment; the message names the
                 key.
         """
-        experiment = system.experiment
         require_design_keys(system)
-        try:
+        with named_file(system.experiment):
             return cls._made(system, stated_control(system), added_information)
-        except ExperimentError as error:
-            raise ExperimentError(f"{experiment.source}: {error}") from None
 
     @classmethod
     def along(cls, system: System, control: Array) -> DesignTask:
@@ -522,10 +520,8 @@ class DesignTask:
         """This task with another horizon [s], on the same variant of the plant."""
         experiment = self.experiment.replace(horizon=horizon)
         task = replace(self, system=replace(self.system, experiment=experiment))
-        try:
+        with named_file(experiment):
             return task._along(stated_control(task.system), self.system.variant)
-        except ExperimentError as error:
-            raise ExperimentError(f"{experiment.source}: {error}") from None
 
     def _along(self, control: Array, variant: ModelVariant) -> DesignTask:
         """This task on another plant, along a control: (n, nu) at the stated sample rate."""

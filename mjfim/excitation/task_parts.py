@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +29,16 @@ from mjfim.model.variants import Relaxation
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.control_table import read_control
 from mjfim.records.trajectory import Trajectory
+
+
+@contextmanager
+def named_file(experiment: Experiment) -> Iterator[None]:
+    """Put the name of the experiment file before the message of an ExperimentError."""
+    try:
+        yield
+    except ExperimentError as error:
+        raise ExperimentError(f"{experiment.source}: {error}") from None
+
 
 # Exponent q of the smooth maximum.
 POOLING_EXPONENT = 20.0
@@ -429,10 +440,8 @@ def stated_motion(system: System) -> Trajectory:
         SimulationDivergedError: The simulation diverges.
     """
     require_horizon_and_control(system, "simulate without a design")
-    try:
+    with named_file(system.experiment):
         inputs = stated_inputs(system)
-    except ExperimentError as error:
-        raise ExperimentError(f"{system.experiment.source}: {error}") from None
     return system.plant.simulate(system.theta, inputs)
 
 

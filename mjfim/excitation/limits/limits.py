@@ -354,14 +354,8 @@ def unsupported_ranges(model: Any) -> tuple[str, ...]:
     Returns:
         Descriptions of limited activations, with their names.
     """
-    actuators = _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.actuator_actlimited)
-    return tuple(f"the activation of {name}" for name in actuators)
-
-
-def _names(model: Any, kind: Any, chosen: Any) -> list[str]:
-    """Names of chosen elements of a kind, or their numbers; chosen: (n,) truth values."""
-    indices = np.flatnonzero(chosen).tolist()
-    return [mujoco.mj_id2name(model, kind, i) or f"number {i}" for i in indices]
+    limited = np.flatnonzero(model.actuator_actlimited).tolist()
+    return tuple(f"the activation of {model.actuator(i).name or f'number {i}'}" for i in limited)
 
 
 def derivative_substeps_of(substeps: int) -> tuple[int, ...]:

@@ -30,6 +30,7 @@ from mjfim.excitation.limits.constraints import (
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import named_file
 from mjfim.model.units import LENGTH
 from mjfim.model.variants import unconstrained
 from mjfim.plant.batch import BatchSimulator
@@ -311,30 +312,23 @@ def require_feasible_start(task: DesignTask) -> None:
         ExperimentError: A limit cannot be kept, or excludes the initial state, the final state or a
             control that holds one.
     """
-    try:
-        _require_feasible_start(task)
-    except ExperimentError as error:
-        raise ExperimentError(f"{task.experiment.source}: {error}") from None
+    with named_file(task.experiment):
+        constraints = constraint_set_of(task, every=True)
+        bandwidth_basis(task, task.stated_times)
+        if not task.experiment.limits.enforce:
+            return
 
+        boundary = task.experiment.boundary
+        start = task.plant.initial_state(task.theta)
 
-def _require_feasible_start(task: DesignTask) -> None:
-    """Carry out `require_feasible_start`; error messages do not name the experiment file yet."""
-    constraints = constraint_set_of(task, every=True)
-    bandwidth_basis(task, task.stated_times)
-    if not task.experiment.limits.enforce:
-        return
+        _require_inside(task, constraints, "the initial state", start)
+        if boundary.end == "rest":
+            _require_inside(task, constraints, "the final state", task.target)
 
-    boundary = task.experiment.boundary
-    start = task.plant.initial_state(task.theta)
-
-    _require_inside(task, constraints, "the initial state", start)
-    if boundary.end == "rest":
-        _require_inside(task, constraints, "the final state", task.target)
-
-    if boundary.start == "rest":
-        _require_held(task, constraints, "boundary.start", start, task.initial_hold)
-    if boundary.end == "rest":
-        _require_held(task, constraints, "boundary.end", task.target, task.final_hold)
+        if boundary.start == "rest":
+            _require_held(task, constraints, "boundary.start", start, task.initial_hold)
+        if boundary.end == "rest":
+            _require_held(task, constraints, "boundary.end", task.target, task.final_hold)
 
 
 def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, state: Array) -> None:
@@ -348,8 +342,17 @@ def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, st
             f"there) or move {where}"
         )
 
-    if constraints.clearance is not None:
-        _require_clear(constraints.clearance, where, state[: task.space.nq])
+    clearance = constraints.clearance
+    if clearance is None:
+        return
+    distance, _, pair = clearance.distances.nearest(state[None, : task.space.nq])
+    if distance < clearance.least:
+        fault = "in collision" if distance < 0.0 else "too close"
+        raise ExperimentError(
+            f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, but "
+            f"have to be {clearance.least:g} m apart; move {where}, lower the clearance, or list "
+            "the pair's bodies in limits.ignored"
+        )
 
 
 def _quantities_at(
@@ -361,20 +364,6 @@ def _quantities_at(
     values = quantities_at(task, substeps, state, ctrl).tolist()
     for kind, name, value in zip(substeps.kinds, substeps.names, values, strict=True):
         yield limits[kind, name], value
-
-
-def _require_clear(clearance: ClearanceConstraint, where: str, qpos: Array) -> None:
-    """Require that a position, (nq,), keeps the clearance."""
-    distance, _, pair = clearance.distances.nearest(qpos[None])
-    if distance >= clearance.least:
-        return
-
-    fault = "in collision" if distance < 0.0 else "too close"
-    raise ExperimentError(
-        f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, but have "
-        f"to be {clearance.least:g} m apart; move {where}, lower the clearance, or list the pair's "
-        "bodies in limits.ignored"
-    )
 
 
 def _require_held(
@@ -400,17 +389,12 @@ def _require_held(
     ]
     for limit, value in (*controls, *forces):
         if not limit.lower <= value <= limit.upper:
+            has_range = limit.kind in ("joint_force", "tendon_force")
+            or_range = " or the MJCF's actuatorfrcrange" if has_range else ""
             raise ExperimentError(
                 f"{where}: standing still requires {limit.name} = {value:.4g}, outside "
-                f"{_key_of(limit)} [{limit.lower:g}, {limit.upper:g}]"
+                f"limits.{limit.kind}{or_range} [{limit.lower:g}, {limit.upper:g}]"
             )
-
-
-def _key_of(limit: Limit) -> str:
-    """The key or the range of the MJCF that states a limit, for error messages."""
-    if limit.kind in ("joint_force", "tendon_force"):
-        return f"limits.{limit.kind} or the MJCF's actuatorfrcrange"
-    return f"limits.{limit.kind}"
 
 
 def all_violations_of(task: DesignTask, trajectory: Trajectory) -> tuple[LimitViolation, ...]:
