@@ -7,7 +7,7 @@ whether a design can begin. The evaluation of a finished design gives its warnin
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,33 +17,19 @@ from mjfim.excitation.limits.limits import unsupported_ranges
 from mjfim.excitation.limits.verification import (
     SAME_STATE_TOLERANCE,
     Verification,
-    all_violations_of,
-    verify,
 )
 from mjfim.excitation.objective import DesignPoint
-from mjfim.excitation.rehearsal import rehearse_task
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import labels_of_system
-from mjfim.information.criteria import shared
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.parallel import one_blas_thread
-from mjfim.parallel.budget import Budget
-from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import GROUPS_TEXT, groups_in_words
 from mjfim.records.design import (
-    Design,
     Evaluation,
-    HistoryRow,
-    ScaledStart,
-    StartResult,
-    Status,
-    improvement_per_iteration,
-    without_motions,
 )
 from mjfim.records.trajectory import Trajectory
 
@@ -384,106 +370,3 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
             f"the initial control does not excite: {unexcited}. Other controls do: begin with one "
             "that moves the joints of these parameters, for example a multisine"
         )
-
-
-# ---- the record of a design
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Ending:
-    """How the search for a design has ended.
-
-    Attributes:
-        name: Name of the initial control from which the design was found.
-        status: Outcome of its descent.
-        slope: Slope of the cost at the last iterate.
-        history: Iterates.
-        starts: Result of every initial control.
-    """
-
-    name: str
-    status: Status
-    slope: float
-    history: tuple[HistoryRow, ...]
-    starts: tuple[StartResult, ...]
-
-
-def designed(
-    stage: DescentLevel,
-    identifiability: Identifiability,
-    *,
-    initial: DesignPoint,
-    final: DesignPoint,
-    ending: Ending,
-    budget: Budget,
-    steps: int,
-    remarks: tuple[str, ...] = (),
-    scaled_start: ScaledStart | None = None,
-) -> Design:
-    """The record of a design, with its warnings.
-
-    Args:
-        stage: The stated level.
-        identifiability: The combinations that can be identified.
-        initial: The initial control, evaluated.
-        final: The designed control, evaluated.
-        ending: How the search has ended.
-        budget: Budget of the search.
-        steps: Engine steps of the search.
-        remarks: Warnings that belong to the search.
-        scaled_start: The largest share of an initial control outside limits that keeps them.
-    """
-    seconds, interrupted = budget.seconds_used, budget.stop.requested
-    task, information = stage.task, stage.problem.information
-    before, after = evaluate_point(stage, initial), evaluate_point(stage, final)
-    played = task.released_as(after.trajectory.state[0]) if final is not initial else task
-
-    # The limits, on the model as the user wrote it.
-    found = verify(played, after.trajectory)
-    clamped = saturated_actuators(task.system.model_at(task.theta), after.trajectory)
-
-    # After Ctrl-C a rehearsal would take too long.
-    rehearsal = None if interrupted else rehearse_task(played, after)
-    status = Status.INTERRUPTED if interrupted else ending.status
-    if task.is_limited and not found.is_feasible and not interrupted:
-        status = Status.INFEASIBLE
-
-    parameters = task.parameters
-    data = shared(
-        information.without_round_off(after.information - task.prior),
-        parameters.prior_information,
-        parameters.recording_specific,
-    )
-    history, motions = without_motions(ending.history)
-    reserve = task.experiment.limits.reserve
-    return Design(
-        status=status,
-        parameters=parameters.names,
-        theta=task.theta,
-        initial=before,
-        final=after,
-        history=history,
-        slope=ending.slope,
-        steps=steps,
-        seconds=seconds,
-        limits=found.margins,
-        usage=found.usage,
-        initial_violations=all_violations_of(task, before.trajectory),
-        scaled_start=scaled_start,
-        warnings=(*design_warnings(after, found, task, clamped), *remarks),
-        found_by=ending.name,
-        starts=ending.starts,
-        nuisance=tuple(p.name for p in parameters.parameters if p.nuisance),
-        combinations=tuple(str(group) for group in identifiability.groups_along_all),
-        combined=identifiability.combinations(
-            information, task.theta[parameters.interest], before.information, after.information
-        ),
-        prior=task.prior,
-        data=data,
-        labels=labels_of_system(task.system),
-        sizes=parameters.sizes(task.theta),
-        motions=motions,
-        improvement=improvement_per_iteration(history, stage.problem.size(final)),
-        rehearsal=rehearsal,
-        reserve={} if reserve == "auto" else dict[str, float](reserve.items()),
-    )

@@ -17,11 +17,11 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.evaluation import UNSTABLE_GROWTH, Ending
+from mjfim.excitation.evaluation import UNSTABLE_GROWTH
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.objective import DIVERGED, DesignPoint
 from mjfim.excitation.release_space import ReleaseSpace
-from mjfim.excitation.search.climb import row_of
+from mjfim.excitation.search.climb import Candidate, row_of
 from mjfim.excitation.search.inside import LimitedCost
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
@@ -296,15 +296,15 @@ class ReleaseSearch:
     ) -> None:
         self._releases = Releases(stage=stage, space=space, plant=stage.task.plant)
         self._budget = budget
-        self._workers = None if executor is None else Workers.of(executor)
+        self._workers = Workers.of_any(executor)
         self._callback: Callable[[DesignEvent], None] = callback or (lambda event: None)
         self._history: tuple[HistoryRow, ...] = ()
         self._steps_before = stage.task.plant.engine_steps
         self._found_by = "grid of releases"
         self.best: Release | None = None
 
-    def run(self) -> tuple[Release, Ending]:
-        """Search the ranges.
+    def run(self) -> tuple[Release, Candidate, list[StartResult]]:
+        """Search the ranges; the best release, as a candidate as well, and the local searches.
 
         Raises:
             SimulationDivergedError: The simulation diverges from every release.
@@ -335,14 +335,16 @@ class ReleaseSearch:
             status = starts[self._found_by].status
         elif any(start.status.success for start in starts.values()):
             status = Status.RELEASE_FOUND
-        ending = Ending(
+        control = self._releases.stage.task.control
+        winner = Candidate(
             name=self._found_by,
+            control=control,
+            best=control,
             status=status,
             slope=np.nan,
             history=self._history,
-            starts=tuple(starts.values()),
         )
-        return self.best, ending
+        return self.best, winner, list(starts.values())
 
     def _grid(self) -> list[Array]:
         """(d,) shares of each release of the grid, the stated one first."""
@@ -466,7 +468,7 @@ def design_release(
     budget: Budget,
     callback: DesignCallback | None,
     executor: ExecutorLike | None,
-) -> tuple[DesignPoint, Ending, tuple[str, ...]]:
+) -> tuple[Candidate, DesignPoint, list[StartResult], tuple[str, ...]]:
     """Design the initial state of a motion whose control is given.
 
     Args:
@@ -478,13 +480,13 @@ def design_release(
         executor: Workers; None for this process.
 
     Returns:
-        The motion from the best release, how the search has ended, and warnings.
+        The best release as a candidate, its motion, the results of local searches, and warnings.
     """
-    best, ending = ReleaseSearch(stage, space, budget, callback, executor).run()
+    best, winner, rows = ReleaseSearch(stage, space, budget, callback, executor).run()
     point, task = best.point, stage.task
     # The stated release stays where no better one within the limits was found.
     if first.cost < point.cost and first.trajectory is not None:
         relaxed = LimitedCost(level=DescentLevel(task.relaxed(), stage.basis))
         if not task.is_limited or relaxed.keeps(first.trajectory.ctrl):
             point = first
-    return point, ending, tuple(space.edges(best.shares))
+    return winner, point, rows, tuple(space.edges(best.shares))

@@ -47,29 +47,19 @@ from mjfim.records.trajectory import Trajectory
 # Share of the distance of the initial and the final state from a limit that a reserve may take.
 END_SHARE = 0.5
 
-# Attribute of `SubstepObservations` to which each kind of limit belongs; angles are turns.
+# Attribute of `SubstepObservations` to which each kind of limit belongs, in the order of the
+# observed numbers. Angles of ball and free joints are turns as well.
 SOURCES = {
     "position": "positions",
     "velocity": "velocities",
     "angular_velocity": "velocities",
     "acceleration": "accelerations",
+    "tilt": "turns",
     "force": "actuator_forces",
     "joint_force": "joint_forces",
     "tendon_force": "tendon_forces",
     "tendon_length": "tendon_lengths",
 }
-
-# The attributes in the order of the observed numbers.
-ORDER = (
-    "positions",
-    "velocities",
-    "accelerations",
-    "turns",
-    "actuator_forces",
-    "joint_forces",
-    "tendon_forces",
-    "tendon_lengths",
-)
 
 
 def observed_numbers(
@@ -85,7 +75,7 @@ def observed_numbers(
         The observations of a single engine step without further rows, and for each of the n limits
         the places of its numbers among them.
     """
-    chosen: dict[str, list[Limit]] = {source: [] for source in ORDER}
+    chosen: dict[str, list[Limit]] = {source: [] for source in SOURCES.values()}
     for limit in limits:
         chosen["turns" if limit.is_angle else SOURCES[limit.kind]].append(limit)
     places: dict[tuple[str, str], tuple[int, ...]] = {}
@@ -95,7 +85,11 @@ def observed_numbers(
         begin += limit.count
 
     turns = [np.arange(x.index, x.index + 4) for x in chosen["turns"] for _ in range(x.count)]
-    weights = [_turn_weights(model, limit) for limit in chosen["turns"]]
+    joints = {quaternion_address(model, joint): joint for joint in quaternion_joints(model)}
+    weights = [
+        (tilt_weights if limit.kind == "tilt" else turn_weights)(model, joints[limit.index])
+        for limit in chosen["turns"]
+    ]
     observations = SubstepObservations(
         positions=_addresses(chosen["positions"]),
         velocities=_addresses(chosen["velocities"]),
@@ -116,12 +110,6 @@ def _addresses(limits: Iterable[Limit]) -> np.ndarray:
     """Addresses of all numbers of some limits."""
     each = [limit.index + i for limit in limits for i in range(limit.count)]
     return np.array(each, dtype=np.intp)
-
-
-def _turn_weights(model: Any, limit: Limit) -> Array:
-    """(count, 4) weights of the quaternion of a limited angle."""
-    joint = next(j for j in quaternion_joints(model) if quaternion_address(model, j) == limit.index)
-    return tilt_weights(model, joint) if limit.kind == "tilt" else turn_weights(model, joint)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -460,10 +448,20 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
     """Ranges of the quantities within samples, ordered by kind."""
     ordered = tuple(limit for kind in SUBSTEP_KINDS for limit in limits if limit.kind == kind)
     observed, columns = observed_numbers(task.system.model, ordered)
+
+    # MuJoCo keeps the forces at the beginning of each engine step, and with RK4 those of its last
+    # stage. The forces at the end of a sample under its control are those that the next sample
+    # begins with where the control does not change. Lengths of tendons are like forces that change.
+    kinds, substeps = {limit.kind for limit in ordered}, task.system.grid.substeps
+    has_forces = not kinds.isdisjoint(FORCE_KINDS)
+    force_rows: tuple[int, ...] = ()
+    if "tendon_length" in kinds or (has_forces and not has_constant_forces(task.system.model)):
+        begun = range(substeps) if is_rk4(task.system.model) else ()
+        force_rows = (*begun, substeps - 1)
     observations = replace(
         observed,
-        derivative_substeps=derivative_substeps_of(task.system.grid.substeps),
-        force_rows=_force_rows(task, {limit.kind for limit in ordered}),
+        derivative_substeps=derivative_substeps_of(substeps),
+        force_rows=force_rows,
         timestep=float(task.plant.simulator.model.opt.timestep),
     )
 
@@ -479,30 +477,6 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
         columns=columns,
         angles=tuple(limit.is_angle for limit in ordered),
     )
-
-
-def _force_rows(task: DesignTask, kinds: set[str]) -> tuple[int, ...]:
-    """Engine steps of a sample whose forces have to be computed in addition to a rollout.
-
-    MuJoCo keeps the forces at the beginning of each engine step, and with RK4 those of its last
-    stage. The forces at the end of a sample under its control are those that the next sample
-    begins with where the control does not change. Lengths of tendons are like forces that change.
-
-    Args:
-        task: The task.
-        kinds: Kinds of its limits.
-    """
-    model = task.system.model
-    changes = "tendon_length" in kinds
-    if not kinds.isdisjoint(FORCE_KINDS):
-        changes = changes or not has_constant_forces(model)
-    if not changes:
-        return ()
-
-    substeps = task.system.grid.substeps
-    with_stages = is_rk4(model)
-    begun = range(substeps) if with_stages else ()
-    return (*begun, substeps - 1)
 
 
 def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds | None:
