@@ -16,10 +16,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.limits.constraint_kinds import ConstraintValues
-from mjfim.excitation.limits.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
+from mjfim.excitation.limits.constraints import FORCE_KINDS
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
-from mjfim.excitation.search.inside import largest_share
+from mjfim.excitation.search.inside import LimitedLevel, largest_share
 from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProblem, values_of
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
 from mjfim.excitation.task import DesignTask
@@ -132,17 +131,15 @@ class Step:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ground:
+class Ground(LimitedLevel):
     """The level on which descents work, over one repetition of the control.
 
     Attributes:
-        level: The level.
         curves: (N, M) curves at the stated sample rate of which controls are sums; None where each
             sample is free.
         repeats: How often the control is played, one after the other.
     """
 
-    level: DescentLevel
     curves: Array | None = None
     repeats: int = 1
 
@@ -161,15 +158,6 @@ class Ground:
     def task(self) -> DesignTask:
         """The task on this level."""
         return self.level.task
-
-    @cached_property
-    def constraints(self) -> ConstraintSet:
-        """The limits."""
-        return constraint_set_of(self.task)
-
-    def values(self, control: Array) -> ConstraintValues | None:
-        """Limited quantities along a control of this level; None where it diverges."""
-        return self.constraints.along(self.task.plant, self.task.theta, control)
 
     def exact(self, point: DesignPoint) -> DesignPoint:
         """A point with the exact criterion of all repetitions."""

@@ -67,26 +67,35 @@ LEAST_PROGRESS = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LimitedCost:
-    """Cost of controls that keep all limits.
+class LimitedLevel:
+    """A level with its limits.
 
     Attributes:
-        level: The stated level, on the plant without the clamps that limits make unreachable.
-        first: The initial control, evaluated on the unmodified plant; None where it is not known.
+        level: The level, on the plant without the clamps that limits make unreachable.
     """
 
     level: DescentLevel
-    first: DesignPoint | None = None
 
     @cached_property
     def constraints(self) -> ConstraintSet:
-        """The limits on the plant without clamps."""
+        """The limits."""
         return constraint_set_of(self.level.task)
 
     def values(self, control: Array) -> ConstraintValues | None:
         """Limited quantities along a control: (N, nu); None where the simulation diverges."""
         task = self.level.task
         return self.constraints.along(task.plant, task.theta, control)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LimitedCost(LimitedLevel):
+    """Cost of controls that keep all limits on the stated level.
+
+    Attributes:
+        first: The initial control, evaluated on the unmodified plant; None where it is not known.
+    """
+
+    first: DesignPoint | None = None
 
     def nearly_keeps(self, control: Array) -> bool:
         """Check the limits on the plant of the search only, which is much quicker."""
