@@ -206,7 +206,12 @@ def _searched(
     begin, starts = first, list[InitialControl]()
     if task.release is None:
         if initial_control is not None:
-            initial_control = _checked_control(task, initial_control)
+            initial_control = np.asarray(initial_control, dtype=np.float64)
+            if initial_control.shape != task.control.shape:
+                raise ExperimentError(
+                    f"initial_control: shape {initial_control.shape}; it must be (samples, "
+                    f"actuators) = {task.control.shape}"
+                )
             moved = task.plant.simulate(task.theta, initial_control)
             begin = task.problem.point(moved, CENTRAL_DIFFERENCES)
         starts = list(initial_controls_of(task, initial_control))
@@ -418,18 +423,6 @@ def consume(
     finally:
         # A callback that raises an error ends the search, with all moves in other processes.
         events.close()
-
-
-def _checked_control(task: DesignTask, control: Array) -> Array:
-    """A given initial control as an array of numbers; ExperimentError for a wrong shape."""
-    control = np.asarray(control, dtype=np.float64)
-    if control.shape != task.control.shape:
-        raise ExperimentError(
-            f"initial_control: shape {control.shape}; it must be (samples, actuators) = "
-            f"{task.control.shape}"
-        )
-
-    return control
 
 
 def design_jointly(

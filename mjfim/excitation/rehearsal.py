@@ -141,14 +141,16 @@ def rehearsed(
         gain: (N, nu, nx) gains, which matter under feedback only.
         steps: Its standard deviations by finite steps.
     """
-    spec, stage = task.experiment.rehearsal, _Stage(task, trajectory, gain)
+    spec, player = task.experiment.rehearsal, _RobotPlayer(task, trajectory, gain)
     rng = np.random.default_rng(spec.seed)
     theta = np.array([task.theta, *(_drawn(task, rng) for _ in range(spec.robots))])
 
     # The model comes first, because its motion is the plan of the feedback.
-    most = max(MAX_VALUES // stage.numbers, 1)
+    steps_of_one = len(player.ctrl) * player.steps_per_row + player.late_steps
+    values = task.space.nq + task.space.nv + 2 * len(player.limits) + 1
+    most = max(MAX_VALUES // (steps_of_one * values), 1)
     blocks = [theta[:1], *(theta[i : i + most] for i in range(1, len(theta), most))]
-    parts = [part for block in blocks for part in stage.play(block, rng)]
+    parts = [part for block in blocks for part in player.play(block, rng)]
     measured = {
         each.name: np.array([getattr(part, each.name) for part in parts])
         for each in fields(_Played)
@@ -158,15 +160,15 @@ def rehearsed(
         parameters=task.parameters.names,
         wrong=spec.wrong,
         feedback=spec.feedback,
-        latency=stage.late_steps * stage.timestep,
+        latency=player.late_steps * player.timestep,
         theta=theta,
-        limits=stage.rehearsed_limits(),
-        joints=tuple(group.name for group in stage.groups),
-        units=tuple(group.unit for group in stage.groups),
-        unlimited=tuple(group.name for group in stage.groups if not group.is_limited),
-        floor=stage.floor,
-        has_floor=stage.has_floor,
-        depth=stage.depth,
+        limits=player.rehearsed_limits(),
+        joints=tuple(group.name for group in player.groups),
+        units=tuple(group.unit for group in player.groups),
+        unlimited=tuple(group.name for group in player.groups if not group.is_limited),
+        floor=player.floor,
+        has_floor=player.has_floor,
+        depth=player.depth,
         unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
         steps=steps,
         **measured,
@@ -221,7 +223,7 @@ class _Played:
     unbraked: tuple[str, ...] = ()
 
 
-class _Stage:
+class _RobotPlayer:
     """A design, and what measures the robots that play it.
 
     Attributes:
@@ -291,12 +293,6 @@ class _Stage:
         with suppress(ExperimentError):
             pairs = find_geom_pairs(model, ignored)
             self._distances = GeomDistances(model, pairs, length)
-
-    @property
-    def numbers(self) -> int:
-        """Number of values that the simulation of one robot returns."""
-        steps = len(self.ctrl) * self.steps_per_row + self.late_steps
-        return steps * (self.task.space.nq + self.task.space.nv + 2 * len(self.limits) + 1)
 
     def rehearsed_limits(self) -> tuple[RehearsedLimit, ...]:
         """The limits in the order of the margins."""
@@ -427,8 +423,8 @@ class _Stage:
     def _floor_of(self, model: Any, start: Array) -> tuple[float, bool]:
         """Height of the floor [m], and whether the experiment or the model states it.
 
-        Without a floor it is the lower end of a base that does not move, or 0 for a free body, or
-        the lowest point of the start if that is lower. A robot without a base has no floor.
+        Without a floor it is the lower end of a base that does not move, or 0 for a free body. The
+        lowest point of the start counts if it is lower. A robot without a base has no floor.
         """
         stated = self.task.experiment.rehearsal.floor
         if stated is not None:

@@ -163,8 +163,8 @@ def _wanted_columns(
     The arguments are those of `find_null_space`.
 
     Returns:
-        (n, t) effect of each parameter changed by its size [standard deviations], (n, t) error of
-        these columns, and the (t,) length of each column before the removal.
+        (n, t) effects of each parameter changed by its size [standard deviations], their (n, t)
+        errors, and the (t,) lengths of the columns before the removal.
     """
     J = J * size
     error = np.zeros_like(J) if error is None else error * size

@@ -399,7 +399,13 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
     if stated.clearance is not None and includes_limits:
         length = model_length(task.system.model)
         reach = stated.clearance + max(CLEARANCE_REACH * length, stated.clearance)
-        clearance = ClearanceConstraint.of(_distances(task, reach), stated.clearance)
+        ignored = [frozenset(pair) for pair in stated.ignored]
+        try:
+            pairs = find_geom_pairs(task.system.model, ignored)
+            distances = GeomDistances(task.system.model_at(task.theta), pairs, reach)
+        except ExperimentError as error:
+            raise ExperimentError(f"limits.{error}") from None
+        clearance = ClearanceConstraint.of(distances, stated.clearance)
 
     found = ConstraintSet(
         substeps=substeps,
@@ -492,17 +498,3 @@ def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds
         i = limit.index
         lower[i], upper[i], sizes[i] = limit.lower, limit.upper, limit.size
     return Bounds.from_range(lower, upper, sizes)
-
-
-def _distances(task: DesignTask, reach: float) -> GeomDistances:
-    """Distances up to `reach` [m] of all pairs of geoms that are not ignored.
-
-    Raises:
-        ExperimentError: There are no such pairs, or a body to ignore is unknown.
-    """
-    ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
-    try:
-        pairs = find_geom_pairs(task.system.model, ignored)
-        return GeomDistances(task.system.model_at(task.theta), pairs, reach)
-    except ExperimentError as error:
-        raise ExperimentError(f"limits.{error}") from None

@@ -1,8 +1,8 @@
 """Descents on one level: Algorithm 1 without a barrier, and stages of the interior-point method.
 
 Both yield a `Step` for each iterate, so that whoever asks for the next one decides when it ends.
-Under hard limits a stage minimises `log J + mu B`, with a barrier B of the limits and a weight mu
-that falls from stage to stage.
+Under hard limits a stage minimises `log J + mu B`. B is a barrier of the limits; its weight mu
+falls from stage to stage.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Controls that keep all hard limits, found without derivatives.
 
 A control is scaled about one that nearly holds the start, enlarged one actuator at a time, and
-changed at random. What keeps the limits is a simulation, first on the plant of the search and then
-on the unmodified model, so that these controls count where derivatives mislead, as with dry
-friction, and as a first result long before a descent has one.
+changed at random. Simulations show whether it keeps the limits, first on the plant of the search
+and then on the unmodified model. So these controls count where derivatives mislead, as with dry
+friction. They are also a first result, long before a descent has one.
 """
 
 from __future__ import annotations
@@ -46,9 +46,8 @@ SINGLE_FACTORS = (2.0, 1.4)
 BANDWIDTHS = (0.6, 0.15, 1.0, 0.35, 0.06)
 CONTROLS_PER_BANDWIDTH = 2
 
-# Size of a random change relative to the control, at first and within bounds, and the factors by
-# which it changes after a success and after a failure. After four failures for one success the
-# size remains.
+# Size of a random change relative to the control, at first and within bounds. It changes by one
+# factor after a success and by another after a failure; four failures undo one success.
 FIRST_SIZE = 0.3
 SMALLEST_SIZE, LARGEST_SIZE = 0.03, 1.0
 AFTER_SUCCESS = 1.5

@@ -180,7 +180,18 @@ class InteriorProblem:
         """
         values = values_of(point)
         values = self.constraints.evaluate(values.trajectory, values.observed, slopes=True)
-        expansion, jacobian = self._expand_cost(point, values)
+        theta, observations = self.base.theta, self.constraints.observations
+        if point.point is not None:
+            expansion, observed = self.base.expand_observed(point.point, observations)
+            assert observed is not None
+            jacobian = observed
+        else:
+            # Without a cost only the dynamics and the observations are linearised.
+            A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
+                theta, values.trajectory, observations
+            )
+            a, b = np.zeros((len(A) + 1, A.shape[1])), np.zeros((len(A), B.shape[2]))
+            expansion = Expansion(A=A, B=B, a=a, b=b)
 
         scale = self._merit_scale(point)
         barrier: BarrierExpansion = self.constraints.expand(values, jacobian, self.delta)
@@ -194,26 +205,6 @@ class InteriorProblem:
             b=expansion.b / scale + barrier.b,
             barrier=barrier,
         )
-
-    def _expand_cost(
-        self, point: InteriorPoint, values: ConstraintValues
-    ) -> tuple[Expansion, Array]:
-        """Expansion of J, and the derivative of the observations: (N, substeps, w, nx+nu)."""
-        observations = self.constraints.observations
-
-        if point.point is not None:
-            expansion, jacobian = self.base.expand_observed(point.point, observations)
-            if jacobian is None:
-                raise ValueError("the expansion has no derivatives of the observations")
-            return expansion, jacobian
-
-        # Without a cost only the dynamics and the observations are linearised.
-        A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
-            self.base.theta, values.trajectory, observations
-        )
-        a = np.zeros((len(A) + 1, A.shape[1]))
-        b = np.zeros((len(A), B.shape[2]))
-        return Expansion(A=A, B=B, a=a, b=b), jacobian
 
     def project(
         self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array
