@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -16,8 +16,8 @@ from mjfim.errors import (
     listed,
 )
 from mjfim.excitation.evaluation import (
-    DesignReport,
-    Ending,
+    design_warnings,
+    evaluate_point,
     identifiability_along,
     point_at_stated_rate,
     require_designable,
@@ -28,8 +28,9 @@ from mjfim.excitation.initial_controls import (
     initial_controls_of,
     series_of,
 )
-from mjfim.excitation.limits.verification import require_feasible_start
+from mjfim.excitation.limits.verification import all_violations_of, require_feasible_start, verify
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.rehearsal import rehearse_task
 from mjfim.excitation.release import design_release
 from mjfim.excitation.search.climb import Candidate
 from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
@@ -37,12 +38,21 @@ from mjfim.excitation.search.search import Search, candidate_of
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import labels_of_system
 from mjfim.information.criteria import shared
 from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.parallel.budget import Budget, StopReason, StopToken, stop_on_interrupt
+from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.design import Design, Status
+from mjfim.records.design import (
+    Design,
+    ScaledStart,
+    StartResult,
+    Status,
+    improvement_per_iteration,
+    without_motions,
+)
 from mjfim.records.events import DesignCallback, DesignEvent, shown_progress
 
 T = TypeVar("T")
@@ -140,7 +150,7 @@ def design_task(
     """
     budget = design_budget(task) if budget is None else budget
     # All parts of the design use the same processes, also those that replace killed ones.
-    executor = None if executor is None else Workers.of(executor)
+    executor = Workers.of_any(executor)
     is_automatic = task.experiment.limits.reserve == "auto"
     rounds = RESERVE_ROUNDS if is_automatic else 1
     found: list[Design] = []
@@ -177,9 +187,14 @@ def _searched(
     identifiability: Identifiability | None,
 ) -> Design:
     """Design the control of a task whose reserve is known."""
-    if task.release is not None:
-        return design_release(task, budget, callback, executor)
-    _require_controls(task)
+    if not task.controls and task.release is None:
+        # An example for the first joint whose position is one number.
+        joint = next((joint.position_column for joint in task.system.coordinates), "qpos:<joint>")
+        raise ExperimentError(
+            f"{task.experiment.source}: the model has no actuators, so there is no control to "
+            "design. State in initial.free which initial state a design may choose, for example "
+            f'[initial] free = {{ "{joint}" = [-1.0, 1.0] }}'
+        )
     require_feasible_start(task)
     require_coarse_factor(task)
     steps_before = task.plant.engine_steps
@@ -188,54 +203,144 @@ def _searched(
     begun = budget.seconds_used
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     evaluation_seconds = budget.seconds_used - begun
-    if initial_control is not None:
-        initial_control = _checked_control(task, initial_control)
-    starts = list(initial_controls_of(task, initial_control))
-    begin = first
-    if initial_control is not None:
-        begin = task.problem.point(
-            task.plant.simulate(task.theta, initial_control), CENTRAL_DIFFERENCES
-        )
+    begin, starts = first, list[InitialControl]()
+    if task.release is None:
+        if initial_control is not None:
+            initial_control = np.asarray(initial_control, dtype=np.float64)
+            if initial_control.shape != task.control.shape:
+                raise ExperimentError(
+                    f"initial_control: shape {initial_control.shape}; it must be (samples, "
+                    f"actuators) = {task.control.shape}"
+                )
+            moved = task.plant.simulate(task.theta, initial_control)
+            begin = task.problem.point(moved, CENTRAL_DIFFERENCES)
+        starts = list(initial_controls_of(task, initial_control))
     if identifiability is None:
         identifiability = identifiability_along(task, begin)
         require_designable(task, identifiability)
     stage = DescentLevel(task, identifiability.basis)
     first, begin = stage.problem.reevaluated(first), stage.problem.reevaluated(begin)
-
-    search = Search(
-        stage=stage,
-        first=first,
-        executor=executor,
-        budget=budget,
-        evaluation_seconds=evaluation_seconds,
-    )
-    steps_before = task.plant.engine_steps - steps_before
-    # A stated time that is left is used for series.
-    rng = np.random.default_rng(task.experiment.descent.seed)
-    further = () if np.isinf(budget.seconds_left) else map(candidate_of, series_of(task, rng))
-    results = consume(search.run([candidate_of(each) for each in starts], further), callback)
-    if not search.grounds.is_limited:
-        results = _with_stops_evaluated(stage, results)
-    interrupted = budget.stop.requested
-    winner, point = _chosen(search, results, [first, begin])
-    steps = steps_before + search.steps
-    begun_names = {result.name for result in results}
-    report = DesignReport(
-        stage=stage,
-        identifiability=identifiability,
+    scaled_start, remarks = None, tuple[str, ...]()
+    if task.release is not None:
+        winner, point, rows, remarks = design_release(
+            stage, task.release, first, budget, callback, executor
+        )
+        steps = task.plant.engine_steps - steps_before
+    else:
+        search = Search(
+            stage=stage,
+            first=first,
+            executor=executor,
+            budget=budget,
+            evaluation_seconds=evaluation_seconds,
+        )
+        steps_before = task.plant.engine_steps - steps_before
+        # A stated time that is left is used for series.
+        rng = np.random.default_rng(task.experiment.descent.seed)
+        further = () if np.isinf(budget.seconds_left) else map(candidate_of, series_of(task, rng))
+        results = consume(search.run([candidate_of(each) for each in starts], further), callback)
+        if not search.grounds.is_limited:
+            results = _with_stops_evaluated(stage, results)
+        winner, point = _chosen(search, results, [first, begin])
+        rows = [result.start_result for result in results]
+        if not budget.stop.requested:
+            remarks = _without_time(task, starts, results)
+        steps, scaled_start = steps_before + search.steps, search.scaled_start
+    return _record(
+        stage,
+        identifiability,
         initial=first,
         final=point,
-        scaled_start=search.scaled_start,
-        remarks=() if interrupted else _without_time(task, starts, begun_names),
+        winner=winner,
+        starts=rows,
+        budget=budget,
+        steps=steps,
+        remarks=remarks,
+        scaled_start=scaled_start,
     )
-    ending = Ending(
-        name=winner.name,
-        status=winner.ended,
+
+
+def _record(
+    stage: DescentLevel,
+    identifiability: Identifiability,
+    *,
+    initial: DesignPoint,
+    final: DesignPoint,
+    winner: Candidate,
+    starts: Sequence[StartResult],
+    budget: Budget,
+    steps: int,
+    remarks: tuple[str, ...],
+    scaled_start: ScaledStart | None,
+) -> Design:
+    """The record of a design, with its warnings.
+
+    Args:
+        stage: The stated level.
+        identifiability: The combinations that can be identified.
+        initial: The initial control, evaluated.
+        final: The designed control, evaluated.
+        winner: The candidate that gave the design.
+        starts: Result of every initial control.
+        budget: Budget of the search.
+        steps: Engine steps of the search.
+        remarks: Warnings that belong to the search.
+        scaled_start: The largest share of an initial control outside limits that keeps them.
+    """
+    seconds, interrupted = budget.seconds_used, budget.stop.requested
+    task, information = stage.task, stage.problem.information
+    before, after = evaluate_point(stage, initial), evaluate_point(stage, final)
+    played = task.released_as(after.trajectory.state[0]) if final is not initial else task
+
+    # The limits, on the model as the user wrote it.
+    found = verify(played, after.trajectory)
+    clamped = saturated_actuators(task.system.model_at(task.theta), after.trajectory)
+
+    # After Ctrl-C a rehearsal would take too long.
+    rehearsal = None if interrupted else rehearse_task(played, after)
+    status = Status.INTERRUPTED if interrupted else winner.ended
+    if task.is_limited and not found.is_feasible and not interrupted:
+        status = Status.INFEASIBLE
+
+    parameters = task.parameters
+    data = shared(
+        information.without_round_off(after.information - task.prior),
+        parameters.prior_information,
+        parameters.recording_specific,
+    )
+    history, motions = without_motions(winner.history)
+    reserve = task.experiment.limits.reserve
+    return Design(
+        status=status,
+        parameters=parameters.names,
+        theta=task.theta,
+        initial=before,
+        final=after,
+        history=history,
         slope=winner.slope,
-        history=winner.history,
-        starts=tuple(result.start_result for result in results),
+        steps=steps,
+        seconds=seconds,
+        limits=found.margins,
+        usage=found.usage,
+        initial_violations=all_violations_of(task, before.trajectory),
+        scaled_start=scaled_start,
+        warnings=(*design_warnings(after, found, task, clamped), *remarks),
+        found_by=winner.name,
+        starts=tuple(starts),
+        nuisance=tuple(p.name for p in parameters.parameters if p.nuisance),
+        combinations=tuple(str(group) for group in identifiability.groups_along_all),
+        combined=identifiability.combinations(
+            information, task.theta[parameters.interest], before.information, after.information
+        ),
+        prior=task.prior,
+        data=data,
+        labels=labels_of_system(task.system),
+        sizes=parameters.sizes(task.theta),
+        motions=motions,
+        improvement=improvement_per_iteration(history, stage.problem.size(final)),
+        rehearsal=rehearsal,
+        reserve={} if reserve == "auto" else dict[str, float](reserve.items()),
     )
-    return report.design(ending, budget.seconds_used, steps, interrupted)
 
 
 def _chosen(
@@ -287,9 +392,10 @@ def _with_stops_evaluated(stage: DescentLevel, results: Sequence[Candidate]) -> 
 
 
 def _without_time(
-    task: DesignTask, starts: Sequence[InitialControl], begun: Collection[str]
+    task: DesignTask, starts: Sequence[InitialControl], results: Sequence[Candidate]
 ) -> tuple[str, ...]:
     """Say which initial controls were left out, because the time was too short for them."""
+    begun = {result.name for result in results}
     left = [start.name for start in starts if start.name not in begun]
     seconds = task.experiment.descent.seconds
     if not left or not begun or seconds is None:
@@ -317,32 +423,6 @@ def consume(
     finally:
         # A callback that raises an error ends the search, with all moves in other processes.
         events.close()
-
-
-def _require_controls(task: DesignTask) -> None:
-    """Raise ExperimentError where the model has no actuators, so that there is no control."""
-    if task.controls:
-        return
-
-    # An example for the first joint whose position is one number.
-    joint = next((joint.position_column for joint in task.system.coordinates), "qpos:<joint>")
-    raise ExperimentError(
-        f"{task.experiment.source}: the model has no actuators, so there is no control to design. "
-        "State in initial.free which initial state a design may choose, for example [initial] "
-        f'free = {{ "{joint}" = [-1.0, 1.0] }}'
-    )
-
-
-def _checked_control(task: DesignTask, control: Array) -> Array:
-    """A given initial control as an array of numbers; ExperimentError for a wrong shape."""
-    control = np.asarray(control, dtype=np.float64)
-    if control.shape != task.control.shape:
-        raise ExperimentError(
-            f"initial_control: shape {control.shape}; it must be (samples, actuators) = "
-            f"{task.control.shape}"
-        )
-
-    return control
 
 
 def design_jointly(
@@ -447,13 +527,9 @@ def _initial_information(task: DesignTask) -> Array:
         SimulationDivergedError: The simulation diverges along the initial control.
     """
     point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    if point.information is None or point.sensitivity is None:
-        raise SimulationDivergedError(
-            "the simulation diverges when the parameters change slightly along the initial control"
-        )
-
     # The initial control may excite some combinations only; the others carry no information.
-    excited = task.identifiability_test.along(task.initial, point.sensitivity).along_trajectory
+    excited = identifiability_along(task, point).along_trajectory
+    assert point.information is not None
     basis = excited.basis if excited.count else None
     information = replace(task.information, basis=basis)
 

@@ -6,8 +6,8 @@ whether a design can begin. The evaluation of a finished design gives its warnin
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,34 +17,20 @@ from mjfim.excitation.limits.limits import unsupported_ranges
 from mjfim.excitation.limits.verification import (
     SAME_STATE_TOLERANCE,
     Verification,
-    all_violations_of,
-    verify,
 )
 from mjfim.excitation.objective import DesignPoint
-from mjfim.excitation.rehearsal import rehearse_task
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import labels_of_system
-from mjfim.information.criteria import shared
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.parallel import one_blas_thread
-from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.check import GROUPS_TEXT, ParameterGroup, groups_in_words
+from mjfim.records.check import GROUPS_TEXT, groups_in_words
 from mjfim.records.design import (
-    Design,
     Evaluation,
-    HistoryRow,
-    ScaledStart,
-    StartResult,
-    Status,
-    improvement_per_iteration,
-    without_motions,
 )
-from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Trajectory
 
 # Growth of a disturbance along a trajectory without feedback above which the user is warned.
@@ -292,8 +278,7 @@ def identifiability_along(task: DesignTask, begin: DesignPoint) -> Identifiabili
     They are looked for along the control with which the search begins and along random controls.
     """
     require_evaluated(task, begin)
-    if begin.trajectory is None or begin.sensitivity is None:
-        raise SimulationDivergedError("the trajectory diverges")
+    assert begin.trajectory is not None and begin.sensitivity is not None
     return task.identifiability_test.along(begin.trajectory, begin.sensitivity)
 
 
@@ -353,10 +338,12 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     tried = "control" if task.release is None else "release"
     silent = [estimated[i].name for i in along_all.silent if not estimated[i].group]
     if silent:
+        quoted = listed([f"parameters.{name}" for name in silent])
         raise UnidentifiableError(
-            f"{_subject(silent)} nothing in the measured outputs, neither along the initial "
-            f"{tried} nor along {PROBES} random {tried}s; remove "
-            f"{'it' if len(silent) == 1 else 'them'}, or measure a quantity that shows the effect"
+            f"{quoted} {'changes' if len(silent) == 1 else 'change'} nothing in the measured "
+            f"outputs, neither along the initial {tried} nor along {PROBES} random {tried}s; "
+            f"remove {'it' if len(silent) == 1 else 'them'}, or measure a quantity that shows the "
+            "effect"
         )
 
     # A criterion that asks for combinations that cannot be identified.
@@ -377,164 +364,9 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
         return
     if identifiability.along_trajectory.count > along_all.count:
         groups = identifiability.groups_along_trajectory
-        unexcited = first_ones([_unexcited_group(group) for group in groups], "; ", GROUPS_TEXT)
+        names = [group.short if group.combinations else group.short_names for group in groups]
+        unexcited = first_ones(names, "; ", GROUPS_TEXT)
         raise UnidentifiableError(
             f"the initial control does not excite: {unexcited}. Other controls do: begin with one "
             "that moves the joints of these parameters, for example a multisine"
-        )
-
-
-def _unexcited_group(group: ParameterGroup) -> str:
-    """Name of a group of parameters that the initial control does not excite."""
-    return group.short if group.combinations else group.short_names
-
-
-def _subject(names: Sequence[str]) -> str:
-    """Beginning of a sentence about some parameters."""
-    quoted = listed([f"parameters.{name}" for name in names])
-    return f"{quoted} {'changes' if len(names) == 1 else 'change'}"
-
-
-# ---- the record of a design
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Ending:
-    """How the search for a design has ended.
-
-    Attributes:
-        name: Name of the initial control from which the design was found.
-        status: Outcome of its descent.
-        slope: Slope of the cost at the last iterate.
-        history: Iterates.
-        starts: Result of every initial control.
-    """
-
-    name: str
-    status: Status
-    slope: float
-    history: tuple[HistoryRow, ...]
-    starts: tuple[StartResult, ...]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DesignReport:
-    """Evaluation of a design, from which its record is made.
-
-    Attributes:
-        stage: The stated level.
-        identifiability: The combinations that can be identified.
-        initial: The initial control, evaluated.
-        final: The designed control, evaluated.
-        played: The task with the initial state of the design; None where it is the stated one.
-        remarks: Warnings that belong to the search.
-        scaled_start: The largest share of an initial control outside limits that keeps them.
-    """
-
-    stage: DescentLevel
-    identifiability: Identifiability
-    initial: DesignPoint
-    final: DesignPoint
-    played: DesignTask | None = None
-    remarks: tuple[str, ...] = ()
-    scaled_start: ScaledStart | None = None
-
-    def design(
-        self,
-        best: Ending,
-        seconds: float,
-        steps: int,
-        interrupted: bool,
-    ) -> Design:
-        """The record of the design, with its warnings.
-
-        Args:
-            best: How the search ended for the candidate that gave the design.
-            seconds: Time of the search [s].
-            steps: Engine steps of the search.
-            interrupted: Whether the search was stopped on request.
-        """
-        task = self.stage.task
-        initial = evaluate_point(self.stage, self.initial)
-        final = evaluate_point(self.stage, self.final)
-
-        # The limits, on the model as the user wrote it.
-        found = verify(self.played or task, final.trajectory)
-        model = task.system.model_at(task.theta)
-        clamped = saturated_actuators(model, final.trajectory)
-
-        # After Ctrl-C a rehearsal would take too long.
-        rehearsal = None if interrupted else rehearse_task(self.played or task, final)
-        status = Status.INTERRUPTED if interrupted else best.status
-        if task.is_limited and not found.is_feasible and not interrupted:
-            status = Status.INFEASIBLE
-
-        warnings = (*design_warnings(final, found, task, clamped), *self.remarks)
-        return self._record(
-            best=best,
-            seconds=seconds,
-            steps=steps,
-            status=status,
-            initial=initial,
-            final=final,
-            found=found,
-            warnings=warnings,
-            rehearsal=rehearsal,
-        )
-
-    def _record(
-        self,
-        *,
-        best: Ending,
-        seconds: float,
-        steps: int,
-        status: Status,
-        initial: Evaluation,
-        final: Evaluation,
-        found: Verification,
-        warnings: tuple[str, ...],
-        rehearsal: Rehearsal | None,
-    ) -> Design:
-        """The record, from all its parts."""
-        task = self.stage.task
-        information = self.stage.problem.information
-        parameters = task.parameters
-        combined = self.identifiability.combinations(
-            information, task.theta[parameters.interest], initial.information, final.information
-        )
-        data = shared(
-            information.without_round_off(final.information - task.prior),
-            parameters.prior_information,
-            parameters.recording_specific,
-        )
-        history, motions = without_motions(best.history)
-        reserve = task.experiment.limits.reserve
-        return Design(
-            status=status,
-            parameters=parameters.names,
-            theta=task.theta,
-            initial=initial,
-            final=final,
-            history=history,
-            slope=best.slope,
-            steps=steps,
-            seconds=seconds,
-            limits=found.margins,
-            usage=found.usage,
-            initial_violations=all_violations_of(task, initial.trajectory),
-            scaled_start=self.scaled_start,
-            warnings=warnings,
-            found_by=best.name,
-            starts=best.starts,
-            nuisance=tuple(p.name for p in parameters.parameters if p.nuisance),
-            combinations=tuple(str(group) for group in self.identifiability.groups_along_all),
-            combined=combined,
-            prior=task.prior,
-            data=data,
-            labels=labels_of_system(task.system),
-            sizes=parameters.sizes(task.theta),
-            motions=motions,
-            improvement=improvement_per_iteration(history, self.stage.problem.size(self.final)),
-            rehearsal=rehearsal,
-            reserve={} if reserve == "auto" else dict[str, float](reserve.items()),
         )

@@ -62,11 +62,6 @@ class InitialControl:
     basis: Array | None = None
     repeats: int = 1
 
-    @property
-    def over_horizon(self) -> Array:
-        """(N, nu) control over the whole horizon."""
-        return np.tile(self.control, (self.repeats, 1))
-
 
 def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[InitialControl]:
     """Collect the controls from which a design starts.
@@ -90,7 +85,9 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
 
     found = [first]
     for path in dict.fromkeys(descent.previous):
-        control = control_of_earlier_design(task, path)
+        # A shorter design is repeated.
+        with opened(task.experiment, path) as file:
+            control = read_control(file, task.t, task.dt, task.controls, repeat=True)
         found.append(InitialControl(name=f"previous design {path}", control=control))
 
     # Fourier series and multisines share one source of random numbers, in this order.
@@ -102,20 +99,12 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
         part = _first_part(task, count)
         found.append(InitialControl(name=name, control=part, repeats=count))
 
-    return chain(found, _multisines(task, rng))
-
-
-def control_of_earlier_design(task: DesignTask, path: str) -> Array:
-    """(N, nu) control of the design.csv of an earlier design, repeated where it is shorter."""
-    with opened(task.experiment, path) as file:
-        return read_control(file, task.t, task.dt, task.controls, repeat=True)
-
-
-def _multisines(task: DesignTask, rng: np.random.Generator) -> Iterator[InitialControl]:
-    """The random multisines; their number is that of `descent.starts` minus the initial one."""
-    last = task.experiment.descent.starts - 1
-    for i in range(1, last + 1):
-        yield InitialControl(name=f"multisine {i} of {last}", control=_multisine(task, rng))
+    last = descent.starts - 1
+    multisines = (
+        InitialControl(name=f"multisine {i} of {last}", control=_multisine(task, rng))
+        for i in range(1, last + 1)
+    )
+    return chain(found, multisines)
 
 
 def _multisine(task: DesignTask, rng: np.random.Generator) -> Array:

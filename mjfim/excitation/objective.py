@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,6 +135,7 @@ class DesignProblem:
         parameter_samples: Samples over which a robust design pools the criterion, theta first, or
             None. One control drives all samples, without feedback.
         lumped: Parameters whose sensitivities follow from those of the others, or None.
+        extends: Expansions also have psi as a state, for a metric that weighs psi.
     """
 
     plant: Plant
@@ -144,6 +145,7 @@ class DesignProblem:
     forward_differences_only: bool = False
     parameter_samples: ParameterSamples | None = None
     lumped: LumpedParameters | None = None
+    extends: bool = False
 
     def point(
         self,
@@ -168,43 +170,14 @@ class DesignProblem:
 
         others = []
         for theta in self._further_samples():
-            others.append(self.sample_point(theta, trajectory.ctrl, accuracy))
+            try:
+                moved = self.plant.simulate(theta, trajectory.ctrl)
+            except SimulationDivergedError:
+                return DIVERGED
+            others.append(self._point_without_cost(theta, moved, accuracy))
             if others[-1].trajectory is None:
                 return DIVERGED
         return self._with_cost(replace(point, others=tuple(others)))
-
-    def sample_point(self, theta: Array, ctrl: Array, accuracy: DifferenceAccuracy) -> DesignPoint:
-        """Evaluate the criterion of a control at a further parameter sample.
-
-        Args:
-            theta: (p,) the sample [theta-unit].
-            ctrl: (N, nu) the control [u-unit].
-            accuracy: Differences with which sensitivities are computed.
-
-        Returns:
-            The point without its cost; `DIVERGED` where the simulation diverges.
-        """
-        try:
-            moved = self.plant.simulate(theta, ctrl)
-        except SimulationDivergedError:
-            return DIVERGED
-        return self._point_without_cost(theta, moved, accuracy)
-
-    def sample_slope(self, theta: Array, point: DesignPoint) -> Array:
-        """Differentiate the criterion at a further parameter sample by the control.
-
-        The trajectory of a sample is a function of the control alone.
-
-        Args:
-            theta: (p,) the sample [theta-unit].
-            point: Point of a control at the sample.
-
-        Returns:
-            (N, nu) derivative.
-        """
-        bilinear, a, b = self._criterion_gradient(theta, point)
-        open_loop = np.zeros((len(b), b.shape[1], a.shape[1]))
-        return Expansion(A=bilinear.A, B=bilinear.B, a=a, b=b).gradient(open_loop)
 
     def reevaluated(self, point: DesignPoint) -> DesignPoint:
         """Evaluate the criterion and the cost of a point without a simulation.
@@ -320,7 +293,16 @@ class DesignProblem:
             model = self.information.eigenvalue_model(criterion, sensitivity, bilinear, point.cost)
 
         if self.parameter_samples is not None:
-            a, b = self._pooled_gradient(self.parameter_samples, point, a, b)
+            # The trajectories of the further samples are functions of the control alone, so that
+            # they add to b only.
+            first, *weights = self.parameter_samples.weights(point.phi)
+            a, b = first * a, first * b
+            thetas = self._further_samples()
+            for weight, theta, other in zip(weights, thetas, point.others, strict=True):
+                own, own_a, own_b = self._criterion_gradient(theta, other)
+                open_loop = np.zeros((len(own_b), own_b.shape[1], own_a.shape[1]))
+                slope = Expansion(A=own.A, B=own.B, a=own_a, b=own_b).gradient(open_loop)
+                b += weight * slope
 
         a_running, b_running = self.running.gradient(trajectory)
         expansion = Expansion(
@@ -328,27 +310,21 @@ class DesignProblem:
             B=bilinear.B,
             a=a + a_running,
             b=b + b_running,
-            extended=None,
-            barrier=None,
+            extended=self._extended(point, a_running, b_running) if self.extends else None,
             eigenvalue_model=model,
         )
         return expansion, bilinear.observation_jacobian
 
-    def _pooled_gradient(
-        self, samples: ParameterSamples, point: DesignPoint, a: Array, b: Array
-    ) -> tuple[Array, Array]:
-        """Gradient of the pooled criterion, from the gradient (a, b) of the criterion at theta.
-
-        The trajectories of the further samples are functions of the control alone, so that they add
-        to b only.
-        """
-        weights = samples.weights(point.phi)
-        a, b = weights[0] * a, weights[0] * b
-
-        thetas = self._further_samples()
-        for weight, theta, other in zip(weights[1:], thetas, point.others, strict=True):
-            b += weight * self.sample_slope(theta, other)
-        return a, b
+    def _extended(self, point: DesignPoint, a: Array, b: Array) -> Expansion:
+        """Expansion of J over (x, psi), from the gradient (a, b) of the running cost."""
+        trajectory, sensitivity, criterion = _computed(point)
+        full = self.plant.derivatives.bilinear(
+            self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy
+        )
+        by_psi, by_state, by_control = self.information.partial_derivatives(
+            criterion, sensitivity, full
+        )
+        return extend(full, a + by_state, b + by_control, by_psi)
 
     def _criterion_gradient(
         self, theta: Array, point: DesignPoint, observations: SubstepObservations | None = None
@@ -403,36 +379,6 @@ def _computed(point: DesignPoint) -> tuple[Trajectory, Sensitivity, Criterion]:
     if point.trajectory is None or point.sensitivity is None or point.criterion is None:
         raise ValueError("a diverged trial has no expansion")
     return point.trajectory, point.sensitivity, point.criterion
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ExtendedDesignProblem(DesignProblem):
-    """A design problem whose expansions have psi as a state, for a metric that weighs psi."""
-
-    @classmethod
-    def of(cls, problem: DesignProblem) -> ExtendedDesignProblem:
-        """The extended problem with the attributes of another one."""
-        return cls(**{field.name: getattr(problem, field.name) for field in fields(problem)})
-
-    def expand_observed(
-        self, point: DesignPoint, observations: SubstepObservations | None
-    ) -> tuple[Expansion, Array | None]:
-        """Expansion with its extended form. See `DesignProblem.expand_observed`."""
-        expansion, jacobian = super().expand_observed(point, observations)
-        return replace(expansion, extended=self._extended(point)), jacobian
-
-    def _extended(self, point: DesignPoint) -> Expansion:
-        """Expansion of J over (x, psi)."""
-        trajectory, sensitivity, criterion = point.trajectory, point.sensitivity, point.criterion
-        if trajectory is None or sensitivity is None or criterion is None:
-            raise ValueError("a diverged trial has no expansion")
-
-        full = self.plant.derivatives.bilinear(
-            self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy
-        )
-        a_psi, a, b = self.information.partial_derivatives(criterion, sensitivity, full)
-        a_running, b_running = self.running.gradient(trajectory)
-        return extend(full, a_running + a, b_running + b, a_psi)
 
 
 def extend(full: Bilinear, a: Array, b: Array, a_psi: Array) -> Expansion:

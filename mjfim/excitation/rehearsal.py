@@ -141,15 +141,16 @@ def rehearsed(
         gain: (N, nu, nx) gains, which matter under feedback only.
         steps: Its standard deviations by finite steps.
     """
-    spec = task.experiment.rehearsal
-    stage = _Stage(task, trajectory, gain)
+    spec, player = task.experiment.rehearsal, _RobotPlayer(task, trajectory, gain)
     rng = np.random.default_rng(spec.seed)
     theta = np.array([task.theta, *(_drawn(task, rng) for _ in range(spec.robots))])
 
     # The model comes first, because its motion is the plan of the feedback.
-    most = max(MAX_VALUES // stage.numbers, 1)
+    steps_of_one = len(player.ctrl) * player.steps_per_row + player.late_steps
+    values = task.space.nq + task.space.nv + 2 * len(player.limits) + 1
+    most = max(MAX_VALUES // (steps_of_one * values), 1)
     blocks = [theta[:1], *(theta[i : i + most] for i in range(1, len(theta), most))]
-    parts = [part for block in blocks for part in stage.play(block, rng)]
+    parts = [part for block in blocks for part in player.play(block, rng)]
     measured = {
         each.name: np.array([getattr(part, each.name) for part in parts])
         for each in fields(_Played)
@@ -159,15 +160,15 @@ def rehearsed(
         parameters=task.parameters.names,
         wrong=spec.wrong,
         feedback=spec.feedback,
-        latency=stage.late_steps * stage.timestep,
+        latency=player.late_steps * player.timestep,
         theta=theta,
-        limits=stage.rehearsed_limits(),
-        joints=tuple(group.name for group in stage.groups),
-        units=tuple(group.unit for group in stage.groups),
-        unlimited=tuple(group.name for group in stage.groups if not group.is_limited),
-        floor=stage.floor,
-        has_floor=stage.has_floor,
-        depth=stage.depth,
+        limits=player.rehearsed_limits(),
+        joints=tuple(group.name for group in player.groups),
+        units=tuple(group.unit for group in player.groups),
+        unlimited=tuple(group.name for group in player.groups if not group.is_limited),
+        floor=player.floor,
+        has_floor=player.has_floor,
+        depth=player.depth,
         unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
         steps=steps,
         **measured,
@@ -222,7 +223,7 @@ class _Played:
     unbraked: tuple[str, ...] = ()
 
 
-class _Stage:
+class _RobotPlayer:
     """A design, and what measures the robots that play it.
 
     Attributes:
@@ -260,7 +261,11 @@ class _Stage:
         self._observations = self.constraints.observations.of_single_steps()
         model = task.system.model_at(task.theta)
         self._simulator = BatchSimulator(model, threads=task.plant.simulator.threads)
-        self.rest = self._rest_control()
+        # (nu,) control that holds the start; None where the motion begins without a rest.
+        self.rest: Array | None = None
+        if task.controls:
+            with suppress(ExperimentError):
+                self.rest = task.initial_hold
         space = task.space
         self.sensed = np.full(space.nq + space.nv + space.na, -1)
         for entry, output in outputs_by_state(task.system.model, task.system.outputs).items():
@@ -288,12 +293,6 @@ class _Stage:
         with suppress(ExperimentError):
             pairs = find_geom_pairs(model, ignored)
             self._distances = GeomDistances(model, pairs, length)
-
-    @property
-    def numbers(self) -> int:
-        """Number of values that the simulation of one robot returns."""
-        steps = len(self.ctrl) * self.steps_per_row + self.late_steps
-        return steps * (self.task.space.nq + self.task.space.nv + 2 * len(self.limits) + 1)
 
     def rehearsed_limits(self) -> tuple[RehearsedLimit, ...]:
         """The limits in the order of the margins."""
@@ -382,12 +381,11 @@ class _Stage:
         nearest = np.nan
         if self._distances is not None:
             nearest = self._distances.nearest(qpos[rows])[0]
-        end_speed = largest(qvel[-1:])
         return _Played(
             margins=margins,
             speed=largest(qvel),
             acceleration=largest(change),
-            end_speed=end_speed,
+            end_speed=largest(qvel[-1:]),
             lowest=float(heights.min()),
             end_height=float(heights[-1]),
             nearest=nearest,
@@ -425,8 +423,8 @@ class _Stage:
     def _floor_of(self, model: Any, start: Array) -> tuple[float, bool]:
         """Height of the floor [m], and whether the experiment or the model states it.
 
-        Without a floor it is the lower end of a base that does not move, or 0 for a free body, or
-        the lowest point of the start if that is lower. A robot without a base has no floor.
+        Without a floor it is the lower end of a base that does not move, or 0 for a free body. The
+        lowest point of the start counts if it is lower. A robot without a base has no floor.
         """
         stated = self.task.experiment.rehearsal.floor
         if stated is not None:
@@ -536,29 +534,11 @@ class _Stage:
 
     # ---- the start
 
-    def _rest_control(self) -> Array | None:
-        """(nu,) control that holds the start; None where the motion begins without a rest."""
-        if not self.task.controls:
-            return None
-        try:
-            return self.task.initial_hold
-        except ExperimentError:
-            return None
-
     def _start(self, model: Any, theta: Array) -> Array:
         """(ns,) initial state of a robot: its equilibrium near the start, where it has one."""
         stated = self.task.plant.initial_state(theta)
         if self.rest is None:
             return stated
-        found, moves = self._equilibrium(model, stated)
-        return found if moves <= MAX_REST_MOVE else stated
-
-    def _equilibrium(self, model: Any, stated: Array) -> tuple[Array, float]:
-        """An equilibrium near a state, and the largest acceleration that is left.
-
-        The acceleration is relative to the size of its coordinate over the square of the horizon,
-        and infinite where the equilibrium is unstable.
-        """
         space, sizes = self.task.space, self.task.plant.sizes
         data = mujoco.MjData(model)
         # Positions and activations may change by multiples of their sizes; velocities stay.
@@ -576,14 +556,16 @@ class _Stage:
 
         still = np.zeros(len(directions))
         if np.abs(relative_rates(still)).max(initial=0.0) <= MAX_REST_MOVE:
-            return stated, 0.0
+            return stated
         found = scipy.optimize.least_squares(
             relative_rates, still, xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=MAX_REST_STEPS
         )
         # Nobody balances a robot on an equilibrium that it leaves within the motion.
         growth = np.linalg.eigvals(found.jac[: space.nv, : space.nv]).real.max(initial=0.0)
-        moves = float(np.abs(relative_rates(found.x)).max(initial=0.0)) if growth < 1.0 else np.inf
-        return space.plus(stated, found.x @ directions), moves
+        moves = np.abs(relative_rates(found.x)).max(initial=0.0)
+        if growth < 1.0 and moves <= MAX_REST_MOVE:
+            return space.plus(stated, found.x @ directions)
+        return stated
 
     # ---- the controller, with or without feedback
 
@@ -643,35 +625,24 @@ def _pose(data: Any) -> tuple[Array, ...]:
 def _speed_groups(task: DesignTask) -> Iterator[_SpeedGroup]:
     """The joints of a model: a free joint has a speed and an angular speed."""
     model = task.system.model
-    limited = {
-        kind: [limit.name for limit in task.limits if limit.kind == kind]
-        for kind in ("velocity", "angular_velocity")
-    }
-
-    def is_limited(name: str, *kinds: str) -> bool:
-        """Whether a limit of these kinds names the joint or one of its coordinates."""
-        found = [each for kind in kinds for each in limited[kind]]
-        return any(each == name or each.startswith(f"{name}.") for each in found)
+    limited = {limit.kind: set[str]() for limit in task.limits}
+    for limit in task.limits:
+        # A limit may name a joint or one of its coordinates.
+        limited[limit.kind] |= {limit.name, limit.name.rpartition(".")[0]}
 
     for joint, name in enumerate(joint_names(model)):
         first, count = int(model.jnt_dofadr[joint]), joint_dofs(model, joint)
+        kinds: tuple[str, ...] = ("velocity", "angular_velocity")
+        groups = [(name, first, count, joint_unit(model, joint), kinds)]
         if count == 6:
+            groups = [
+                (name, first, 3, LENGTH, kinds[:1]),
+                (f"{name} (rotation)", first + 3, 3, ANGLE, kinds[1:]),
+            ]
+        for title, begin, number, unit, own in groups:
             yield _SpeedGroup(
-                name=name,
-                dofs=tuple(range(first, first + 3)),
-                unit=per_second(LENGTH),
-                is_limited=is_limited(name, "velocity"),
+                name=title,
+                dofs=tuple(range(begin, begin + number)),
+                unit=per_second(unit),
+                is_limited=any(name in limited.get(kind, ()) for kind in own),
             )
-            yield _SpeedGroup(
-                name=f"{name} (rotation)",
-                dofs=tuple(range(first + 3, first + 6)),
-                unit=per_second(ANGLE),
-                is_limited=is_limited(name, "angular_velocity"),
-            )
-            continue
-        yield _SpeedGroup(
-            name=name,
-            dofs=tuple(range(first, first + count)),
-            unit=per_second(joint_unit(model, joint)),
-            is_limited=is_limited(name, "velocity", "angular_velocity"),
-        )

@@ -8,39 +8,32 @@ from __future__ import annotations
 
 import itertools
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.evaluation import (
-    UNSTABLE_GROWTH,
-    DesignReport,
-    Ending,
-    identifiability_along,
-    require_designable,
-)
+from mjfim.excitation.evaluation import UNSTABLE_GROWTH
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.limits.verification import require_feasible_start
 from mjfim.excitation.objective import DIVERGED, DesignPoint
 from mjfim.excitation.release_space import ReleaseSpace
-from mjfim.excitation.search.climb import row_of
+from mjfim.excitation.search.climb import Candidate, row_of
 from mjfim.excitation.search.inside import LimitedCost
-from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification
-from mjfim.parallel import ExecutorLike, Workers, carry_out, one_blas_thread, pool_stop_token
+from mjfim.parallel import ExecutorLike, Workers, one_blas_thread, pool_stop_token, results
 from mjfim.parallel.budget import Budget
 from mjfim.parallel.shared_value import KeptPerThread, SharedValue
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
-from mjfim.records.design import Design, HistoryRow, StartResult, Status, extended
+from mjfim.records.design import HistoryRow, StartResult, Status, extended
 from mjfim.records.events import DesignCallback, DesignEvent
 from mjfim.records.trajectory import Trajectory
 
@@ -103,25 +96,24 @@ class Release:
         return (False, self.point.cost) if margin >= 0.0 else (True, -margin)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Releases:
     """Evaluates releases of a task.
 
-    Args:
+    Attributes:
         stage: The stated level.
         space: The ranges.
         plant: Plant with difference steps that suit.
     """
 
-    def __init__(self, stage: DescentLevel, space: ReleaseSpace, plant: Plant) -> None:
-        self.stage = stage
-        self.space = space
-        self.plant = plant
+    stage: DescentLevel
+    space: ReleaseSpace
+    plant: Plant
 
     @cached_property
-    def _constraints(self) -> ConstraintSet | None:
-        """The limits; None without any."""
-        task = self.stage.task
-        return constraint_set_of(task) if task.is_limited else None
+    def _constraints(self) -> ConstraintSet:
+        """The limits."""
+        return constraint_set_of(self.stage.task)
 
     def released(self, shares: Array) -> Plant:
         """Give the plant the initial state of a release: (d,) shares."""
@@ -129,15 +121,13 @@ class Releases:
 
     def evaluate(self, shares: Array) -> Release:
         """Simulate a release, (d,) shares, with its limits, its information and its cost."""
-        plant = self.released(shares)
-        moved = self._simulated(plant)
+        plant, task, problem = self.released(shares), self.stage.task, self.stage.problem
+        values = self._constraints.along(plant, task.theta, task.control)
         nothing = Release(shares=shares, margins={})
-        if moved is None:
+        if values is None:
             return nothing
-        trajectory, margins = moved
-        problem = replace(self.stage.problem, plant=plant)
-        point = problem.point(trajectory, CENTRAL_DIFFERENCES)
-        if point.trajectory is None or point.criterion is None:
+        point = replace(problem, plant=plant).point(values.trajectory, CENTRAL_DIFFERENCES)
+        if point.trajectory is None:
             return nothing
 
         # The objective has no unit. A logarithmic criterion may be negative; one nat per parameter
@@ -147,42 +137,21 @@ class Releases:
             objective = float(np.log(max(point.cost, TINY)))
             if problem.information.criterion == "D":
                 objective = point.cost / problem.size(point)
-        growth = self._margin_of_growth(plant, trajectory)
-        margins = {**margins, GROWTH: growth}
+        margins = {
+            **self._constraints.relative_margins(values),
+            GROWTH: self._margin_of_growth(plant, values.trajectory),
+        }
         return Release(shares=shares, point=point, margins=margins, objective=objective)
 
     def _margin_of_growth(self, plant: Plant, trajectory: Trajectory) -> float:
         """Margin of the growth of a small disturbance; 0 where it grows `UNSTABLE_GROWTH`-fold."""
         task = self.stage.task
         try:
-            A, _, _, _ = plant.derivatives.jacobians(task.theta, trajectory)
+            A = plant.derivatives.jacobians(task.theta, trajectory)[0]
         except SimulationDivergedError:
             return -1.0
         growth = max(largest_amplification(A, task.sizes[: task.space.nx]), np.finfo(float).tiny)
         return float(1.0 - np.log(growth) / np.log(UNSTABLE_GROWTH))
-
-    def _simulated(self, plant: Plant) -> tuple[Trajectory, dict[str, float]] | None:
-        """Motion of a plant from its initial state, with the relative margins of its limits."""
-        task, constraints = self.stage.task, self._constraints
-        if constraints is None:
-            try:
-                return plant.simulate(task.theta, task.control), {}
-            except SimulationDivergedError:
-                return None
-        found = plant.observe(task.theta, task.control, constraints.observations)
-        if found is None:
-            return None
-        values = constraints.evaluate(*found, slopes=False)
-        return found[0], constraints.relative_margins(values)
-
-    def evaluated(self, grid: Sequence[Array], is_over: Callable[[], bool]) -> list[Release]:
-        """Evaluate releases, (d,) shares each, until the time is over; the first one always."""
-        found: list[Release] = []
-        for shares in grid:
-            if found and is_over():
-                break
-            found.append(self.evaluate(shares))
-        return found
 
     def followed(
         self, start: Release, is_over: Callable[[], bool]
@@ -257,37 +226,53 @@ class _Plan:
             self.experiment, threads=self.threads, added_information=self.added_information
         )
         plant = task.plant.with_step_factors(self.step_factors)
-        return Releases(DescentLevel(task, self.basis), self.space, plant)
+        return Releases(stage=DescentLevel(task, self.basis), space=self.space, plant=plant)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Order:
-    """Order to evaluate some releases, or to follow one."""
+    """Order to evaluate some releases, or to follow one; `plan` is for workers only."""
 
-    plan: SharedValue[_Plan]
+    name: str
     budget: Budget
     grid: tuple[Array, ...] = ()
     start: Release | None = None
+    plan: SharedValue[_Plan] | None = None
 
+
+# Name of an order, what it has tried, how it has ended, and the engine steps of a worker. Without a
+# status its time was over.
+_Tried = tuple[str, list[Release], Status | None, int]
 
 _kept = KeptPerThread[Releases](2)
 
 
-@one_blas_thread()
-def _in_worker(order: _Order) -> tuple[list[Release], Status | None, int]:
-    """Carry out an order; what was tried, how it has ended, and the engine steps."""
-    releases = _kept.get(order.plan.digest, order.plan.value.releases)
-    stop, before = pool_stop_token(), releases.plant.engine_steps
+def _tried(releases: Releases, order: _Order) -> _Tried:
+    """Carry out an order in this process."""
+    stop = pool_stop_token()
 
     def is_over() -> bool:
         """Whether the time is over, or a stop was requested."""
         return stop.requested or order.budget.exhausted is not None
 
-    if order.start is None:
-        found, status = releases.evaluated(order.grid, is_over), None
-    else:
-        found, status = releases.followed(order.start, is_over)
-    return found, status, releases.plant.engine_steps - before
+    if order.start is not None:
+        return order.name, *releases.followed(order.start, is_over), 0
+    found: list[Release] = []
+    for shares in order.grid:
+        if found and is_over():
+            break
+        found.append(releases.evaluate(shares))
+    return order.name, found, None, 0
+
+
+@one_blas_thread()
+def _in_worker(order: _Order) -> _Tried:
+    """Carry out an order in a worker."""
+    assert order.plan is not None
+    releases = _kept.get(order.plan.digest, order.plan.value.releases)
+    before = releases.plant.engine_steps
+    name, found, status, _ = _tried(releases, order)
+    return name, found, status, releases.plant.engine_steps - before
 
 
 class ReleaseSearch:
@@ -309,25 +294,36 @@ class ReleaseSearch:
         callback: DesignCallback | None,
         executor: ExecutorLike | None = None,
     ) -> None:
-        self._releases = Releases(stage, space, stage.task.plant)
+        self._releases = Releases(stage=stage, space=space, plant=stage.task.plant)
         self._budget = budget
-        self._workers = None if executor is None else Workers.of(executor)
+        self._workers = Workers.of_any(executor)
         self._callback: Callable[[DesignEvent], None] = callback or (lambda event: None)
         self._history: tuple[HistoryRow, ...] = ()
         self._steps_before = stage.task.plant.engine_steps
         self._found_by = "grid of releases"
         self.best: Release | None = None
 
-    def run(self) -> tuple[Release, Ending]:
-        """Search the ranges.
+    def run(self) -> tuple[Release, Candidate, list[StartResult]]:
+        """Search the ranges; the best release, as a candidate as well, and the local searches.
 
         Raises:
             SimulationDivergedError: The simulation diverges from every release.
         """
-        tried = []
-        for release in self._evaluated(self._grid()):
-            tried.append(release)
-            self._take(release, self._found_by)
+        grid, tried = self._grid(), list[Release]()
+        size = 1 if self._workers is None else RELEASES_PER_ORDER
+        budget = self._budget.share(GRID_TIME_SHARE)
+        orders = [
+            _Order(name=self._found_by, budget=budget, grid=tuple(grid[first : first + size]))
+            for first in range(0, len(grid), size)
+        ]
+        for _, found, _, _ in self._carried_out(orders, budget):
+            for release in found:
+                tried.append(release)
+                self._take(release, self._found_by)
+        # After a request to stop before the first result there is at least this one.
+        if self.best is None:
+            tried.append(self._releases.evaluate(grid[0]))
+            self._take(tried[-1], self._found_by)
         self._calibrate()
         starts = self._local_searches(tried)
         if self.best is None:
@@ -339,14 +335,16 @@ class ReleaseSearch:
             status = starts[self._found_by].status
         elif any(start.status.success for start in starts.values()):
             status = Status.RELEASE_FOUND
-        ending = Ending(
+        control = self._releases.stage.task.control
+        winner = Candidate(
             name=self._found_by,
+            control=control,
+            best=control,
             status=status,
             slope=np.nan,
             history=self._history,
-            starts=tuple(starts.values()),
         )
-        return self.best, ending
+        return self.best, winner, list(starts.values())
 
     def _grid(self) -> list[Array]:
         """(d,) shares of each release of the grid, the stated one first."""
@@ -363,29 +361,15 @@ class ReleaseSearch:
             grid = [*corners, *grid]
         return grid if stated is None else [stated, *grid]
 
-    def _evaluated(self, grid: list[Array]) -> Iterator[Release]:
-        """Evaluate releases in their order, until a share of the time is used."""
-        budget = self._budget.share(GRID_TIME_SHARE)
-        if self._workers is None:
-            for number, shares in enumerate(grid):
-                if number and budget.exhausted is not None:
-                    return
-                yield self._releases.evaluate(shares)
-            return
-
-        firsts = range(0, len(grid), RELEASES_PER_ORDER)
-        parts = [tuple(grid[first : first + RELEASES_PER_ORDER]) for first in firsts]
-        orders = [_Order(plan=self._plan(len(parts)), budget=budget, grid=part) for part in parts]
-        for outcome in carry_out(self._workers, _in_worker, orders, budget):
-            if outcome.is_lost:
-                yield from map(self._releases.evaluate, parts[outcome.index])
-                continue
-            found, _, steps = outcome.result
-            self._releases.plant.simulator.add_steps(steps)
-            yield from found
-        # After a request to stop before the first result there is at least this one.
-        if self.best is None:
-            yield self._releases.evaluate(grid[0])
+    def _carried_out(self, orders: list[_Order], budget: Budget) -> Iterator[_Tried]:
+        """What the orders have tried, in their order, here or on the workers."""
+        if self._workers is not None:
+            plan = self._plan(len(orders))
+            orders = [replace(order, plan=plan) for order in orders]
+        here = partial(_tried, self._releases)
+        for tried in results(_in_worker, orders, self._workers, budget, here):
+            self._releases.plant.simulator.add_steps(tried[-1])
+            yield tried
 
     def _calibrate(self) -> None:
         """Choose difference steps that suit the best release of the grid."""
@@ -395,7 +379,7 @@ class ReleaseSearch:
         before = self._releases
         theta = before.stage.task.theta
         plant = before.released(best.shares).calibrated(theta, best.point.trajectory)
-        self._releases = Releases(before.stage, before.space, plant)
+        self._releases = replace(before, plant=plant)
         self.best = self._releases.evaluate(best.shares)
         last = self._history[-1]
         row = self._row(self.best, last.iteration, last.gamma)
@@ -404,48 +388,27 @@ class ReleaseSearch:
     def _local_searches(self, tried: list[Release]) -> dict[str, StartResult]:
         """Follow the best releases of the grid; results by name."""
         wanted = max(LOCAL_SEARCHES, self._releases.stage.task.experiment.descent.starts)
-        starts = _apart(sorted(tried, key=lambda release: release.rank), wanted)
-        results = {}
-        for number, (found, status) in enumerate(self._followed(starts)):
+        chosen = _apart(sorted(tried, key=lambda release: release.rank), wanted)
+        starts = {f"grid release {i} of {len(chosen)}": each for i, each in enumerate(chosen, 1)}
+        if self._budget.exhausted is not None:
+            return {}
+        orders = [
+            _Order(name=name, budget=self._budget, start=start) for name, start in starts.items()
+        ]
+        rows = {}
+        for name, found, status, _ in self._carried_out(orders, self._budget):
             if not found and status is None:
                 continue
-            name = f"grid release {number + 1} of {len(starts)}"
             for release in found:
                 self._take(release, name)
-            best = min([starts[number], *found], key=lambda release: release.rank)
-            results[name] = StartResult(
+            best = min([starts[name], *found], key=lambda release: release.rank)
+            rows[name] = StartResult(
                 name=name,
                 cost=best.point.cost,
                 status=status or Status.MAX_ITERATIONS,
                 iterations=len(found),
             )
-        return results
-
-    def _followed(self, starts: list[Release]) -> Iterator[tuple[list[Release], Status | None]]:
-        """Local searches from some releases, in their order."""
-
-        def is_over() -> bool:
-            """Whether the time is over."""
-            return self._budget.exhausted is not None
-
-        if self._workers is None or is_over():
-            for start in starts:
-                if is_over():
-                    return
-                yield self._releases.followed(start, is_over)
-            return
-
-        plan = self._plan(len(starts))
-        orders = [_Order(plan=plan, budget=self._budget, start=start) for start in starts]
-        results: list[tuple[list[Release], Status | None]] = [([], None) for _ in starts]
-        for outcome in carry_out(self._workers, _in_worker, orders, self._budget):
-            if outcome.is_lost:
-                results[outcome.index] = self._releases.followed(starts[outcome.index], is_over)
-                continue
-            found, status, steps = outcome.result
-            self._releases.plant.simulator.add_steps(steps)
-            results[outcome.index] = found, status
-        yield from results
+        return rows
 
     def _plan(self, tasks: int) -> SharedValue[_Plan]:
         """What all orders share; the workers do some number of tasks."""
@@ -499,43 +462,31 @@ def _apart(ranked: list[Release], count: int) -> list[Release]:
 
 
 def design_release(
-    task: DesignTask, budget: Budget, callback: DesignCallback | None, executor: ExecutorLike | None
-) -> Design:
-    """Design the initial state of a motion whose control is given. See `design`."""
-    assert task.release is not None
-    require_feasible_start(task)
-    require_coarse_factor(task)
-    steps_before = task.plant.engine_steps
-    first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    identifiability = identifiability_along(task, first)
-    require_designable(task, identifiability)
-    stage = DescentLevel(task, identifiability.basis)
-    first = stage.problem.reevaluated(first)
-    search = ReleaseSearch(stage, task.release, budget, callback, executor)
-    best, ending = search.run()
-    interrupted = budget.stop.requested
+    stage: DescentLevel,
+    space: ReleaseSpace,
+    first: DesignPoint,
+    budget: Budget,
+    callback: DesignCallback | None,
+    executor: ExecutorLike | None,
+) -> tuple[Candidate, DesignPoint, list[StartResult], tuple[str, ...]]:
+    """Design the initial state of a motion whose control is given.
 
+    Args:
+        stage: The stated level.
+        space: Ranges of the initial state.
+        first: The motion from the stated initial state.
+        budget: Ends the search.
+        callback: Called for each release that is better than all before.
+        executor: Workers; None for this process.
+
+    Returns:
+        The best release as a candidate, its motion, the results of local searches, and warnings.
+    """
+    best, winner, rows = ReleaseSearch(stage, space, budget, callback, executor).run()
+    point, task = best.point, stage.task
     # The stated release stays where no better one within the limits was found.
-    chosen, played = best.point, task
-    if first.cost < chosen.cost and _keeps_limits(stage, first):
-        chosen = first
-    elif chosen.trajectory is not None:
-        played = task.released_as(chosen.trajectory.state[0])
-    report = DesignReport(
-        stage=stage,
-        identifiability=identifiability,
-        initial=first,
-        final=chosen,
-        played=played,
-        remarks=tuple(task.release.edges(best.shares)),
-    )
-    steps = task.plant.engine_steps - steps_before
-    return report.design(ending, budget.seconds_used, steps, interrupted)
-
-
-def _keeps_limits(stage: DescentLevel, point: DesignPoint) -> bool:
-    """Check whether the motion of the stated release keeps the limits."""
-    if not stage.task.is_limited or point.trajectory is None:
-        return not stage.task.is_limited
-    relaxed = DescentLevel(stage.task.relaxed(), stage.basis)
-    return LimitedCost(level=relaxed).keeps(point.trajectory.ctrl)
+    if first.cost < point.cost and first.trajectory is not None:
+        relaxed = LimitedCost(level=DescentLevel(task.relaxed(), stage.basis))
+        if not task.is_limited or relaxed.keeps(first.trajectory.ctrl):
+            point = first
+    return winner, point, rows, tuple(space.edges(best.shares))

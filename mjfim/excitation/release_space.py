@@ -61,7 +61,9 @@ class ReleaseSpace:
             return None
 
         space, start = system.space, system.nominal_initial_state
-        components = _choosable(system)
+        # Positions and velocities.
+        deviations = system.source.coordinates.deviations[: 2 * space.nv]
+        components = {component.name: component for component in deviations}
         chosen: list[TangentComponent] = []
         ranges = []
         for name, (low, high) in stated.items():
@@ -73,6 +75,10 @@ class ReleaseSpace:
             chosen.append(component)
             ranges.append(_narrowed(name, (low, high), _limit_of(system, limits, component)))
 
+        # Rotations of quaternions are relative to the stated state.
+        qpos, qvel, _ = space.split(start)
+        origin = np.concatenate([np.zeros(space.nv), qvel])
+        origin[space.scalar_v] = qpos[space.scalar_q]
         addresses = np.array([component.address for component in chosen], dtype=np.intp)
         lower, upper = np.array(ranges, dtype=np.float64).T
         return cls(
@@ -81,19 +87,16 @@ class ReleaseSpace:
             addresses=addresses,
             lower=lower,
             upper=upper,
-            origin=_coordinates(space, start)[addresses],
+            origin=origin[addresses],
             stated=np.array(start),
             space=space,
         )
 
-    def values(self, shares: Array) -> Array:
-        """(d,) values of the coordinates at shares: (d,) [x-unit]."""
-        return np.asarray(self.lower + shares * (self.upper - self.lower))
-
     def state(self, shares: Array) -> Array:
         """(ns,) nominal initial state at shares: (d,)."""
         move = np.zeros(self.space.nx)
-        move[self.addresses] = self.values(shares) - self.origin
+        values = self.lower + shares * (self.upper - self.lower)
+        move[self.addresses] = values - self.origin
         return self.space.plus(self.stated, move)
 
     def shares_of_stated(self) -> Array | None:
@@ -115,20 +118,6 @@ class ReleaseSpace:
                 + ": a wider range in initial.free, within the limits, may tell more"
             )
         return found
-
-
-def _choosable(system: System) -> dict[str, TangentComponent]:
-    """Positions and velocities by name."""
-    count = 2 * system.space.nv
-    return {c.name: c for c in system.source.coordinates.deviations[:count]}
-
-
-def _coordinates(space: StateSpace, state: Array) -> Array:
-    """(2 nv,) positions and velocities of a state: (ns,); rotations of quaternions are 0."""
-    qpos, qvel, _ = space.split(state)
-    positions = np.zeros(space.nv)
-    positions[space.scalar_v] = qpos[space.scalar_q]
-    return np.concatenate([positions, qvel])
 
 
 def _limit_of(system: System, limits: Sequence[Limit], component: TangentComponent) -> Limit | None:

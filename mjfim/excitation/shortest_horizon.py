@@ -11,7 +11,8 @@ that is shorter by the tolerance does not.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -397,48 +398,56 @@ def shortest_experiment(
     ):
         task = DesignTask.resolve(experiment, threads=threads)
         require_controls(task.system, "the search for the shortest horizon")
-        search = _HorizonSearch(task, tolerance, show, Workers.of_any(executor), token)
+        search = _HorizonSearch(
+            base=task,
+            tolerance=tolerance,
+            callback=show,
+            executor=Workers.of_any(executor),
+            stop=token,
+            targets=target_accuracies(task),
+        )
         return search.run(_default_longest(task) if longest is None else longest)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _HorizonSearch:
     """Search for the smallest number of samples whose design reaches the targets.
 
-    Args:
+    Attributes:
         base: The task of the experiment as stated.
         tolerance: Tolerance of the horizon [s], or None for the default.
         callback: Called with every event.
         executor: Runs several starts side by side, or None.
         stop: Token that ends the search.
-
-    Attributes:
+        targets: (p,) target standard deviations [theta-unit].
         tried: Result of every number of samples.
         designs: Best design of every number of samples that has one.
     """
 
-    def __init__(
-        self,
-        base: DesignTask,
-        tolerance: float | None,
-        callback: Callback | None,
-        executor: ExecutorLike | None,
-        stop: StopToken,
-    ) -> None:
-        self.base = base
-        self.experiment = base.experiment
-        self.tolerance = tolerance
-        self.callback = callback
-        self.executor = executor
-        self.stop = stop
+    base: DesignTask
+    tolerance: float | None
+    callback: Callback | None
+    executor: ExecutorLike | None
+    stop: StopToken
+    targets: Array
+    tried: dict[int, Tried] = field(default_factory=dict)
+    designs: dict[int, Design] = field(default_factory=dict)
 
-        self.targets = target_accuracies(base)
-        self.grid = _sample_grid(base)
-        self.tried: dict[int, Tried] = {}
-        self.designs: dict[int, Design] = {}
+    @cached_property
+    def grid(self) -> SampleGrid:
+        """The numbers of samples that a design may have: those that its coarse level divides."""
+        descent = self.base.experiment.descent
+        if descent.method != "lbfgs":
+            return SampleGrid(unit=1, first_multiple=0)
+        if descent.coarse != "auto":
+            return SampleGrid(unit=descent.coarse, first_multiple=0, minimum=max(descent.coarse, 2))
+        # With the largest factor, horizons would be too far apart.
+        unit = SAMPLE_FACTORS[1]
+        return SampleGrid(unit=unit, first_multiple=MIN_COARSE_SAMPLES * unit)
 
     def run(self, longest: float) -> ShortestExperiment:
         """Search the horizons up to the longest one [s]."""
-        rate = self.experiment.rate
+        rate = self.base.experiment.rate
         if longest * rate < self.grid.minimum:
             raise ExperimentError(
                 f"shortest_experiment: longest {longest:g} s is less than {self.grid.minimum} "
@@ -475,17 +484,17 @@ class _HorizonSearch:
         """
         width = DEFAULT_TOLERANCE * samples
         if self.tolerance is not None:
-            width = self.tolerance * self.experiment.rate
+            width = self.tolerance * self.base.experiment.rate
 
         resolution = samples - self.grid.round_down(samples - 1)
         return max(int(width + ROUNDING_TOLERANCE), resolution)
 
     def at(self, samples: int) -> Experiment:
         """The experiment with a number of samples, and those repeats that divide it."""
-        repeats = self.experiment.descent.repeats
+        repeats = self.base.experiment.descent.repeats
         dividing = tuple(count for count in repeats if samples % count == 0)
-        horizon = samples / self.experiment.rate
-        return self.experiment.replace(horizon=horizon, descent={"repeats": dividing})
+        horizon = samples / self.base.experiment.rate
+        return self.base.experiment.replace(horizon=horizon, descent={"repeats": dividing})
 
     def ratio(self, samples: int) -> float | None:
         """Largest ratio of a predicted to a target standard deviation; None if stopped early."""
@@ -536,7 +545,7 @@ class _HorizonSearch:
         Returns:
             The outcome, or None where the design was stopped.
         """
-        horizon = samples / self.experiment.rate
+        horizon = samples / self.base.experiment.rate
         try:
             task = self.base.restated(self.at(samples))
             initial = None
@@ -549,47 +558,31 @@ class _HorizonSearch:
                 executor=self.executor,
                 budget=design_budget(task, self.stop),
             )
-            if design.status is Status.INTERRUPTED:
-                return self._interrupted(samples, design)
-            require_reachable(task, design, self.targets)
+            is_stopped = design.status is Status.INTERRUPTED
+            if not is_stopped:
+                require_reachable(task, design, self.targets)
         except MjfimError as error:
             # An error at the first horizon ends the search; later ones only exclude their horizon.
             if not self.tried:
                 raise
             return Tried(horizon=horizon, ratio=np.inf, why=str(error))
 
+        margins = design.limits.items()
+        violated = [f"{kind} by {-margin:.3g}" for kind, margin in margins if margin < 0.0]
         if design.status is Status.INFEASIBLE:
-            margins = design.limits.items()
-            violated = [f"{kind} by {-margin:.3g}" for kind, margin in margins if margin < 0.0]
             why = f"{design.status.value} ({', '.join(violated)})"
             return Tried(horizon=horizon, ratio=np.inf, why=why)
 
+        # After a stop, a design counts if it keeps the limits, and reaches the targets or is the
+        # first one.
         ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
-        self._keep_better(samples, design, ratio)
-        name = task.parameters.names[parameter]
-        return Tried(horizon=horizon, ratio=ratio, parameter=name)
-
-    def _interrupted(self, samples: int, design: Design) -> Tried | None:
-        """Use the design of a number of samples whose search was stopped, if it is of use.
-
-        Returns:
-            The outcome of a design that keeps the limits and either reaches the targets or is the
-            first one; else None.
-        """
-        is_feasible = all(margin >= 0.0 for margin in design.limits.values())
-        ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
-        if not is_feasible or (not ratio <= 1.0 and self.designs):
+        if is_stopped and (violated or (not ratio <= 1.0 and self.designs)):
             return None
-
-        self._keep_better(samples, design, ratio)
-        name = self.base.parameters.names[parameter]
-        return Tried(horizon=samples / self.experiment.rate, ratio=ratio, parameter=name)
-
-    def _keep_better(self, samples: int, design: Design, ratio: float) -> None:
-        """Keep a design where it has the smallest ratio so far for its number of samples."""
         known = self.designs.get(samples)
         if known is None or ratio < largest_ratio_to_target(known.final.std, self.targets)[0]:
             self.designs[samples] = design
+        name = task.parameters.names[parameter]
+        return Tried(horizon=horizon, ratio=ratio, parameter=name)
 
     def _out_of_reach(self, samples: int) -> OutOfReachError:
         """The error that says how far the longest experiment is from the targets."""
@@ -602,8 +595,8 @@ class _HorizonSearch:
             missed = missed_targets(names, design.final.std, self.targets)
             reason = f"the target is missed by {missed}"
         return OutOfReachError(
-            f"{self.experiment.source}: even {longest.horizon:g} s is too short: {reason}. Allow a "
-            "longer experiment (`longest`, or a longer table of the initial control) or a "
+            f"{self.base.experiment.source}: even {longest.horizon:g} s is too short: {reason}. "
+            "Allow a longer experiment (`longest`, or a longer table of the initial control) or a "
             "stronger control, or relax the targets; `mjfim check` prints the number of "
             "repetitions that reach them"
         )
@@ -627,20 +620,6 @@ def fit_control(task: DesignTask, control: Array) -> Array:
     given = (np.arange(n) + 0.5) / n
     wanted = (np.arange(N) + 0.5) / N
     return np.stack([np.interp(wanted, given, column) for column in control.T], axis=1)
-
-
-def _sample_grid(task: DesignTask) -> SampleGrid:
-    """The numbers of samples that a design may have: those that its coarse level can divide."""
-    descent = task.experiment.descent
-    if descent.method != "lbfgs":
-        return SampleGrid(unit=1, first_multiple=0)
-
-    if descent.coarse == "auto":
-        # With the largest factor, horizons would be too far apart.
-        unit = SAMPLE_FACTORS[1]
-        return SampleGrid(unit=unit, first_multiple=MIN_COARSE_SAMPLES * unit)
-
-    return SampleGrid(unit=descent.coarse, first_multiple=0, minimum=max(descent.coarse, 2))
 
 
 def _default_longest(task: DesignTask) -> float:

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.release_space import ReleaseSpace
@@ -21,6 +21,7 @@ from mjfim.excitation.task_parts import (
     holding_control,
     information_of,
     least_drift_control,
+    named_file,
     parameter_samples_of,
     require_bounded_controls,
     require_design_keys,
@@ -100,7 +101,6 @@ class DesignTask:
         *,
         threads: int | None = None,
         added_information: Array | None = None,
-        variant: ModelVariant | None = None,
     ) -> DesignTask:
         """Resolve an experiment into the task of designing its control.
 
@@ -109,7 +109,6 @@ class DesignTask:
             threads: Threads for the engine; default: one per core.
             added_information: (p, p) information of other experiments besides the stated `earlier`
                 files.
-            variant: How the plant differs from the user's model; default: not at all.
 
         Raises:
             ExperimentError: Something is wrong or missing in the experiment; the message names the
@@ -117,8 +116,7 @@ class DesignTask:
             ModelError: The model cannot be used.
         """
         system = System.resolve(experiment, threads=threads)
-        task = cls.of(system, added_information=added_information)
-        return task if variant is None else task.with_variant(variant)
+        return cls.of(system, added_information=added_information)
 
     @classmethod
     def of(cls, system: System, *, added_information: Array | None = None) -> DesignTask:
@@ -133,12 +131,9 @@ class DesignTask:
             ExperimentError: Something is wrong or missing in the experiment; the message names the
                 key.
         """
-        experiment = system.experiment
         require_design_keys(system)
-        try:
+        with named_file(system.experiment):
             return cls._made(system, stated_control(system), added_information)
-        except ExperimentError as error:
-            raise ExperimentError(f"{experiment.source}: {error}") from None
 
     @classmethod
     def along(cls, system: System, control: Array) -> DesignTask:
@@ -283,7 +278,6 @@ class DesignTask:
         # Prior information is a sum over samples; the cost wants it per second, equal on every
         # sample grid.
         per_sample = measure_rate / (experiment.measure_rate or experiment.rate)
-        all_wanted = len(parameters.interest) == len(parameters)
 
         return FisherInformation(
             noise=self.system.noise,
@@ -292,7 +286,7 @@ class DesignTask:
             prior=self.prior * per_sample,
             criterion=experiment.cost.criterion,
             weight=experiment.cost.information,
-            interest=None if all_wanted else parameters.interest,
+            interest=parameters.interest,
             contrast=self.contrast,
             stated_prior=np.diag(parameters.prior_information),
         )
@@ -365,12 +359,8 @@ class DesignTask:
     @property
     def is_shaped(self) -> bool:
         """True where the experiment states how the design begins or ends, or its bandwidth."""
-        boundary = self.experiment.boundary
-        return (
-            boundary.start != "given"
-            or boundary.end != "free"
-            or self.experiment.limits.bandwidth is not None
-        )
+        boundary, bandwidth = self.experiment.boundary, self.experiment.limits.bandwidth
+        return (boundary.start, boundary.end, bandwidth) != ("given", "free", None)
 
     @property
     def centre(self) -> Array:
@@ -395,22 +385,20 @@ class DesignTask:
         found = [self.centre]
 
         for control in (least_drift_control(self.system, start, rest), rest):
-            inside = self._inside_ranges(control)
+            inside = self._inside_ranges(control, RANGE_MARGIN)
             is_new = not any(np.array_equal(inside, other) for other in found)
             if is_new and np.isfinite(inside).all():
                 found.append(inside)
 
         return tuple(found)
 
-    def _inside_ranges(self, control: Array) -> Array:
-        """A control, (nu,), moved inside the ranges of the controls [u-unit]."""
+    def _inside_ranges(self, control: Array, margin: float) -> Array:
+        """A control, (..., nu), moved inside the ranges of the controls by a relative margin."""
         inside = np.array(control)
         for limit in self.limits:
             if limit.kind == "control":
-                gap = RANGE_MARGIN * limit.scale
-                inside[limit.index] = np.clip(
-                    inside[limit.index], limit.lower + gap, limit.upper - gap
-                )
+                gap, each = margin * limit.scale, inside[..., limit.index]
+                inside[..., limit.index] = np.clip(each, limit.lower + gap, limit.upper - gap)
         return inside
 
     @cached_property
@@ -424,12 +412,13 @@ class DesignTask:
     @cached_property
     def target(self) -> Array:
         """(ns,) final state that the boundary requires; the initial state unless it is at rest."""
-        start = self.plant.initial_state(self.theta)
+        state = self.plant.initial_state(self.theta)
         if self.experiment.boundary.end != "rest":
-            return start
+            return state
 
         key = keyframe(self.system.model, "boundary.keyframe", self.experiment.boundary.keyframe)
-        state = start if key is None else np.concatenate([key.qpos, key.qvel, key.act])
+        if key is not None:
+            state = np.concatenate([key.qpos, key.qvel, key.act])
         qpos, _, act = self.space.split(state)
         return np.concatenate([qpos, np.zeros(self.space.nv), act])
 
@@ -467,13 +456,7 @@ class DesignTask:
         window = self.fade(self.samples)
 
         wave = multisine(self.t, len(self.controls), 1.0 / self.horizon, RANDOM_HARMONICS, rng)
-        control = about + window * (peak * rng.uniform(least, most) * wave)
-
-        for limit in self.limits:
-            if limit.kind == "control":
-                column = control[:, limit.index]
-                control[:, limit.index] = np.clip(column, limit.lower, limit.upper)
-        return np.asarray(control)
+        return self._inside_ranges(about + window * (peak * rng.uniform(least, most) * wave), 0.0)
 
     def fade(self, samples: int) -> Array:
         """(samples, 1) window between 0 and 1 that fades a control in and out.
@@ -500,25 +483,15 @@ class DesignTask:
             left out.
         """
         rng = np.random.default_rng(self.experiment.descent.seed)
-        if self.release is not None:
-            yield from self._random_releases(self.release, count, rng)
-            return
-
         for _ in range(count):
-            control = self.random_control(rng, LEAST_PROBE_AMPLITUDE, MOST_PROBE_AMPLITUDE)
+            plant, control = self.plant, self.control
+            if self.release is None:
+                control = self.random_control(rng, LEAST_PROBE_AMPLITUDE, MOST_PROBE_AMPLITUDE)
+            else:
+                shares = rng.uniform(size=len(self.release.names))
+                plant = plant.with_initial_state(self.release.state(shares))
             try:
-                yield self.plant.simulate(self.theta, control)
-            except SimulationDivergedError:
-                continue
-
-    def _random_releases(
-        self, release: ReleaseSpace, count: int, rng: np.random.Generator
-    ) -> Iterator[Trajectory]:
-        """Motions from random releases within the ranges; those that diverge are left out."""
-        for _ in range(count):
-            state = release.state(rng.uniform(size=len(release.names)))
-            try:
-                yield self.plant.with_initial_state(state).simulate(self.theta, self.control)
+                yield plant.simulate(self.theta, control)
             except SimulationDivergedError:
                 continue
 
@@ -547,10 +520,8 @@ class DesignTask:
         """This task with another horizon [s], on the same variant of the plant."""
         experiment = self.experiment.replace(horizon=horizon)
         task = replace(self, system=replace(self.system, experiment=experiment))
-        try:
+        with named_file(experiment):
             return task._along(stated_control(task.system), self.system.variant)
-        except ExperimentError as error:
-            raise ExperimentError(f"{experiment.source}: {error}") from None
 
     def _along(self, control: Array, variant: ModelVariant) -> DesignTask:
         """This task on another plant, along a control: (n, nu) at the stated sample rate."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import scipy
@@ -22,13 +23,22 @@ from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import Signal
 from mjfim.files import read_json
 from mjfim.information.criteria import marginal
-from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.parameters import sample_parameters
 from mjfim.model.variants import Relaxation
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.control_table import read_control
 from mjfim.records.trajectory import Trajectory
+
+
+@contextmanager
+def named_file(experiment: Experiment) -> Iterator[None]:
+    """Put the name of the experiment file before the message of an ExperimentError."""
+    try:
+        yield
+    except ExperimentError as error:
+        raise ExperimentError(f"{experiment.source}: {error}") from None
+
 
 # Exponent q of the smooth maximum.
 POOLING_EXPONENT = 20.0
@@ -430,10 +440,8 @@ def stated_motion(system: System) -> Trajectory:
         SimulationDivergedError: The simulation diverges.
     """
     require_horizon_and_control(system, "simulate without a design")
-    try:
+    with named_file(system.experiment):
         inputs = stated_inputs(system)
-    except ExperimentError as error:
-        raise ExperimentError(f"{system.experiment.source}: {error}") from None
     return system.plant.simulate(system.theta, inputs)
 
 
@@ -467,11 +475,7 @@ def stated_inputs(system: System) -> Array:
     rest = np.array(system.rest)
     for law in laws.laws:
         rest[law.control] = system.nominal_initial_state[law.q]
-    return _of_signal(laws, generate(source, t, system.controls, rest), dt)
-
-
-def _of_signal(laws: ControlLaws, signal: Array, dt: float) -> Array:
-    """(N, w) inputs from one signal for each actuator: (N, nu)."""
+    signal = generate(source, t, system.controls, rest)
     inputs = np.zeros((len(signal), len(laws.inputs)))
     places, controls = laws.direct
     inputs[:, places] = signal[:, controls]
@@ -518,12 +522,11 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
     """
     control = least_drift_control(system, state, guess)
 
-    stated = system.plant.model(system.theta)
-    drift = _Drift(system, system.plant.simulator, stated, state).under(control[None])[0]
-
     # Contacts are softer with a longer timestep. Where the search takes one, the stated timestep
     # decides whether the state is held.
     if system.variant.timestep_factor == 1 and system.variant.sample_factor == 1:
+        stated = system.plant.model(system.theta)
+        drift = _drift(system, system.plant.simulator, stated, state, control[None])[0]
         _require_held(system, state, drift, key, place)
     return control
 
@@ -543,70 +546,41 @@ def least_drift_control(system: System, state: Array, guess: Array) -> Array:
     Returns:
         (nu,) control, which may violate limits.
     """
-    model = _without_clamps(system.plant.model(system.theta))
-    sample = system.plant.simulator
-
-    # Over one engine step, the drift is linear in most controls, however far the guess is from
-    # the control that is sought. Over a sample, it shows the effect of all of them.
-    control = guess
-    for simulator in (sample.with_substeps(1), sample):
-        control = _settled(_Drift(system, simulator, model, state), control)
-    return control
-
-
-def _settled(drift: _Drift, guess: Array) -> Array:
-    """Gauss-Newton steps towards the control, (nu,), under which a state changes least."""
-    natural = drift.system.plant.sizes
-    control = np.array(guess)
-    sizes = np.maximum(np.abs(control), natural.control)
-    steps = RELATIVE_DIFFERENCE * sizes
-
-    for _ in range(NEWTON_STEPS):
-        # The drift under the control, and under one control for each component that is moved.
-        rows = drift.under(np.vstack([control, control + np.diag(steps)]))
-        B = (rows[1:] - rows[0]).T / RELATIVE_DIFFERENCE / natural.state[:, None]
-        if not np.isfinite(B).all():
-            break
-
-        # The Gauss-Newton step makes the linearised drift as small as possible, relative to the
-        # sizes of states and controls.
-        control = control - sizes * np.linalg.lstsq(B, rows[0] / natural.state)[0]
-
-    return control
-
-
-class _Drift(NamedTuple):
-    """Change of a state over one sample.
-
-    Attributes:
-        system: The system.
-        simulator: Simulates the sample.
-        model: The compiled model.
-        state: (ns,) state before the sample.
-    """
-
-    system: System
-    simulator: BatchSimulator
-    model: Any
-    state: Array
-
-    def under(self, controls: Array) -> Array:
-        """(m, nx) change of the state under each of (m, nu) controls."""
-        states = np.broadcast_to(self.state, (len(controls), len(self.state)))
-        after, _, _ = self.simulator.step([self.model], states, controls)
-        return np.asarray(self.system.space.minus(after, self.state))
-
-
-def _without_clamps(model: Any) -> Any:
-    """A copy of a model whose controls and forces are not clamped."""
-    unclamped = copy.copy(model)
+    model = copy.copy(system.plant.model(system.theta))
     clamps = Relaxation(
         joint_forces=tuple(range(model.njnt)),
         actuators=tuple(range(model.nactuator)),
         controls=True,
     )
-    clamps.apply(unclamped)
-    return unclamped
+    clamps.apply(model)
+    sample, natural = system.plant.simulator, system.plant.sizes
+    control = np.array(guess)
+
+    # Over one engine step, the drift is linear in most controls, however far the guess is from
+    # the control that is sought. Over a sample, it shows the effect of all of them.
+    for simulator in (sample.with_substeps(1), sample):
+        sizes = np.maximum(np.abs(control), natural.control)
+        moves = np.vstack([np.zeros_like(control), np.diag(RELATIVE_DIFFERENCE * sizes)])
+        for _ in range(NEWTON_STEPS):
+            # The drift under the control, and under one control for each component that is moved.
+            rows = _drift(system, simulator, model, state, control + moves)
+            B = (rows[1:] - rows[0]).T / RELATIVE_DIFFERENCE / natural.state[:, None]
+            if not np.isfinite(B).all():
+                break
+
+            # The Gauss-Newton step makes the linearised drift as small as possible, relative to
+            # the sizes of states and controls.
+            control = control - sizes * np.linalg.lstsq(B, rows[0] / natural.state)[0]
+    return control
+
+
+def _drift(
+    system: System, simulator: BatchSimulator, model: Any, state: Array, controls: Array
+) -> Array:
+    """(m, nx) change of a state, (ns,), over one sample under each of (m, nu) controls."""
+    states = np.broadcast_to(state, (len(controls), len(state)))
+    after, _, _ = simulator.step([model], states, controls)
+    return np.asarray(system.space.minus(after, state))
 
 
 def _require_held(system: System, state: Array, drift: Array, key: str, place: str) -> None:

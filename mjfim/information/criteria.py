@@ -7,7 +7,7 @@ the Schur complement.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,49 +45,39 @@ class Criterion:
     power: float = np.inf
 
 
-def _spectrum(information: Array) -> tuple[Array, Array, bool]:
-    """Ascending eigenvalues (p,), eigenvectors as columns (p, p), and True for a regular matrix."""
-    values, vectors = np.linalg.eigh(information)
-    return values, vectors, bool(values[0] > SINGULAR_RATIO * values[-1])
-
-
-def _singular(values: Array, vectors: Array) -> Criterion:
-    """Infinite criterion of a singular matrix.
-
-    Its direction belongs to the smallest eigenvalue, and the weight of the direction is zero.
-    """
-    return Criterion(
-        value=np.inf, weights=np.zeros(1), directions=vectors[:, :1].T, eigenvalues=values
-    )
-
-
-def _spectral_criterion(
-    value: float,
-    weights: Array,
-    values: Array,
-    vectors: Array,
+def _of_eigenvalues(
+    information: Array,
+    phi: Callable[[Array], tuple[float, Array]],
     *,
     power: float = np.inf,
-    negligible_weight: float = NEGLIGIBLE_WEIGHT,
+    negligible_weight: float = 0.0,
 ) -> Criterion:
-    """Criterion that depends on the eigenvalues alone; eigenvectors of small weight are left out.
+    """Criterion that depends on the eigenvalues alone.
+
+    A singular matrix has the direction of the smallest eigenvalue, with the weight zero.
 
     Args:
-        value: phi.
-        weights: (p,) derivatives of phi with respect to the eigenvalues; the first has the largest
-            absolute value.
-        values: (p,) ascending eigenvalues.
-        vectors: (p, p) eigenvectors as columns.
+        information: (p, p) information.
+        phi: The criterion of p ascending eigenvalues, and its derivatives by the first ones of
+            them. The first derivative has the largest absolute value.
         power: Exponent q of the smooth E-criterion.
-        negligible_weight: Smallest weight that is kept, relative to the first one.
+        negligible_weight: Eigenvectors are left out whose weight, relative to the first one, is not
+            above this number; 0 for none.
     """
-    kept = np.abs(weights) > negligible_weight * np.abs(weights[0])
+    values, vectors = np.linalg.eigh(information)
+    value, weights = np.inf, np.zeros(1)
+    if is_regular := bool(values[0] > SINGULAR_RATIO * values[-1]):
+        value, weights = phi(values)
+    directions = vectors.T[: len(weights)]
+    if is_regular and negligible_weight > 0.0:
+        kept = np.abs(weights) > negligible_weight * np.abs(weights[0])
+        weights, directions = weights[kept], directions[kept]
     return Criterion(
-        value=value,
-        weights=weights[kept],
-        directions=vectors.T[kept],
+        value=float(value),
+        weights=weights,
+        directions=directions,
         eigenvalues=values,
-        power=power,
+        power=power if is_regular else np.inf,
     )
 
 
@@ -96,19 +86,9 @@ def e_optimality(information: Array) -> Criterion:
 
     Args:
         information: (p, p) information.
-
-    Returns:
-        The criterion.
     """
-    values, vectors, regular = _spectrum(information)
-    if not regular:
-        return _singular(values, vectors)
-
-    return Criterion(
-        value=float(1.0 / values[0]),
-        weights=np.array([-(values[0] ** -2)]),
-        directions=vectors[:, :1].T,
-        eigenvalues=values,
+    return _of_eigenvalues(
+        information, lambda values: (1.0 / values[0], np.array([-(values[0] ** -2)]))
     )
 
 
@@ -124,27 +104,16 @@ def smooth_e_optimality(
         power: Exponent q.
         negligible_weight: Eigenvectors whose weight is below this fraction of the largest weight
             are left out of the derivative.
-
-    Returns:
-        The criterion.
     """
-    values, vectors, regular = _spectrum(information)
-    if not regular:
-        return _singular(values, vectors)
 
-    # Powers of the ratio are used, because powers of the eigenvalues would overflow.
-    ratio = values[0] / values
-    total = float(np.sum(ratio**power))
-    weights = total ** (1.0 / power - 1.0) * ratio ** (power + 1.0) / values[0] ** 2
+    def phi(values: Array) -> tuple[float, Array]:
+        """The criterion, with powers of a ratio: powers of the eigenvalues would overflow."""
+        ratio = values[0] / values
+        total = float(np.sum(ratio**power))
+        weights = total ** (1.0 / power - 1.0) * ratio ** (power + 1.0) / values[0] ** 2
+        return total ** (1.0 / power) / values[0], -weights
 
-    return _spectral_criterion(
-        total ** (1.0 / power) / values[0],
-        -weights,
-        values,
-        vectors,
-        power=power,
-        negligible_weight=negligible_weight,
-    )
+    return _of_eigenvalues(information, phi, power=power, negligible_weight=negligible_weight)
 
 
 def a_optimality(information: Array) -> Criterion:
@@ -152,15 +121,12 @@ def a_optimality(information: Array) -> Criterion:
 
     Args:
         information: (p, p) information.
-
-    Returns:
-        The criterion.
     """
-    values, vectors, regular = _spectrum(information)
-    if not regular:
-        return _singular(values, vectors)
-
-    return _spectral_criterion(float(np.sum(1.0 / values)), -(values**-2.0), values, vectors)
+    return _of_eigenvalues(
+        information,
+        lambda values: (np.sum(1.0 / values), -(values**-2.0)),
+        negligible_weight=NEGLIGIBLE_WEIGHT,
+    )
 
 
 def d_optimality(information: Array) -> Criterion:
@@ -168,20 +134,8 @@ def d_optimality(information: Array) -> Criterion:
 
     Args:
         information: (p, p) information.
-
-    Returns:
-        The criterion.
     """
-    values, vectors, regular = _spectrum(information)
-    if not regular:
-        return _singular(values, vectors)
-
-    return Criterion(
-        value=float(-np.sum(np.log(values))),
-        weights=-1.0 / values,
-        directions=vectors.T,
-        eigenvalues=values,
-    )
+    return _of_eigenvalues(information, lambda values: (-np.sum(np.log(values)), -1.0 / values))
 
 
 def c_optimality(information: Array, contrast: Array) -> Criterion:
@@ -190,20 +144,14 @@ def c_optimality(information: Array, contrast: Array) -> Criterion:
     Args:
         information: (p, p) information.
         contrast: C, (p, c) combinations of the parameters.
-
-    Returns:
-        The criterion.
     """
-    values, vectors, regular = _spectrum(information)
-    if not regular:
-        return _singular(values, vectors)
+    spectral = e_optimality(information)
+    if np.isinf(spectral.value):
+        return spectral
 
     Y = np.asarray(np.linalg.solve(information, contrast).T, dtype=np.float64)
-    return Criterion(
-        value=float(np.sum(Y * contrast.T)),
-        weights=-np.ones(len(Y)),
-        directions=Y,
-        eigenvalues=values,
+    return replace(
+        spectral, value=float(np.sum(Y * contrast.T)), weights=-np.ones(len(Y)), directions=Y
     )
 
 

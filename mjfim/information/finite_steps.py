@@ -1,9 +1,9 @@
 """Standard deviations by finite steps of the parameters along the axes of their covariance.
 
 A derivative says what an infinitely small change of a parameter does. Dry friction, contacts and
-strong curvature answer otherwise to a change as large as the standard deviation. Along each
-principal direction v of the covariance, with the standard deviation s, the outputs are simulated
-at theta - 2 s v and theta + 2 s v. Where the derivatives hold, the whitened outputs differ by 4.
+strong curvature answer otherwise to a change as large as the standard deviation. The outputs are
+simulated at theta - 2 s v and theta + 2 s v, along each principal direction v of the covariance
+with the standard deviation s. Where the derivatives hold, the whitened outputs differ by 4.
 """
 
 from __future__ import annotations

@@ -134,6 +134,11 @@ class IdentifiabilityTest:
     differentiated: Callable[[Iterable[Trajectory]], Iterable[RowsAndError | None]] | None = None
 
     @property
+    def inside(self) -> np.ndarray:
+        """(t,) True for the wanted parameters that change the model."""
+        return np.asarray(self.parameters.changes_model[self.parameters.interest])
+
+    @property
     def prior(self) -> Array:
         """(p, p) information of earlier experiments and of the priors."""
         return self.parameters.prior_information + self.earlier
@@ -281,7 +286,7 @@ def _step_rows(test: IdentifiabilityTest, trajectory: Trajectory) -> RowsAndErro
         model is wanted, or where a step diverges. Control laws remember what happened before a
         sample, so that only whole motions are tested with them.
     """
-    if not len(_inside(test)) or test.plant.laws is not None:
+    if not test.inside.any() or test.plant.laws is not None:
         return None
     count = min(MOST_SAMPLES, trajectory.samples)
     picked = np.unique(np.linspace(0, trajectory.samples - 1, count).astype(int))
@@ -295,12 +300,6 @@ def _step_rows(test: IdentifiabilityTest, trajectory: Trajectory) -> RowsAndErro
     return first, second - first
 
 
-def _inside(test: IdentifiabilityTest) -> np.ndarray:
-    """Indices of the wanted parameters that change the model."""
-    interest = test.parameters.interest
-    return np.asarray(interest[test.parameters.changes_model[interest]])
-
-
 def _hidden_from_steps(
     test: IdentifiabilityTest, steps: Sequence[RowsAndError | None]
 ) -> Array | None:
@@ -308,17 +307,19 @@ def _hidden_from_steps(
     known = [each for each in steps if each is not None]
     if not known:
         return None
-    parameters, inside = test.parameters, _inside(test)
+    parameters, interest = test.parameters, test.parameters.interest
+    inside = interest[test.inside]
+    J, error = (np.concatenate(rows)[:, inside] for rows in zip(*known, strict=True))
     null = find_null_space(
-        np.concatenate([J for J, _ in known])[:, inside],
-        np.concatenate([error for _, error in known])[:, inside],
+        J,
+        error,
         parameters.magnitude[inside],
         parameters.scale[inside],
         np.arange(len(inside)),
         np.zeros_like(test.prior),
     )
-    directions = np.zeros((len(parameters.interest), null.count))
-    directions[np.searchsorted(parameters.interest, inside)] = null.directions
+    directions = np.zeros((len(interest), null.count))
+    directions[test.inside] = null.directions
     if not test.earlier.any() or not null.count:
         return directions
 

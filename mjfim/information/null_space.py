@@ -122,7 +122,7 @@ def find_null_space(
     # searched orthogonally to them.
     t = len(interest)
     found = np.eye(t)[:, dead]
-    if known is not None and known.shape[1]:
+    if known is not None:
         found = _independent(np.concatenate([found, known / size[interest][:, None]], axis=1))
         Q = np.linalg.qr(found)[0]
         J = J - (J @ Q) @ Q.T
@@ -132,11 +132,14 @@ def find_null_space(
     hidden, smallest = _hidden_directions(J, error, live)
     found = _independent(np.concatenate([found, hidden], axis=1))
     directions = found * size[interest][:, None]
+    # A parameter is silent if its axis lies in the span of the directions.
+    inside = np.sum(np.linalg.qr(found)[0] ** 2, axis=1)
+    complement = np.linalg.qr(directions / scale[interest][:, None], mode="complete")[0]
 
     return NullSpace(
         directions=directions,
-        silent=_silent_parameters(found),
-        basis=_complement(directions / scale[interest][:, None]),
+        silent=tuple(np.flatnonzero(inside > 1.0 - LEAST_COEFFICIENT**2).tolist()),
+        basis=complement[:, directions.shape[1] :],
         smallest=smallest * least_share,
     )
 
@@ -160,8 +163,8 @@ def _wanted_columns(
     The arguments are those of `find_null_space`.
 
     Returns:
-        (n, t) effect of each parameter changed by its size [standard deviations], (n, t) error of
-        these columns, and the (t,) length of each column before the removal.
+        (n, t) effects of each parameter changed by its size [standard deviations], their (n, t)
+        errors, and the (t,) lengths of the columns before the removal.
     """
     J = J * size
     error = np.zeros_like(J) if error is None else error * size
@@ -174,7 +177,11 @@ def _wanted_columns(
         J = np.concatenate([J, prior_rows])
         error = np.concatenate([error, np.zeros_like(prior_rows)])
 
-        Q = _range(J[:, nuisance])
+        columns = J[:, nuisance]
+        length = np.linalg.norm(columns, axis=0)
+        columns = columns[:, length > 0.0] / length[length > 0.0]
+        U, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+        Q = U[:, sizes > ZERO_SINGULAR_VALUES[0]]
         J = J - Q @ (Q.T @ J)
         error = error - Q @ (Q.T @ error)
 
@@ -210,41 +217,11 @@ def _hidden_directions(J: Array, error: Array, live: np.ndarray) -> tuple[Array,
     return unit, float(values[~zero].min(initial=1.0))
 
 
-def _silent_parameters(directions: Array) -> tuple[int, ...]:
-    """Indices of the parameters whose axis lies in the span of (t, k) directions."""
-    if not directions.shape[1]:
-        return ()
-    inside = np.sum(np.linalg.qr(directions)[0] ** 2, axis=1)
-    return tuple(np.flatnonzero(inside > 1.0 - LEAST_COEFFICIENT**2).tolist())
-
-
-def _complement(directions: Array) -> Array:
-    """(t, t-k) orthonormal directions that are orthogonal to (t, k) directions."""
-    t, k = directions.shape
-    if not k:
-        return np.eye(t)
-
-    Q = np.linalg.qr(directions, mode="complete")[0]
-    return Q[:, k:]
-
-
 def _independent(directions: Array) -> Array:
     """Orthonormal columns that span the space of (t, m) directions."""
     U, sizes, _ = np.linalg.svd(directions, full_matrices=False)
     largest = max(sizes.max(initial=0.0), SMALLEST_NORM)
-    kept = sizes > DEPENDENT * largest
-    return U[:, kept]
-
-
-def _range(A: Array) -> Array:
-    """Orthonormal basis of the range of A: (n, m); its columns are scaled to unit length first."""
-    length = np.linalg.norm(A, axis=0)
-    nonzero = length > 0.0
-    unit = A[:, nonzero] / length[nonzero]
-
-    U, sizes, _ = np.linalg.svd(unit, full_matrices=False)
-    kept = sizes > ZERO_SINGULAR_VALUES[0]
-    return U[:, kept]
+    return U[:, sizes > DEPENDENT * largest]
 
 
 def parameter_groups(
@@ -261,9 +238,6 @@ def parameter_groups(
     Returns:
         The groups. Parameters without any effect form the last one, which has no combinations.
     """
-    if not null.count:
-        return ()
-
     N = null.directions
     lumped = _lumped_parameters(N / size[:, None], units)
     base = np.setdiff1d(np.arange(len(N)), lumped)
@@ -279,11 +253,13 @@ def parameter_groups(
     for members in _joined(links):
         if members <= set(null.silent):
             continue
-        rows = [
-            _combination(names, b, lumped, coefficients[i])
-            for i, b in enumerate(base.tolist())
-            if b in members
-        ]
+        rows = []
+        for b, row in zip(base.tolist(), coefficients, strict=True):
+            if b in members:
+                used = [j for j in range(len(lumped)) if row[j] != 0.0]
+                combined = (names[b], *(names[lumped[j]] for j in used))
+                factors = (1.0, *(float(row[j]) for j in used))
+                rows.append(Combination(members=combined, coefficients=factors))
         member_names = tuple(names[m] for m in sorted(members))
         groups.append(ParameterGroup(members=member_names, combinations=tuple(rows)))
 
@@ -310,17 +286,6 @@ def _lumping_coefficients(N: Array, size: Array, lumped: np.ndarray, base: np.nd
     return np.where(relative > threshold, coefficients, 0.0)
 
 
-def _combination(
-    names: Sequence[str], base: int, lumped: np.ndarray, coefficients: Array
-) -> Combination:
-    """Sum of a base parameter and of the lumped parameters times their coefficients: (k,)."""
-    used = np.flatnonzero(coefficients).tolist()
-    return Combination(
-        members=(names[base], *(names[lumped[j]] for j in used)),
-        coefficients=(1.0, *(float(coefficients[j]) for j in used)),
-    )
-
-
 def _lumped_parameters(N: Array, units: Sequence[str]) -> np.ndarray:
     """Choose k parameters that are lumped into the others; their rows of N are independent.
 
@@ -336,7 +301,7 @@ def _lumped_parameters(N: Array, units: Sequence[str]) -> np.ndarray:
     """
     last = len(LUMPING_ORDER)
     order = sorted(range(len(N)), key=lambda i: (LUMPING_ORDER.get(units[i], last), -i))
-    longest = np.linalg.norm(N, axis=1).max()
+    longest = np.linalg.norm(N, axis=1).max(initial=0.0)
     chosen: list[int] = []
     spanned = np.zeros((0, N.shape[1]))
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mjfim.excitation.objective import ExtendedDesignProblem, extend
+from mjfim.excitation.objective import extend
 from mjfim.excitation.task import DesignTask
 from mjfim.information.fisher import FisherInformation
 from mjfim.model.parameter_writer import ParameterWriter
@@ -34,7 +36,7 @@ CORRELATED = ({"outputs": ("angle", "drive"), "covariance": ((1e-4, 5e-4), (5e-4
 
 def expanded(task: DesignTask) -> Expansion:
     """Expansion of J about the initial trajectory, with psi among the states."""
-    problem = ExtendedDesignProblem.of(task.problem)
+    problem = replace(task.problem, extends=True)
     return problem.expand(problem.point(task.initial, CENTRAL_DIFFERENCES))
 
 

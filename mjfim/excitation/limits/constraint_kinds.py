@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple, Protocol, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +131,13 @@ class ConstraintValues:
         """Weight of one sample in the barrier, which is a mean over time."""
         return 1.0 / len(self.observed)
 
+    @property
+    def jacobian(self) -> Array:
+        """The derivatives of the quantities. Raises ValueError where there are none."""
+        if self.observation_jacobian is None:
+            raise ValueError("the observations have no derivatives")
+        return self.observation_jacobian
+
 
 class KindMargins(NamedTuple):
     """Margins of the quantities of one kind.
@@ -174,34 +181,35 @@ class ExpansionSums:
         return ExpansionSums(a=np.zeros((N + 1, nx)), b=np.zeros((N, nu)), weights=weights)
 
 
-class LimitedQuantities(Protocol):
-    """Quantities between bounds along a trajectory, with the derivatives of their barrier."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Constraint(ABC):
+    """Inequality constraints of one or several kinds: quantities between bounds.
 
-    def slacks(self, values: ConstraintValues) -> Array:
-        """Relative distances to the lower and to the upper bounds, (2, ...); infinite without one.
+    Attributes:
+        kind: Kind of the limits, where there is one.
+        bounds: Ranges of the quantities.
+    """
 
-        Norms of several numbers are left out.
+    kind: ClassVar[str] = ""
 
-        Args:
-            values: The constrained quantities.
-        """
-        ...
+    bounds: Bounds
 
-    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
-        """Changes of these distances along a tangent curve, to first order.
+    @abstractmethod
+    def quantity(self, values: ConstraintValues) -> Array:
+        """The quantities that are single numbers, with one column for each range."""
+
+    @abstractmethod
+    def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """Change of the quantities along a tangent curve, to first order.
 
         Args:
             values: The constrained quantities with their derivatives.
             step: The tangent curve.
         """
-        ...
 
+    @abstractmethod
     def add_expansion(
-        self,
-        values: ConstraintValues,
-        delta: float,
-        sums: ExpansionSums,
-        factors: Array | None = None,
+        self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
         """Add the derivatives of the barrier to the sums.
 
@@ -209,35 +217,50 @@ class LimitedQuantities(Protocol):
             values: The constrained quantities with their derivatives.
             delta: Relaxation of the barrier, a relative margin.
             sums: Sums over all kinds, changed in place.
-            factors: Factors of the curvature, ordered like `slacks`; default: 1.
+            factors: Factors of the curvature, ordered like `slacks`; None for 1.
         """
-        ...
-
-
-class Constraint(Protocol):
-    """Inequality constraints of one or several kinds along a trajectory."""
 
     @property
-    def quantities_between_bounds(self) -> LimitedQuantities:
-        """The limited quantities, without what measures them."""
-        ...
+    def number_bounds(self) -> Bounds:
+        """Ranges of the quantities that are single numbers with a sign."""
+        return self.bounds
+
+    def weight(self, values: ConstraintValues) -> float:
+        """Weight of one row of the quantities in the barrier."""
+        return values.weight
+
+    def tightened(self, fractions: Mapping[str, float]) -> Self:
+        """Narrow the ranges by the fraction of their half-width for this kind."""
+        return replace(self, bounds=self.bounds.tightened(fractions.get(self.kind, 0.0)))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """Margins of every constrained quantity, by kind."""
-        ...
+        yield KindMargins(self.kind, self.bounds.margin(self.quantity(values)), self.bounds.scale)
 
-    def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """Value of the barrier.
+    def barrier(
+        self, values: ConstraintValues, delta: float, factors: Array | None = None
+    ) -> BarrierDerivatives:
+        """The barrier with its derivatives by the quantities.
 
         Args:
             values: The constrained quantities.
             delta: Relaxation of the barrier, a relative margin.
+            factors: Factors of the curvature, ordered like `slacks`; default: 1.
         """
-        ...
+        numbers, weight = self.quantity(values), self.weight(values)
+        return self.number_bounds.barrier(numbers, delta, weight, factors)
+
+    def slacks(self, values: ConstraintValues) -> Array:
+        """Relative distances of the numbers to both bounds, (2, ...); infinite without a bound."""
+        return self.number_bounds.slacks(self.quantity(values))
+
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """Changes of these distances along a tangent curve, to first order."""
+        return self.number_bounds.slack_changes(self.change(values, step))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SubstepConstraint:
+class SubstepConstraint(Constraint):
     """Ranges of positions, velocities, accelerations, angles, speeds and forces.
 
     These quantities are observed at every engine step, so within the samples as well.
@@ -253,7 +276,6 @@ class SubstepConstraint:
     """
 
     observations: SubstepObservations
-    bounds: Bounds
     kinds: tuple[str, ...]
     names: tuple[str, ...]
     columns: tuple[tuple[int, ...], ...]
@@ -287,11 +309,6 @@ class SubstepConstraint:
             scale[list(magnitude.columns)] = magnitude.norm_at(float(self.bounds.scale[i]))
         return scale
 
-    @property
-    def quantities_between_bounds(self) -> SubstepConstraint:
-        """See `Constraint.quantities_between_bounds`."""
-        return self
-
     def tightened(
         self, fractions: Mapping[str, float], room: Array | float = np.inf
     ) -> SubstepConstraint:
@@ -314,14 +331,32 @@ class SubstepConstraint:
             found[..., i] = magnitude.value(observed)
         return found
 
-    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
-        """See `LimitedQuantities.slack_changes`."""
-        jacobian = values.observation_jacobian
-        if jacobian is None:
-            raise ValueError("the observations have no derivatives")
+    def _observed(self, values: ConstraintValues) -> Array:
+        """(N, S, w) numbers at the S rows with derivatives."""
+        return values.observed[:, np.array(self.observations.derivative_rows)]
+
+    def quantity(self, values: ConstraintValues) -> Array:
+        """See `Constraint.quantity`; at the rows with derivatives."""
+        return self._observed(values)[..., self.number_columns]
+
+    @cached_property
+    def number_bounds(self) -> Bounds:
+        """See `Constraint.number_bounds`."""
+        return Bounds(
+            lower=self.bounds.lower[self.numbers],
+            upper=self.bounds.upper[self.numbers],
+            scale=self.bounds.scale[self.numbers],
+        )
+
+    def weight(self, values: ConstraintValues) -> float:
+        """Weight of one row with derivatives."""
+        return values.weight / len(self.observations.derivative_rows)
+
+    def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `Constraint.change`."""
         moved = np.concatenate([step.z[:-1], step.v], axis=1)
-        changes = np.einsum("kswi,ki->ksw", jacobian[:, :, self.number_columns], moved)
-        return self._number_bounds.slack_changes(changes)
+        jacobian = values.jacobian[:, :, self.number_columns]
+        return np.asarray(np.einsum("kswi,ki->ksw", jacobian, moved))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """Margins at every engine step, one item per quantity. See `Constraint.margins`."""
@@ -329,45 +364,31 @@ class SubstepConstraint:
         for i, kind in enumerate(self.kinds):
             yield KindMargins(kind, margins[..., i], float(self.bounds.scale[i]))
 
-    def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """Mean over the rows with derivatives. See `Constraint.barrier`."""
-        observed, weight = self._observed_with_weight(values)
-        total = self._number_barrier(observed, delta, weight).value
-        return total + sum(
-            self._vector_barrier(i, magnitude, observed, delta, weight).value
-            for i, magnitude in self.magnitudes
-        )
+    def barrier(
+        self, values: ConstraintValues, delta: float, factors: Array | None = None
+    ) -> BarrierDerivatives:
+        """See `Constraint.barrier`; the value counts magnitudes as well."""
+        numbers = super().barrier(values, delta, factors)
+        vectors = (each.value for _, each in self._vector_barriers(values, delta))
+        return replace(numbers, value=numbers.value + sum(vectors))
 
     def add_expansion(
-        self,
-        values: ConstraintValues,
-        delta: float,
-        sums: ExpansionSums,
-        factors: Array | None = None,
+        self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
-        """See `LimitedQuantities.add_expansion`; the Hessian is one matrix product per sample."""
-        jacobian = values.observation_jacobian
-        if jacobian is None:
-            raise ValueError("the observations have no derivatives")
-
+        """See `Constraint.add_expansion`; the Hessian is one matrix product per sample."""
         # Slope of the barrier by every observed number, and its curvature times the Jacobian.
-        observed, weight = self._observed_with_weight(values)
-        slope = np.zeros(observed.shape)
-        bent = np.zeros(jacobian.shape)
-
-        barrier = self._number_barrier(observed, delta, weight, factors)
-        slope[..., self.number_columns] = barrier.slope
-        bent[:, :, self.number_columns] = (
-            barrier.curvature[..., None] * jacobian[:, :, self.number_columns]
-        )
-        for i, magnitude in self.magnitudes:
-            columns = list(magnitude.columns)
-            vectors = self._vector_barrier(i, magnitude, observed, delta, weight)
+        jacobian = values.jacobian
+        slope, bent = np.zeros(jacobian.shape[:3]), np.zeros(jacobian.shape)
+        numbers, columns = super().barrier(values, delta, factors), self.number_columns
+        slope[..., columns] = numbers.slope
+        bent[:, :, columns] = numbers.curvature[..., None] * jacobian[:, :, columns]
+        for i, vectors in self._vector_barriers(values, delta):
+            columns = np.array(self.columns[i])
             slope[..., columns] = vectors.slope
             bent[:, :, columns] = vectors.curvature @ jacobian[:, :, columns]
 
         # Gradient by the state and the control, (N, nx+nu).
-        N, nx = len(observed), sums.a.shape[1]
+        N, nx = len(jacobian), sums.a.shape[1]
         gradient = np.einsum("kswi,ksw->ki", jacobian, slope)
         sums.a[:-1] += gradient[:, :nx]
         sums.b[:] += gradient[:, nx:]
@@ -379,85 +400,18 @@ class SubstepConstraint:
         sums.weights.S[:] += hessian[:, nx:, :nx]
         sums.weights.R[:] += hessian[:, nx:, nx:]
 
-    def slacks(self, values: ConstraintValues) -> Array:
-        """See `LimitedQuantities.slacks`; of the quantities that are single numbers."""
-        observed, _ = self._observed_with_weight(values)
-        return self._number_bounds.slacks(observed[..., self.number_columns])
-
-    def _number_barrier(
-        self, observed: Array, delta: float, weight: float, factors: Array | None = None
-    ) -> BarrierDerivatives:
-        """Barrier of the quantities that are single numbers, with derivatives by them."""
-        numbers = observed[..., self.number_columns]
-        return self._number_bounds.barrier(numbers, delta, weight, factors)
-
-    @property
-    def _number_bounds(self) -> Bounds:
-        """Ranges of the quantities that are single numbers."""
-        return Bounds(
-            lower=self.bounds.lower[self.numbers],
-            upper=self.bounds.upper[self.numbers],
-            scale=self.bounds.scale[self.numbers],
-        )
-
-    def _vector_barrier(
-        self, i: int, magnitude: Magnitude, observed: Array, delta: float, weight: float
-    ) -> BarrierDerivatives:
-        """Barrier of quantity i, a magnitude, with derivatives by its observed numbers."""
-        upper, scale = float(self.bounds.upper[i]), float(self.bounds.scale[i])
-        return magnitude.barrier(observed, upper, scale, delta=delta, weight=weight)
-
-    def _observed_with_weight(self, values: ConstraintValues) -> tuple[Array, float]:
-        """Numbers at the S rows with derivatives, (N, S, w), and the weight of each."""
-        rows = np.array(self.observations.derivative_rows)
-        return values.observed[:, rows], values.weight / len(rows)
+    def _vector_barriers(
+        self, values: ConstraintValues, delta: float
+    ) -> Iterator[tuple[int, BarrierDerivatives]]:
+        """Barriers of the magnitudes by their places, with derivatives by observed numbers."""
+        observed, weight = self._observed(values), self.weight(values)
+        for i, magnitude in self.magnitudes:
+            upper, scale = float(self.bounds.upper[i]), float(self.bounds.scale[i])
+            yield i, magnitude.barrier(observed, upper, scale, delta=delta, weight=weight)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class BoundedQuantity(ABC):
-    """Ranges of a quantity that follows from the trajectory alone.
-
-    Attributes:
-        kind: Kind of the limits.
-        bounds: Ranges of the quantity.
-    """
-
-    kind: ClassVar[str] = ""
-
-    bounds: Bounds
-
-    @abstractmethod
-    def quantity(self, values: ConstraintValues) -> Array:
-        """The quantity, with one column for each range."""
-
-    def weight(self, values: ConstraintValues) -> float:
-        """Weight of one row of the quantity in the barrier."""
-        return values.weight
-
-    @property
-    def quantities_between_bounds(self) -> Self:
-        """See `Constraint.quantities_between_bounds`."""
-        return self
-
-    def tightened(self, fractions: Mapping[str, float]) -> Self:
-        """Narrow the ranges by the fraction of their half-width for this kind."""
-        return replace(self, bounds=self.bounds.tightened(fractions.get(self.kind, 0.0)))
-
-    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
-        """See `Constraint.margins`."""
-        yield KindMargins(self.kind, self.bounds.margin(self.quantity(values)), self.bounds.scale)
-
-    def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """See `Constraint.barrier`."""
-        return self.bounds.barrier(self.quantity(values), delta, self.weight(values)).value
-
-    def slacks(self, values: ConstraintValues) -> Array:
-        """See `LimitedQuantities.slacks`."""
-        return self.bounds.slacks(self.quantity(values))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ControlConstraint(BoundedQuantity):
+class ControlConstraint(Constraint):
     """Ranges of the controls.
 
     Attributes:
@@ -470,19 +424,15 @@ class ControlConstraint(BoundedQuantity):
         """(N, nu) controls [u-unit]."""
         return values.trajectory.ctrl
 
-    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
-        """See `LimitedQuantities.slack_changes`."""
-        return self.bounds.slack_changes(step.v)
+    def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `Constraint.change`."""
+        return step.v
 
     def add_expansion(
-        self,
-        values: ConstraintValues,
-        delta: float,
-        sums: ExpansionSums,
-        factors: Array | None = None,
+        self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
-        """See `LimitedQuantities.add_expansion`."""
-        barrier = self.bounds.barrier(values.trajectory.ctrl, delta, values.weight, factors)
+        """See `Constraint.add_expansion`."""
+        barrier = self.barrier(values, delta, factors)
         diagonal = np.arange(sums.b.shape[1])
 
         sums.b[:] += barrier.slope
@@ -490,7 +440,7 @@ class ControlConstraint(BoundedQuantity):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ControlRateConstraint(BoundedQuantity):
+class ControlRateConstraint(Constraint):
     """Ranges of the rates of the controls.
 
     A rate is the change of a control from one sample to the next over the time in which it is
@@ -541,23 +491,19 @@ class ControlRateConstraint(BoundedQuantity):
             last = curve[0]
         return np.diff(curve, axis=0, prepend=first[None], append=last[None]) / self.dt
 
-    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
-        """See `LimitedQuantities.slack_changes`."""
+    def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `Constraint.change`."""
         # Controls that are stated beside the curve do not change.
         unchanged = np.zeros(step.v.shape[1])
         before = None if self.control_before is None else unchanged
         after = None if self.control_after is None else unchanged
-        return self.bounds.slack_changes(self._rates_between(step.v, before, after))
+        return self._rates_between(step.v, before, after)
 
     def add_expansion(
-        self,
-        values: ConstraintValues,
-        delta: float,
-        sums: ExpansionSums,
-        factors: Array | None = None,
+        self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
-        """See `LimitedQuantities.add_expansion`."""
-        barrier = self.bounds.barrier(self.quantity(values), delta, values.weight, factors)
+        """See `Constraint.add_expansion`."""
+        barrier = self.barrier(values, delta, factors)
         slope = barrier.slope / self.dt
 
         # A control raises the rate into its sample and lowers the rate out of it.
@@ -579,7 +525,7 @@ class ControlRateConstraint(BoundedQuantity):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EndStateConstraint(BoundedQuantity):
+class EndStateConstraint(Constraint):
     """Tolerances of the final state about a target.
 
     Attributes:
@@ -608,10 +554,13 @@ class EndStateConstraint(BoundedQuantity):
         each = np.repeat([position, velocity, 0.0], (space.nv, space.nv, space.na))
         return replace(self, bounds=self.bounds.tightened(each))
 
-    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
-        """See `LimitedQuantities.slack_changes`."""
-        J = self.space.minus_derivative(self.quantity(values))
-        return self.bounds.slack_changes(J @ step.z[-1])
+    def _slope(self, values: ConstraintValues) -> Array:
+        """(nx, nx) derivative by the final state; the difference of rotations is not linear."""
+        return self.space.minus_derivative(self.quantity(values))
+
+    def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `Constraint.change`."""
+        return np.asarray(self._slope(values) @ step.z[-1])
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
@@ -624,124 +573,77 @@ class EndStateConstraint(BoundedQuantity):
         yield KindMargins("end_velocity", margins[velocities], scale[velocities])
 
     def add_expansion(
-        self,
-        values: ConstraintValues,
-        delta: float,
-        sums: ExpansionSums,
-        factors: Array | None = None,
+        self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
-        """See `LimitedQuantities.add_expansion`."""
-        difference = self.quantity(values)
-        barrier = self.bounds.barrier(difference, delta, END_WEIGHT, factors)
-
-        # The difference of two rotations is not linear in the state, so that J is no identity.
-        J = self.space.minus_derivative(difference)
+        """See `Constraint.add_expansion`."""
+        barrier, J = self.barrier(values, delta, factors), self._slope(values)
         sums.a[-1] += J.T @ barrier.slope
         sums.weights.Q[-1] += J.T @ (barrier.curvature[:, None] * J)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LimitedDistances:
-    """Distances between geoms that were measured already; they have to be at least a clearance.
-
-    Attributes:
-        least: The clearance [m].
-        reach: Largest distance that is measured [m].
-    """
-
-    least: float
-    reach: float
-
-    def slacks(self, values: ConstraintValues) -> Array:
-        """See `LimitedQuantities.slacks`."""
-        measured = measured_distances(values)
-        return self.bounds(measured).slacks(measured)
-
-    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
-        """See `LimitedQuantities.slack_changes`."""
-        slopes = self._slopes(values)
-        changes = np.einsum("kmi,ki->km", slopes, step.z[1:, : slopes.shape[2]])
-        return self.bounds(measured_distances(values)).slack_changes(changes)
-
-    def add_expansion(
-        self,
-        values: ConstraintValues,
-        delta: float,
-        sums: ExpansionSums,
-        factors: Array | None = None,
-    ) -> None:
-        """See `LimitedQuantities.add_expansion`."""
-        measured, slopes = measured_distances(values), self._slopes(values)
-        barrier = self.bounds(measured).barrier(measured, delta, values.weight, factors)
-        nv = slopes.shape[2]
-        hessian = np.swapaxes(slopes * barrier.curvature[..., None], 1, 2) @ slopes
-
-        # Distances are measured at the samples 1 ... N.
-        sums.a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, slopes)
-        sums.weights.Q[1:, :nv, :nv] += hessian
-
-    def bounds(self, measured: Array) -> Bounds:
-        """Bounds of (N, m) distances: at least the clearance; the barrier is zero at the reach."""
-        m = measured.shape[1]
-        return Bounds(
-            lower=np.full(m, self.least),
-            upper=np.full(m, np.inf),
-            scale=np.full(m, self.reach - self.least),
-        )
-
-    @staticmethod
-    def _slopes(values: ConstraintValues) -> Array:
-        """(N, m, nv) derivatives of the distances by the position [m / q-unit]."""
-        if values.distance_slopes is None:
-            raise ValueError("the distances have no derivatives")
-        return values.distance_slopes
-
-
-def measured_distances(values: ConstraintValues) -> Array:
-    """(N, m) distances between geoms [m]. Raises ValueError where they were not measured."""
-    if values.distances is None:
-        raise ValueError("the distances were not measured")
-    return values.distances
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ClearanceConstraint:
+class ClearanceConstraint(Constraint):
     """Distances between geoms that have to be at least a clearance.
 
     Attributes:
-        distances: Measures the distances of all pairs up to its reach.
-        least: The clearance [m].
+        distances: Measures the distances of all pairs up to its reach, where the barrier is zero.
     """
 
     distances: GeomDistances
-    least: float
+
+    @classmethod
+    def of(cls, distances: GeomDistances, least: float) -> ClearanceConstraint:
+        """The constraint with a clearance [m]."""
+        each = np.ones(len(distances.columns))
+        scale = (distances.reach - least) * each
+        bounds = Bounds(lower=least * each, upper=np.inf * each, scale=scale)
+        return cls(distances=distances, bounds=bounds)
+
+    @property
+    def least(self) -> float:
+        """The clearance [m]."""
+        return float(self.bounds.lower[0])
 
     @property
     def scale(self) -> float:
         """Distance to which margins are relative: the clearance, unless it is negligible [m]."""
         return max(self.least, NEGLIGIBLE_CLEARANCE * self.distances.reach)
 
-    @property
-    def quantities_between_bounds(self) -> LimitedDistances:
-        """See `Constraint.quantities_between_bounds`."""
-        return LimitedDistances(least=self.least, reach=self.distances.reach)
-
     def tightened(self, fractions: Mapping[str, float]) -> ClearanceConstraint:
         """Raise the clearance by a fraction of it, at most half of the way to the reach."""
         raised = self.least * (1.0 + fractions.get("clearance", 0.0))
         highest = 0.5 * (self.least + self.distances.reach)
-        return replace(self, least=min(raised, highest))
+        return self.of(self.distances, min(raised, highest))
+
+    def quantity(self, values: ConstraintValues) -> Array:
+        """(N, m) distances between geoms [m]. Raises ValueError where they were not measured."""
+        if values.distances is None:
+            raise ValueError("the distances were not measured")
+        return values.distances
+
+    def _slopes(self, values: ConstraintValues) -> Array:
+        """(N, m, nv) derivatives of the distances by the position [m / q-unit]."""
+        if values.distance_slopes is None:
+            raise ValueError("the distances have no derivatives")
+        return values.distance_slopes
+
+    def change(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `Constraint.change`."""
+        slopes = self._slopes(values)
+        return np.asarray(np.einsum("kmi,ki->km", slopes, step.z[1:, : slopes.shape[2]]))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
-        margins = measured_distances(values) - self.least
-        yield KindMargins("clearance", margins, self.scale)
+        yield KindMargins("clearance", self.quantity(values) - self.least, self.scale)
 
-    def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """See `Constraint.barrier`."""
-        measured = measured_distances(values)
-        return (
-            self.quantities_between_bounds.bounds(measured)
-            .barrier(measured, delta, values.weight)
-            .value
-        )
+    def add_expansion(
+        self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
+    ) -> None:
+        """See `Constraint.add_expansion`."""
+        barrier, slopes = self.barrier(values, delta, factors), self._slopes(values)
+        nv = slopes.shape[2]
+        hessian = np.swapaxes(slopes * barrier.curvature[..., None], 1, 2) @ slopes
+
+        # Distances are measured at the samples 1 ... N.
+        sums.a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, slopes)
+        sums.weights.Q[1:, :nv, :nv] += hessian

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,7 +20,6 @@ from mjfim.excitation.limits.constraint_kinds import (
     ControlRateConstraint,
     EndStateConstraint,
     ExpansionSums,
-    LimitedQuantities,
     SubstepConstraint,
 )
 from mjfim.excitation.limits.limits import Limit, derivative_substeps_of, has_constant_forces
@@ -41,34 +41,25 @@ from mjfim.optimize.cost_models import (
 )
 from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.plant import Plant
 from mjfim.records.trajectory import Trajectory
 
 # Share of the distance of the initial and the final state from a limit that a reserve may take.
 END_SHARE = 0.5
 
-# Attribute of `SubstepObservations` to which each kind of limit belongs; angles are turns.
+# Attribute of `SubstepObservations` to which each kind of limit belongs, in the order of the
+# observed numbers. Angles of ball and free joints are turns as well.
 SOURCES = {
     "position": "positions",
     "velocity": "velocities",
     "angular_velocity": "velocities",
     "acceleration": "accelerations",
+    "tilt": "turns",
     "force": "actuator_forces",
     "joint_force": "joint_forces",
     "tendon_force": "tendon_forces",
     "tendon_length": "tendon_lengths",
 }
-
-# The attributes in the order of the observed numbers.
-ORDER = (
-    "positions",
-    "velocities",
-    "accelerations",
-    "turns",
-    "actuator_forces",
-    "joint_forces",
-    "tendon_forces",
-    "tendon_lengths",
-)
 
 
 def observed_numbers(
@@ -84,21 +75,21 @@ def observed_numbers(
         The observations of a single engine step without further rows, and for each of the n limits
         the places of its numbers among them.
     """
-    sources = [_source(limit) for limit in limits]
-    places: dict[int, tuple[int, ...]] = {}
+    chosen: dict[str, list[Limit]] = {source: [] for source in SOURCES.values()}
+    for limit in limits:
+        chosen["turns" if limit.is_angle else SOURCES[limit.kind]].append(limit)
+    places: dict[tuple[str, str], tuple[int, ...]] = {}
     begin = 0
-    for source in ORDER:
-        for i, limit in enumerate(limits):
-            if sources[i] == source:
-                places[i] = tuple(range(begin, begin + limit.count))
-                begin += limit.count
+    for limit in itertools.chain.from_iterable(chosen.values()):
+        places[limit.kind, limit.name] = tuple(range(begin, begin + limit.count))
+        begin += limit.count
 
-    chosen = {
-        source: [limit for limit, each in zip(limits, sources, strict=True) if each == source]
-        for source in ORDER
-    }
     turns = [np.arange(x.index, x.index + 4) for x in chosen["turns"] for _ in range(x.count)]
-    weights = [_turn_weights(model, limit) for limit in chosen["turns"]]
+    joints = {quaternion_address(model, joint): joint for joint in quaternion_joints(model)}
+    weights = [
+        (tilt_weights if limit.kind == "tilt" else turn_weights)(model, joints[limit.index])
+        for limit in chosen["turns"]
+    ]
     observations = SubstepObservations(
         positions=_addresses(chosen["positions"]),
         velocities=_addresses(chosen["velocities"]),
@@ -112,12 +103,7 @@ def observed_numbers(
         derivative_substeps=(1,),
         timestep=float(model.opt.timestep),
     )
-    return observations, tuple(places[i] for i in range(len(limits)))
-
-
-def _source(limit: Limit) -> str:
-    """The attribute of `SubstepObservations` that holds the numbers of a limit."""
-    return "turns" if limit.is_angle else SOURCES[limit.kind]
+    return observations, tuple(places[limit.kind, limit.name] for limit in limits)
 
 
 def _addresses(limits: Iterable[Limit]) -> np.ndarray:
@@ -126,27 +112,19 @@ def _addresses(limits: Iterable[Limit]) -> np.ndarray:
     return np.array(each, dtype=np.intp)
 
 
-def _turn_weights(model: Any, limit: Limit) -> Array:
-    """(count, 4) weights of the quaternion of a limited angle."""
-    joint = next(j for j in quaternion_joints(model) if quaternion_address(model, j) == limit.index)
-    return tilt_weights(model, joint) if limit.kind == "tilt" else turn_weights(model, joint)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CurvatureOfLimits(StepCurvature):
     """The barrier about a trajectory, from which its curvature along steps follows.
 
-    It can be pickled with the state of a search.
-
     Attributes:
-        members: The kinds of limited quantities.
+        members: The kinds of constraints.
         values: The quantities along the trajectory, with their derivatives.
         delta: Relaxation of the barrier, a relative margin.
         nu: Number of controls.
         mu: Weight of the barrier.
     """
 
-    members: tuple[LimitedQuantities, ...]
+    members: tuple[Constraint, ...]
     values: ConstraintValues
     delta: float
     nu: int
@@ -174,10 +152,7 @@ class CurvatureOfLimits(StepCurvature):
         Args:
             factors: Factors of the curvature, by kind; default: 1.
         """
-        jacobian = self.values.observation_jacobian
-        if jacobian is None:
-            raise ValueError("the observations have no derivatives")
-
+        jacobian = self.values.jacobian
         sums = ExpansionSums.zero(len(jacobian), jacobian.shape[-1] - self.nu, self.nu)
         for i, member in enumerate(self.members):
             each = None if factors is None else factors[i]
@@ -266,6 +241,11 @@ class ConstraintSet:
             clearance=None if self.clearance is None else self.clearance.tightened(fractions),
         )
 
+    def along(self, plant: Plant, theta: Array, ctrl: Array) -> ConstraintValues | None:
+        """The constrained quantities along a control, (N, nu); None where the motion diverges."""
+        observed = plant.observe(theta, ctrl, self.observations)
+        return None if observed is None else self.evaluate(*observed, slopes=False)
+
     def evaluate(self, trajectory: Trajectory, observed: Array, slopes: bool) -> ConstraintValues:
         """Collect the constrained quantities along a trajectory.
 
@@ -277,10 +257,9 @@ class ConstraintSet:
         Returns:
             The quantities.
         """
-        if self.clearance is None:
-            return ConstraintValues(trajectory=trajectory, observed=observed)
-
-        distances, by_state = self.clearance.distances(trajectory.qpos[1:], slopes)
+        distances, by_state = None, None
+        if self.clearance is not None:
+            distances, by_state = self.clearance.distances(trajectory.qpos[1:], slopes)
         return ConstraintValues(
             trajectory=trajectory,
             observed=observed,
@@ -324,7 +303,7 @@ class ConstraintSet:
             values: The constrained quantities along a trajectory.
             delta: Relaxation of the barrier, a relative margin.
         """
-        return float(sum(member.barrier(values, delta) for member in self.members))
+        return float(sum(member.barrier(values, delta).value for member in self.members))
 
     def expand(
         self, values: ConstraintValues, observation_jacobian: Array, delta: float
@@ -343,8 +322,7 @@ class ConstraintSet:
         nu = values.trajectory.ctrl.shape[1]
         values = replace(values, observation_jacobian=observation_jacobian)
 
-        members = tuple(member.quantities_between_bounds for member in self.members)
-        curvature = CurvatureOfLimits(members=members, values=values, delta=delta, nu=nu)
+        curvature = CurvatureOfLimits(members=self.members, values=values, delta=delta, nu=nu)
         sums = curvature.sums()
 
         step_scale = np.full(nu, np.inf)
@@ -386,9 +364,12 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         free = np.full(nu, np.inf)
         control = Bounds.from_range(-free, free)
 
-    # Controls without a range have the scale of the initial control.
+    # The scale of a control without a range is its largest initial deviation from rest, or its
+    # natural size where the initial control rests.
     is_free = ~np.isfinite(control.lower) & ~np.isfinite(control.upper)
-    control = replace(control, scale=np.where(is_free, _control_sizes(task), control.scale))
+    sizes = np.abs(task.control - task.system.rest).max(axis=0)
+    sizes = np.where(sizes > 0.0, sizes, task.plant.sizes.control)
+    control = replace(control, scale=np.where(is_free, sizes, control.scale))
 
     # The holding controls are computed even without limits on rates, because a boundary that cannot
     # be kept is an error.
@@ -406,13 +387,25 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         )
 
     substeps = _substep_constraint(task, limits)
-    end = None if boundary.end == "free" else _end_constraint(task)
+    end = None
+    if boundary.end != "free":
+        # Activations are free.
+        nv, na = task.space.nv, task.space.na
+        width = np.repeat([boundary.position, boundary.velocity, np.inf], (nv, nv, na))
+        bounds = Bounds.from_range(-width, width)
+        end = EndStateConstraint(space=task.space, bounds=bounds, target=task.target)
 
     clearance = None
     if stated.clearance is not None and includes_limits:
         length = model_length(task.system.model)
         reach = stated.clearance + max(CLEARANCE_REACH * length, stated.clearance)
-        clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
+        ignored = [frozenset(pair) for pair in stated.ignored]
+        try:
+            pairs = find_geom_pairs(task.system.model, ignored)
+            distances = GeomDistances(task.system.model_at(task.theta), pairs, reach)
+        except ExperimentError as error:
+            raise ExperimentError(f"limits.{error}") from None
+        clearance = ClearanceConstraint.of(distances, stated.clearance)
 
     found = ConstraintSet(
         substeps=substeps,
@@ -461,10 +454,20 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
     """Ranges of the quantities within samples, ordered by kind."""
     ordered = tuple(limit for kind in SUBSTEP_KINDS for limit in limits if limit.kind == kind)
     observed, columns = observed_numbers(task.system.model, ordered)
+
+    # MuJoCo keeps the forces at the beginning of each engine step, and with RK4 those of its last
+    # stage. The forces at the end of a sample under its control are those that the next sample
+    # begins with where the control does not change. Lengths of tendons are like forces that change.
+    kinds, substeps = {limit.kind for limit in ordered}, task.system.grid.substeps
+    has_forces = not kinds.isdisjoint(FORCE_KINDS)
+    force_rows: tuple[int, ...] = ()
+    if "tendon_length" in kinds or (has_forces and not has_constant_forces(task.system.model)):
+        begun = range(substeps) if is_rk4(task.system.model) else ()
+        force_rows = (*begun, substeps - 1)
     observations = replace(
         observed,
-        derivative_substeps=derivative_substeps_of(task.system.grid.substeps),
-        force_rows=_force_rows(task, {limit.kind for limit in ordered}),
+        derivative_substeps=derivative_substeps_of(substeps),
+        force_rows=force_rows,
         timestep=float(task.plant.simulator.model.opt.timestep),
     )
 
@@ -482,30 +485,6 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
     )
 
 
-def _force_rows(task: DesignTask, kinds: set[str]) -> tuple[int, ...]:
-    """Engine steps of a sample whose forces have to be computed in addition to a rollout.
-
-    MuJoCo keeps the forces at the beginning of each engine step, and with RK4 those of its last
-    stage. The forces at the end of a sample under its control are those that the next sample
-    begins with where the control does not change. Lengths of tendons are like forces that change.
-
-    Args:
-        task: The task.
-        kinds: Kinds of its limits.
-    """
-    model = task.system.model
-    changes = "tendon_length" in kinds
-    if not kinds.isdisjoint(FORCE_KINDS):
-        changes = changes or not has_constant_forces(model)
-    if not changes:
-        return ()
-
-    substeps = task.system.grid.substeps
-    with_stages = is_rk4(model)
-    begun = range(substeps) if with_stages else ()
-    return (*begun, substeps - 1)
-
-
 def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds | None:
     """Ranges of all nu controls for one kind of limit; None where no control has such a limit.
 
@@ -514,51 +493,8 @@ def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds
     rows = [limit for limit in limits if limit.kind == kind]
     if not rows:
         return None
-
-    lower = np.full(nu, -np.inf)
-    upper = np.full(nu, np.inf)
-    sizes = np.ones(nu)
+    lower, upper, sizes = np.repeat([[-np.inf], [np.inf], [1.0]], nu, axis=1)
     for limit in rows:
-        lower[limit.index] = limit.lower
-        upper[limit.index] = limit.upper
-        sizes[limit.index] = limit.size
+        i = limit.index
+        lower[i], upper[i], sizes[i] = limit.lower, limit.upper, limit.size
     return Bounds.from_range(lower, upper, sizes)
-
-
-def _control_sizes(task: DesignTask) -> Array:
-    """Scales of controls without a range: their largest initial deviation from rest.
-
-    Returns:
-        (nu,) scales [u-unit], the natural sizes where the initial control rests.
-    """
-    size = np.abs(task.control - task.system.rest).max(axis=0)
-    return np.where(size > 0.0, size, task.plant.sizes.control)
-
-
-def _distances(task: DesignTask, reach: float) -> GeomDistances:
-    """Distances up to `reach` [m] of all pairs of geoms that are not ignored.
-
-    Raises:
-        ExperimentError: There are no such pairs, or a body to ignore is unknown.
-    """
-    ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
-    try:
-        pairs = find_geom_pairs(task.system.model, ignored)
-        return GeomDistances(task.system.model_at(task.theta), pairs, reach)
-    except ExperimentError as error:
-        raise ExperimentError(f"limits.{error}") from None
-
-
-def _end_constraint(task: DesignTask) -> EndStateConstraint:
-    """The tolerances of the final state that `[boundary]` states; activations are free."""
-    boundary, space = task.experiment.boundary, task.space
-    width = np.concatenate(
-        [
-            np.full(space.nv, boundary.position),
-            np.full(space.nv, boundary.velocity),
-            np.full(space.na, np.inf),
-        ]
-    )
-    return EndStateConstraint(
-        space=space, bounds=Bounds.from_range(-width, width), target=task.target
-    )

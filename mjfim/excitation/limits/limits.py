@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
@@ -135,57 +135,54 @@ def _limits_of_kind(
         kind: The kind.
         stated: Numbers of the experiment file: one for all names, or a table by name.
         found: The elements of the model.
+
+    Raises:
+        ExperimentError: An angle without a sign may be half a turn, which limits nothing; see also
+            `limits_of`.
     """
     by_name = _stated_ranges(kind, stated, found)
     limits = []
 
     for name, element in found.by_kind[kind].items():
-        # A stated range has to be valid by itself, before the MJCF's range narrows it.
+        ranges, own = [], element.stated
         if name in by_name:
             lower, upper = by_name[name]
+            # A stated range has to be valid by itself, before the MJCF's range narrows it.
             Limit(kind=kind, name=name, index=element.index, lower=float(lower), upper=float(upper))
-
-        own = element.stated
-        if own is not None and name in by_name and kind in SOFT_KINDS:
-            # A stop gives way: an end that is stated a little outside of the MJCF's holds.
-            (lower, upper), room = by_name[name], SOFT_SHARE * (own[1] - own[0])
-            low = lower if own[0] - room <= lower < own[0] else own[0]
-            own = low, upper if own[1] < upper <= own[1] + room else own[1]
-        ranges = [each for each in (by_name.get(name), own) if each is not None]
+            ranges.append((lower, upper))
+            if own is not None and kind in SOFT_KINDS:
+                # A stop gives way: an end that is stated a little outside of the MJCF's holds.
+                room = SOFT_SHARE * (own[1] - own[0])
+                low = lower if own[0] - room <= lower < own[0] else own[0]
+                own = low, upper if own[1] < upper <= own[1] + room else own[1]
+        if own is not None:
+            ranges.append(own)
         if not ranges:
             continue
 
         lower, upper = _intersection(f"limits.{kind}.{name}", ranges)
-        if np.isfinite(lower) or np.isfinite(upper):
-            limits.append(_limit(kind, name, element, (lower, upper)))
+        is_bounded = np.isfinite([lower, upper])
+        if not is_bounded.any():
+            continue
+        # The natural size is stated where there is a single bound.
+        limit = Limit(
+            kind=kind,
+            name=name,
+            index=element.index,
+            lower=lower,
+            upper=upper,
+            size=1.0 if is_bounded.all() else element.size,
+            count=element.count,
+            unit=element.unit,
+        )
+        if limit.is_angle and not upper < np.pi:
+            raise ExperimentError(
+                f"limits.{kind}.{name}: {upper:g} rad limits nothing: this angle is in radians, "
+                "between 0 and pi"
+            )
+        limits.append(limit)
 
     return limits
-
-
-def _limit(kind: str, name: str, element: LimitedElement, bounds: Range) -> Limit:
-    """Limit of one name; its natural size is stated where there is a single bound.
-
-    Raises:
-        ExperimentError: An angle without a sign may be half a turn, which limits nothing.
-    """
-    lower, upper = bounds
-    limit = Limit(
-        kind=kind,
-        name=name,
-        index=element.index,
-        lower=lower,
-        upper=upper,
-        count=element.count,
-        unit=element.unit,
-    )
-    if limit.is_angle and not upper < np.pi:
-        raise ExperimentError(
-            f"limits.{kind}.{name}: {upper:g} rad limits nothing: this angle is in radians, "
-            "between 0 and pi"
-        )
-    if np.isfinite(lower) and np.isfinite(upper):
-        return limit
-    return replace(limit, size=element.size)
 
 
 def _intersection(key: str, ranges: Sequence[Range]) -> Range:
@@ -354,14 +351,8 @@ def unsupported_ranges(model: Any) -> tuple[str, ...]:
     Returns:
         Descriptions of limited activations, with their names.
     """
-    actuators = _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.actuator_actlimited)
-    return tuple(f"the activation of {name}" for name in actuators)
-
-
-def _names(model: Any, kind: Any, chosen: Any) -> list[str]:
-    """Names of chosen elements of a kind, or their numbers; chosen: (n,) truth values."""
-    indices = np.flatnonzero(chosen).tolist()
-    return [mujoco.mj_id2name(model, kind, i) or f"number {i}" for i in indices]
+    limited = np.flatnonzero(model.actuator_actlimited).tolist()
+    return tuple(f"the activation of {model.actuator(i).name or f'number {i}'}" for i in limited)
 
 
 def derivative_substeps_of(substeps: int) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ of both counts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.excitation.limits.constraint_kinds import ClearanceConstraint
+from mjfim.excitation.limits.constraint_kinds import (
+    ClearanceConstraint,
+    ConstraintValues,
+    ControlConstraint,
+    ControlRateConstraint,
+)
 from mjfim.excitation.limits.constraints import (
     FORCE_KINDS,
     ConstraintSet,
@@ -25,9 +30,9 @@ from mjfim.excitation.limits.constraints import (
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import named_file
 from mjfim.model.units import LENGTH
 from mjfim.model.variants import unconstrained
-from mjfim.optimize.cost_models import Bounds
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage, LimitViolation
 from mjfim.records.trajectory import Trajectory
@@ -72,19 +77,6 @@ class Verification:
             margin >= 0.0 for kind, margin in self.margins.items() if kind not in self.unenforced
         )
 
-    @classmethod
-    def diverged(cls, kinds: Iterable[str], unenforced: frozenset[str]) -> Verification:
-        """The verification of a control under which the simulation diverges.
-
-        Args:
-            kinds: Kinds of the limits.
-            unenforced: Kinds that are checked, but not enforced.
-        """
-        margins = dict.fromkeys((*kinds, "simulation"), -np.inf)
-        return cls(
-            margins=margins, relative_margins=margins, deviation=np.inf, unenforced=unenforced
-        )
-
 
 def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
     """Play the control of a trajectory open loop on the unmodified model, at the theta of the task.
@@ -99,100 +91,80 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
     constraints = constraint_set_of(task, every=True)
     model = task.system.model_at(task.theta)
     exact = _played(task, constraints, trajectory.ctrl, model)
-    if exact is None:
-        return _diverged(task, constraints)
-
+    found = _verification(task, constraints, trajectory, exact, model)
     # Without constraint forces, the settings of their solver do not matter.
-    found = _verification(task, constraints, trajectory, exact)
-    if unconstrained(model) or not np.isfinite(found.deviation):
+    if exact is None or unconstrained(model) or not np.isfinite(found.deviation):
         return found
 
-    stated_model = task.system.model_with_stated_solver(task.theta)
-    stated = _played(task, constraints, trajectory.ctrl, stated_model)
-    if stated is None:
-        return _diverged(task, constraints)
-
+    model = task.system.model_with_stated_solver(task.theta)
+    stated = _played(task, constraints, trajectory.ctrl, model)
     # Both solvers give the same motion where no constraint force acts along it.
-    if stated.equals(exact):
+    if (
+        stated is not None
+        and stated.trajectory.moves_as(exact.trajectory)
+        and np.array_equal(stated.observed, exact.observed)
+    ):
         return found
-    return _worse_of(found, _verification(task, constraints, trajectory, stated))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Played:
-    """A control that is played open loop on one model.
-
-    Attributes:
-        motion: The motion at the samples.
-        observed: (N, rows, w) limited quantities within the samples.
-        positions: (N * substeps, nq) positions after every engine step; None without a clearance.
-    """
-
-    motion: Trajectory
-    observed: Array
-    positions: Array | None
-
-    def equals(self, other: _Played) -> bool:
-        """Whether another model moves in the same way, to the last digit.
-
-        Args:
-            other: The same control on the other model.
-        """
-        if not self.motion.moves_as(other.motion):
-            return False
-        if not np.array_equal(self.observed, other.observed):
-            return False
-        if self.positions is None or other.positions is None:
-            return self.positions is other.positions
-        return np.array_equal(self.positions, other.positions)
+    return _worse_of(found, _verification(task, constraints, trajectory, stated, model))
 
 
 def _played(
     task: DesignTask, constraints: ConstraintSet, ctrl: Array, model: Any
-) -> _Played | None:
-    """Play a control, (N, nu), on one model; None where the simulation diverges."""
+) -> ConstraintValues | None:
+    """Play a control, (N, nu), on one model; None where the simulation diverges.
+
+    The distances between geoms are not measured.
+    """
     simulator = BatchSimulator(model, substeps=task.system.grid.substeps)
-    out = simulator.rollout(
-        [model],
-        task.plant.initial_state(task.theta)[None],
-        ctrl[None],
-        constraints.observations,
-    )
+    start = task.plant.initial_state(task.theta)
+    out = simulator.rollout([model], start[None], ctrl[None], constraints.observations)
     if not out.finite[0] or out.observed is None:
         return None
-
     motion = task.plant.trajectory(out.states[0], ctrl)
-    positions = None
-    if constraints.clearance is not None:
-        positions = _positions_at_engine_steps(task, simulator, motion)
-    return _Played(motion=motion, observed=out.observed[0], positions=positions)
-
-
-def _diverged(task: DesignTask, constraints: ConstraintSet) -> Verification:
-    """The verification of a control under which the simulation diverges."""
-    return Verification.diverged(constraints.substeps.kinds, _unenforced_kinds(task))
+    return ConstraintValues(trajectory=motion, observed=out.observed[0])
 
 
 def _verification(
-    task: DesignTask, constraints: ConstraintSet, trajectory: Trajectory, played: _Played
+    task: DesignTask,
+    constraints: ConstraintSet,
+    trajectory: Trajectory,
+    values: ConstraintValues | None,
+    model: Any,
 ) -> Verification:
-    """Check all limits of a trajectory along its control as one model plays it."""
-    motion = played.motion
+    """Check all limits of a trajectory along its control as one model plays it.
+
+    Args:
+        task: The task.
+        constraints: Its limits.
+        trajectory: The trajectory.
+        values: What `_played` returns for the model.
+        model: The model.
+    """
+    unenforced = _unenforced_kinds(task)
+    if values is None:
+        margins = dict.fromkeys((*constraints.substeps.kinds, "simulation"), -np.inf)
+        return Verification(
+            margins=margins, relative_margins=margins, deviation=np.inf, unenforced=unenforced
+        )
 
     # All limits but the clearance.
+    motion = values.trajectory
     others = replace(constraints, clearance=None)
-    values = others.evaluate(motion, played.observed, slopes=False)
     margins = others.margins(values)
     relative_margins = others.relative_margins(values)
     usage = [
         *usage_within_samples(task, constraints, values.observed),
-        *_usage_of_controls(task, constraints, motion.ctrl),
+        *_bounded_usage(task, constraints.control, values),
     ]
+    if constraints.rate is not None:
+        usage.extend(_bounded_usage(task, constraints.rate, values))
 
     # The clearance, at every engine step instead of at the samples.
     clearance = constraints.clearance
-    if clearance is not None and played.positions is not None:
-        distance, used = _clearance_usage(task, clearance, played.positions)
+    if clearance is not None:
+        held = np.repeat(motion.ctrl, task.system.grid.substeps, axis=0)
+        steps = BatchSimulator(model).rollout([model], motion.state[:1], held[None]).states[0]
+        distance, used = _clearance_usage(task, clearance, steps[1:, : task.space.nq])
         usage.append(used)
         margins["clearance"] = distance - clearance.least
         relative_margins["clearance"] = margins["clearance"] / clearance.least
@@ -203,7 +175,7 @@ def _verification(
         margins=margins,
         relative_margins=relative_margins,
         deviation=deviation,
-        unenforced=_unenforced_kinds(task),
+        unenforced=unenforced,
         usage=tuple(usage),
     )
 
@@ -279,27 +251,20 @@ def usage_within_samples(
         )
 
 
-def _usage_of_controls(
-    task: DesignTask, constraints: ConstraintSet, ctrl: Array
-) -> Iterator[LimitUsage]:
-    """Position of the controls, (N, nu), and of their rates in the ranges that are stated."""
-    yield from _bounded_usage(task, "control", constraints.control.bounds, ctrl)
-    if constraints.rate is not None:
-        rates = constraints.rate.rates(ctrl)
-        yield from _bounded_usage(task, "control_rate", constraints.rate.bounds, rates)
-
-
 def _bounded_usage(
-    task: DesignTask, kind: str, bounds: Bounds, values: Array
+    task: DesignTask,
+    constraint: ControlConstraint | ControlRateConstraint,
+    values: ConstraintValues,
 ) -> Iterator[LimitUsage]:
-    """Position of values at n successive samples, (n, nu), in those ranges that are stated."""
-    t = np.arange(len(values), dtype=np.float64) * task.dt
-    positions = bounds.relative_position(values)
+    """Position of the controls, or of their rates, in those ranges that are stated."""
+    bounds = constraint.bounds
+    positions = bounds.relative_position(constraint.quantity(values))
+    t = np.arange(len(positions), dtype=np.float64) * task.dt
 
     bounded = np.isfinite(bounds.lower) | np.isfinite(bounds.upper)
     for i in np.flatnonzero(bounded).tolist():
         yield LimitUsage(
-            kind=kind,
+            kind=constraint.kind,
             name=task.controls[i],
             t=t,
             share=positions[:, i],
@@ -337,16 +302,6 @@ def _engine_times(task: DesignTask, count: int) -> Array:
     return np.arange(1, count + 1) * task.dt / task.system.grid.substeps
 
 
-def _positions_at_engine_steps(
-    task: DesignTask, simulator: BatchSimulator, played: Trajectory
-) -> Array:
-    """(N * substeps, nq) positions after every engine step."""
-    single_steps = BatchSimulator(simulator.model)
-    held = np.repeat(played.ctrl, task.system.grid.substeps, axis=0)
-    out = single_steps.rollout([simulator.model], played.state[:1], held[None])
-    return np.asarray(out.states[0][1:, : task.space.nq])
-
-
 def require_feasible_start(task: DesignTask) -> None:
     """Check that the limits and the boundary can be kept before anything is designed.
 
@@ -357,30 +312,23 @@ def require_feasible_start(task: DesignTask) -> None:
         ExperimentError: A limit cannot be kept, or excludes the initial state, the final state or a
             control that holds one.
     """
-    try:
-        _require_feasible_start(task)
-    except ExperimentError as error:
-        raise ExperimentError(f"{task.experiment.source}: {error}") from None
+    with named_file(task.experiment):
+        constraints = constraint_set_of(task, every=True)
+        bandwidth_basis(task, task.stated_times)
+        if not task.experiment.limits.enforce:
+            return
 
+        boundary = task.experiment.boundary
+        start = task.plant.initial_state(task.theta)
 
-def _require_feasible_start(task: DesignTask) -> None:
-    """Carry out `require_feasible_start`; error messages do not name the experiment file yet."""
-    constraints = constraint_set_of(task, every=True)
-    bandwidth_basis(task, task.stated_times)
-    if not task.experiment.limits.enforce:
-        return
+        _require_inside(task, constraints, "the initial state", start)
+        if boundary.end == "rest":
+            _require_inside(task, constraints, "the final state", task.target)
 
-    boundary = task.experiment.boundary
-    start = task.plant.initial_state(task.theta)
-
-    _require_inside(task, constraints, "the initial state", start)
-    if boundary.end == "rest":
-        _require_inside(task, constraints, "the final state", task.target)
-
-    if boundary.start == "rest":
-        _require_held(task, constraints, "boundary.start", start, task.initial_hold)
-    if boundary.end == "rest":
-        _require_held(task, constraints, "boundary.end", task.target, task.final_hold)
+        if boundary.start == "rest":
+            _require_held(task, constraints, "boundary.start", start, task.initial_hold)
+        if boundary.end == "rest":
+            _require_held(task, constraints, "boundary.end", task.target, task.final_hold)
 
 
 def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, state: Array) -> None:
@@ -394,8 +342,17 @@ def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, st
             f"there) or move {where}"
         )
 
-    if constraints.clearance is not None:
-        _require_clear(constraints.clearance, where, state[: task.space.nq])
+    clearance = constraints.clearance
+    if clearance is None:
+        return
+    distance, _, pair = clearance.distances.nearest(state[None, : task.space.nq])
+    if distance < clearance.least:
+        fault = "in collision" if distance < 0.0 else "too close"
+        raise ExperimentError(
+            f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, but "
+            f"have to be {clearance.least:g} m apart; move {where}, lower the clearance, or list "
+            "the pair's bodies in limits.ignored"
+        )
 
 
 def _quantities_at(
@@ -407,20 +364,6 @@ def _quantities_at(
     values = quantities_at(task, substeps, state, ctrl).tolist()
     for kind, name, value in zip(substeps.kinds, substeps.names, values, strict=True):
         yield limits[kind, name], value
-
-
-def _require_clear(clearance: ClearanceConstraint, where: str, qpos: Array) -> None:
-    """Require that a position, (nq,), keeps the clearance."""
-    distance, _, pair = clearance.distances.nearest(qpos[None])
-    if distance >= clearance.least:
-        return
-
-    fault = "in collision" if distance < 0.0 else "too close"
-    raise ExperimentError(
-        f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, but have "
-        f"to be {clearance.least:g} m apart; move {where}, lower the clearance, or list the pair's "
-        "bodies in limits.ignored"
-    )
 
 
 def _require_held(
@@ -446,17 +389,12 @@ def _require_held(
     ]
     for limit, value in (*controls, *forces):
         if not limit.lower <= value <= limit.upper:
+            has_range = limit.kind in ("joint_force", "tendon_force")
+            or_range = " or the MJCF's actuatorfrcrange" if has_range else ""
             raise ExperimentError(
                 f"{where}: standing still requires {limit.name} = {value:.4g}, outside "
-                f"{_key_of(limit)} [{limit.lower:g}, {limit.upper:g}]"
+                f"limits.{limit.kind}{or_range} [{limit.lower:g}, {limit.upper:g}]"
             )
-
-
-def _key_of(limit: Limit) -> str:
-    """The key or the range of the MJCF that states a limit, for error messages."""
-    if limit.kind in ("joint_force", "tendon_force"):
-        return f"limits.{limit.kind} or the MJCF's actuatorfrcrange"
-    return f"limits.{limit.kind}"
 
 
 def all_violations_of(task: DesignTask, trajectory: Trajectory) -> tuple[LimitViolation, ...]:
@@ -490,29 +428,38 @@ def _clamped_forces(task: DesignTask, trajectory: Trajectory) -> Iterator[LimitV
 
     free = task.relaxed()
     constraints = constraint_set_of(free)
-    played = free.plant.observe(free.theta, trajectory.ctrl, constraints.observations)
-    if played is None:
+    values = constraints.along(free.plant, free.theta, trajectory.ctrl)
+    if values is None:
         return
 
-    for usage in usage_within_samples(free, constraints, played[1]):
+    for usage in usage_within_samples(free, constraints, values.observed):
         limit = limits.get((usage.kind, usage.name))
         if limit is not None and (np.abs(usage.share) > 1.0).any():
             yield _violation_of(usage, limit, clamped=True)
 
 
-def _violation_of(usage: LimitUsage, limit: Limit, *, clamped: bool = False) -> LimitViolation:
-    """The violation of a limit, given its usage, which is outside somewhere."""
+def _violation_of(
+    usage: LimitUsage, limit: Limit | None, *, clamped: bool = False
+) -> LimitViolation:
+    """The violation of a limit, or of the clearance without one; the usage is outside somewhere."""
     outside = np.flatnonzero(np.abs(usage.share) > 1.0)
     worst = int(np.argmax(np.abs(usage.share)))
+    share, bounds = float(usage.share[worst]), limit or usage
+    if limit is None:
+        value = usage.lower / share
+    elif np.isfinite(limit.upper):
+        value = limit.upper - (1.0 - share) * limit.scale
+    else:
+        value = limit.lower + (1.0 + share) * limit.scale
     return LimitViolation(
         kind=usage.kind,
         name=usage.name,
         since=float(usage.t[outside[0]]),
         t=float(usage.t[worst]),
-        value=_value_at(limit, usage, worst),
-        lower=_finite(limit.lower),
-        upper=_finite(limit.upper),
-        unit=limit.unit,
+        value=value,
+        lower=bounds.lower if np.isfinite(bounds.lower) else None,
+        upper=bounds.upper if np.isfinite(bounds.upper) else None,
+        unit=LENGTH if limit is None else limit.unit,
         clamped=clamped,
     )
 
@@ -528,67 +475,24 @@ def violations_of(task: DesignTask, found: Verification) -> tuple[LimitViolation
         One entry for every limited joint, actuator and final state outside its range.
     """
     limits = {(limit.kind, limit.name): limit for limit in task.limits}
-    listed = [*_violations_over_time(task, found, limits), *_violations_at_the_end(task, found)]
-    return tuple(sorted(listed, key=lambda violation: violation.since))
-
-
-def _violations_over_time(
-    task: DesignTask, found: Verification, limits: dict[tuple[str, str], Limit]
-) -> Iterator[LimitViolation]:
-    """Violations of ranges and of the clearance."""
-    for usage in found.usage:
-        outside = np.flatnonzero(np.abs(usage.share) > 1.0)
-        if not outside.size or found.margins.get(usage.kind, 0.0) >= 0.0:
-            continue
-
-        limit = limits.get((usage.kind, usage.name))
-        if limit is not None:
-            yield _violation_of(usage, limit)
-            continue
-
-        worst = int(np.argmax(np.abs(usage.share)))
-        clearance = task.experiment.limits.clearance or 0.0
-        yield LimitViolation(
-            kind=usage.kind,
-            name=usage.name,
-            since=float(usage.t[outside[0]]),
-            t=float(usage.t[worst]),
-            value=clearance / float(usage.share[worst]),
-            lower=clearance,
-            upper=None,
-            unit=LENGTH,
-        )
-
-
-def _value_at(limit: Limit, usage: LimitUsage, row: int) -> float:
-    """The limited quantity at a row of its usage [unit of the limit]."""
-    share = float(usage.share[row])
-    if np.isfinite(limit.upper):
-        return limit.upper - (1.0 - share) * limit.scale
-    return limit.lower + (1.0 + share) * limit.scale
-
-
-def _finite(bound: float) -> float | None:
-    """A bound; None where it is infinite."""
-    return bound if np.isfinite(bound) else None
-
-
-def _violations_at_the_end(task: DesignTask, found: Verification) -> Iterator[LimitViolation]:
-    """Violations of the tolerances of the final state."""
+    listed = [
+        _violation_of(usage, limits.get((usage.kind, usage.name)))
+        for usage in found.usage
+        if found.margins.get(usage.kind, 0.0) < 0.0 and (np.abs(usage.share) > 1.0).any()
+    ]
     boundary = task.experiment.boundary
-    for kind, tolerance in (
-        ("end_position", boundary.position),
-        ("end_velocity", boundary.velocity),
-    ):
+    tolerances = {"end_position": boundary.position, "end_velocity": boundary.velocity}
+    for kind, tolerance in tolerances.items():
         margin = found.margins.get(kind, 0.0)
-        if not margin < 0.0:
-            continue
-        yield LimitViolation(
-            kind=kind,
-            name="final state",
-            since=task.horizon,
-            t=task.horizon,
-            value=tolerance - margin,
-            lower=None,
-            upper=tolerance,
-        )
+        if margin < 0.0:
+            violation = LimitViolation(
+                kind=kind,
+                name="final state",
+                since=task.horizon,
+                t=task.horizon,
+                value=tolerance - margin,
+                lower=None,
+                upper=tolerance,
+            )
+            listed.append(violation)
+    return tuple(sorted(listed, key=lambda violation: violation.since))

@@ -38,8 +38,8 @@ from mjfim.records.design import (
 )
 from mjfim.records.events import DesignEvent
 
-# Largest weight with which a violated limit is tightened in the next stage, and the weight from
-# which stages are repeated where the result violates a limit of the unmodified model.
+# Largest weight with which a violated limit is tightened in the next stage. Where the result
+# violates a limit of the unmodified model, the stages from the second weight on are repeated.
 TIGHTENING_MU = 4e-3
 REPEATED_MU = 1e-3
 MAX_REPEATED_STAGES = 3
@@ -234,9 +234,8 @@ class Plan:
             self.experiment,
             threads=self.threads,
             added_information=self.added_information,
-            variant=self.variant,
         )
-        return Grounds(task, self.combinations)
+        return Grounds(task.with_variant(self.variant), self.combinations)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,8 +1,8 @@
 """Descents on one level: Algorithm 1 without a barrier, and stages of the interior-point method.
 
 Both yield a `Step` for each iterate, so that whoever asks for the next one decides when it ends.
-Under hard limits a stage minimises `log J + mu B`, with a barrier B of the limits and a weight mu
-that falls from stage to stage.
+Under hard limits a stage minimises `log J + mu B`. B is a barrier of the limits; its weight mu
+falls from stage to stage.
 """
 
 from __future__ import annotations
@@ -16,15 +16,13 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.limits.constraint_kinds import ConstraintValues
-from mjfim.excitation.limits.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
-from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem, ExtendedDesignProblem
-from mjfim.excitation.search.inside import largest_share
+from mjfim.excitation.limits.constraints import FORCE_KINDS
+from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
+from mjfim.excitation.search.inside import LimitedLevel, largest_share
 from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProblem, values_of
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import independent_curves
-from mjfim.information.criteria import Criterion
 from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
@@ -133,17 +131,15 @@ class Step:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ground:
+class Ground(LimitedLevel):
     """The level on which descents work, over one repetition of the control.
 
     Attributes:
-        level: The level.
         curves: (N, M) curves at the stated sample rate of which controls are sums; None where each
             sample is free.
         repeats: How often the control is played, one after the other.
     """
 
-    level: DescentLevel
     curves: Array | None = None
     repeats: int = 1
 
@@ -162,17 +158,6 @@ class Ground:
     def task(self) -> DesignTask:
         """The task on this level."""
         return self.level.task
-
-    @cached_property
-    def constraints(self) -> ConstraintSet:
-        """The limits."""
-        return constraint_set_of(self.task)
-
-    def values(self, control: Array) -> ConstraintValues | None:
-        """Limited quantities along a control of this level; None where it diverges."""
-        task = self.task
-        observed = task.plant.observe(task.theta, control, self.constraints.observations)
-        return None if observed is None else self.constraints.evaluate(*observed, slopes=False)
 
     def exact(self, point: DesignPoint) -> DesignPoint:
         """A point with the exact criterion of all repetitions."""
@@ -202,7 +187,7 @@ class Ground:
             done: Number of iterations on coarser levels.
             is_limited: The limits are checked.
         """
-        rate, watch = 1.0 / self.task.dt, _Watch(self) if is_limited else None
+        rate, clamped = 1.0 / self.task.dt, 0
         while True:
             level = replace(self.level, power=memory.power)
             direction, problem = _direction_for(level)
@@ -213,9 +198,11 @@ class Ground:
             status, eigenvalues = None, np.zeros(0)
             for iterate in self._free_iterates(problem, controls, direction, done):
                 step = self._free_step(iterate, level.power)
-                yield step if watch is None else watch.seen(step)
+                if is_limited:
+                    step, clamped = self._watched(step, clamped)
+                yield step
                 status, controls = iterate.status, [step.control]
-                eigenvalues = _criterion(iterate.point).eigenvalues
+                eigenvalues = step.iterate.point.criterion.eigenvalues
                 if status is None and iterate.index and _meet(level, eigenvalues, MEETING_RATIO):
                     break
 
@@ -234,7 +221,13 @@ class Ground:
         tolerance, most = descent.tolerance, descent.max_iterations
         if self.task.system.variant.is_coarse:
             tolerance, most = max(tolerance, COARSE_TOLERANCE), most // 2
-        start = self._cheapest(problem, controls)
+        start = DIVERGED
+        for control in {id(each): each for each in controls}.values():
+            try:
+                moved = self.task.plant.simulate(self.task.theta, self.task.averaged(control))
+            except SimulationDivergedError:
+                continue
+            start = min(start, problem.point(moved), key=lambda point: point.cost)
         if not np.isfinite(start.cost):
             return
         yield from optimize(
@@ -246,17 +239,6 @@ class Ground:
             tolerance=tolerance,
             max_iterations=max(most - done, 0),
         )
-
-    def _cheapest(self, problem: DesignProblem, controls: Sequence[Array]) -> DesignPoint:
-        """The point of lowest cost among controls; `DIVERGED` if all diverge."""
-        points = []
-        for control in {id(each): each for each in controls}.values():
-            try:
-                moved = self.task.plant.simulate(self.task.theta, self.task.averaged(control))
-            except SimulationDivergedError:
-                continue
-            points.append(problem.point(moved))
-        return min(points, key=lambda point: point.cost, default=DIVERGED)
 
     def _free_step(self, iterate: Iterate[DesignPoint], power: float) -> Step:
         """An iterate of a descent without a barrier."""
@@ -271,6 +253,21 @@ class Ground:
             point=point if np.isinf(power) else self.exact(point),
             control=np.repeat(point.trajectory.ctrl, factor, axis=0),
         )
+
+    def _watched(self, step: Step, clamped: int) -> tuple[Step, int]:
+        """An iterate, and whether it has left the limits over all engine steps.
+
+        Derivatives do not exist where a clamp of the model acts. clamped: number of iterates before
+        this one, one after the other, along which a clamp acts; it comes back with this one.
+        """
+        values = self.values(step.iterate.point.trajectory.ctrl)
+        if values is None or not self.constraints.is_feasible(values):
+            return replace(step, is_inside=False, has_left=True), clamped
+        margins = self.constraints.margins(values)
+        is_clamped = any(margins.get(kind, 1.0) <= 0.0 for kind in FORCE_KINDS)
+        clamped = clamped + 1 if is_clamped else 0
+        has_left = clamped > MAX_CLAMPED_ITERATES
+        return replace(step, is_inside=not is_clamped, has_left=has_left), clamped
 
     # ---- with a barrier
 
@@ -473,13 +470,7 @@ def _direction_for(level: DescentLevel) -> tuple[Direction, DesignProblem]:
     psi_weights = np.full(len(Q) * len(task.parameters), descent.psi_weight * task.dt)
     extended_Q = np.diag(np.concatenate([np.diag(Q), psi_weights]))
     direction = MetricDescent(extended_Q, R, extended_Q, weighs_psi=True)
-    return direction, ExtendedDesignProblem.of(level.problem)
-
-
-def _criterion(point: DesignPoint) -> Criterion:
-    """The criterion of a point that has not diverged."""
-    assert point.criterion is not None
-    return point.criterion
+    return direction, replace(level.problem, extends=True)
 
 
 def _meet(level: DescentLevel, eigenvalues: Array, ratio: float) -> bool:
@@ -503,33 +494,6 @@ def _next_power(level: DescentLevel, eigenvalues: Array, status: Status | None) 
         return power
     error = float(np.sum((eigenvalues[0] / eigenvalues) ** power) ** (1.0 / power))
     return SMOOTH_POWERS[-1] if error > MAX_SMOOTHING_ERROR else power
-
-
-class _Watch:
-    """Observes whether a descent without a barrier leaves the limits.
-
-    Args:
-        ground: Its level.
-    """
-
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
-        self._clamped = 0
-
-    def seen(self, step: Step) -> Step:
-        """An iterate, and whether it is inside the limits over all engine steps.
-
-        Derivatives do not exist where a clamp of the model acts.
-        """
-        constraints = self._ground.constraints
-        values = self._ground.values(step.iterate.point.trajectory.ctrl)
-        if values is None or not constraints.is_feasible(values):
-            return replace(step, is_inside=False, has_left=True)
-        margins = constraints.margins(values)
-        is_clamped = any(margins.get(kind, 1.0) <= 0.0 for kind in FORCE_KINDS)
-        self._clamped = self._clamped + 1 if is_clamped else 0
-        has_left = self._clamped > MAX_CLAMPED_ITERATES
-        return replace(step, is_inside=not is_clamped, has_left=has_left)
 
 
 def _repeated(point: DesignPoint, count: int) -> DesignPoint:

@@ -1,9 +1,9 @@
 """Controls that keep all hard limits, found without derivatives.
 
 A control is scaled about one that nearly holds the start, enlarged one actuator at a time, and
-changed at random. What keeps the limits is a simulation, first on the plant of the search and then
-on the unmodified model, so that these controls count where derivatives mislead, as with dry
-friction, and as a first result long before a descent has one.
+changed at random. Simulations show whether it keeps the limits, first on the plant of the search
+and then on the unmodified model. So these controls count where derivatives mislead, as with dry
+friction. They are also a first result, long before a descent has one.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +46,8 @@ SINGLE_FACTORS = (2.0, 1.4)
 BANDWIDTHS = (0.6, 0.15, 1.0, 0.35, 0.06)
 CONTROLS_PER_BANDWIDTH = 2
 
-# Size of a random change relative to the control, at first and within bounds, and the factors by
-# which it changes after a success and after a failure. After four failures for one success the
-# size remains.
+# Size of a random change relative to the control, at first and within bounds. It changes by one
+# factor after a success and by another after a failure; four failures undo one success.
 FIRST_SIZE = 0.3
 SMALLEST_SIZE, LARGEST_SIZE = 0.03, 1.0
 AFTER_SUCCESS = 1.5
@@ -67,29 +66,35 @@ LEAST_PROGRESS = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LimitedCost:
-    """Cost of controls that keep all limits.
+class LimitedLevel:
+    """A level with its limits.
 
     Attributes:
-        level: The stated level, on the plant without the clamps that limits make unreachable.
-        first: The initial control, evaluated on the unmodified plant; None where it is not known.
+        level: The level, on the plant without the clamps that limits make unreachable.
     """
 
     level: DescentLevel
-    first: DesignPoint | None = None
 
     @cached_property
     def constraints(self) -> ConstraintSet:
-        """The limits on the plant without clamps."""
+        """The limits."""
         return constraint_set_of(self.level.task)
 
     def values(self, control: Array) -> ConstraintValues | None:
         """Limited quantities along a control: (N, nu); None where the simulation diverges."""
         task = self.level.task
-        observed = task.plant.observe(task.theta, control, self.constraints.observations)
-        if observed is None:
-            return None
-        return self.constraints.evaluate(*observed, slopes=False)
+        return self.constraints.along(task.plant, task.theta, control)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LimitedCost(LimitedLevel):
+    """Cost of controls that keep all limits on the stated level.
+
+    Attributes:
+        first: The initial control, evaluated on the unmodified plant; None where it is not known.
+    """
+
+    first: DesignPoint | None = None
 
     def nearly_keeps(self, control: Array) -> bool:
         """Check the limits on the plant of the search only, which is much quicker."""
@@ -191,13 +196,6 @@ def largest_share(keeps: Callable[[float], bool], budget: Budget) -> float | Non
     return share
 
 
-def _keeps_share(
-    keeps: Callable[[Array], bool], about: Array, deviation: Array, share: float
-) -> bool:
-    """Check whether a share of a deviation passes a test of controls."""
-    return keeps(about + share * deviation)
-
-
 class InsideSearch:
     """Search for controls that keep all limits, by scaling and by random changes.
 
@@ -232,7 +230,12 @@ class InsideSearch:
         that fails. A request to stop ends the search for a larger share.
         """
         for keeps in (self.cost.nearly_keeps, self.cost.keeps):
-            share = largest_share(partial(_keeps_share, keeps, about, deviation), budget)
+
+            def passes(share: float, keeps: Callable[[Array], bool] = keeps) -> bool:
+                """Whether a share of the deviation passes the test."""
+                return keeps(about + share * deviation)
+
+            share = largest_share(passes, budget)
             if share is None:
                 return None
             found = self._evaluated(about, share * deviation, share)
@@ -398,80 +401,55 @@ CORRECTION_SHARES = (1.0, 0.98, 0.94, 0.85, 0.72, 0.55, 0.35)
 CORRECTIONS = 2
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EndCorrection:
-    """The smallest change of a control that moves the last state, to first order.
+def _end_correction(cost: LimitedCost, values: ConstraintValues) -> Array | None:
+    """The smallest change of a control that moves the last state of a motion, to first order.
 
     It keeps the bandwidth that the experiment states. Without one it is free at each sample.
 
-    Attributes:
+    Args:
         cost: Cost of controls that keep all limits, whose plant is linearised.
-        change: (N, nu, nv) change of the control [u-unit] for a unit of each component of the last
-            state that has a tolerance [x-unit].
+        values: Limited quantities along the motion.
+
+    Returns:
+        (N, nu, nv) change of the control [u-unit] for a unit of each component of the last state
+        that has a tolerance [x-unit]. None with a free end, and where the motion diverges or is so
+        unstable that its derivatives overflow.
     """
+    constraints, task = cost.constraints, cost.level.task
+    if constraints.end is None:
+        return None
+    try:
+        A, B, _ = task.plant.derivatives.observation_jacobians(
+            task.theta, values.trajectory, constraints.observations
+        )
+    except SimulationDivergedError:
+        return None
 
-    cost: LimitedCost
-    change: Array
+    # Derivative of the last state by the control of each sample, in sizes of the controls.
+    bounded = _has_tolerance(constraints.end)
+    sizes = constraints.control.bounds.scale
+    reach = np.eye(len(bounded))[bounded]
+    by_control = np.empty((len(A), len(reach), B.shape[2]))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in reversed(range(len(A))):
+            by_control[k] = reach @ B[k] * sizes
+            reach = reach @ A[k]
 
-    @classmethod
-    def along(cls, cost: LimitedCost, values: ConstraintValues) -> EndCorrection | None:
-        """Linearise the plant along a motion.
+        # A control of limited bandwidth is a sum of splines, of which only the shares are free.
+        curves = bandwidth_basis(task, task.stated_times)
+        by_share = by_control if curves is None else np.tensordot(curves.T, by_control, axes=1)
 
-        Args:
-            cost: Cost of controls that keep all limits.
-            values: Limited quantities along the motion.
+        # States have several units, so that each row is divided by its tolerance.
+        tolerance = constraints.end.bounds.scale[bounded]
+        flat = by_share.transpose(1, 0, 2).reshape(len(tolerance), -1) / tolerance[:, None]
+    if not np.isfinite(flat).all():
+        return None
 
-        Returns:
-            The correction; None with a free end, and where the motion diverges or is so unstable
-            that its derivatives overflow.
-        """
-        constraints, task = cost.constraints, cost.level.task
-        if constraints.end is None:
-            return None
-        try:
-            A, B, _ = task.plant.derivatives.observation_jacobians(
-                task.theta, values.trajectory, constraints.observations
-            )
-        except SimulationDivergedError:
-            return None
-
-        # Derivative of the last state by the control of each sample, in sizes of the controls.
-        bounded = _has_tolerance(constraints.end)
-        sizes = constraints.control.bounds.scale
-        reach = np.eye(len(bounded))[bounded]
-        by_control = np.empty((len(A), len(reach), B.shape[2]))
-        with np.errstate(over="ignore", invalid="ignore"):
-            for k in reversed(range(len(A))):
-                by_control[k] = reach @ B[k] * sizes
-                reach = reach @ A[k]
-
-            # A control of limited bandwidth is a sum of splines, of which only the shares are free.
-            curves = bandwidth_basis(task, task.stated_times)
-            by_share = by_control if curves is None else np.tensordot(curves.T, by_control, axes=1)
-
-            # States have several units, so that each row is divided by its tolerance.
-            tolerance = constraints.end.bounds.scale[bounded]
-            flat = by_share.transpose(1, 0, 2).reshape(len(tolerance), -1) / tolerance[:, None]
-        if not np.isfinite(flat).all():
-            return None
-
-        inverse = np.linalg.pinv(flat, rcond=LEAST_REACH) / tolerance
-        change = inverse.reshape(len(by_share), B.shape[2], len(tolerance)) * sizes[:, None]
-        if curves is not None:
-            change = np.tensordot(curves, change, axes=1)
-        return cls(cost=cost, change=change)
-
-    def corrected(self, control: Array, values: ConstraintValues) -> Array:
-        """Change a control so that its motion ends nearer to the target.
-
-        Args:
-            control: (N, nu) control [u-unit].
-            values: Limited quantities along its motion.
-        """
-        end = self.cost.constraints.end
-        assert end is not None
-        difference = end.space.minus(values.trajectory.state[-1], end.target)
-        return np.asarray(control - self.change @ difference[_has_tolerance(end)])
+    inverse = np.linalg.pinv(flat, rcond=LEAST_REACH) / tolerance
+    change = inverse.reshape(len(by_share), B.shape[2], len(tolerance)) * sizes[:, None]
+    if curves is not None:
+        change = np.tensordot(curves, change, axes=1)
+    return np.asarray(change)
 
 
 def _has_tolerance(end: EndStateConstraint) -> NDArray[np.bool_]:
@@ -491,7 +469,7 @@ def with_corrected_end(cost: LimitedCost, control: Array, budget: Budget) -> Ins
         The control; None where the motion does not miss its target, or no share helps.
     """
     centre = cost.level.task.centre
-    correction: EndCorrection | None = None
+    end, change = cost.constraints.end, None
     for share in CORRECTION_SHARES:
         candidate = np.asarray(centre + share * (control - centre))
         for corrections_left in reversed(range(1 + CORRECTIONS)):
@@ -509,8 +487,9 @@ def with_corrected_end(cost: LimitedCost, control: Array, budget: Budget) -> Ins
             if not (misses and corrections_left):
                 break
             # The change of the control hardly depends on its size, so that it is computed once.
-            correction = correction or EndCorrection.along(cost, values)
-            if correction is None:
+            change = _end_correction(cost, values) if change is None else change
+            if end is None or change is None:
                 return None
-            candidate = correction.corrected(candidate, values)
+            difference = end.space.minus(values.trajectory.state[-1], end.target)
+            candidate = np.asarray(candidate - change @ difference[_has_tolerance(end)])
     return None

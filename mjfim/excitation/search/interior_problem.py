@@ -101,21 +101,19 @@ class InteriorProblem:
         Returns:
             The point; `DIVERGED_POINT` where the simulation diverges.
         """
-        observed = self.base.plant.observe(self.base.theta, ctrl, self.constraints.observations)
-        if observed is None:
+        values = self.constraints.along(self.base.plant, self.base.theta, ctrl)
+        if values is None:
             return DIVERGED_POINT
 
-        values = self.constraints.evaluate(*observed, slopes=False)
+        point, merit = None, 0.0
+        if self.with_cost:
+            accuracy = self.base.plant.derivatives.quickest_accuracy
+            point = self.base.point(values.trajectory, accuracy, lumps=lumps)
+            if point is DIVERGED:
+                return DIVERGED_POINT
+            merit = self._merit(point)
         barrier = self.constraints.value(values, self.delta)
-        if not self.with_cost:
-            return InteriorPoint(values=values, point=None, merit=0.0, barrier=barrier)
-
-        accuracy = self.base.plant.derivatives.quickest_accuracy
-        point = self.base.point(values.trajectory, accuracy, lumps=lumps)
-        if point is DIVERGED:
-            return DIVERGED_POINT
-
-        return InteriorPoint(values=values, point=point, merit=self._merit(point), barrier=barrier)
+        return InteriorPoint(values=values, point=point, merit=merit, barrier=barrier)
 
     def reevaluate(self, point: InteriorPoint) -> InteriorPoint:
         """Evaluate a point of another problem without a simulation.
@@ -132,8 +130,8 @@ class InteriorProblem:
             return point
 
         evaluated = self.base.reevaluated(point.point)
-        return InteriorPoint(
-            values=point.values,
+        return replace(
+            point,
             point=evaluated,
             merit=self._merit(evaluated),
             barrier=self.constraints.value(point.values, self.delta),
@@ -182,7 +180,18 @@ class InteriorProblem:
         """
         values = values_of(point)
         values = self.constraints.evaluate(values.trajectory, values.observed, slopes=True)
-        expansion, jacobian = self._expand_cost(point, values)
+        theta, observations = self.base.theta, self.constraints.observations
+        if point.point is not None:
+            expansion, observed = self.base.expand_observed(point.point, observations)
+            assert observed is not None
+            jacobian = observed
+        else:
+            # Without a cost only the dynamics and the observations are linearised.
+            A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
+                theta, values.trajectory, observations
+            )
+            a, b = np.zeros((len(A) + 1, A.shape[1])), np.zeros((len(A), B.shape[2]))
+            expansion = Expansion(A=A, B=B, a=a, b=b)
 
         scale = self._merit_scale(point)
         barrier: BarrierExpansion = self.constraints.expand(values, jacobian, self.delta)
@@ -190,35 +199,12 @@ class InteriorProblem:
         if not (self.follows_curvature and self.mu <= SHARP_MU):
             barrier = replace(barrier, curvature=None)
 
-        return Expansion(
-            A=expansion.A,
-            B=expansion.B,
+        return replace(
+            expansion,
             a=expansion.a / scale + barrier.a,
             b=expansion.b / scale + barrier.b,
-            extended=None,
             barrier=barrier,
-            eigenvalue_model=expansion.eigenvalue_model,
         )
-
-    def _expand_cost(
-        self, point: InteriorPoint, values: ConstraintValues
-    ) -> tuple[Expansion, Array]:
-        """Expansion of J, and the derivative of the observations: (N, substeps, w, nx+nu)."""
-        observations = self.constraints.observations
-
-        if point.point is not None:
-            expansion, jacobian = self.base.expand_observed(point.point, observations)
-            if jacobian is None:
-                raise ValueError("the expansion has no derivatives of the observations")
-            return expansion, jacobian
-
-        # Without a cost only the dynamics and the observations are linearised.
-        A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
-            self.base.theta, values.trajectory, observations
-        )
-        a = np.zeros((len(A) + 1, A.shape[1]))
-        b = np.zeros((len(A), B.shape[2]))
-        return Expansion(A=A, B=B, a=a, b=b), jacobian
 
     def project(
         self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array
