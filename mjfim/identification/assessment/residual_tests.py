@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -102,29 +101,13 @@ SMALLEST_SQUARES = 1e-300
 
 
 def is_larger_than_noise(chi2: float, dof: int) -> bool:
-    """Test whether residuals are larger than the stated noise.
-
-    Args:
-        chi2: Sum of squared whitened residuals.
-        dof: Degrees of freedom.
-
-    Returns:
-        True where the difference is significant and relevant.
-    """
+    """Whether residuals are significantly and relevantly larger than the stated noise."""
     significant = scipy.special.chdtrc(dof, chi2) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) > RELEVANT_SIZE_RATIO)
 
 
 def is_smaller_than_noise(chi2: float, dof: int) -> bool:
-    """Test whether residuals are smaller than the stated noise.
-
-    Args:
-        chi2: Sum of squared whitened residuals.
-        dof: Degrees of freedom.
-
-    Returns:
-        True where the difference is significant and relevant.
-    """
+    """Whether residuals are significantly and relevantly smaller than the stated noise."""
     significant = scipy.special.chdtr(dof, chi2) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) < 1.0 / RELEVANT_SIZE_RATIO)
 
@@ -138,14 +121,12 @@ def autocorrelated(tests: Sequence[Whiteness]) -> tuple[Whiteness, ...]:
     Returns:
         These tests, strongest autocorrelation first.
     """
-    level = SIGNIFICANCE / max(len(tests), 1)
-
-    found = []
-    for test in tests:
-        inflation = max(test.inflation, test.time) * test.variance
-        if test.p < level and inflation > RELEVANT_INFLATION:
-            found.append(test)
-
+    found = [
+        test
+        for test in tests
+        if test.p < SIGNIFICANCE / len(tests)
+        and max(test.inflation, test.time) * test.variance > RELEVANT_INFLATION
+    ]
     return tuple(sorted(found, key=lambda test: -test.inflation))
 
 
@@ -227,14 +208,12 @@ def largest_interval(
     if not measured.any():
         return None
 
-    # Windows of equal duration; round-off must not exclude the last row.
+    # Windows of equal duration.
     number = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
-    edges = np.linspace(t[0], t[-1] * (1 + 1e-12), number + 1)
-    rows = np.searchsorted(t, edges)
-    rows[0], rows[-1] = 0, len(t)
-    parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
-    counts = np.array([len(part) for part in parts])
-    squares = np.array([float(part @ part) for part in parts])
+    edges = np.linspace(t[0], t[-1], number + 1)
+    window = np.searchsorted(edges[1:-1], t[measured], side="right")
+    counts = np.bincount(window, minlength=number)
+    squares = np.bincount(window, z[measured] ** 2, minlength=number)
 
     inside = _largest_windows(counts, squares)
     within = float(squares[inside].sum())
@@ -273,13 +252,9 @@ def _largest_windows(counts: np.ndarray, squares: Array) -> slice:
     if not rms[peak] > PEAK_RATIO * overall:
         return slice(0, len(rms))
 
-    least = PEAK_SHARE * rms[peak]
-    first = last = peak
-    while first > 0 and rms[first - 1] >= least:
-        first -= 1
-    while last < len(rms) - 1 and rms[last + 1] >= least:
-        last += 1
-    return slice(first, last + 1)
+    small = np.flatnonzero(rms < PEAK_SHARE * rms[peak])
+    before, after = small[small < peak], small[small > peak]
+    return slice(int(before.max(initial=-1)) + 1, int(after.min(initial=len(rms))))
 
 
 def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:

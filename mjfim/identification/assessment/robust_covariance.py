@@ -447,9 +447,8 @@ def _compare_recordings(theta: Array, evidence: Blocks) -> tuple[Array, Array, n
     variance = np.maximum(variance, formal * inflation)
 
     # Compare the weighted scatter of the estimates with the scatter that their variances explain.
-    known = np.isfinite(each)
-    others = np.maximum(known.sum(axis=0) - 1, 1)
-    w, _, deviation = weighted(each, variance, known, np.zeros(c))
+    others = np.maximum(np.isfinite(each).sum(axis=0) - 1, 1)
+    w, _, deviation = weighted(each, variance)
     found = np.sum(w * deviation**2, axis=0)
     apart = scipy.special.fdtrc(others, freedom, found / others) < SIGNIFICANCE
     sums = w.sum(axis=0)
@@ -459,20 +458,20 @@ def _compare_recordings(theta: Array, evidence: Blocks) -> tuple[Array, Array, n
 
 
 def weighted(
-    values: Array, variances: Array, known: np.ndarray, tau2: Array
+    values: Array, variances: Array, tau2: Array | float = 0.0
 ) -> tuple[Array, Array, Array]:
     """Average estimates of recordings that scatter.
 
     Args:
-        values: (K, q) estimates.
-        variances: (K, q) their variances.
-        known: (K, q) True where there is an estimate.
+        values: (K, q) estimates; NaN where a recording gives none.
+        variances: (K, q) their variances; infinite where there is none.
         tau2: (q,) further variances, between recordings.
 
     Returns:
         (K, q) weights, zero where there is no estimate, (q,) weighted means, and (K, q) deviations
         from them.
     """
+    known = np.isfinite(values) & np.isfinite(variances) & (variances > 0.0)
     weights = np.where(known, 1.0 / (np.where(known, variances, 1.0) + tau2), 0.0)
     total = weights.sum(axis=0)
     finite = np.where(known, values, 0.0)
