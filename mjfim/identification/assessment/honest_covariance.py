@@ -177,16 +177,11 @@ def stretched_formal_covariance(estimate: Estimate, std: Array) -> Array:
     """
     # A parameter that the fit holds has no correlation with the others.
     formal = np.sqrt(np.diag(estimate.covariance))
-    is_known = np.isfinite(formal) & (formal > 0.0)
-    scale = np.where(is_known, 1.0 / np.where(is_known, formal, 1.0), 0.0)
+    is_known = np.isfinite(formal) & (formal > 0.0) & np.isfinite(std)
+    scale = np.where(is_known, std, 0.0) / np.where(is_known, formal, 1.0)
     shared = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
-    correlation = scale[:, None] * shared * scale
-    np.fill_diagonal(correlation, 1.0)
-
-    is_finite = np.isfinite(std)
-    finite = np.where(is_finite, std, 0.0)
-    covariance = finite[:, None] * correlation * finite
-    covariance[~is_finite, ~is_finite] = np.inf
+    covariance = scale[:, None] * shared * scale
+    np.fill_diagonal(covariance, std**2)
     return np.asarray(covariance)
 
 
@@ -263,8 +258,6 @@ def _stretch(root: Array, j: int, factor: float) -> None:
         j: Index of the parameter.
         factor: The factor.
     """
-    if factor == 1.0:
-        return
     axis = root[j] / np.linalg.norm(root[j])
     root += (factor - 1.0) * np.outer(root @ axis, axis)
 
@@ -290,9 +283,9 @@ def _differences(covariance: Array, study: HorizonStudy, known: np.ndarray) -> A
     root = covariance_root(covariance)
     apart = np.asarray(study.is_apart, dtype=bool)[:, known]
     differences = (study.theta - study.theta[study.chosen])[:, known] / NORMAL_95
-    found = [np.zeros((0, len(known)))]
-    for is_apart, difference in zip(apart, differences, strict=True):
-        if is_apart.any():
-            along = np.linalg.pinv(root[is_apart]) @ difference[is_apart]
-            found.append((root @ along)[None])
-    return np.concatenate(found)
+    return np.array(
+        [
+            root @ (np.linalg.pinv(root[is_apart]) @ difference[is_apart])
+            for is_apart, difference in zip(apart, differences, strict=True)
+        ]
+    )

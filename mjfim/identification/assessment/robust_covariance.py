@@ -236,7 +236,7 @@ def robust_uncertainty(
     min_rows: float,
     draws: int,
     rng: np.random.Generator,
-    own: np.ndarray | None = None,
+    own: np.ndarray,
     inflation: float = 1.0,
 ) -> Uncertainty:
     """Uncertainty of the common unknowns at a minimum.
@@ -250,7 +250,7 @@ def robust_uncertainty(
             independent.
         draws: Number of bootstrap replicates.
         rng: Random generator of the bootstrap.
-        own: (K, e) columns of the unknowns that belong to each of K recordings; default: none.
+        own: (K, e) columns of the unknowns that belong to each of K recordings; e may be 0.
         inflation: Factor of the formal variances from which the covariance of combinations begins.
             The scatter of few blocks says nothing about most combinations of many unknowns.
 
@@ -269,7 +269,7 @@ def robust_uncertainty(
     scatter = along.T @ along * (count / max(count - 1, 1))
     of_scatter = _in_unknowns(scatter + root.T @ prior @ root, root)
     sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
-    formal = np.sqrt(np.maximum(np.diag(root @ root.T), 0.0))
+    formal = np.linalg.norm(root, axis=1)
 
     # Larger and correlated residuals widen what the data say, but not the priors.
     of_noise = _in_unknowns(root.T @ (inflation * of_data + prior) @ root, root)
@@ -277,8 +277,6 @@ def robust_uncertainty(
     replicates = _bootstrap(blocks, draws, rng)
 
     # Separate estimates from each recording, with the priors on its private unknowns.
-    if own is None:
-        own = np.zeros((int(blocks.recording.max()) + 1, 0), dtype=int)
     evidence = recording_evidence(condensed, blocks, recording, own)
     shared = np.setdiff1d(np.arange(len(theta)), own)
     of_shared, between_shared, apart = _compare_recordings(theta[shared], evidence)
@@ -451,9 +449,9 @@ def _compare_recordings(theta: Array, evidence: Blocks) -> tuple[Array, Array, n
     w, _, deviation = weighted(each, variance)
     found = np.sum(w * deviation**2, axis=0)
     apart = scipy.special.fdtrc(others, freedom, found / others) < SIGNIFICANCE
+    between, w = np.zeros(c), w[:, apart]
     sums = w.sum(axis=0)
-    free = np.where(apart, sums - np.sum(w**2, axis=0) / np.where(apart, sums, 1.0), 1.0)
-    between = np.where(apart, np.sqrt(np.maximum(found - others, 0.0) / free), 0.0)
+    between[apart] = np.sqrt((found - others)[apart] / (sums - np.sum(w**2, axis=0) / sums))
     return each, between, apart
 
 
