@@ -47,14 +47,14 @@ from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
 
 # Numbers with which a law is more than a position servo, unless they have no effect.
-BEYOND_SERVOS = (
+BEYOND_SERVOS = {
     "ki",
     "slew",
     "latency",
     "time_constant",
     "feedback_latency",
     "velocity_time_constant",
-)
+}
 
 
 def laws_in_loop(
@@ -87,7 +87,7 @@ def laws_in_loop(
                     numbers[key] = values[name]
                     units[key] = law_unit(model, law.actuator, field)
 
-        plain = not any(name in numbers for name in BEYOND_SERVOS) and not law.differences
+        plain = BEYOND_SERVOS.isdisjoint(numbers) and not law.differences
         unit = control_unit(model, int(model.actuator(law.actuator).id))
         is_servo = plain and unit in FORCE_UNITS.values() and set(law.columns) == {"reference"}
         estimated = (key for key in numbers if f"controller/{law.actuator}:{key}" in paths)
@@ -295,15 +295,16 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
         return ()
 
     found = predict_unfitted(result.problem, result.solution, result.held_out, budget)
-    complete = () if budget.stop.requested else found
+    if budget.stop.requested:
+        return ()
     if result.held_out is None:
-        return complete
+        return found
 
     # The budget may have ended the predictions early.
     recordings = _as_aligned(result.held_out, result.task.held_out)
     return tuple(
         replace(prediction, recording=recording)
-        for prediction, recording in zip(complete, recordings, strict=False)
+        for prediction, recording in zip(found, recordings, strict=False)
     )
 
 
