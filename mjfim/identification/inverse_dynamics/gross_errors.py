@@ -248,11 +248,7 @@ class _Search:
         steps = np.where(high - z >= z - low, steps, -steps)
         friction = np.tile([0.0, 0.0, -np.inf], self.system.space.nv)
         unbounded = np.full(len(friction), np.inf)
-        of_row = self.equations.equation_of_row
-
-        def means(values: Array) -> Array:
-            """(E,) mean squares of values (R,) by equation."""
-            return np.asarray(np.bincount(of_row, values**2) / np.maximum(np.bincount(of_row), 1))
+        of_row = self.equations.places[1]
 
         def at(z: Array) -> tuple[_Change, Array, Array]:
             """The change, the rows and the slopes by the free forces at unknowns z."""
@@ -261,7 +257,8 @@ class _Search:
             changed = change.with_entries(change.unknown, change.where, z[n:])
             return changed, *self._rows(changed, theta)
 
-        best = np.inf, np.full(of_row.max() + 1, np.inf), change
+        means = self.equations.mean_squares
+        best = np.inf, np.full(len(self.equations.equations), np.inf), change
         for count in range(LINEARISATIONS):
             changed, rows, free = at(z)
             # A constant force is free, so that only changing ones count.

@@ -142,28 +142,25 @@ def _chosen(readings: Sequence[Readings], anchor: float, spacing: float | None) 
     times = np.unique(np.concatenate([reading.t for reading in readings]))
     duration = float(times[-1] - times[0])
     most = max(int(MOST_COEFFICIENTS * len(times)) - DEGREE, 1)
-    if spacing is not None:
-        count = int(np.clip(round(duration / spacing), 1, most))
-        return _fitted(readings, anchor, times, count)[1]
 
-    intervals, since = min(FEWEST_INTERVALS, most), 0
-    least, best, chosen = np.inf, None, intervals
-    while since < HALVINGS_WITHOUT_IMPROVEMENT:
-        criterion, spline = _fitted(readings, anchor, times, intervals)
-        since += 1
-        if best is None or criterion < least:
-            least, best, chosen, since = criterion, spline, intervals, 0
-        if intervals == most:
-            break
+    def tried(intervals: float) -> tuple[float, int, RegressionSpline]:
+        """The criterion of a spline with about so many intervals, their number, the spline."""
+        count = int(np.clip(round(intervals), 1, most))
+        criterion, spline = _fitted(readings, anchor, times, count)
+        return criterion, count, spline
+
+    if spacing is not None:
+        return tried(duration / spacing)[2]
+
+    best, since = tried(FEWEST_INTERVALS), 0
+    intervals = best[1]
+    while since < HALVINGS_WITHOUT_IMPROVEMENT and intervals < most:
         intervals = min(2 * intervals, most)
-    for factor in (np.sqrt(0.5), np.sqrt(2.0)):
-        criterion, spline = _fitted(
-            readings, anchor, times, int(np.clip(round(factor * chosen), 1, most))
-        )
-        if best is None or criterion < least:
-            least, best = criterion, spline
-    assert best is not None
-    return best
+        found, since = tried(intervals), since + 1
+        if found[0] < best[0]:
+            best, since = found, 0
+    others = [tried(factor * best[1]) for factor in (np.sqrt(0.5), np.sqrt(2.0))]
+    return min(best, *others, key=lambda each: each[0])[2]
 
 
 def _fitted(
@@ -296,11 +293,11 @@ class MeasuredMotion:
         # Before the first sample and after the last one, their controls are held.
         half = 0.5 * self.step
         middle = np.clip(self.t + self.lag - delay, half, edges[-1] - half)
+        ends = middle + np.array([[-half], [half]])
         mean = np.empty((len(self.t), recorded.shape[1]))
         for place, column in enumerate(recorded.T):
-            integral = np.concatenate([[0.0], dt * np.cumsum(column)])
-            before = np.interp(middle - half, edges, integral)
-            mean[:, place] = (np.interp(middle + half, edges, integral) - before) / self.step
+            integral = np.append(0.0, dt * np.cumsum(column))
+            mean[:, place] = np.diff(np.interp(ends, edges, integral), axis=0)[0] / self.step
         return mean
 
     def smoothed(self, values: Array) -> tuple[Array, np.ndarray]:
