@@ -477,7 +477,8 @@ def _shapes(
             for values, _ in term.shapes(stated, element, speed)
         ]
         tried.append([shape for shape in of_term if shape])
-    for k in range(max((len(of_term) for of_term in tried), default=0)):
+    tried = [of_term for of_term in tried if of_term]
+    for k in range(max(map(len, tried), default=0)):
         yield {j: x for of_term in tried for j, x in of_term[min(k, len(of_term) - 1)].items()}
 
 
