@@ -264,9 +264,8 @@ def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
         theta: (s,) estimate from all recordings [theta-unit].
         evidence: What each of K recordings says.
     """
-    equations = [evidence.normal_equations(k) for k in range(evidence.count)]
-    H = np.sum([information for information, _ in equations], axis=0)
-    scaled, scale = scaled_to_unit_diagonal(H)
+    equations = np.array([evidence.normal_equations(k) for k in range(evidence.count)])
+    scaled, scale = scaled_to_unit_diagonal(equations[..., :-1].sum(axis=0))
     eigenvalues, vectors = np.linalg.eigh(scaled)
     is_known = eigenvalues > TOTAL_TOLERANCE * eigenvalues.max(initial=0.0)
     directions = vectors[:, is_known] / np.sqrt(eigenvalues[is_known]) / scale[:, None]
@@ -276,15 +275,14 @@ def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
     known_theta = np.where(is_determined, theta, np.nan)
 
     # Each recording in the coordinates z, and its estimate.
-    informations = np.array([directions.T @ each @ directions for each, _ in equations])
-    eigenvalues, vectors = np.linalg.eigh(informations)
+    moved = directions.T @ equations @ scipy.linalg.block_diag(directions, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(moved[..., :-1])
     transposed = np.swapaxes(vectors, 1, 2)
     is_known = eigenvalues > TOLERANCE
     inverses = np.where(is_known, 1.0 / np.where(is_known, eigenvalues, 1.0), 0.0)[:, None]
     inverses = vectors * inverses @ transposed
     roots = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] @ transposed
-    gradients = np.array([directions.T @ g for _, g in equations])
-    steps = -inverses @ gradients[..., None]
+    steps = -inverses @ moved[..., -1:]
     scatters = []
     for k, step in enumerate(steps[..., 0]):
         # An interrupted fit may have used no segment of a recording.
@@ -311,7 +309,7 @@ def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
         parts=parts,
         values=np.array([value for value, _ in found]),
         std=np.array([std for _, std in found]),
-        freedom=float(max(len(evidence.scores) - evidence.count, 1)),
+        freedom=float(max(len(evidence.equations) - evidence.count, 1)),
     )
 
 

@@ -316,10 +316,8 @@ def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     """
     parameters, theta, held = result.task.system.parameters, result.theta, result.task.settings.hold
     tolerance = BOUND_TOLERANCE * parameters.magnitude
-    below = theta < parameters.lower - tolerance
-    above = theta > parameters.upper + tolerance
-
     distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
+    is_beyond = bool((distance < -tolerance).any())
     problem, at = result.problem, result.solution.unknowns
     lower, upper = problem.bounds_at(at)
     values = problem.common_values(at)
@@ -328,7 +326,7 @@ def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     distance[problem.parameter_of_column[near]] = 0.0
     at_bound = np.flatnonzero(distance < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
-    return names, bool((below | above).any())
+    return names, is_beyond
 
 
 def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:

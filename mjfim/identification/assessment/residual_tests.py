@@ -169,24 +169,19 @@ def misfit_reasons(
         reasons.append(f"residuals are {size:.2f} times the stated noise")
 
     if found:
-        listed = [f"{test.output} ({_describe(test)})" for test in found[:MAX_LISTED_OUTPUTS]]
+        # Where neighbouring values hardly correlate, means over long runs describe it.
+        listed = []
+        for test in found[:MAX_LISTED_OUTPUTS]:
+            words = f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
+            if abs(test.correlation) > RELEVANT_CORRELATION:
+                words = f"lag-1 correlation {test.correlation:+.2f}"
+            listed.append(f"{test.output} ({words})")
         more = len(found) - len(listed)
         suffix = f" and {more} more" if more else ""
         reasons.append(f"residuals are autocorrelated: {', '.join(listed)}{suffix}")
     elif missing:
         reasons.append("a term that the model lacks explains part of the residuals")
     return tuple(reasons)
-
-
-def _describe(test: Whiteness) -> str:
-    """An autocorrelation in words.
-
-    It is described by the correlation of neighbouring values, or, where that is small, by the
-    variance of means over long runs.
-    """
-    if abs(test.correlation) > RELEVANT_CORRELATION:
-        return f"lag-1 correlation {test.correlation:+.2f}"
-    return f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
 
 
 def largest_interval(

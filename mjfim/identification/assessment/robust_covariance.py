@@ -36,21 +36,20 @@ OWN_TOLERANCE = 1e-14
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blocks:
-    """Scores and information of B blocks that count as independent, about c unknowns.
+    """Normal equations of B blocks that count as independent, about c unknowns.
 
     They are all common unknowns of a fit, or those that all K recordings share: there, unknowns
     that belong to a single recording are eliminated, and follow at their optimum.
 
     Attributes:
-        scores: (B, c) gradient of half of each block's squared residuals.
-        information: (B, c, c) information of each block.
+        equations: (B, c, c+1) information H of each block and its score g, the gradient of half of
+            its squared residuals: `[H, g]`.
         recording: (B,) index of the recording.
         priors: Rows `[J, r]` of priors: one array (l, c+1) of all of them, or K arrays of those on
             unknowns that belong to each recording.
     """
 
-    scores: Array
-    information: Array
+    equations: Array
     recording: np.ndarray
     priors: tuple[Array, ...]
 
@@ -59,21 +58,17 @@ class Blocks:
         """Number of recordings K, whose priors are apart."""
         return len(self.priors)
 
-    def normal_equations(self, k: int) -> tuple[Array, Array]:
-        """(c, c) information H and (c,) gradient g of half of the squares of recording k."""
-        of_recording = self.recording == k
-        J, r = self.priors[k][:, :-1], self.priors[k][:, -1]
-        H = self.information[of_recording].sum(axis=0) + J.T @ J
-        g = self.scores[of_recording].sum(axis=0) + J.T @ r
-        return H, g
+    def normal_equations(self, k: int) -> Array:
+        """(c, c+1) normal equations `[H, g]` of recording k."""
+        rows = self.priors[k]
+        return np.asarray(self.equations[self.recording == k].sum(axis=0) + rows[:, :-1].T @ rows)
 
     def centred_scores(self, k: int, step: Array) -> Array:
         """(b, c) scores of recording k after a step (c,) to its own estimate, less their mean.
 
         At this estimate, differences between recordings do not count as scatter within one.
         """
-        of_recording = self.recording == k
-        scores = self.scores[of_recording] + self.information[of_recording] @ step
+        scores = self.equations[self.recording == k] @ np.append(step, 1.0)
         return np.asarray(scores - scores.sum(axis=0) / max(len(scores), 1))
 
 
@@ -94,8 +89,7 @@ def recording_evidence(
     recording_of_segment[condensed.segment_of_block] = recording
 
     shared = np.setdiff1d(np.arange(c), own)
-    scores = np.zeros((len(blocks.scores), len(shared)))
-    information = np.zeros((len(blocks.scores), len(shared), len(shared)))
+    equations = np.zeros((len(blocks.equations), len(shared), len(shared) + 1))
     priors = []
 
     for k, columns in enumerate(own):
@@ -106,22 +100,18 @@ def recording_evidence(
 
         # The unknowns of the recording follow the shared ones: d own = response @ d shared.
         of_recording = blocks.recording == k
-        H = blocks.information[of_recording].sum(axis=0) + rows[:, :-1].T @ rows[:, :-1]
+        own_equations = blocks.equations[of_recording]
+        H = (own_equations.sum(axis=0) + rows[:, :-1].T @ rows)[:, :-1]
         inverse = scaled_pseudo_inverse(H[np.ix_(columns, columns)], OWN_TOLERANCE)
         follows = np.zeros((c, len(shared)))
         follows[shared] = np.eye(len(shared))
         follows[columns] = -inverse @ H[np.ix_(columns, shared)]
 
-        scores[of_recording] = blocks.scores[of_recording] @ follows
-        information[of_recording] = follows.T @ blocks.information[of_recording] @ follows
-        priors.append(np.column_stack([rows[:, :-1] @ follows, rows[:, -1]]))
+        wide = scipy.linalg.block_diag(follows, 1.0)
+        equations[of_recording] = follows.T @ own_equations @ wide
+        priors.append(rows @ wide)
 
-    return Blocks(
-        scores=scores,
-        information=information,
-        recording=blocks.recording,
-        priors=tuple(priors),
-    )
+    return Blocks(equations=equations, recording=blocks.recording, priors=tuple(priors))
 
 
 def independent_blocks(
@@ -139,17 +129,15 @@ def independent_blocks(
     count = int(label.max(initial=-1)) + 1
     c = condensed.common_count
 
-    scores = np.zeros((count, c))
-    information = np.zeros((count, c, c))
-    np.add.at(scores, label, condensed.block_scores)
-    np.add.at(information, label, condensed.block_information)
+    equations = np.zeros((count, c, c + 1))
+    np.add.at(equations[..., :-1], label, condensed.block_information)
+    np.add.at(equations[..., -1], label, condensed.block_scores)
 
     recording_of_label = np.zeros(count, dtype=int)
     recording_of_label[label] = recording
     known = condensed.reduced_private_rows.reshape(-1, c + 1)
     return Blocks(
-        scores=scores,
-        information=information,
+        equations=equations,
         recording=recording_of_label,
         priors=(np.concatenate([condensed.common_rows, known]),),
     )
@@ -258,14 +246,15 @@ def robust_uncertainty(
         The uncertainty.
     """
     blocks = independent_blocks(condensed, recording, rows, min_rows)
-    count = len(blocks.scores)
+    information, scores = blocks.equations[..., :-1], blocks.equations[..., -1]
+    count = len(scores)
     prior_rows = blocks.priors[0][:, :-1]
     prior = prior_rows.T @ prior_rows
-    of_data = blocks.information.sum(axis=0)
+    of_data = information.sum(axis=0)
 
     # Sandwich and formal covariance.
     root = inverse_root(of_data + prior)
-    along = (blocks.scores - blocks.scores.mean(axis=0)) @ root
+    along = (scores - scores.mean(axis=0)) @ root
     scatter = along.T @ along * (count / max(count - 1, 1))
     of_scatter = _in_unknowns(scatter + root.T @ prior @ root, root)
     sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
@@ -376,8 +365,8 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
 
     Draws that do not determine all unknowns are left out.
     """
-    count, c = blocks.scores.shape
-    total = blocks.scores.sum(axis=0)
+    count, c, _ = blocks.equations.shape
+    total = blocks.equations[..., -1].sum(axis=0)
     prior_rows = blocks.priors[0][:, :-1]
     prior_information = prior_rows.T @ prior_rows
     probabilities = np.full(count, 1.0 / count)
@@ -387,11 +376,11 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
         # Each replicate weights a block by the number of times that it was drawn.
         n = min(REPLICATES_AT_ONCE, draws - first)
         weights = rng.multinomial(count, probabilities, size=n).astype(np.float64)
-        H = np.tensordot(weights, blocks.information, axes=1) + prior_information
-        g = weights @ blocks.scores - total
+        drawn = np.tensordot(weights, blocks.equations, axes=1)
+        H = drawn[..., :-1] + prior_information
 
         # Priors are drawn as well, from their normal distribution.
-        g = g + rng.standard_normal((n, len(prior_rows))) @ prior_rows
+        g = drawn[..., -1] - total + rng.standard_normal((n, len(prior_rows))) @ prior_rows
 
         usable = _condition_number(H) < MAX_CONDITION_OF_DRAW
         solved = np.linalg.solve(H[usable], g[usable][..., None])
@@ -421,7 +410,8 @@ def _compare_recordings(theta: Array, evidence: Blocks) -> tuple[Array, Array, n
     for k in range(K):
         # Normal equations of the recording and of the priors on its private unknowns, one
         # Gauss-Newton step away from the common estimate.
-        H, g = evidence.normal_equations(k)
+        equations = evidence.normal_equations(k)
+        H, g = equations[:, :-1], equations[:, -1]
         if _condition_number(H) > MAX_CONDITION_OF_RECORDING:
             continue
         inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)

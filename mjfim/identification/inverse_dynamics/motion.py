@@ -408,7 +408,6 @@ def _curves(system: System, recording: AlignedRecording) -> Curves:
     for q, v in space.quaternions:
         dofs = tuple(range(v, v + 3))
         curves |= {q + i: (output_of.get(q + i), None, dofs) for i in range(4)}
-        # Measured angular velocities replace the slopes of the quaternion.
         rates = [output_of.get(space.nq + dof) for dof in dofs]
         if None not in rates:
             curves |= {
@@ -454,10 +453,13 @@ def _motion(
     qpos = np.empty((len(t), space.nq))
     qvel = np.empty((len(t), space.nv))
     qacc = np.empty((len(t), space.nv))
-    for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True):
+    # Measured angular velocities replace the slopes of a quaternion.
+    key_of = {v: q for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True)}
+    key_of |= {-1 - key: key for key in splines if key < 0}
+    for q in space.scalar_q.tolist():
         qpos[:, q] = splines[q].at(t)
-        qvel[:, v] = splines[q].at(t - lag, 1)
-        qacc[:, v] = splines[q].at(t, 2)
+    for dof, key in key_of.items():
+        qvel[:, dof], qacc[:, dof] = splines[key].at(t - lag, 1), splines[key].at(t, 2)
 
     for q, v in space.quaternions:
 
@@ -468,11 +470,7 @@ def _motion(
 
         position = at(t)
         qpos[:, q : q + 4] = position / np.linalg.norm(position, axis=1, keepdims=True)
-        if -1 - v in splines:
-            for dof in range(v, v + 3):
-                qvel[:, dof] = splines[-1 - dof].at(t - lag, 1)
-                qacc[:, dof] = splines[-1 - dof].at(t, 2)
-        else:
+        if v not in key_of:
             qvel[:, v : v + 3] = _turning(at(t - lag), at(t - lag, 1))
             qacc[:, v : v + 3] = _turning(position, at(t, 2))
     return qpos, qvel, qacc
