@@ -153,11 +153,10 @@ def with_scatter(parts: Array, tau2: Array) -> Array:
         parts: (..., s, s+1) what recordings say.
         tau2: (s, s) covariance T between recordings.
     """
-    found = np.linalg.solve(np.eye(len(tau2)) + parts[..., :-1] @ tau2, parts)
-    return _symmetric(found)
+    return _symmetric(np.linalg.solve(np.eye(len(tau2)) + parts[..., :-1] @ tau2, parts))
 
 
-def _symmetric(parts: Array) -> Array:
+def _symmetric(parts: np.ndarray) -> Array:
     """The parts, whose information is symmetric but for rounding."""
     A = parts[..., :-1]
     return np.concatenate([0.5 * (A + np.swapaxes(A, -1, -2)), parts[..., -1:]], axis=-1)

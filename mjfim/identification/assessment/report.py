@@ -295,16 +295,15 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
         return ()
 
     found = predict_unfitted(result.problem, result.solution, result.held_out, budget)
-    if budget.stop.requested:
-        return ()
+    complete = () if budget.stop.requested else found
     if result.held_out is None:
-        return found
+        return complete
 
     # The budget may have ended the predictions early.
     recordings = _as_aligned(result.held_out, result.task.held_out)
     return tuple(
         replace(prediction, recording=recording)
-        for prediction, recording in zip(found, recordings, strict=False)
+        for prediction, recording in zip(complete, recordings, strict=False)
     )
 
 

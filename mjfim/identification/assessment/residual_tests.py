@@ -235,7 +235,7 @@ def worst_residual(
     return replace(worst, share=within / max(total, SMALLEST_SQUARES))
 
 
-def _largest_windows(counts: np.ndarray, squares: Array) -> slice:
+def _largest_windows(counts: np.ndarray, squares: np.ndarray) -> slice:
     """Neighbouring windows in which residuals are largest.
 
     These are all windows where none has clearly larger residuals than the others.

@@ -93,7 +93,10 @@ def extended_problem(
         central=problem.central,
         workers=problem.workers,
     )
-    private = _extended_private(problem, wider, at)
+    # Private unknowns of new coordinates are zero.
+    before, after = _private_names(problem), _private_names(wider)
+    private = np.zeros((len(at.private), len(after)))
+    private[:, [after.index(name) for name in before]] = at.private
     return wider, replace(at, theta=theta, private=private)
 
 
@@ -146,17 +149,6 @@ def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment,
         start[places] = values[added]
         segments.append(replace(segment, start=start))
     return tuple(segments)
-
-
-def _extended_private(problem: FitProblem, wider: FitProblem, at: UnknownValues) -> Array:
-    """(P, n) private unknowns of the extended model; those of new coordinates are zero."""
-    before, after = _private_names(problem), _private_names(wider)
-    if before == after:
-        return at.private
-
-    private = np.zeros((len(at.private), len(after)))
-    private[:, [after.index(name) for name in before]] = at.private
-    return private
 
 
 def _private_names(problem: FitProblem) -> list[str]:
@@ -337,7 +329,7 @@ def find_missing_terms(
     )
     found, untested, moved = search.by_score(groups)
     screened = (search.screened(candidate) for candidate in candidates if candidate.screened)
-    found += [term for term in screened if term is not None]
+    found += filter(None, screened)
     return TermTests(
         terms=first_terms(_by_significance(found)),
         data=TermTestData(
@@ -367,11 +359,11 @@ def first_terms(ordered: Sequence[Term]) -> tuple[Term, ...]:
 
 def _without_members(ordered: Sequence[Term]) -> tuple[Term, ...]:
     """The terms in their order, without those that an earlier one at several joints contains."""
-    kept: list[Term] = []
-    for term in ordered:
-        if not any(earlier.contains(term) for earlier in kept):
-            kept.append(term)
-    return tuple(kept)
+    return tuple(
+        term
+        for i, term in enumerate(ordered)
+        if not any(earlier.contains(term) for earlier in ordered[:i])
+    )
 
 
 def _by_significance(terms: Sequence[Term]) -> list[Term]:
@@ -562,13 +554,7 @@ class _TermSearch:
             column_of[self.problem.system.parameters.names[j]]
             for j in self.problem.parameter_of_column.tolist()
         ]
-        tested = np.array(
-            [
-                column_of[f"?{i}.{k}"]
-                for i, candidate in enumerate(candidates)
-                for k in range(len(candidate.tested))
-            ]
-        )
+        tested = np.array([column_of[name] for name in parameters])
         rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
         norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
         J = rows[:, :-1] / norms
@@ -612,17 +598,17 @@ class _TermSearch:
                 own = [(number, next(changes)) for number in candidates[i].tested]
                 if not any(n.positive and n.value + change < 0.0 for n, change in own):
                     possible.append(i)
-                for number, change in own:
-                    numbers.append(
-                        TermNumber(
-                            path=number.path,
-                            value=change,
-                            unit=number.unit,
-                            scale=abs(change) or number.size,
-                            is_size=True,
-                        )
+                of_size = [
+                    TermNumber(
+                        path=number.path,
+                        value=change,
+                        unit=number.unit,
+                        scale=abs(change) or number.size,
+                        is_size=True,
                     )
-                numbers += candidates[i].further
+                    for number, change in own
+                ]
+                numbers += [*of_size, *candidates[i].further]
             if possible == left:
                 break
             left = possible
@@ -671,8 +657,7 @@ class _TermSearch:
             elif best > 0.0:
                 break
         reduction = self.squares - least
-        least = max(MIN_REDUCTION, MIN_EXPLAINED_SHARE * self.squares)
-        if not best or reduction < least:
+        if reduction < max(MIN_REDUCTION, MIN_EXPLAINED_SHARE * self.squares):
             return None
         number = TermNumber(
             path=tested.path, value=best, unit=tested.unit, scale=best, is_size=True

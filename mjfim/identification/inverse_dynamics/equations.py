@@ -265,7 +265,7 @@ class MotionEquations:
         """(2, R) index of the recording, and of the equation, of each row."""
         counts = [len(t) for each in self.recorded for _, t, _ in each.windows]
         shape = len(self.recorded), len(self.equations)
-        return np.repeat(np.indices(shape).reshape(2, -1), counts, axis=1)
+        return np.asarray(np.repeat(np.indices(shape).reshape(2, -1), counts, axis=1))
 
     def mean_squares(self, values: Array) -> Array:
         """(E,) mean squares of values of the rows: (R,), by equation; 0 without rows."""

@@ -337,19 +337,18 @@ def measured_motion(
     curves = _curves(system, recording)
     y = recording.y - system.parameters.bias_derivative(recording.y.shape[1]) @ theta
     splines: dict[int, RegressionSpline] = {}
-    for key, curve in curves.items():
+    for key, (outputs, _) in curves.items():
         readings = []
-        for derivative, output in enumerate(curve[:2]):
-            if output is not None:
-                known = recording.measured[:, output]
-                readings.append(
-                    Readings(
-                        t=recording.t[known] - derivative * lag,
-                        values=y[known, output],
-                        sigma=float(system.noise.sigma[output]),
-                        derivative=derivative,
-                    )
+        for derivative, output in outputs.items():
+            known = recording.measured[:, output]
+            readings.append(
+                Readings(
+                    t=recording.t[known] - derivative * lag,
+                    values=y[known, output],
+                    sigma=float(system.noise.sigma[output]),
+                    derivative=derivative,
                 )
+            )
         # Where only its slope is measured, a curve begins as the experiment says.
         anchor = float(system.nominal_initial_state[key]) if key >= 0 else 0.0
         splines[key] = fit_spline(readings, anchor)
@@ -365,9 +364,9 @@ def measured_motion(
 
     usable = np.ones((len(t), space.nv), dtype=bool)
     spacing, speed_sigma = np.zeros(space.nv), np.zeros(space.nv)
-    for key, (*outputs, dofs) in curves.items():
+    for key, (outputs, dofs) in curves.items():
         spline, own = splines[key], list(dofs)
-        measured = recording.measured[:, [output for output in outputs if output is not None]]
+        measured = recording.measured[:, list(outputs.values())]
         reach = REACH * max(spline.spacing, step)
         usable[:, own] &= _is_near(t, recording.t[measured.any(axis=1)], reach)[:, None]
         spacing[own] = np.maximum(spacing[own], spline.spacing)
@@ -390,10 +389,10 @@ def measured_motion(
 # ---- curves
 
 
-# A number that changes with time: the outputs that measure it and its slope, if any does, and the
+# A number that changes with time: the outputs that measure it (0) and its slope (1), and the
 # degrees of freedom that it moves, three for a component of a quaternion. Its key is its address in
 # qpos, or negative for the integral of an angular velocity.
-Curves = dict[int, tuple[int | None, int | None, tuple[int, ...]]]
+Curves = dict[int, tuple[dict[int, int], tuple[int, ...]]]
 
 
 def _curves(system: System, recording: AlignedRecording) -> Curves:
@@ -401,23 +400,22 @@ def _curves(system: System, recording: AlignedRecording) -> Curves:
     space = system.space
     output_of = measured_states(system, recording)
 
+    def measured(*addresses: int) -> dict[int, int]:
+        """The outputs that measure a number of the state, and its slope, by the derivative."""
+        places = enumerate(addresses)
+        return {derivative: output_of[place] for derivative, place in places if place in output_of}
+
     curves: Curves = {
-        q: (output_of.get(q), output_of.get(space.nq + v), (v,))
+        q: (measured(q, space.nq + v), (v,))
         for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True)
     }
     for q, v in space.quaternions:
         dofs = tuple(range(v, v + 3))
-        curves |= {q + i: (output_of.get(q + i), None, dofs) for i in range(4)}
-        rates = [output_of.get(space.nq + dof) for dof in dofs]
-        if None not in rates:
-            curves |= {
-                -1 - dof: (None, output, (dof,)) for dof, output in zip(dofs, rates, strict=True)
-            }
+        curves |= {q + i: (measured(q + i), dofs) for i in range(4)}
+        if all(space.nq + dof in output_of for dof in dofs):
+            curves |= {-1 - dof: ({1: output_of[space.nq + dof]}, (dof,)) for dof in dofs}
 
-    known = {
-        key: [output for output in curve[:2] if output is not None] for key, curve in curves.items()
-    }
-    missing = sorted({dof for key, curve in curves.items() if not known[key] for dof in curve[2]})
+    missing = sorted({dof for outputs, dofs in curves.values() if not outputs for dof in dofs})
     if missing:
         names = dof_names(system.model)
         unmeasured = listed([names[dof] for dof in missing])
@@ -427,7 +425,7 @@ def _curves(system: System, recording: AlignedRecording) -> Curves:
             'columns such as `qpos:<joint>`, or state fit.start = "measured"'
         )
     counts = recording.measured.sum(axis=0)
-    fewest = min(int(counts[output]) for outputs_of in known.values() for output in outputs_of)
+    fewest = min(int(counts[list(outputs.values())].min()) for outputs, _ in curves.values())
     if fewest < FEWEST_READINGS:
         raise RecordingError(
             f"{recording.name}: a degree of freedom has only {fewest} measured values; "
