@@ -22,13 +22,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy
 
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.identification.assessment.robust_covariance import (
-    LEVEL,
     covariance_root,
     covering_covariance,
+    t_quantile,
 )
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate, HorizonStudy, Uncertainty
@@ -41,8 +40,6 @@ def jackknife_deviations(without_parts: Array) -> Array:
         without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
     """
     K = len(without_parts)
-    if K < 2:
-        return np.zeros_like(without_parts)
     scatter = without_parts - without_parts.mean(axis=0)
     return np.asarray(np.sqrt((K - 1) / K) * scatter)
 
@@ -56,16 +53,6 @@ def jackknife_std(without_parts: Array) -> Array:
     if len(without_parts) < 2:
         return np.full(without_parts.shape[1], np.nan)
     return np.asarray(np.linalg.norm(jackknife_deviations(without_parts), axis=0))
-
-
-def student_quantile(parts: int, confidence: float) -> float:
-    """Half width of an interval in standard errors that K parts have given.
-
-    Args:
-        parts: Number K of parts, at least 2.
-        confidence: Probability that the interval holds the true value.
-    """
-    return float(scipy.special.stdtrit(parts - 1, 0.5 + 0.5 * confidence))
 
 
 # Distance of the end of an interval from a bound, relative to the width of the interval, at which
@@ -135,7 +122,7 @@ def with_honest_covariance(
         inner = _covering(inner, _differences(inner, estimate.horizons, known))
     if without_parts is not None and len(without_parts) > 1:
         # Deviations between the parts of the data, by Student's factor, like the intervals.
-        factor = student_quantile(len(without_parts), LEVEL) / NORMAL_95
+        factor = t_quantile(len(without_parts) - 1) / NORMAL_95
         inner = _covering(inner, factor * jackknife_deviations(without_parts)[:, known])
     found[place] = agreeing_covariance(inner, std[known])
     return replace(estimate, honest_covariance=found)

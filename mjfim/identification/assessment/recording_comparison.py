@@ -30,6 +30,7 @@ from mjfim.identification.assessment.robust_covariance import (
     Blocks,
     independent_blocks,
     recording_evidence,
+    t_quantile,
     weighted,
 )
 from mjfim.information.criteria import standard_deviations
@@ -40,9 +41,6 @@ MAX_NEWTON_STEPS = 60
 
 # Relative change of tau² at which the steps end, and relative excess of the squares that counts.
 TAU_TOLERANCE = 1e-10
-
-# Confidence level of intervals.
-LEVEL = 0.95
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,15 +193,6 @@ def satterthwaite(share: Array, within: float, between: int | np.ndarray) -> Arr
     """
     share = np.clip(share, 0.0, 1.0)
     return 1.0 / ((1.0 - share) ** 2 / within + share**2 / np.maximum(between, 1))
-
-
-def t_quantile(freedom: np.ndarray) -> Array:
-    """Half widths of 95 % intervals of Student's distribution [standard deviations].
-
-    Args:
-        freedom: (s,) degrees of freedom.
-    """
-    return np.asarray(scipy.special.stdtrit(freedom, 0.5 + LEVEL / 2.0))
 
 
 def f_tail(squares: float, dof: int, freedom: float) -> float:

@@ -315,10 +315,7 @@ def _autocorrelation(series: Sequence[Array], least_lag: int, longest_lag: int) 
     """
     lag = min(max(least_lag, FIRST_LAGS), longest_lag)
     while True:
-        products = np.zeros(lag + 1)
-        for part in series:
-            products += lagged_products(part, lag)
-
+        products = np.sum([lagged_products(part, lag) for part in series], axis=0)
         rho = products / products[0]
         if lag >= longest_lag or (rho[least_lag:] < NO_AUTOCORRELATION).any():
             return np.asarray(rho)
@@ -337,11 +334,9 @@ def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float
     """
     length = RUN_RATIO
     while True:
-        means = []
-        for part in series:
-            runs = len(part) // length
-            means.append(part[: runs * length].reshape(runs, length).mean(axis=1))
-
+        means = [
+            part[: len(part) // length * length].reshape(-1, length).mean(axis=1) for part in series
+        ]
         joined = np.concatenate(means)
         if len(joined) < MIN_VALUES:
             return

@@ -276,14 +276,13 @@ def robust_uncertainty(
 
     # The hull of the formal, the sandwich and the bootstrap interval. Quantiles of Student's
     # distribution allow for the number of blocks from which the sandwich covariance comes.
-    upper_tail = 0.5 + LEVEL / 2.0
-    factor = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail)) / NORMAL_95
+    factor = float(t_quantile(max(count - 1, 1))) / NORMAL_95
     half_width = np.maximum(
         NORMAL_95 * np.hypot(formal, between), factor * NORMAL_95 * np.hypot(sandwich, between)
     )
     low, high = theta - half_width, theta + half_width
     if len(replicates):
-        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, upper_tail], axis=0)
+        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
         low, high = np.minimum(low, theta + tails[0]), np.maximum(high, theta + tails[1])
     return Uncertainty(
         sandwich=sandwich,
@@ -295,6 +294,16 @@ def robust_uncertainty(
         draws=theta + replicates,
         covariance=covering_covariance(of_noise, factor**2 * of_scatter),
     )
+
+
+def t_quantile(freedom: np.ndarray | int, level: float = LEVEL) -> Array:
+    """Half widths of intervals of Student's distribution [standard deviations].
+
+    Args:
+        freedom: Degrees of freedom, at least 1.
+        level: Probability that an interval holds the true value.
+    """
+    return np.asarray(scipy.special.stdtrit(freedom, 0.5 + 0.5 * level))
 
 
 def inverse_root(information: Array) -> Array:

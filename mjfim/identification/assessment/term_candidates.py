@@ -21,6 +21,7 @@ from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
     element_name,
     force_sizes,
+    free_name,
     names_of,
     position_sizes,
 )
@@ -340,7 +341,10 @@ def _library_term(
     estimated: tuple[str, ...],
 ) -> Candidate:
     """A term at an element; ExperimentError where the model cannot have it."""
-    name = _free_name(system, f"{element}_{kind.kind}")
+    taken = {*system.experiment.terms}
+    for each in ("joint", "actuator", "tendon", "body"):
+        taken.update(names_of(system.model, each))
+    name = free_name(f"{element}_{kind.kind}", taken)
     stated = {key: value for key, value in values.items() if value}
     table = TermTable(name=name, element=((kind.acts_on, element),), values=tuple(stated.items()))
     term = kind.of(table, system.source.stated.model, _period_of(system))
@@ -379,14 +383,3 @@ def _library_term(
         alone=kind.kind if kind.alone else "",
         screened=kind.screened,
     )
-
-
-def _free_name(system: System, stem: str) -> str:
-    """A name that no element and no term has."""
-    taken = {*system.experiment.terms}
-    for kind in ("joint", "actuator", "tendon", "body"):
-        taken.update(names_of(system.model, kind))
-    name, number = stem, 2
-    while name in taken:
-        name, number = f"{stem}_{number}", number + 1
-    return name

@@ -261,11 +261,11 @@ class MotionEquations:
     # ---- rows
 
     @cached_property
-    def places(self) -> np.ndarray:
-        """(2, R) index of the recording, and of the equation, of each row."""
+    def places(self) -> tuple[np.ndarray, ...]:
+        """(R,) index of the recording of each row, and (R,) that of the equation."""
         counts = [len(t) for each in self.recorded for _, t, _ in each.windows]
         shape = len(self.recorded), len(self.equations)
-        return np.asarray(np.repeat(np.indices(shape).reshape(2, -1), counts, axis=1))
+        return tuple(np.repeat(np.indices(shape).reshape(2, -1), counts, axis=1))
 
     def mean_squares(self, values: Array) -> Array:
         """(E,) mean squares of values of the rows: (R,), by equation; 0 without rows."""

@@ -275,7 +275,7 @@ class EquationSearch:
 
     def _rows(self, x: Array) -> Array:
         """The rows at x: (p,)."""
-        return self.equations.rows(self.coordinates.theta(x)[None])[0]
+        return np.asarray(self.equations.rows(self.coordinates.theta(x)[None])[0])
 
     def _linearised(self, x: Array, rows: Array, weights: Array) -> FoundEquations:
         """Linearise about a point x: (p,) whose rows are known."""
