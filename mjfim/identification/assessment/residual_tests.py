@@ -210,7 +210,15 @@ def largest_interval(
     counts = np.bincount(window, minlength=number)
     squares = np.bincount(window, z[measured] ** 2, minlength=number)
 
-    inside = _largest_windows(counts, squares)
+    # The neighbouring windows in which residuals are largest; all of them where none is clearly
+    # larger. Windows with few values count as if they had more: a single value is no interval.
+    inside = slice(0, number)
+    rms = np.sqrt(squares / np.maximum(counts, VALUES_PER_WINDOW))
+    peak = int(np.argmax(rms))
+    if rms[peak] > PEAK_RATIO * np.sqrt(squares.sum() / counts.sum()):
+        small = np.flatnonzero(rms < PEAK_SHARE * rms[peak])
+        before, after = small[small < peak], small[small > peak]
+        inside = slice(int(before.max(initial=-1)) + 1, int(after.min(initial=number)))
     within = float(squares[inside].sum())
     worst = WorstResidual(
         output=output,
@@ -233,23 +241,6 @@ def worst_residual(
     total = sum(squares for squares, _, _ in known)
     _, within, worst = max(known, key=lambda each: each[2].size)
     return replace(worst, share=within / max(total, SMALLEST_SQUARES))
-
-
-def _largest_windows(counts: np.ndarray, squares: np.ndarray) -> slice:
-    """Neighbouring windows in which residuals are largest.
-
-    These are all windows where none has clearly larger residuals than the others.
-    """
-    # Windows with few values count as if they had more: a single large value is not an interval.
-    rms = np.sqrt(squares / np.maximum(counts, VALUES_PER_WINDOW))
-    peak = int(np.argmax(rms))
-    overall = float(np.sqrt(squares.sum() / counts.sum()))
-    if not rms[peak] > PEAK_RATIO * overall:
-        return slice(0, len(rms))
-
-    small = np.flatnonzero(rms < PEAK_SHARE * rms[peak])
-    before, after = small[small < peak], small[small > peak]
-    return slice(int(before.max(initial=-1)) + 1, int(after.min(initial=len(rms))))
 
 
 def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:

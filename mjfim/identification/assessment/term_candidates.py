@@ -237,11 +237,12 @@ def _misalignments(system: System) -> Iterator[Candidate]:
     """Wrong orientation of every site that carries a measured vector sensor."""
     model: Any = system.model
     measured = {output.sensor for output in system.outputs.outputs if output.sensor is not None}
-    kinds = [int(kind) for kind in VECTOR_SENSORS]
     sites: dict[str, str] = {}
     for sensor in range(model.nsensor):
         first, count = int(model.sensor_adr[sensor]), int(model.sensor_dim[sensor])
-        if int(model.sensor_type[sensor]) in kinds and measured & {*range(first, first + count)}:
+        if int(model.sensor_type[sensor]) in VECTOR_SENSORS and measured & {
+            *range(first, first + count)
+        }:
             site = element_name(model, "site", int(model.sensor_objid[sensor]))
             sites.setdefault(site, element_name(model, "sensor", sensor))
 

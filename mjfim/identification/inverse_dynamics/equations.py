@@ -365,7 +365,7 @@ def _recorded(
         else:
             known = near[:, place] & motion.usable[:, touched[place]].all(axis=1)
             finest = motion.spacing[touched[place]].max(initial=0.0)
-            found = _windows(motion, finest, known, np.zeros(count, dtype=bool))
+            found = _windows(motion, finest, known, np.zeros_like(known))
         windows.append(found)
     return RecordedEquations(
         motion=motion,
@@ -392,8 +392,8 @@ def _windows(
     shape = (len(centres), len(motion.t))
     weights = scipy.sparse.csr_array((values.ravel(), columns.ravel(), ends), shape)
 
-    possible = weights @ (~usable).astype(np.float64) <= MOST_UNUSABLE
-    resting = weights @ slow.astype(np.float64)
+    possible = weights @ ~usable <= MOST_UNUSABLE
+    resting = weights @ slow
     for share in SLOW_SHARES:
         kept = possible & (resting <= share)
         if kept.sum() >= FEWEST_WINDOWS * possible.sum():

@@ -648,7 +648,7 @@ def _record(
         status = "not converged: no step lowers the residuals of the equation of motion any more"
     return InverseDynamicsFit(
         parameters=parameters.names,
-        units=tuple(parameter.unit for parameter in parameters.parameters),
+        units=search.equations.system.units,
         theta=search.coordinates.theta(found.x),
         std=std,
         covariance=covariance,

@@ -152,16 +152,14 @@ class _Search:
         system: The system.
         equations: The equations along the log.
         start: (p,) parameters where fits begin.
-        lower: (p,) smallest parameters that the experiment makes plausible.
-        upper: (p,) largest ones.
+        bounds: (2, p) smallest and largest parameters that the experiment makes plausible.
         active: Indices of the parameters that may change.
     """
 
     system: System
     equations: MotionEquations
     start: Array
-    lower: Array
-    upper: Array
+    bounds: Array
     active: np.ndarray
 
     @staticmethod
@@ -179,24 +177,23 @@ class _Search:
 
         # Bounds on both sides are stated; a single one may be that of physics.
         guess, size = parameters.guess, parameters.magnitude
-        bounds = np.array([parameters.lower, parameters.upper])
+        stated = np.array([parameters.lower, parameters.upper])
         about = np.sort([guess / UNSTATED_FACTOR, guess * UNSTATED_FACTOR], axis=0)
         about = np.where(guess == 0.0, [-size, size], about)
         prior = PRIOR_SIGMAS / np.maximum(parameters.prior_weight, np.finfo(float).tiny)
         about = np.clip(about, guess - prior, guess + prior)
-        lower, upper = np.where(np.isfinite(bounds).all(axis=0), bounds, np.clip(about, *bounds))
+        bounds = np.where(np.isfinite(stated).all(axis=0), stated, np.clip(about, *stated))
         return _Search(
             system=system,
             equations=equations,
-            start=np.clip(start, lower, upper),
-            lower=lower,
-            upper=upper,
+            start=np.clip(start, *bounds),
+            bounds=bounds,
             active=active,
         )
 
     def found(self) -> str:
         """The sentence about the error that explains the log; empty for none."""
-        count = self.system.model.nu + len(scalar_joints(self.system.model))
+        count = self.system.model.nu + len(self.joints)
         none = _Change(
             order=np.arange(count),
             factor=np.ones(count),
@@ -242,8 +239,8 @@ class _Search:
         n, begin = len(active), getattr(change, change.unknown)[change.where]
         most = LARGEST_NUMBER * change.sizes
         z = np.concatenate([self.start[active], begin])
-        low = np.concatenate([self.lower[active], begin - most])
-        high = np.concatenate([self.upper[active], begin + most])
+        about = begin + np.array([-most, most])
+        low, high = np.concatenate([self.bounds[:, active], about], axis=1)
         steps = STEP * np.concatenate([self.system.parameters.magnitude[active], change.sizes])
         steps = np.where(high - z >= z - low, steps, -steps)
         friction = np.tile([0.0, 0.0, -np.inf], self.system.space.nv)

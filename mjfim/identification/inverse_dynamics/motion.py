@@ -529,9 +529,11 @@ def measured_forces(
     for sensor in range(model.nsensor):
         output = by_address.get(int(model.sensor_adr[sensor]))
         kind, element = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
-        if output is None or kind not in (JOINT_FORCE, ACTUATOR_FORCE):
-            continue
-        if not any(recording.measured[:, output].any() for recording in recordings):
+        if (
+            output is None
+            or kind not in (JOINT_FORCE, ACTUATOR_FORCE)
+            or not any(recording.measured[:, output].any() for recording in recordings)
+        ):
             continue
         of_joint = kind == JOINT_FORCE
         found.append(
