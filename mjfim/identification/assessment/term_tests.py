@@ -100,32 +100,6 @@ def extended_problem(
     return wider, replace(at, theta=theta, private=private)
 
 
-def with_stated_residuals(
-    problem: FitProblem, at: UnknownValues, wider: FitProblem, begin: UnknownValues
-) -> FitProblem | None:
-    """The problem of an extended model whose residuals are those of the stated one.
-
-    Even the smallest size of a term may change the residuals. The readings follow this change.
-
-    Args:
-        problem: The stated problem.
-        at: Its solution.
-        wider: The extended problem.
-        begin: The solution in it.
-
-    Returns:
-        The extended problem; None where a simulation diverges.
-    """
-    stated, extended = problem.predict(at), wider.predict(begin)
-    if stated is None or extended is None:
-        return None
-    recordings = tuple(
-        replace(recording, y=recording.y + np.nan_to_num(after - before))
-        for recording, before, after in zip(wider.recordings, stated, extended, strict=True)
-    )
-    return replace(wider, recordings=recordings)
-
-
 def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment, ...]:
     """The segments of a problem with initial states of the extended model."""
     system = wider.system
@@ -307,7 +281,10 @@ def find_missing_terms(
     Returns:
         The significant terms that a selection may try, the most significant one first.
     """
-    speeds = _typical_speeds(problem, at)
+    motion = problem.motion(at, problem.segments[0].recording, SPEED_SAMPLES)
+    speeds = np.zeros(problem.system.space.nv)
+    if motion is not None:
+        speeds = np.sqrt(np.mean(motion.qvel**2, axis=0))
     candidates, impossible = candidates_of(problem.system, speeds)
     linear = [candidate for candidate in candidates if not candidate.screened]
     apart = dict.fromkeys(["", *(candidate.alone for candidate in linear)])
@@ -352,8 +329,8 @@ def first_terms(ordered: Sequence[Term]) -> tuple[Term, ...]:
     Returns:
         The first ones, and the first of those that no earlier one at several joints contains.
     """
-    first = (*ordered[:MAX_NAMED_TERMS], *_without_members(ordered)[:MAX_NAMED_TERMS])
-    keys = {term.key for term in first}
+    named = _without_members(ordered)[:MAX_NAMED_TERMS]
+    keys = {term.key for term in (*ordered[:MAX_NAMED_TERMS], *named)}
     return tuple(term for term in ordered if term.key in keys)
 
 
@@ -398,15 +375,6 @@ def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
         groups[-1].append(candidate)
         is_of_joint = bool(candidate.joint)
     return groups
-
-
-def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
-    """(nv,) root mean square of the speeds along the first recording [m/s or rad/s]."""
-    first = problem.segments[0].recording
-    motion = problem.motion(at, first, SPEED_SAMPLES)
-    if motion is None:
-        return np.zeros(problem.system.space.nv)
-    return np.asarray(np.sqrt(np.mean(motion.qvel**2, axis=0)))
 
 
 # Normal equations of the m tested numbers of some candidates after the parameters are eliminated:
@@ -543,14 +511,21 @@ class _TermSearch:
         if extended is None:
             return None
         wider, begin = extended
-        shifted = with_stated_residuals(self.problem, self.at, wider, begin)
-        condensed = None if shifted is None else shifted.condense(begin)
+        # Even the smallest size of a term may change the residuals. The readings follow it.
+        before, after = self.problem.predict(self.at), wider.predict(begin)
+        if before is None or after is None:
+            return None
+        shifted = tuple(
+            replace(recording, y=recording.y + np.nan_to_num(with_terms - stated))
+            for recording, stated, with_terms in zip(wider.recordings, before, after, strict=True)
+        )
+        condensed = replace(wider, recordings=shifted).condense(begin)
         if condensed is None:
             return None
 
         names = wider.parameters.names
         column_of = {names[j]: i for i, j in enumerate(wider.parameter_of_column.tolist())}
-        stated = [
+        own = [
             column_of[self.problem.system.parameters.names[j]]
             for j in self.problem.parameter_of_column.tolist()
         ]
@@ -566,7 +541,7 @@ class _TermSearch:
         inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
         response = inverse @ H[np.ix_(others, tested)]
         information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
-        places = np.searchsorted(others, stated)
+        places = np.searchsorted(others, own)
         # A parameter that the data do not determine has no standard deviation.
         variances = np.diag(inverse)[places]
         moves = response[places] / np.sqrt(np.where(variances > 0.0, variances, np.inf))[:, None]

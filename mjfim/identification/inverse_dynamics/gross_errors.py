@@ -137,12 +137,6 @@ class _Change:
         changed: dict[str, Any] = {name: array}
         return replace(self, **changed)
 
-    @property
-    def signs_alone(self) -> _Change:
-        """The change with the signs of its factors and without unknown numbers."""
-        signs = np.sign(self.factor)
-        return replace(self, factor=signs, where=self.where[:0], sizes=self.sizes[:0])
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Search:
@@ -211,7 +205,11 @@ class _Search:
         scores = [self.fitted(change, is_quick=True)[0] for change in changes]
         ranked = [(k, changes[k]) for k in np.argsort(scores)[:FITTED_ERRORS].tolist()]
         # Where the parameters leave the size of a factor open, its sign alone explains as much.
-        ranked += [(-1, each.signs_alone) for _, each in ranked if each.unknown == "factor"]
+        ranked += [
+            (-1, replace(none, words=each.words, factor=np.sign(each.factor)))
+            for _, each in ranked
+            if each.unknown == "factor"
+        ]
         cures = []
         for k, tried in ranked:
             score, squares, change = self.fitted(tried)
