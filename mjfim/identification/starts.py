@@ -25,8 +25,8 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.assessment.accuracy import FitResult
-from mjfim.identification.assessment.honest_covariance import jackknife_std, student_quantile
-from mjfim.identification.assessment.robust_covariance import inverse_root
+from mjfim.identification.assessment.honest_covariance import jackknife_std
+from mjfim.identification.assessment.robust_covariance import inverse_root, t_quantile
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
 from mjfim.identification.left_out import (
@@ -622,4 +622,4 @@ def _half_width(without: Array, confidence: float) -> Array:
     """
     if len(without) < 2:
         return np.full(without.shape[1], np.nan)
-    return student_quantile(len(without), confidence) * jackknife_std(without)
+    return t_quantile(len(without) - 1, confidence) * jackknife_std(without)

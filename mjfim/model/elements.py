@@ -7,6 +7,7 @@ units.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import mujoco
@@ -90,6 +91,14 @@ def unique_names(model: Any, kind: str) -> tuple[str, ...]:
             names[i] = name
 
     return tuple(names)
+
+
+def free_name(stem: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: the stem, or `stem_2` and so on."""
+    name, number = stem, 2
+    while name in taken:
+        name, number = f"{stem}_{number}", number + 1
+    return name
 
 
 def geom_labels(model: Any) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.identify import Callback, fit_task, identify_system
 from mjfim.identification.search import FitSearch, FitTask, with_length
-from mjfim.model.elements import identifier, model_length, names_of
+from mjfim.model.elements import free_name, identifier, model_length, names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.terms.library import AXES
 from mjfim.parallel import one_blas_thread
@@ -37,7 +37,7 @@ from mjfim.records.estimate_parts import PayloadEstimate
 from mjfim.records.events import begin_stage, shown_progress
 from mjfim.records.trajectory import Recording
 from mjfim.studies.first_candidates import PAYLOAD_SHARE
-from mjfim.studies.selected_models import free_name, selected_experiment
+from mjfim.studies.selected_models import selected_experiment
 
 # Kind of the term that is a payload, and the name of the one that is added.
 KIND = "payload"

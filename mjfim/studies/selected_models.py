@@ -14,11 +14,12 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import (
-    student_quantile,
     with_honest_covariance,
 )
+from mjfim.identification.assessment.robust_covariance import t_quantile
 from mjfim.identification.assessment.term_tests import TermTests
 from mjfim.identification.left_out import HeldOutLosses
+from mjfim.model.elements import free_name
 from mjfim.model.parameters import Parameter, ParameterSet
 from mjfim.model.paths import ParameterPath
 from mjfim.records.estimate import Estimate
@@ -206,14 +207,6 @@ def start_of(
     return np.clip(start, parameters.lower, parameters.upper)
 
 
-def free_name(stem: str, taken: Collection[str]) -> str:
-    """Return a name that is not taken: the stem, or `stem_2` and so on."""
-    name, number = stem, 2
-    while name in taken:
-        name, number = f"{stem}_{number}", number + 1
-    return name
-
-
 def with_selection(
     estimate: Estimate, selection: Selection, losses: HeldOutLosses, system: System
 ) -> Estimate:
@@ -238,7 +231,7 @@ def with_selection(
     if parts < MIN_PARTS:
         estimate = replace(estimate, warnings=(*estimate.warnings, NOT_WIDENED))
     else:
-        quantile = student_quantile(parts, CONFIDENCE)
+        quantile = t_quantile(parts - 1, CONFIDENCE)
         low = np.minimum(low, estimate.theta - quantile * losses.jackknife)
         high = np.maximum(high, estimate.theta + quantile * losses.jackknife)
 

@@ -432,3 +432,17 @@ def test_stated_bounds_priors_and_factors_of_stribeck_friction_hold(
     assert factor * fit.theta[1] == pytest.approx(0.15, rel=0.2)
     assert np.isfinite(fit.std).all()
     assert fit.std[1] > 0.0
+
+
+def test_a_term_without_unknown_speeds_leaves_the_speeds_of_others_to_be_tried(
+    tmp_path: Path,
+) -> None:
+    """Stribeck friction of both joints, of which the speed of one is unknown."""
+    friction = {"kind": "lugre", "values": {"coulomb": 0.4, "excess": 0.4, "speed": 0.3}}
+    experiment = cart(
+        tmp_path,
+        parameters=CART | {"speed": {"target": "term/a:speed"}},
+        terms={"a": friction | {"joint": "slide"}, "b": friction | {"joint": "hinge"}},
+    )
+    fit = inverse_dynamics(experiment, [cart_log(experiment, 1e-6)])
+    assert fit.success

@@ -8,14 +8,14 @@ from scipy.optimize import brentq
 from scipy.stats import chi2, f, kstest
 
 from mjfim.identification.assessment.recording_comparison import (
-    Information,
     between_variance,
     difference,
     f_tail,
     random_effects,
     satterthwaite,
-    total_of,
+    with_scatter,
 )
+from tests.support.numerics import Array
 
 
 def test_between_variance_solves_the_equation_of_paule_and_mandel() -> None:
@@ -68,10 +68,9 @@ def test_p_values_of_equal_recordings_are_uniform() -> None:
     assert kstest(random_effects(values, variances, 1e9).p, "uniform").pvalue > 1e-3
 
 
-def parts_of(rng: np.random.Generator, ranks: list[int], size: int) -> list[Information]:
-    """Random information about `size` unknowns, of given ranks."""
-    rows = [rng.normal(size=(rank, size)) for rank in ranks]
-    return [Information(matrix=J.T @ J, vector=J.T @ (J @ rng.normal(size=size))) for J in rows]
+def part_of(J: Array, b: Array) -> Array:
+    """Information and its product with the estimate, from rows and their values."""
+    return np.column_stack([J.T @ J, J.T @ b])
 
 
 @pytest.mark.parametrize("ranks", [[4, 4], [2, 3, 4], [1, 1, 1, 1], [2, 2, 1]])
@@ -81,42 +80,37 @@ def test_difference_is_the_increase_of_squares(ranks: list[int]) -> None:
     size = 4
     rows = [rng.normal(size=(rank, size)) for rank in ranks]
     y = [rng.normal(size=rank) for rank in ranks]
-    parts = [Information(matrix=J.T @ J, vector=J.T @ b) for J, b in zip(rows, y, strict=True)]
+    parts = np.array([part_of(J, b) for J, b in zip(rows, y, strict=True)])
 
     # Each part alone explains its data exactly, because it has at most as many rows as unknowns.
     J, b = np.concatenate(rows), np.concatenate(y)
     together = np.linalg.lstsq(J, b)[0]
-    squares, dof = difference(parts, 1e-9)
+    squares, dof = difference(parts)
     assert squares == pytest.approx(np.sum((J @ together - b) ** 2), rel=1e-9, abs=1e-12)
     assert dof == len(b) - np.linalg.matrix_rank(J)
 
 
 def test_scatter_adds_to_the_covariance_also_of_singular_information() -> None:
     rng = np.random.default_rng(4)
-    (full,) = parts_of(rng, [3], 3)
+    J = rng.normal(size=(3, 3))
+    full = part_of(J, J @ rng.normal(size=3))
     tau2 = np.diag([0.5, 0.0, 2.0])
-    found = full.with_scatter(tau2)
+    found = with_scatter(full, tau2)
+    A, vector = found[:, :-1], found[:, -1]
     np.testing.assert_allclose(
-        np.linalg.inv(found.matrix), np.linalg.inv(full.matrix) + tau2, rtol=1e-9, atol=1e-12
+        np.linalg.inv(A), np.linalg.inv(full[:, :-1]) + tau2, rtol=1e-9, atol=1e-12
     )
-    estimate = np.linalg.solve(full.matrix, full.vector)
-    np.testing.assert_allclose(np.linalg.solve(found.matrix, found.vector), estimate, rtol=1e-8)
+    estimate = np.linalg.solve(full[:, :-1], full[:, -1])
+    np.testing.assert_allclose(np.linalg.solve(A, vector), estimate, rtol=1e-8)
 
     # Information about one direction: its variance grows by the scatter along it.
     direction = np.array([1.0, 2.0, -1.0])
-    rank_one = Information(matrix=np.outer(direction, direction), vector=3.0 * direction)
-    scattered = rank_one.with_scatter(tau2)
+    rank_one = part_of(direction[None], np.array([3.0]))
     variance = 1.0 + direction @ tau2 @ direction
-    np.testing.assert_allclose(scattered.matrix, rank_one.matrix / variance, atol=1e-12)
-    np.testing.assert_allclose(scattered.vector, rank_one.vector / variance, atol=1e-12)
-    assert rank_one.with_scatter(np.zeros((3, 3))) is rank_one
-
-
-def test_totals_add() -> None:
-    parts = parts_of(np.random.default_rng(5), [2, 2, 1], 3)
-    total = total_of(parts)
-    np.testing.assert_allclose(total.matrix, sum(part.matrix for part in parts))
-    np.testing.assert_allclose(total.vector, sum(part.vector for part in parts))
+    both = with_scatter(np.array([rank_one, full]), tau2)
+    np.testing.assert_allclose(both[0], rank_one / variance, atol=1e-12)
+    np.testing.assert_allclose(both[1], found, rtol=1e-12)
+    np.testing.assert_array_equal(with_scatter(rank_one, np.zeros((3, 3))), rank_one)
 
 
 def test_distributions() -> None:

@@ -80,6 +80,7 @@ class Linear:
             min_rows=length,
             draws=draws,
             rng=np.random.default_rng(0),
+            own=np.zeros((len(y), 0), dtype=int),
         )
         return theta, formal, result
 
@@ -292,6 +293,7 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
         min_rows=36.0,
         draws=50,
         rng=np.random.default_rng(0),
+        own=np.zeros((len(other.private_rows), 0), dtype=int),
     )
     np.testing.assert_allclose(two.sandwich * unit, one.sandwich, rtol=1e-6)
     np.testing.assert_allclose(two.interval * unit[:, None], one.interval, rtol=1e-6)
@@ -386,6 +388,7 @@ def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
                 min_rows=1.0,
                 draws=0,
                 rng=np.random.default_rng(0),
+                own=np.zeros((1, 0), dtype=int),
                 inflation=inflation,
             )
             for inflation in (1.0, 100.0)
@@ -410,6 +413,7 @@ def test_combinations_known_far_better_than_others_keep_their_digits() -> None:
         min_rows=16,
         draws=0,
         rng=rng,
+        own=np.zeros((1, 0), dtype=int),
         inflation=25.0,
     )
     weights = np.array([1.0, 1.0])
@@ -434,6 +438,7 @@ def test_no_combination_is_better_known_than_by_the_formal_covariance() -> None:
         min_rows=16,
         draws=0,
         rng=rng,
+        own=np.zeros((1, 0), dtype=int),
     )
 
     # In coordinates in which the formal covariance is nearly that of all combinations alike.

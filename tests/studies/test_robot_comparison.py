@@ -269,12 +269,12 @@ class Setting:
         recording = condensed.segment_of_block
         rows = np.full(len(recording), float(FINE))
         length = block_length([growth], self.K * N)
+        own = np.zeros((self.K, 0), dtype=int)
         uncertainty = robust_uncertainty(
-            condensed, theta, recording, rows, min_rows=length, draws=100, rng=rng
+            condensed, theta, recording, rows, min_rows=length, draws=100, rng=rng, own=own
         )
         comparison = None
         if self.K > 1:
-            own = np.zeros((self.K, 0), dtype=int)
             blocks = independent_blocks(condensed, recording, rows, length)
             comparison = compare_evidence(
                 theta,

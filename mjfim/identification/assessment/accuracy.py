@@ -177,19 +177,16 @@ def _accuracy_of(fit: FitResult) -> Accuracy:
         root = inverse_root(H)
         common = root @ root.T
     formal = _of_parameters(problem, solution, common)
-    std = np.zeros(len(formal))
+    std = np.sqrt(np.diag(formal))
     std[index] = common_std[columns]
-    if not problem.free_starts:
-        std[problem.private] = np.sqrt(np.diag(formal)[problem.private])
 
     # Members of a group are not identifiable separately, though pins make their information
     # regular.
-    units = [parameter.unit for parameter in parameters.parameters]
-    groups = parameter_groups(fit.null_space, parameters.names, parameters.magnitude, units)
+    groups = parameter_groups(fit.null_space, parameters.names, parameters.magnitude, system.units)
     members = [name for group in groups for name in group.members]
     in_group = np.isin(parameters.names, members)
-    std = np.where(in_group, np.inf, std)
-    formal = np.where(np.logical_or.outer(in_group, in_group), np.inf, formal)
+    std[in_group] = np.inf
+    formal[in_group], formal[:, in_group] = np.inf, np.inf
     declared_alone = np.array([not parameter.group for parameter in parameters.parameters])
 
     # Robust values, from the blocks of the last linearisation; formal ones where there are none.
@@ -224,9 +221,8 @@ def _accuracy_of(fit: FitResult) -> Accuracy:
 
     # Intervals end at the bounds. An estimate beyond its bounds, which the method newton allows,
     # stays inside its interval.
-    low = np.maximum(interval[:, 0], np.minimum(parameters.lower, theta))
-    high = np.minimum(interval[:, 1], np.maximum(parameters.upper, theta))
-    interval = np.column_stack([low, high])
+    low, high = np.minimum(parameters.lower, theta), np.maximum(parameters.upper, theta)
+    interval = np.clip(interval, low[:, None], high[:, None])
 
     # Information of the recordings alone about the parameters that they share. Only the priors on
     # the other unknowns, which are marginalised, count.

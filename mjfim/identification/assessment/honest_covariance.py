@@ -22,13 +22,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy
 
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.identification.assessment.robust_covariance import (
-    LEVEL,
     covariance_root,
     covering_covariance,
+    t_quantile,
 )
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate, HorizonStudy, Uncertainty
@@ -41,8 +40,6 @@ def jackknife_deviations(without_parts: Array) -> Array:
         without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
     """
     K = len(without_parts)
-    if K < 2:
-        return np.zeros_like(without_parts)
     scatter = without_parts - without_parts.mean(axis=0)
     return np.asarray(np.sqrt((K - 1) / K) * scatter)
 
@@ -56,16 +53,6 @@ def jackknife_std(without_parts: Array) -> Array:
     if len(without_parts) < 2:
         return np.full(without_parts.shape[1], np.nan)
     return np.asarray(np.linalg.norm(jackknife_deviations(without_parts), axis=0))
-
-
-def student_quantile(parts: int, confidence: float) -> float:
-    """Half width of an interval in standard errors that K parts have given.
-
-    Args:
-        parts: Number K of parts, at least 2.
-        confidence: Probability that the interval holds the true value.
-    """
-    return float(scipy.special.stdtrit(parts - 1, 0.5 + 0.5 * confidence))
 
 
 # Distance of the end of an interval from a bound, relative to the width of the interval, at which
@@ -135,7 +122,7 @@ def with_honest_covariance(
         inner = _covering(inner, _differences(inner, estimate.horizons, known))
     if without_parts is not None and len(without_parts) > 1:
         # Deviations between the parts of the data, by Student's factor, like the intervals.
-        factor = student_quantile(len(without_parts), LEVEL) / NORMAL_95
+        factor = t_quantile(len(without_parts) - 1) / NORMAL_95
         inner = _covering(inner, factor * jackknife_deviations(without_parts)[:, known])
     found[place] = agreeing_covariance(inner, std[known])
     return replace(estimate, honest_covariance=found)
@@ -177,16 +164,11 @@ def stretched_formal_covariance(estimate: Estimate, std: Array) -> Array:
     """
     # A parameter that the fit holds has no correlation with the others.
     formal = np.sqrt(np.diag(estimate.covariance))
-    is_known = np.isfinite(formal) & (formal > 0.0)
-    scale = np.where(is_known, 1.0 / np.where(is_known, formal, 1.0), 0.0)
+    is_known = np.isfinite(formal) & (formal > 0.0) & np.isfinite(std)
+    scale = np.where(is_known, std, 0.0) / np.where(is_known, formal, 1.0)
     shared = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
-    correlation = scale[:, None] * shared * scale
-    np.fill_diagonal(correlation, 1.0)
-
-    is_finite = np.isfinite(std)
-    finite = np.where(is_finite, std, 0.0)
-    covariance = finite[:, None] * correlation * finite
-    covariance[~is_finite, ~is_finite] = np.inf
+    covariance = scale[:, None] * shared * scale
+    np.fill_diagonal(covariance, std**2)
     return np.asarray(covariance)
 
 
@@ -263,8 +245,6 @@ def _stretch(root: Array, j: int, factor: float) -> None:
         j: Index of the parameter.
         factor: The factor.
     """
-    if factor == 1.0:
-        return
     axis = root[j] / np.linalg.norm(root[j])
     root += (factor - 1.0) * np.outer(root @ axis, axis)
 
@@ -290,9 +270,9 @@ def _differences(covariance: Array, study: HorizonStudy, known: np.ndarray) -> A
     root = covariance_root(covariance)
     apart = np.asarray(study.is_apart, dtype=bool)[:, known]
     differences = (study.theta - study.theta[study.chosen])[:, known] / NORMAL_95
-    found = [np.zeros((0, len(known)))]
-    for is_apart, difference in zip(apart, differences, strict=True):
-        if is_apart.any():
-            along = np.linalg.pinv(root[is_apart]) @ difference[is_apart]
-            found.append((root @ along)[None])
-    return np.concatenate(found)
+    return np.array(
+        [
+            root @ (np.linalg.pinv(root[is_apart]) @ difference[is_apart])
+            for is_apart, difference in zip(apart, differences, strict=True)
+        ]
+    )

@@ -28,9 +28,8 @@ from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import inertia_combinations
 from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.assessment.robust_covariance import covariance_root
-from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
+from mjfim.identification.linear_coordinates import unknown_bodies
 from mjfim.model.inertia import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
-from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate, ParameterDraws
 from mjfim.records.events import begin_stage
 
@@ -245,14 +244,20 @@ def draw_parameters_system(
             "are drawn; identify with the method least_squares, which keeps bounds"
         )
 
-    combinations = _undetermined(system.parameters, estimate, drawn)
-    if len(combinations):
-        # The distribution given that these combinations stay as they are. What is known of sums,
-        # such as a moment of inertia and the armature of its joint, is known of the parameters that
-        # are still drawn. Roots orthogonal to the combinations lose no digits of it.
+    found, held = None, 0
+    if len(estimate.data) == len(names):
+        found = inertia_combinations(system.parameters, estimate.theta, estimate.data)
+    if found is not None and not found[1].all():
+        # The distribution given that combinations stay as they are which only the CAD prior
+        # determines. What is known of sums, such as a moment of inertia and the armature of its
+        # joint, is known of the parameters that are still drawn. Roots orthogonal to the
+        # combinations lose no digits of it.
+        columns, is_determined, axes = found
+        held = int(np.sum(~is_determined))
         root = covariance_root(covariance)
-        _, _, axes = np.linalg.svd(combinations @ root)
-        kept = root @ axes[len(combinations) :].T
+        of_inertias = root[np.searchsorted(drawn, columns)]
+        _, _, directions = np.linalg.svd(np.linalg.inv(axes)[~is_determined] @ of_inertias)
+        kept = root @ directions[held:].T
         covariance = kept @ kept.T
     values, replaced = _physical_draws(
         system, estimate, drawn, centre, covariance, count=count, rng=rng
@@ -264,7 +269,7 @@ def draw_parameters_system(
         centre=centre,
         std=np.sqrt(np.diag(covariance)),
         replaced=replaced,
-        held_combinations=len(combinations),
+        held_combinations=held,
     )
 
 
@@ -283,27 +288,6 @@ def complete_theta(system: System, estimate: Estimate, draws: ParameterDraws, ro
     theta = np.array(estimate.theta)
     theta[~system.parameters.initial_deviations] = draws.values[robot]
     return theta
-
-
-def _undetermined(parameters: ParameterSet, estimate: Estimate, drawn: np.ndarray) -> Array:
-    """(m, q) weights in the combinations of inertias that only the CAD prior determines.
-
-    Args:
-        parameters: The parameters.
-        estimate: The estimate.
-        drawn: (q,) indices in theta of the drawn parameters, ascending.
-    """
-    found = None
-    if len(estimate.data) == len(parameters):
-        found = inertia_combinations(parameters, estimate.theta, estimate.data)
-    if found is None:
-        return np.zeros((0, len(drawn)))
-
-    columns, is_determined, axes = found
-    of_inertias = np.linalg.inv(axes)[~is_determined]
-    weights = np.zeros((len(of_inertias), len(drawn)))
-    weights[:, np.searchsorted(drawn, columns)] = of_inertias
-    return weights
 
 
 def _physical_draws(
@@ -331,20 +315,21 @@ def _physical_draws(
         ExperimentError: Hardly any draw is physical.
     """
     lower, upper = system.parameters.lower[drawn], system.parameters.upper[drawn]
-    places = [
-        (body, np.searchsorted(drawn, body.columns)) for body in unknown_bodies(system.parameters)
-    ]
+    bodies = unknown_bodies(system.parameters)
+    start = np.array(estimate.theta)
+    start[drawn] = centre
 
     # Pseudo-inertias are linear in the barycentric coordinates, and these in the draws. Bodies that
     # are not physical at the centre do not bound the draws.
     physical = []
-    for body, place in places:
-        linear = body.linear(centre[place])
+    for body in bodies:
+        begin = start[body.columns]
+        linear = body.linear(begin)
         if body.is_physical(linear):
-            slopes = np.zeros((len(centre), *BARYCENTRIC_DERIVATIVES.shape[1:]))
-            by_draws = body.linear_slopes(centre[place])
-            slopes[place] = np.tensordot(by_draws, BARYCENTRIC_DERIVATIVES, axes=1)
-            physical.append((pseudo_inertia_of(linear), slopes))
+            slopes = np.zeros((len(start), *BARYCENTRIC_DERIVATIVES.shape[1:]))
+            by_draws = body.linear_slopes(begin)
+            slopes[body.columns] = np.tensordot(by_draws, BARYCENTRIC_DERIVATIVES, axes=1)
+            physical.append((pseudo_inertia_of(linear), slopes[drawn]))
     values = np.zeros((count, len(drawn)))
     missing = np.arange(count)
     replaced = 0
@@ -360,13 +345,18 @@ def _physical_draws(
         )
         is_physical = np.zeros(len(missing), dtype=bool)
         for row, i in enumerate(missing):
-            robot = _moved(places, centre, tried[row])
-            if robot is None:
-                continue
-            theta = np.array(estimate.theta)
-            theta[drawn] = robot
-            if not system.impossible(theta):
-                values[i], is_physical[row] = robot, True
+            theta = np.array(start)
+            theta[drawn] = tried[row]
+            # Inertias move along straight lines of their barycentric coordinates.
+            for body in bodies:
+                begin = start[body.columns]
+                step = theta[body.columns] - begin
+                if not body.is_physical_after(begin, step):
+                    break
+                theta[body.columns] = body.moved(begin, step)
+            else:
+                if not system.impossible(theta):
+                    values[i], is_physical[row] = theta[drawn], True
         missing = missing[~is_physical]
         if not len(missing):
             return values, replaced
@@ -377,22 +367,3 @@ def _physical_draws(
         f"been replaced {MAX_ROUNDS} times; the recordings determine the inertias too poorly. "
         "State them as a whole (`inertial`) with a `cad_prior`, or with a narrower `prior`"
     )
-
-
-def _moved(
-    places: Sequence[tuple[UnknownBody, np.ndarray]], centre: Array, values: Array
-) -> Array | None:
-    """(q,) parameters whose inertias have moved along straight lines; None where no body is there.
-
-    Args:
-        places: Bodies whose whole inertia is drawn, and the (10,) places of their coordinates.
-        centre: (q,) parameters at which the lines begin.
-        values: (q,) parameters without curvature, drawn from the normal distribution.
-    """
-    robot = np.array(values)
-    for body, place in places:
-        begin, step = centre[place], values[place] - centre[place]
-        if not body.is_physical_after(begin, step):
-            return None
-        robot[place] = body.moved(begin, step)
-    return robot

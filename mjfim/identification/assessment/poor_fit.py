@@ -6,6 +6,7 @@ a long time then have many local minima, in which a fit ends. Shorter segments a
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -66,7 +67,7 @@ def sentence_about_instability(amplification: float, length: float, recommended:
 def touched_in(fit: FitResult) -> str:
     """Stops and contacts that act along the fitted motions, in words; empty without any."""
     problem, at = fit.problem, fit.solution.unknowns
-    model, found = problem.system.plant.model(problem.theta(at)), dict[str, int]()
+    model, found = problem.system.plant.model(problem.theta(at)), Counter[str]()
     if allows_dry_friction_only(model):
         return ""
     samples = 0
@@ -76,9 +77,8 @@ def touched_in(fit: FitResult) -> str:
             continue
         samples += motion.samples
         for _, data in forward_samples(model, motion, range(motion.samples)):
-            for name in set(acting_constraints(model, data)):
-                if name.startswith(TOUCHES):
-                    found[name] = found.get(name, 0) + 1
+            acting = set(acting_constraints(model, data))
+            found.update(name for name in acting if name.startswith(TOUCHES))
     found_in = [f"{name} in {n} of {samples} samples" for name, n in found.items()]
     return listed(found_in) if found_in else ""
 

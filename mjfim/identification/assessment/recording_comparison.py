@@ -30,6 +30,7 @@ from mjfim.identification.assessment.robust_covariance import (
     Blocks,
     independent_blocks,
     recording_evidence,
+    t_quantile,
     weighted,
 )
 from mjfim.information.criteria import standard_deviations
@@ -40,9 +41,6 @@ MAX_NEWTON_STEPS = 60
 
 # Relative change of tau² at which the steps end, and relative excess of the squares that counts.
 TAU_TOLERANCE = 1e-10
-
-# Confidence level of intervals.
-LEVEL = 0.95
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,18 +76,13 @@ def random_effects(values: Array, variances: Array, freedom: float) -> RandomEff
         variances: (K, q) their variances.
         freedom: Degrees of freedom of the variances.
     """
-    known = np.isfinite(values) & np.isfinite(variances) & (variances > 0.0)
-    count = known.sum(axis=0)
-
-    # Cochran's Q, by the F distribution because the variances are estimated as well.
-    weights, _, deviation = weighted(values, variances, known, np.zeros(values.shape[1]))
+    weights, _, deviation = weighted(values, variances)
     squares = np.sum(weights * deviation**2, axis=0)
+    count = np.sum(weights > 0.0, axis=0)
     others = np.maximum(count - 1, 1)
-    p = np.where(count > 1, scipy.special.fdtrc(others, freedom, squares / others), 1.0)
-    share = np.maximum(1.0 - others / np.maximum(squares, others), 0.0)
 
     tau2 = between_variance(values, variances)
-    weights, mean, deviation = weighted(values, variances, known, tau2)
+    weights, mean, deviation = weighted(values, variances, tau2)
     scatter, total = np.sum(weights * deviation**2, axis=0), weights.sum(axis=0)
     mean = np.where(count > 0, mean, np.nan)
     variance = np.where(count > 0, 1.0 / np.where(count > 0, total, 1.0), np.inf)
@@ -100,13 +93,14 @@ def random_effects(values: Array, variances: Array, freedom: float) -> RandomEff
     new_variance = (1.0 + count) / np.where(enough, total, 1.0)
     reach = t_quantile(others) * np.sqrt(scatter / others * new_variance)
     reach = np.where(enough, reach, np.inf)
+    # Cochran's Q, by the F distribution because the variances are estimated as well.
     return RandomEffects(
         count=count,
         mean=mean,
         variance=variance,
         tau2=tau2,
-        share=(np.where(count > 1, share, 0.0)),
-        p=p,
+        share=1.0 - others / np.maximum(squares, others),
+        p=scipy.special.fdtrc(others, freedom, squares / others),
         prediction=np.column_stack([mean - reach, mean + reach]),
     )
 
@@ -121,13 +115,12 @@ def between_variance(values: Array, variances: Array) -> Array:
     Returns:
         (q,) variances tau²; 0 where the variances explain the scatter.
     """
-    known = np.isfinite(values) & np.isfinite(variances) & (variances > 0.0)
-    expected = known.sum(axis=0) - 1
     tau2 = np.zeros(values.shape[1])
+    expected = np.sum(weighted(values, variances)[0] > 0.0, axis=0) - 1
     moves = expected > 0
 
     for _ in range(MAX_NEWTON_STEPS):
-        weights, _, deviation = weighted(values, variances, known, tau2)
+        weights, _, deviation = weighted(values, variances, tau2)
         squares = np.sum(weights * deviation**2, axis=0)
         slope = np.sum(weights**2 * deviation**2, axis=0)
 
@@ -144,50 +137,30 @@ def between_variance(values: Array, variances: Array) -> Array:
 # ---- several quantities at once
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Information:
-    """Knowledge about s unknowns, possibly in some directions only.
-
-    Attributes:
-        matrix: (s, s) information A.
-        vector: (s,) information times estimate, `A theta`.
-    """
-
-    matrix: Array
-    vector: Array
-
-    def __add__(self, other: Information) -> Information:
-        return Information(matrix=self.matrix + other.matrix, vector=self.vector + other.vector)
-
-    def with_scatter(self, tau2: Array) -> Information:
-        """Knowledge about the mean of recordings that scatter.
-
-        The information is `(A^-1 + T)^-1 = A (1 + T A)^-1`, which exists for a singular A as well.
-
-        Args:
-            tau2: (s, s) covariance T between recordings.
-        """
-        if not tau2.any():
-            return self
-        left = np.eye(len(tau2)) + self.matrix @ tau2
-        matrix = np.linalg.solve(left, self.matrix)
-        vector = np.asarray(np.linalg.solve(left, self.vector), dtype=np.float64)
-        return Information(matrix=0.5 * (matrix + matrix.T), vector=vector)
+# What a recording says about s unknowns, possibly in some directions only: an array (s, s+1)
+# `[A, A theta]` of the information A and of its product with the estimate. Those of several
+# recordings add.
 
 
-def total_of(parts: list[Information]) -> Information:
-    """Add what several recordings say.
+def with_scatter(parts: Array, tau2: Array) -> Array:
+    """What recordings that scatter say about their mean.
+
+    The information is `(A^-1 + T)^-1 = A (1 + T A)^-1`, which exists for a singular A as well.
 
     Args:
-        parts: At least one part.
+        parts: (..., s, s+1) what recordings say.
+        tau2: (s, s) covariance T between recordings.
     """
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
+    return _symmetric(np.linalg.solve(np.eye(len(tau2)) + parts[..., :-1] @ tau2, parts))
 
 
-def difference(parts: list[Information], tolerance: float) -> tuple[float, int]:
+def _symmetric(parts: np.ndarray) -> Array:
+    """The parts, whose information is symmetric but for rounding."""
+    A = parts[..., :-1]
+    return np.concatenate([0.5 * (A + np.swapaxes(A, -1, -2)), parts[..., -1:]], axis=-1)
+
+
+def difference(parts: Array) -> tuple[float, int]:
     """Sum of squares by which parts contradict each other, and its degrees of freedom.
 
     It is the increase of the weighted squares if all parts have the same unknowns. Directions about
@@ -195,14 +168,13 @@ def difference(parts: list[Information], tolerance: float) -> tuple[float, int]:
     chi-squared distribution.
 
     Args:
-        parts: The parts; their matrices have a common scale.
-        tolerance: Eigenvalues below this number count as zero.
+        parts: (K, s, s+1) the parts; their information has a common scale.
     """
     squares, rank = 0.0, 0
-    for sign, part in (*((1, part) for part in parts), (-1, total_of(parts))):
-        eigenvalues, vectors = np.linalg.eigh(part.matrix)
-        is_known = eigenvalues > tolerance
-        along = vectors[:, is_known].T @ part.vector
+    for sign, part in (*((1, part) for part in parts), (-1, parts.sum(axis=0))):
+        eigenvalues, vectors = np.linalg.eigh(part[:, :-1])
+        is_known = eigenvalues > TOLERANCE
+        along = vectors[:, is_known].T @ part[:, -1]
         squares += sign * float(np.sum(along**2 / eigenvalues[is_known]))
         rank += sign * int(is_known.sum())
     return max(squares, 0.0), rank
@@ -221,15 +193,6 @@ def satterthwaite(share: Array, within: float, between: int | np.ndarray) -> Arr
     """
     share = np.clip(share, 0.0, 1.0)
     return 1.0 / ((1.0 - share) ** 2 / within + share**2 / np.maximum(between, 1))
-
-
-def t_quantile(freedom: np.ndarray) -> Array:
-    """Half widths of 95 % intervals of Student's distribution [standard deviations].
-
-    Args:
-        freedom: (s,) degrees of freedom.
-    """
-    return np.asarray(scipy.special.stdtrit(freedom, 0.5 + LEVEL / 2.0))
 
 
 def f_tail(squares: float, dof: int, freedom: float) -> float:
@@ -259,7 +222,7 @@ class RecordingViews:
         theta: (s,) estimate from all recordings, where z = 0; NaN for unknowns that they do not
             determine.
         directions: (s, r) derivative of theta by z.
-        parts: What each of K recordings says about z.
+        parts: (K, r, r+1) what each of K recordings says about z.
         values: (K, s) values that each recording alone suggests; NaN where it determines none.
         std: (K, s) their standard deviations; infinite where there is none.
         freedom: Degrees of freedom of the scatter within the recordings.
@@ -267,7 +230,7 @@ class RecordingViews:
 
     theta: Array
     directions: Array
-    parts: list[Information]
+    parts: Array
     values: Array
     std: Array
     freedom: float
@@ -281,17 +244,6 @@ class RecordingViews:
         inverse = np.linalg.pinv(self.directions)
         return inverse * tau2 @ inverse.T
 
-    def mean(self, chosen: Sequence[int], tau2: Array) -> tuple[Array, Array]:
-        """(s,) mean of theta over recordings that scatter, and (s,) its standard deviations.
-
-        Args:
-            chosen: Indices of the recordings.
-            tau2: (s,) variances of theta between recordings.
-        """
-        scatter = self.scatter(tau2)
-        total = total_of([self.parts[k].with_scatter(scatter) for k in chosen])
-        return _estimate(self.theta, self.directions, total)
-
 
 def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
     """Find what single recordings say about the unknowns that they share.
@@ -300,9 +252,8 @@ def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
         theta: (s,) estimate from all recordings [theta-unit].
         evidence: What each of K recordings says.
     """
-    equations = [evidence.normal_equations(k) for k in range(evidence.count)]
-    H = np.sum([information for information, _ in equations], axis=0)
-    scaled, scale = scaled_to_unit_diagonal(H)
+    equations = np.array([evidence.normal_equations(k) for k in range(evidence.count)])
+    scaled, scale = scaled_to_unit_diagonal(equations[..., :-1].sum(axis=0))
     eigenvalues, vectors = np.linalg.eigh(scaled)
     is_known = eigenvalues > TOTAL_TOLERANCE * eigenvalues.max(initial=0.0)
     directions = vectors[:, is_known] / np.sqrt(eigenvalues[is_known]) / scale[:, None]
@@ -312,13 +263,16 @@ def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
     known_theta = np.where(is_determined, theta, np.nan)
 
     # Each recording in the coordinates z, and its estimate.
-    informations = [directions.T @ each @ directions for each, _ in equations]
-    steps = [
-        -_inverse(each) @ (directions.T @ g)
-        for each, (_, g) in zip(informations, equations, strict=True)
-    ]
+    moved = directions.T @ equations @ scipy.linalg.block_diag(directions, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(moved[..., :-1])
+    transposed = np.swapaxes(vectors, 1, 2)
+    is_known = eigenvalues > TOLERANCE
+    inverses = np.where(is_known, 1.0 / np.where(is_known, eigenvalues, 1.0), 0.0)[:, None]
+    inverses = vectors * inverses @ transposed
+    roots = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] @ transposed
+    steps = -inverses @ moved[..., -1:]
     scatters = []
-    for k, step in enumerate(steps):
+    for k, step in enumerate(steps[..., 0]):
         # An interrupted fit may have used no segment of a recording.
         centred = evidence.centred_scores(k, directions @ step) @ directions
         count = len(centred)
@@ -330,19 +284,11 @@ def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
     pooled = vectors * np.maximum(eigenvalues, 1.0) @ vectors.T
 
     # Scores of a recording scatter more than its information says by a factor of at least 1.
-    parts = []
-    for k, (information, step, scatter) in enumerate(
-        zip(informations, steps, scatters, strict=True)
-    ):
-        eigenvalues, vectors = np.linalg.eigh(information)
-        root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
-        inverse = _inverse(information)
-        expected = float(np.sum(inverse * (root @ pooled @ root)))
-        factor = 1.0
-        if np.sum(evidence.recording == k) > 1 and expected > 0.0:
-            factor = max(float(np.sum(inverse * scatter)) / expected, 1.0)
-        matrix = root @ np.linalg.inv(pooled) @ root / factor
-        parts.append(Information(matrix=0.5 * (matrix + matrix.T), vector=matrix @ step))
+    expected = np.sum(inverses * (roots @ pooled @ roots), axis=(1, 2))
+    expected = np.where(expected > 0.0, expected, np.inf)
+    factors = np.maximum(np.sum(inverses * scatters, axis=(1, 2)) / expected, 1.0)
+    matrices = roots @ np.linalg.inv(pooled) @ roots / factors[:, None, None]
+    parts = _symmetric(np.concatenate([matrices, matrices @ steps], axis=2))
 
     found = [_estimate(known_theta, directions, part) for part in parts]
     return RecordingViews(
@@ -351,34 +297,26 @@ def recording_views(theta: Array, evidence: Blocks) -> RecordingViews:
         parts=parts,
         values=np.array([value for value, _ in found]),
         std=np.array([std for _, std in found]),
-        freedom=float(max(len(evidence.scores) - evidence.count, 1)),
+        freedom=float(max(len(evidence.equations) - evidence.count, 1)),
     )
 
 
-def _estimate(theta: Array, directions: Array, part: Information) -> tuple[Array, Array]:
+def _estimate(theta: Array, directions: Array, part: Array) -> tuple[Array, Array]:
     """(s,) estimate of a part, and (s,) standard deviations; NaN and infinite where it has none."""
-    eigenvalues, vectors = np.linalg.eigh(part.matrix)
+    eigenvalues, vectors = np.linalg.eigh(part[:, :-1])
     is_known = eigenvalues > TOLERANCE
-    inverse = _inverse(part.matrix)
+    root = vectors[:, is_known] / np.sqrt(eigenvalues[is_known])
 
     # A parameter is known if no unknown direction moves it.
     size = np.linalg.norm(directions, axis=1)
     unknown = np.linalg.norm(directions @ vectors[:, ~is_known], axis=1)
     determined = np.isfinite(theta) & (size > 0.0) & (unknown <= UNKNOWN_SHARE * size)
-    value = theta + directions @ (inverse @ part.vector)
-    variance = np.einsum("sr,rq,sq->s", directions, inverse, directions)
+    axes = directions @ root
+    value = theta + axes @ (root.T @ part[:, -1])
     return (
         np.where(determined, value, np.nan),
-        np.where(determined, np.sqrt(np.maximum(variance, 0.0)), np.inf),
+        np.where(determined, np.linalg.norm(axes, axis=1), np.inf),
     )
-
-
-def _inverse(information: Array) -> Array:
-    """Pseudo-inverse of an information in directions in which that of all recordings is 1."""
-    eigenvalues, vectors = np.linalg.eigh(information)
-    is_known = eigenvalues > TOLERANCE
-    along = vectors[:, is_known]
-    return np.asarray(along / eigenvalues[is_known] @ along.T)
 
 
 # Probability to name an odd recording where all are equal.
@@ -452,8 +390,8 @@ def _left_out(
     """
     others = [i for i in remaining if i != k]
     values, variances = views.values[others], views.std[others] ** 2
-    tau2 = between_variance(values, variances)
     effects = random_effects(values, variances, views.freedom)
+    tau2 = effects.tau2
 
     # Single parameters, by Student's distribution. The scatter between the others is known from
     # few of them.
@@ -467,9 +405,8 @@ def _left_out(
     each = 2.0 * scipy.special.stdtr(freedom, -t)
 
     # All parameters together.
-    scatter = views.scatter(tau2)
-    parts = [views.parts[i].with_scatter(scatter) for i in others]
-    squares, dof = difference([views.parts[k].with_scatter(scatter), total_of(parts)], TOLERANCE)
+    parts = with_scatter(views.parts, views.scatter(tau2))
+    squares, dof = difference(np.array([parts[k], parts[others].sum(axis=0)]))
     mean_share = np.array([share[is_known].mean() if is_known.any() else 0.0])
     (joint_freedom,) = satterthwaite(mean_share, views.freedom, len(others) - 1)
     joint = f_tail(squares, dof, float(joint_freedom))
@@ -560,10 +497,11 @@ def compare_evidence(
         values, std = np.column_stack([values, stated[0]]), np.column_stack([std, stated[1]])
     effects = random_effects(values, std**2, views.freedom)
     mean, deviation = effects.mean, np.sqrt(effects.variance)
-    mean[:count], deviation[:count] = views.mean(range(evidence.count), effects.tau2[:count])
+    total = with_scatter(views.parts, views.scatter(effects.tau2[:count])).sum(axis=0)
+    mean[:count], deviation[:count] = _estimate(views.theta, views.directions, total)
     share = effects.tau2 / np.where(deviation > 0.0, deviation**2 * evidence.count, 1.0)
     reach = t_quantile(satterthwaite(share, views.freedom, evidence.count - 1)) * deviation
-    squares, dof = difference(views.parts, TOLERANCE)
+    squares, dof = difference(views.parts)
     is_stated = np.arange(len(parameters)) >= count
     return RecordingComparison(
         recordings=tuple(recordings),

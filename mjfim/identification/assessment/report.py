@@ -47,14 +47,14 @@ from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
 
 # Numbers with which a law is more than a position servo, unless they have no effect.
-BEYOND_SERVOS = (
+BEYOND_SERVOS = {
     "ki",
     "slew",
     "latency",
     "time_constant",
     "feedback_latency",
     "velocity_time_constant",
-)
+}
 
 
 def laws_in_loop(
@@ -87,7 +87,7 @@ def laws_in_loop(
                     numbers[key] = values[name]
                     units[key] = law_unit(model, law.actuator, field)
 
-        plain = not any(name in numbers for name in BEYOND_SERVOS) and not law.differences
+        plain = BEYOND_SERVOS.isdisjoint(numbers) and not law.differences
         unit = control_unit(model, int(model.actuator(law.actuator).id))
         is_servo = plain and unit in FORCE_UNITS.values() and set(law.columns) == {"reference"}
         estimated = (key for key in numbers if f"controller/{law.actuator}:{key}" in paths)
@@ -315,10 +315,8 @@ def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     """
     parameters, theta, held = result.task.system.parameters, result.theta, result.task.settings.hold
     tolerance = BOUND_TOLERANCE * parameters.magnitude
-    below = theta < parameters.lower - tolerance
-    above = theta > parameters.upper + tolerance
-
     distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
+    is_beyond = bool((distance < -tolerance).any())
     problem, at = result.problem, result.solution.unknowns
     lower, upper = problem.bounds_at(at)
     values = problem.common_values(at)
@@ -327,7 +325,7 @@ def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     distance[problem.parameter_of_column[near]] = 0.0
     at_bound = np.flatnonzero(distance < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
-    return names, bool((below | above).any())
+    return names, is_beyond
 
 
 def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -102,29 +101,13 @@ SMALLEST_SQUARES = 1e-300
 
 
 def is_larger_than_noise(chi2: float, dof: int) -> bool:
-    """Test whether residuals are larger than the stated noise.
-
-    Args:
-        chi2: Sum of squared whitened residuals.
-        dof: Degrees of freedom.
-
-    Returns:
-        True where the difference is significant and relevant.
-    """
+    """Whether residuals are significantly and relevantly larger than the stated noise."""
     significant = scipy.special.chdtrc(dof, chi2) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) > RELEVANT_SIZE_RATIO)
 
 
 def is_smaller_than_noise(chi2: float, dof: int) -> bool:
-    """Test whether residuals are smaller than the stated noise.
-
-    Args:
-        chi2: Sum of squared whitened residuals.
-        dof: Degrees of freedom.
-
-    Returns:
-        True where the difference is significant and relevant.
-    """
+    """Whether residuals are significantly and relevantly smaller than the stated noise."""
     significant = scipy.special.chdtr(dof, chi2) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) < 1.0 / RELEVANT_SIZE_RATIO)
 
@@ -138,14 +121,12 @@ def autocorrelated(tests: Sequence[Whiteness]) -> tuple[Whiteness, ...]:
     Returns:
         These tests, strongest autocorrelation first.
     """
-    level = SIGNIFICANCE / max(len(tests), 1)
-
-    found = []
-    for test in tests:
-        inflation = max(test.inflation, test.time) * test.variance
-        if test.p < level and inflation > RELEVANT_INFLATION:
-            found.append(test)
-
+    found = [
+        test
+        for test in tests
+        if test.p < SIGNIFICANCE / len(tests)
+        and max(test.inflation, test.time) * test.variance > RELEVANT_INFLATION
+    ]
     return tuple(sorted(found, key=lambda test: -test.inflation))
 
 
@@ -188,24 +169,19 @@ def misfit_reasons(
         reasons.append(f"residuals are {size:.2f} times the stated noise")
 
     if found:
-        listed = [f"{test.output} ({_describe(test)})" for test in found[:MAX_LISTED_OUTPUTS]]
+        # Where neighbouring values hardly correlate, means over long runs describe it.
+        listed = []
+        for test in found[:MAX_LISTED_OUTPUTS]:
+            words = f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
+            if abs(test.correlation) > RELEVANT_CORRELATION:
+                words = f"lag-1 correlation {test.correlation:+.2f}"
+            listed.append(f"{test.output} ({words})")
         more = len(found) - len(listed)
         suffix = f" and {more} more" if more else ""
         reasons.append(f"residuals are autocorrelated: {', '.join(listed)}{suffix}")
     elif missing:
         reasons.append("a term that the model lacks explains part of the residuals")
     return tuple(reasons)
-
-
-def _describe(test: Whiteness) -> str:
-    """An autocorrelation in words.
-
-    It is described by the correlation of neighbouring values, or, where that is small, by the
-    variance of means over long runs.
-    """
-    if abs(test.correlation) > RELEVANT_CORRELATION:
-        return f"lag-1 correlation {test.correlation:+.2f}"
-    return f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
 
 
 def largest_interval(
@@ -227,16 +203,22 @@ def largest_interval(
     if not measured.any():
         return None
 
-    # Windows of equal duration; round-off must not exclude the last row.
+    # Windows of equal duration.
     number = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
-    edges = np.linspace(t[0], t[-1] * (1 + 1e-12), number + 1)
-    rows = np.searchsorted(t, edges)
-    rows[0], rows[-1] = 0, len(t)
-    parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
-    counts = np.array([len(part) for part in parts])
-    squares = np.array([float(part @ part) for part in parts])
+    edges = np.linspace(t[0], t[-1], number + 1)
+    window = np.searchsorted(edges[1:-1], t[measured], side="right")
+    counts = np.bincount(window, minlength=number)
+    squares = np.bincount(window, z[measured] ** 2, minlength=number)
 
-    inside = _largest_windows(counts, squares)
+    # The neighbouring windows in which residuals are largest; all of them where none is clearly
+    # larger. Windows with few values count as if they had more: a single value is no interval.
+    inside = slice(0, number)
+    rms = np.sqrt(squares / np.maximum(counts, VALUES_PER_WINDOW))
+    peak = int(np.argmax(rms))
+    if rms[peak] > PEAK_RATIO * np.sqrt(squares.sum() / counts.sum()):
+        small = np.flatnonzero(rms < PEAK_SHARE * rms[peak])
+        before, after = small[small < peak], small[small > peak]
+        inside = slice(int(before.max(initial=-1)) + 1, int(after.min(initial=number)))
     within = float(squares[inside].sum())
     worst = WorstResidual(
         output=output,
@@ -259,27 +241,6 @@ def worst_residual(
     total = sum(squares for squares, _, _ in known)
     _, within, worst = max(known, key=lambda each: each[2].size)
     return replace(worst, share=within / max(total, SMALLEST_SQUARES))
-
-
-def _largest_windows(counts: np.ndarray, squares: Array) -> slice:
-    """Neighbouring windows in which residuals are largest.
-
-    These are all windows where none has clearly larger residuals than the others.
-    """
-    # Windows with few values count as if they had more: a single large value is not an interval.
-    rms = np.sqrt(squares / np.maximum(counts, VALUES_PER_WINDOW))
-    peak = int(np.argmax(rms))
-    overall = float(np.sqrt(squares.sum() / counts.sum()))
-    if not rms[peak] > PEAK_RATIO * overall:
-        return slice(0, len(rms))
-
-    least = PEAK_SHARE * rms[peak]
-    first = last = peak
-    while first > 0 and rms[first - 1] >= least:
-        first -= 1
-    while last < len(rms) - 1 and rms[last + 1] >= least:
-        last += 1
-    return slice(first, last + 1)
 
 
 def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
@@ -345,10 +306,7 @@ def _autocorrelation(series: Sequence[Array], least_lag: int, longest_lag: int) 
     """
     lag = min(max(least_lag, FIRST_LAGS), longest_lag)
     while True:
-        products = np.zeros(lag + 1)
-        for part in series:
-            products += lagged_products(part, lag)
-
+        products = np.sum([lagged_products(part, lag) for part in series], axis=0)
         rho = products / products[0]
         if lag >= longest_lag or (rho[least_lag:] < NO_AUTOCORRELATION).any():
             return np.asarray(rho)
@@ -367,11 +325,9 @@ def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float
     """
     length = RUN_RATIO
     while True:
-        means = []
-        for part in series:
-            runs = len(part) // length
-            means.append(part[: runs * length].reshape(runs, length).mean(axis=1))
-
+        means = [
+            part[: len(part) // length * length].reshape(-1, length).mean(axis=1) for part in series
+        ]
         joined = np.concatenate(means)
         if len(joined) < MIN_VALUES:
             return

@@ -36,21 +36,20 @@ OWN_TOLERANCE = 1e-14
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blocks:
-    """Scores and information of B blocks that count as independent, about c unknowns.
+    """Normal equations of B blocks that count as independent, about c unknowns.
 
     They are all common unknowns of a fit, or those that all K recordings share: there, unknowns
     that belong to a single recording are eliminated, and follow at their optimum.
 
     Attributes:
-        scores: (B, c) gradient of half of each block's squared residuals.
-        information: (B, c, c) information of each block.
+        equations: (B, c, c+1) information H of each block and its score g, the gradient of half of
+            its squared residuals: `[H, g]`.
         recording: (B,) index of the recording.
         priors: Rows `[J, r]` of priors: one array (l, c+1) of all of them, or K arrays of those on
             unknowns that belong to each recording.
     """
 
-    scores: Array
-    information: Array
+    equations: Array
     recording: np.ndarray
     priors: tuple[Array, ...]
 
@@ -59,21 +58,17 @@ class Blocks:
         """Number of recordings K, whose priors are apart."""
         return len(self.priors)
 
-    def normal_equations(self, k: int) -> tuple[Array, Array]:
-        """(c, c) information H and (c,) gradient g of half of the squares of recording k."""
-        of_recording = self.recording == k
-        J, r = self.priors[k][:, :-1], self.priors[k][:, -1]
-        H = self.information[of_recording].sum(axis=0) + J.T @ J
-        g = self.scores[of_recording].sum(axis=0) + J.T @ r
-        return H, g
+    def normal_equations(self, k: int) -> Array:
+        """(c, c+1) normal equations `[H, g]` of recording k."""
+        rows = self.priors[k]
+        return np.asarray(self.equations[self.recording == k].sum(axis=0) + rows[:, :-1].T @ rows)
 
     def centred_scores(self, k: int, step: Array) -> Array:
         """(b, c) scores of recording k after a step (c,) to its own estimate, less their mean.
 
         At this estimate, differences between recordings do not count as scatter within one.
         """
-        of_recording = self.recording == k
-        scores = self.scores[of_recording] + self.information[of_recording] @ step
+        scores = self.equations[self.recording == k] @ np.append(step, 1.0)
         return np.asarray(scores - scores.sum(axis=0) / max(len(scores), 1))
 
 
@@ -94,8 +89,7 @@ def recording_evidence(
     recording_of_segment[condensed.segment_of_block] = recording
 
     shared = np.setdiff1d(np.arange(c), own)
-    scores = np.zeros((len(blocks.scores), len(shared)))
-    information = np.zeros((len(blocks.scores), len(shared), len(shared)))
+    equations = np.zeros((len(blocks.equations), len(shared), len(shared) + 1))
     priors = []
 
     for k, columns in enumerate(own):
@@ -106,22 +100,18 @@ def recording_evidence(
 
         # The unknowns of the recording follow the shared ones: d own = response @ d shared.
         of_recording = blocks.recording == k
-        H = blocks.information[of_recording].sum(axis=0) + rows[:, :-1].T @ rows[:, :-1]
+        own_equations = blocks.equations[of_recording]
+        H = (own_equations.sum(axis=0) + rows[:, :-1].T @ rows)[:, :-1]
         inverse = scaled_pseudo_inverse(H[np.ix_(columns, columns)], OWN_TOLERANCE)
         follows = np.zeros((c, len(shared)))
         follows[shared] = np.eye(len(shared))
         follows[columns] = -inverse @ H[np.ix_(columns, shared)]
 
-        scores[of_recording] = blocks.scores[of_recording] @ follows
-        information[of_recording] = follows.T @ blocks.information[of_recording] @ follows
-        priors.append(np.column_stack([rows[:, :-1] @ follows, rows[:, -1]]))
+        wide = scipy.linalg.block_diag(follows, 1.0)
+        equations[of_recording] = follows.T @ own_equations @ wide
+        priors.append(rows @ wide)
 
-    return Blocks(
-        scores=scores,
-        information=information,
-        recording=blocks.recording,
-        priors=tuple(priors),
-    )
+    return Blocks(equations=equations, recording=blocks.recording, priors=tuple(priors))
 
 
 def independent_blocks(
@@ -139,17 +129,15 @@ def independent_blocks(
     count = int(label.max(initial=-1)) + 1
     c = condensed.common_count
 
-    scores = np.zeros((count, c))
-    information = np.zeros((count, c, c))
-    np.add.at(scores, label, condensed.block_scores)
-    np.add.at(information, label, condensed.block_information)
+    equations = np.zeros((count, c, c + 1))
+    np.add.at(equations[..., :-1], label, condensed.block_information)
+    np.add.at(equations[..., -1], label, condensed.block_scores)
 
     recording_of_label = np.zeros(count, dtype=int)
     recording_of_label[label] = recording
     known = condensed.reduced_private_rows.reshape(-1, c + 1)
     return Blocks(
-        scores=scores,
-        information=information,
+        equations=equations,
         recording=recording_of_label,
         priors=(np.concatenate([condensed.common_rows, known]),),
     )
@@ -236,7 +224,7 @@ def robust_uncertainty(
     min_rows: float,
     draws: int,
     rng: np.random.Generator,
-    own: np.ndarray | None = None,
+    own: np.ndarray,
     inflation: float = 1.0,
 ) -> Uncertainty:
     """Uncertainty of the common unknowns at a minimum.
@@ -250,7 +238,7 @@ def robust_uncertainty(
             independent.
         draws: Number of bootstrap replicates.
         rng: Random generator of the bootstrap.
-        own: (K, e) columns of the unknowns that belong to each of K recordings; default: none.
+        own: (K, e) columns of the unknowns that belong to each of K recordings; e may be 0.
         inflation: Factor of the formal variances from which the covariance of combinations begins.
             The scatter of few blocks says nothing about most combinations of many unknowns.
 
@@ -258,18 +246,19 @@ def robust_uncertainty(
         The uncertainty.
     """
     blocks = independent_blocks(condensed, recording, rows, min_rows)
-    count = len(blocks.scores)
+    information, scores = blocks.equations[..., :-1], blocks.equations[..., -1]
+    count = len(scores)
     prior_rows = blocks.priors[0][:, :-1]
     prior = prior_rows.T @ prior_rows
-    of_data = blocks.information.sum(axis=0)
+    of_data = information.sum(axis=0)
 
     # Sandwich and formal covariance.
     root = inverse_root(of_data + prior)
-    along = (blocks.scores - blocks.scores.mean(axis=0)) @ root
+    along = (scores - scores.mean(axis=0)) @ root
     scatter = along.T @ along * (count / max(count - 1, 1))
     of_scatter = _in_unknowns(scatter + root.T @ prior @ root, root)
     sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
-    formal = np.sqrt(np.maximum(np.diag(root @ root.T), 0.0))
+    formal = np.linalg.norm(root, axis=1)
 
     # Larger and correlated residuals widen what the data say, but not the priors.
     of_noise = _in_unknowns(root.T @ (inflation * of_data + prior) @ root, root)
@@ -277,8 +266,6 @@ def robust_uncertainty(
     replicates = _bootstrap(blocks, draws, rng)
 
     # Separate estimates from each recording, with the priors on its private unknowns.
-    if own is None:
-        own = np.zeros((int(blocks.recording.max()) + 1, 0), dtype=int)
     evidence = recording_evidence(condensed, blocks, recording, own)
     shared = np.setdiff1d(np.arange(len(theta)), own)
     of_shared, between_shared, apart = _compare_recordings(theta[shared], evidence)
@@ -289,14 +276,13 @@ def robust_uncertainty(
 
     # The hull of the formal, the sandwich and the bootstrap interval. Quantiles of Student's
     # distribution allow for the number of blocks from which the sandwich covariance comes.
-    upper_tail = 0.5 + LEVEL / 2.0
-    factor = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail)) / NORMAL_95
+    factor = float(t_quantile(max(count - 1, 1))) / NORMAL_95
     half_width = np.maximum(
         NORMAL_95 * np.hypot(formal, between), factor * NORMAL_95 * np.hypot(sandwich, between)
     )
     low, high = theta - half_width, theta + half_width
     if len(replicates):
-        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, upper_tail], axis=0)
+        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
         low, high = np.minimum(low, theta + tails[0]), np.maximum(high, theta + tails[1])
     return Uncertainty(
         sandwich=sandwich,
@@ -308,6 +294,16 @@ def robust_uncertainty(
         draws=theta + replicates,
         covariance=covering_covariance(of_noise, factor**2 * of_scatter),
     )
+
+
+def t_quantile(freedom: np.ndarray | int, level: float = LEVEL) -> Array:
+    """Half widths of intervals of Student's distribution [standard deviations].
+
+    Args:
+        freedom: Degrees of freedom, at least 1.
+        level: Probability that an interval holds the true value.
+    """
+    return np.asarray(scipy.special.stdtrit(freedom, 0.5 + 0.5 * level))
 
 
 def inverse_root(information: Array) -> Array:
@@ -378,8 +374,8 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
 
     Draws that do not determine all unknowns are left out.
     """
-    count, c = blocks.scores.shape
-    total = blocks.scores.sum(axis=0)
+    count, c, _ = blocks.equations.shape
+    total = blocks.equations[..., -1].sum(axis=0)
     prior_rows = blocks.priors[0][:, :-1]
     prior_information = prior_rows.T @ prior_rows
     probabilities = np.full(count, 1.0 / count)
@@ -389,11 +385,11 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
         # Each replicate weights a block by the number of times that it was drawn.
         n = min(REPLICATES_AT_ONCE, draws - first)
         weights = rng.multinomial(count, probabilities, size=n).astype(np.float64)
-        H = np.tensordot(weights, blocks.information, axes=1) + prior_information
-        g = weights @ blocks.scores - total
+        drawn = np.tensordot(weights, blocks.equations, axes=1)
+        H = drawn[..., :-1] + prior_information
 
         # Priors are drawn as well, from their normal distribution.
-        g = g + rng.standard_normal((n, len(prior_rows))) @ prior_rows
+        g = drawn[..., -1] - total + rng.standard_normal((n, len(prior_rows))) @ prior_rows
 
         usable = _condition_number(H) < MAX_CONDITION_OF_DRAW
         solved = np.linalg.solve(H[usable], g[usable][..., None])
@@ -423,7 +419,8 @@ def _compare_recordings(theta: Array, evidence: Blocks) -> tuple[Array, Array, n
     for k in range(K):
         # Normal equations of the recording and of the priors on its private unknowns, one
         # Gauss-Newton step away from the common estimate.
-        H, g = evidence.normal_equations(k)
+        equations = evidence.normal_equations(k)
+        H, g = equations[:, :-1], equations[:, -1]
         if _condition_number(H) > MAX_CONDITION_OF_RECORDING:
             continue
         inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
@@ -447,32 +444,31 @@ def _compare_recordings(theta: Array, evidence: Blocks) -> tuple[Array, Array, n
     variance = np.maximum(variance, formal * inflation)
 
     # Compare the weighted scatter of the estimates with the scatter that their variances explain.
-    known = np.isfinite(each)
-    others = np.maximum(known.sum(axis=0) - 1, 1)
-    w, _, deviation = weighted(each, variance, known, np.zeros(c))
+    others = np.maximum(np.isfinite(each).sum(axis=0) - 1, 1)
+    w, _, deviation = weighted(each, variance)
     found = np.sum(w * deviation**2, axis=0)
     apart = scipy.special.fdtrc(others, freedom, found / others) < SIGNIFICANCE
+    between, w = np.zeros(c), w[:, apart]
     sums = w.sum(axis=0)
-    free = np.where(apart, sums - np.sum(w**2, axis=0) / np.where(apart, sums, 1.0), 1.0)
-    between = np.where(apart, np.sqrt(np.maximum(found - others, 0.0) / free), 0.0)
+    between[apart] = np.sqrt((found - others)[apart] / (sums - np.sum(w**2, axis=0) / sums))
     return each, between, apart
 
 
 def weighted(
-    values: Array, variances: Array, known: np.ndarray, tau2: Array
+    values: Array, variances: Array, tau2: Array | float = 0.0
 ) -> tuple[Array, Array, Array]:
     """Average estimates of recordings that scatter.
 
     Args:
-        values: (K, q) estimates.
-        variances: (K, q) their variances.
-        known: (K, q) True where there is an estimate.
+        values: (K, q) estimates; NaN where a recording gives none.
+        variances: (K, q) their variances; infinite where there is none.
         tau2: (q,) further variances, between recordings.
 
     Returns:
         (K, q) weights, zero where there is no estimate, (q,) weighted means, and (K, q) deviations
         from them.
     """
+    known = np.isfinite(values) & np.isfinite(variances) & (variances > 0.0)
     weights = np.where(known, 1.0 / (np.where(known, variances, 1.0) + tau2), 0.0)
     total = weights.sum(axis=0)
     finite = np.where(known, values, 0.0)

@@ -21,6 +21,7 @@ from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
     element_name,
     force_sizes,
+    free_name,
     names_of,
     position_sizes,
 )
@@ -236,11 +237,12 @@ def _misalignments(system: System) -> Iterator[Candidate]:
     """Wrong orientation of every site that carries a measured vector sensor."""
     model: Any = system.model
     measured = {output.sensor for output in system.outputs.outputs if output.sensor is not None}
-    kinds = [int(kind) for kind in VECTOR_SENSORS]
     sites: dict[str, str] = {}
     for sensor in range(model.nsensor):
         first, count = int(model.sensor_adr[sensor]), int(model.sensor_dim[sensor])
-        if int(model.sensor_type[sensor]) in kinds and measured & {*range(first, first + count)}:
+        if int(model.sensor_type[sensor]) in VECTOR_SENSORS and measured & {
+            *range(first, first + count)
+        }:
             site = element_name(model, "site", int(model.sensor_objid[sensor]))
             sites.setdefault(site, element_name(model, "sensor", sensor))
 
@@ -340,7 +342,10 @@ def _library_term(
     estimated: tuple[str, ...],
 ) -> Candidate:
     """A term at an element; ExperimentError where the model cannot have it."""
-    name = _free_name(system, f"{element}_{kind.kind}")
+    taken = {*system.experiment.terms}
+    for each in ("joint", "actuator", "tendon", "body"):
+        taken.update(names_of(system.model, each))
+    name = free_name(f"{element}_{kind.kind}", taken)
     stated = {key: value for key, value in values.items() if value}
     table = TermTable(name=name, element=((kind.acts_on, element),), values=tuple(stated.items()))
     term = kind.of(table, system.source.stated.model, _period_of(system))
@@ -379,14 +384,3 @@ def _library_term(
         alone=kind.kind if kind.alone else "",
         screened=kind.screened,
     )
-
-
-def _free_name(system: System, stem: str) -> str:
-    """A name that no element and no term has."""
-    taken = {*system.experiment.terms}
-    for kind in ("joint", "actuator", "tendon", "body"):
-        taken.update(names_of(system.model, kind))
-    name, number = stem, 2
-    while name in taken:
-        name, number = f"{stem}_{number}", number + 1
-    return name

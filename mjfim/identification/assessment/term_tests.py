@@ -93,34 +93,11 @@ def extended_problem(
         central=problem.central,
         workers=problem.workers,
     )
-    private = _extended_private(problem, wider, at)
+    # Private unknowns of new coordinates are zero.
+    before, after = _private_names(problem), _private_names(wider)
+    private = np.zeros((len(at.private), len(after)))
+    private[:, [after.index(name) for name in before]] = at.private
     return wider, replace(at, theta=theta, private=private)
-
-
-def with_stated_residuals(
-    problem: FitProblem, at: UnknownValues, wider: FitProblem, begin: UnknownValues
-) -> FitProblem | None:
-    """The problem of an extended model whose residuals are those of the stated one.
-
-    Even the smallest size of a term may change the residuals. The readings follow this change.
-
-    Args:
-        problem: The stated problem.
-        at: Its solution.
-        wider: The extended problem.
-        begin: The solution in it.
-
-    Returns:
-        The extended problem; None where a simulation diverges.
-    """
-    stated, extended = problem.predict(at), wider.predict(begin)
-    if stated is None or extended is None:
-        return None
-    recordings = tuple(
-        replace(recording, y=recording.y + np.nan_to_num(after - before))
-        for recording, before, after in zip(wider.recordings, stated, extended, strict=True)
-    )
-    return replace(wider, recordings=recordings)
 
 
 def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment, ...]:
@@ -146,17 +123,6 @@ def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment,
         start[places] = values[added]
         segments.append(replace(segment, start=start))
     return tuple(segments)
-
-
-def _extended_private(problem: FitProblem, wider: FitProblem, at: UnknownValues) -> Array:
-    """(P, n) private unknowns of the extended model; those of new coordinates are zero."""
-    before, after = _private_names(problem), _private_names(wider)
-    if before == after:
-        return at.private
-
-    private = np.zeros((len(at.private), len(after)))
-    private[:, [after.index(name) for name in before]] = at.private
-    return private
 
 
 def _private_names(problem: FitProblem) -> list[str]:
@@ -315,7 +281,10 @@ def find_missing_terms(
     Returns:
         The significant terms that a selection may try, the most significant one first.
     """
-    speeds = _typical_speeds(problem, at)
+    motion = problem.motion(at, problem.segments[0].recording, SPEED_SAMPLES)
+    speeds = np.zeros(problem.system.space.nv)
+    if motion is not None:
+        speeds = np.sqrt(np.mean(motion.qvel**2, axis=0))
     candidates, impossible = candidates_of(problem.system, speeds)
     linear = [candidate for candidate in candidates if not candidate.screened]
     apart = dict.fromkeys(["", *(candidate.alone for candidate in linear)])
@@ -337,7 +306,7 @@ def find_missing_terms(
     )
     found, untested, moved = search.by_score(groups)
     screened = (search.screened(candidate) for candidate in candidates if candidate.screened)
-    found += [term for term in screened if term is not None]
+    found += filter(None, screened)
     return TermTests(
         terms=first_terms(_by_significance(found)),
         data=TermTestData(
@@ -360,18 +329,18 @@ def first_terms(ordered: Sequence[Term]) -> tuple[Term, ...]:
     Returns:
         The first ones, and the first of those that no earlier one at several joints contains.
     """
-    first = (*ordered[:MAX_NAMED_TERMS], *_without_members(ordered)[:MAX_NAMED_TERMS])
-    keys = {term.key for term in first}
+    named = _without_members(ordered)[:MAX_NAMED_TERMS]
+    keys = {term.key for term in (*ordered[:MAX_NAMED_TERMS], *named)}
     return tuple(term for term in ordered if term.key in keys)
 
 
 def _without_members(ordered: Sequence[Term]) -> tuple[Term, ...]:
     """The terms in their order, without those that an earlier one at several joints contains."""
-    kept: list[Term] = []
-    for term in ordered:
-        if not any(earlier.contains(term) for earlier in kept):
-            kept.append(term)
-    return tuple(kept)
+    return tuple(
+        term
+        for i, term in enumerate(ordered)
+        if not any(earlier.contains(term) for earlier in ordered[:i])
+    )
 
 
 def _by_significance(terms: Sequence[Term]) -> list[Term]:
@@ -406,15 +375,6 @@ def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
         groups[-1].append(candidate)
         is_of_joint = bool(candidate.joint)
     return groups
-
-
-def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
-    """(nv,) root mean square of the speeds along the first recording [m/s or rad/s]."""
-    first = problem.segments[0].recording
-    motion = problem.motion(at, first, SPEED_SAMPLES)
-    if motion is None:
-        return np.zeros(problem.system.space.nv)
-    return np.asarray(np.sqrt(np.mean(motion.qvel**2, axis=0)))
 
 
 # Normal equations of the m tested numbers of some candidates after the parameters are eliminated:
@@ -551,24 +511,25 @@ class _TermSearch:
         if extended is None:
             return None
         wider, begin = extended
-        shifted = with_stated_residuals(self.problem, self.at, wider, begin)
-        condensed = None if shifted is None else shifted.condense(begin)
+        # Even the smallest size of a term may change the residuals. The readings follow it.
+        before, after = self.problem.predict(self.at), wider.predict(begin)
+        if before is None or after is None:
+            return None
+        shifted = tuple(
+            replace(recording, y=recording.y + np.nan_to_num(with_terms - stated))
+            for recording, stated, with_terms in zip(wider.recordings, before, after, strict=True)
+        )
+        condensed = replace(wider, recordings=shifted).condense(begin)
         if condensed is None:
             return None
 
         names = wider.parameters.names
         column_of = {names[j]: i for i, j in enumerate(wider.parameter_of_column.tolist())}
-        stated = [
+        own = [
             column_of[self.problem.system.parameters.names[j]]
             for j in self.problem.parameter_of_column.tolist()
         ]
-        tested = np.array(
-            [
-                column_of[f"?{i}.{k}"]
-                for i, candidate in enumerate(candidates)
-                for k in range(len(candidate.tested))
-            ]
-        )
+        tested = np.array([column_of[name] for name in parameters])
         rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
         norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
         J = rows[:, :-1] / norms
@@ -580,7 +541,7 @@ class _TermSearch:
         inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
         response = inverse @ H[np.ix_(others, tested)]
         information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
-        places = np.searchsorted(others, stated)
+        places = np.searchsorted(others, own)
         # A parameter that the data do not determine has no standard deviation.
         variances = np.diag(inverse)[places]
         moves = response[places] / np.sqrt(np.where(variances > 0.0, variances, np.inf))[:, None]
@@ -612,17 +573,17 @@ class _TermSearch:
                 own = [(number, next(changes)) for number in candidates[i].tested]
                 if not any(n.positive and n.value + change < 0.0 for n, change in own):
                     possible.append(i)
-                for number, change in own:
-                    numbers.append(
-                        TermNumber(
-                            path=number.path,
-                            value=change,
-                            unit=number.unit,
-                            scale=abs(change) or number.size,
-                            is_size=True,
-                        )
+                of_size = [
+                    TermNumber(
+                        path=number.path,
+                        value=change,
+                        unit=number.unit,
+                        scale=abs(change) or number.size,
+                        is_size=True,
                     )
-                numbers += candidates[i].further
+                    for number, change in own
+                ]
+                numbers += [*of_size, *candidates[i].further]
             if possible == left:
                 break
             left = possible
@@ -671,8 +632,7 @@ class _TermSearch:
             elif best > 0.0:
                 break
         reduction = self.squares - least
-        least = max(MIN_REDUCTION, MIN_EXPLAINED_SHARE * self.squares)
-        if not best or reduction < least:
+        if reduction < max(MIN_REDUCTION, MIN_EXPLAINED_SHARE * self.squares):
             return None
         number = TermNumber(
             path=tested.path, value=best, unit=tested.unit, scale=best, is_size=True

@@ -9,8 +9,7 @@ joint limits, do not count, nor do those far from any reading.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -158,12 +157,22 @@ class MotionEquations:
         ]
         sigma = np.max([motion.speed_sigma for motion in motions], axis=0)
         fastest = np.max([np.abs(motion.qvel).max(axis=0) for motion in motions], axis=0)
+        units = np.where(translations(system.model), "N", "N m").tolist()
+        of_dofs = [
+            Equation(name=name, unit=unit, place=dof)
+            for dof, (name, unit) in enumerate(zip(dof_names(system.model), units, strict=True))
+        ]
+        of_laws = [
+            Equation(name=f"law of {force.name}", unit="", place=place)
+            for place, force in enumerate(forces)
+            if force.is_modelled
+        ]
         stated = MotionEquations(
             system=system,
             laws=laws,
             friction_speeds=np.maximum(UNSURE_SIGMAS * sigma, SLOW_SHARE * fastest),
             forces=forces,
-            equations=tuple(_equations(system, forces)),
+            equations=(*of_dofs, *of_laws),
             assumes_friction=assumes_friction,
         )
         relaxed = system.with_variant(RELAXED, Relaxation(constraints=True))
@@ -187,18 +196,16 @@ class MotionEquations:
         self, models: Sequence[Any], motion: MeasuredMotion, thetas: Array
     ) -> list[MotionPoints]:
         """Points of a motion for each compiled model, of parameters (k, p)."""
-        points = []
         acts = self._activations(models, motion)
         delays = thetas @ self.system.parameters.delay_derivative
-        for act, delay in zip(acts, delays.tolist(), strict=True):
-            points.append(
-                MotionPoints(
-                    states=np.concatenate([motion.qpos, motion.qvel, act], axis=1),
-                    acceleration=motion.qacc,
-                    ctrl=self._stated(motion.control(delay)),
-                )
+        return [
+            MotionPoints(
+                states=np.concatenate([motion.qpos, motion.qvel, act], axis=1),
+                acceleration=motion.qacc,
+                ctrl=self._stated(motion.control(delay)),
             )
-        return points
+            for act, delay in zip(acts, delays.tolist(), strict=True)
+        ]
 
     def _stated(self, inputs: Array) -> Array:
         """(n, nu) controls that are inputs themselves, zero for those of laws; inputs: (n, w)."""
@@ -253,56 +260,42 @@ class MotionEquations:
 
     # ---- rows
 
-    def _of_rows(self, values: Sequence[Sequence[float]]) -> np.ndarray:
-        """(R,) a number for each row, from one for each recording and equation."""
-        counts = [[len(t) for _, t, _ in each.windows] for each in self.recorded]
-        return np.repeat(np.array(values).ravel(), np.array(counts).ravel())
-
     @cached_property
-    def equation_of_row(self) -> np.ndarray:
-        """(R,) index of the equation of each row."""
-        return self._of_rows([range(len(self.equations)) for _ in self.recorded])
+    def places(self) -> tuple[np.ndarray, ...]:
+        """(R,) index of the recording of each row, and (R,) that of the equation."""
+        counts = [len(t) for each in self.recorded for _, t, _ in each.windows]
+        shape = len(self.recorded), len(self.equations)
+        return tuple(np.repeat(np.indices(shape).reshape(2, -1), counts, axis=1))
 
-    @cached_property
-    def recording_of_row(self) -> np.ndarray:
-        """(R,) index of the recording of each row."""
-        return self._of_rows([[k] * len(self.equations) for k in range(len(self.recorded))])
+    def mean_squares(self, values: Array) -> Array:
+        """(E,) mean squares of values of the rows: (R,), by equation; 0 without rows."""
+        of_row, count = self.places[1], len(self.equations)
+        squares = np.bincount(of_row, values**2, minlength=count)
+        return np.asarray(squares / np.maximum(np.bincount(of_row, minlength=count), 1))
 
     @property
     def times(self) -> Array:
         """(R,) time of each row [s]."""
         return np.concatenate([t for each in self.recorded for _, t, _ in each.windows])
 
-    @property
-    def usual_speeds(self) -> Array:
-        """(nv,) root mean square of the measured speeds [m/s or rad/s]."""
-        qvel = np.concatenate([each.motion.qvel for each in self.recorded])
-        return np.asarray(np.sqrt(np.mean(qvel**2, axis=0)))
-
-    def cutoff(self, equation: int) -> float:
-        """Frequency up to which an equation is used, the lowest of all recordings [Hz]."""
-        return 1.0 / max(each.windows[equation][2] for each in self.recorded)
-
-    def rows(self, thetas: Array) -> list[Array]:
+    def rows(self, thetas: Array) -> Array:
         """Rows at several values of the parameters.
 
         Args:
             thetas: (k, p) parameters.
 
         Returns:
-            (3, R) for each of them: forces that the model needs or predicts, forces that act in the
-            model or are measured, and the inertial part of the needed ones [N or N m]; NaN where a
-            model does not compile.
+            (k, 3, R) forces that the model needs or predicts, forces that act in the model or are
+            measured, and the inertial part of the needed ones [N or N m]; NaN where a model does
+            not compile.
         """
         models, compiled = self.system.plant.try_models(thetas)
-        found: list[list[Array]] = [[] for _ in thetas]
+        parts = []
         for each in self.recorded:
-            points = self.points(models, each.motion, thetas)
-            for parts, model, of_model in zip(found, models, points, strict=True):
-                parts.append(self._averaged(each, self.equation.terms(model, of_model)))
-        rows = [np.concatenate(parts, axis=1) for parts in found]
-        for values in itertools.compress(rows, np.logical_not(compiled)):
-            values[:] = np.nan
+            points = zip(models, self.points(models, each.motion, thetas), strict=True)
+            parts.append([self._averaged(each, self.equation.terms(*pair)) for pair in points])
+        rows = np.concatenate(parts, axis=2)
+        rows[~compiled] = np.nan
         return rows
 
     def _averaged(self, each: RecordedEquations, terms: EquationTerms) -> Array:
@@ -331,16 +324,6 @@ class MotionEquations:
                 series = [modelled[:, place], each.forces[:, place], nothing]
             parts.append(np.stack([weights @ values for values in series]))
         return np.concatenate(parts, axis=1)
-
-
-def _equations(system: System, forces: Sequence[MeasuredForce]) -> Iterator[Equation]:
-    """Equations of all degrees of freedom, and laws of the actuators whose force is measured."""
-    is_translation = translations(system.model)
-    for dof, name in enumerate(dof_names(system.model)):
-        yield Equation(name=name, unit="N" if is_translation[dof] else "N m", place=dof)
-    for place, force in enumerate(forces):
-        if force.is_modelled:
-            yield Equation(name=f"law of {force.name}", unit="", place=place)
 
 
 def _recorded(
@@ -382,7 +365,7 @@ def _recorded(
         else:
             known = near[:, place] & motion.usable[:, touched[place]].all(axis=1)
             finest = motion.spacing[touched[place]].max(initial=0.0)
-            found = _windows(motion, finest, known, np.zeros(count, dtype=bool))
+            found = _windows(motion, finest, known, np.zeros_like(known))
         windows.append(found)
     return RecordedEquations(
         motion=motion,
@@ -409,9 +392,8 @@ def _windows(
     shape = (len(centres), len(motion.t))
     weights = scipy.sparse.csr_array((values.ravel(), columns.ravel(), ends), shape)
 
-    possible = weights @ (~usable).astype(np.float64) <= MOST_UNUSABLE
-    resting = weights @ slow.astype(np.float64)
-    kept = possible
+    possible = weights @ ~usable <= MOST_UNUSABLE
+    resting = weights @ slow
     for share in SLOW_SHARES:
         kept = possible & (resting <= share)
         if kept.sum() >= FEWEST_WINDOWS * possible.sum():

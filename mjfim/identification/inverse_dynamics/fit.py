@@ -187,7 +187,7 @@ class EquationSearch:
     @property
     def of_row(self) -> np.ndarray:
         """(R,) index of the equation of each row."""
-        return self.equations.equation_of_row
+        return self.equations.places[1]
 
     def run(self) -> FoundEquations:
         """The best result of searches from the start with each shape, and from others if poor."""
@@ -275,7 +275,7 @@ class EquationSearch:
 
     def _rows(self, x: Array) -> Array:
         """The rows at x: (p,)."""
-        return self.equations.rows(self.coordinates.theta(x)[None])[0]
+        return np.asarray(self.equations.rows(self.coordinates.theta(x)[None])[0])
 
     def _linearised(self, x: Array, rows: Array, weights: Array) -> FoundEquations:
         """Linearise about a point x: (p,) whose rows are known."""
@@ -379,10 +379,18 @@ class EquationSearch:
             return np.concatenate([residual, priors]), np.concatenate([R[:, :-1], J])
 
         x, bodies = begin, self.coordinates.bodies
+        chosen, sizes = self.active, self.coordinates.sizes[self.active]
         values, J = all_rows(x)
         cost = first = float(values @ values)
         for _ in range(MAX_STEPS):
-            step = self._step(x, values, J)
+            # The step to the minimum of linear rows, inside the bounds of the active parameters.
+            step = np.zeros(len(x))
+            step[chosen] = sizes * bounded_least_squares(
+                J[:, chosen] * sizes,
+                -values,
+                np.minimum(self.parameters.lower - x, 0.0)[chosen] / sizes,
+                np.maximum(self.parameters.upper - x, 0.0)[chosen] / sizes,
+            )
             change = J @ step
             predicted = -float(change @ (2.0 * values + change))
             if not predicted > LEAST_DECREASE * first + RELATIVE_DECREASE * cost:
@@ -398,18 +406,6 @@ class EquationSearch:
                 break
             x, cost = moved, float(values @ values)
         return x
-
-    def _step(self, x: Array, values: Array, J: Array) -> Array:
-        """(p,) step to the minimum of linear rows, inside the bounds of the active parameters."""
-        chosen, sizes = self.active, self.coordinates.sizes[self.active]
-        step = np.zeros(len(x))
-        step[chosen] = sizes * bounded_least_squares(
-            J[:, chosen] * sizes,
-            -values,
-            np.minimum(self.parameters.lower - x, 0.0)[chosen] / sizes,
-            np.maximum(self.parameters.upper - x, 0.0)[chosen] / sizes,
-        )
-        return step
 
     # ---- accuracy
 
@@ -459,27 +455,30 @@ def _shapes(
 
     Fields with a prior or with a factor keep what is stated.
     """
-    stated, speeds = system.source.stated.model, equations.usual_speeds
-    place: dict[str, int] = {}
-    for j, parameter in enumerate(system.parameters.parameters):
-        target = parameter.targets[0] if len(parameter.targets) == 1 else None
-        is_plain = target is not None and (target.scale, target.offset) == (1.0, 0.0)
-        if target is not None and is_plain and contained[j] and parameter.prior is None:
-            place[target.path] = j
+    stated = system.source.stated.model
+    qvel = np.concatenate([each.motion.qvel for each in equations.recorded])
+    speeds = np.sqrt(np.mean(qvel**2, axis=0))
+    place = {
+        target.path: j
+        for j, parameter in enumerate(system.parameters.parameters)
+        for target in parameter.targets
+        if (len(parameter.targets), target.scale, target.offset) == (1, 1.0, 0.0)
+        and contained[j]
+        and parameter.prior is None
+    }
     tried: list[list[dict[int, float]]] = []
     for name, term in system.source.terms.items():
         element = system.experiment.terms[name].joint
         if element is None:
             continue
         speed = float(speeds[int(system.model.joint(element).dofadr[0])])
-        shapes = [values for values, _ in term.shapes(stated, element, speed)]
-        paths = {key: f"term/{name}:{key}" for values in shapes for key in values}
         of_term = [
-            {place[paths[key]]: value for key, value in values.items() if paths[key] in place}
-            for values in shapes
+            {place[path]: x for key, x in values.items() if (path := f"term/{name}:{key}") in place}
+            for values, _ in term.shapes(stated, element, speed)
         ]
         tried.append([shape for shape in of_term if shape])
-    for k in range(max((len(of_term) for of_term in tried), default=0)):
+    tried = [of_term for of_term in tried if of_term]
+    for k in range(max(map(len, tried), default=0)):
         yield {j: x for of_term in tried for j, x in of_term[min(k, len(of_term) - 1)].items()}
 
 
@@ -495,12 +494,7 @@ def _inverse(information: Array, active: np.ndarray) -> Array:
 def _force_sizes(system: System, rows: Array, equations: MotionEquations) -> Array:
     """(E,) sizes of the forces of the equations, which hardly depend on the start [N or N m]."""
     arms = np.where(translations(system.model), 1.0, model_length(system.model))
-    count = len(equations.equations)
-    measured, needed = np.zeros(count), np.zeros(count)
-    for i in np.unique(equations.equation_of_row).tolist():
-        own = equations.equation_of_row == i
-        measured[i] = float(np.sqrt(np.mean(rows[1][own] ** 2)))
-        needed[i] = float(np.sqrt(np.mean(rows[0][own] ** 2)))
+    needed, measured, _ = (np.sqrt(equations.mean_squares(each)) for each in rows)
 
     # The law of an actuator is compared with its own force.
     sizes = np.where(measured > 0.0, measured, needed)
@@ -654,7 +648,7 @@ def _record(
         status = "not converged: no step lowers the residuals of the equation of motion any more"
     return InverseDynamicsFit(
         parameters=parameters.names,
-        units=tuple(parameter.unit for parameter in parameters.parameters),
+        units=search.equations.system.units,
         theta=search.coordinates.theta(found.x),
         std=std,
         covariance=covariance,
@@ -677,7 +671,9 @@ def _equation_fits(
 ) -> Iterator[EquationFit]:
     """The fits of all equations that have rows, with the series of one recording."""
     equations, rows = search.equations, found.rows
-    recording, times = equations.recording_of_row, equations.times
+    recording, times = equations.places[0], equations.times
+    values = _residual(rows), rows[1], rows[2]
+    residuals, measured, inertial = (np.sqrt(equations.mean_squares(each)) for each in values)
     for i, equation in enumerate(equations.equations):
         own = np.flatnonzero(search.of_row == i)
         if not len(own):
@@ -686,14 +682,13 @@ def _equation_fits(
         parts = [residual[recording[own] == k] for k in np.unique(recording[own])]
         drawn = own[recording[own] == shown]
         drawn = drawn[evenly_spread_indices(len(drawn), SHOWN_ROWS)]
-        parts_of_force = rows[1][own], rows[2][own]
         yield EquationFit(
             name=equation.name,
             unit=equation.unit,
-            residual=float(np.sqrt(np.mean(_residual(rows)[own] ** 2))),
-            size=max(float(np.sqrt(np.mean(part**2))) for part in parts_of_force),
+            residual=float(residuals[i]),
+            size=float(max(measured[i], inertial[i])),
             rows=len(own),
-            cutoff=equations.cutoff(i),
+            cutoff=1.0 / max(each.windows[i][2] for each in equations.recorded),
             sigma=float(found.sigma[i]),
             correlation=max(whiteness_of(equation.name, parts).time, 1.0),
             t=times[drawn],

@@ -137,12 +137,6 @@ class _Change:
         changed: dict[str, Any] = {name: array}
         return replace(self, **changed)
 
-    @property
-    def signs_alone(self) -> _Change:
-        """The change with the signs of its factors and without unknown numbers."""
-        signs = np.sign(self.factor)
-        return replace(self, factor=signs, where=self.where[:0], sizes=self.sizes[:0])
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Search:
@@ -152,16 +146,14 @@ class _Search:
         system: The system.
         equations: The equations along the log.
         start: (p,) parameters where fits begin.
-        lower: (p,) smallest parameters that the experiment makes plausible.
-        upper: (p,) largest ones.
+        bounds: (2, p) smallest and largest parameters that the experiment makes plausible.
         active: Indices of the parameters that may change.
     """
 
     system: System
     equations: MotionEquations
     start: Array
-    lower: Array
-    upper: Array
+    bounds: Array
     active: np.ndarray
 
     @staticmethod
@@ -179,24 +171,23 @@ class _Search:
 
         # Bounds on both sides are stated; a single one may be that of physics.
         guess, size = parameters.guess, parameters.magnitude
-        bounds = np.array([parameters.lower, parameters.upper])
+        stated = np.array([parameters.lower, parameters.upper])
         about = np.sort([guess / UNSTATED_FACTOR, guess * UNSTATED_FACTOR], axis=0)
         about = np.where(guess == 0.0, [-size, size], about)
         prior = PRIOR_SIGMAS / np.maximum(parameters.prior_weight, np.finfo(float).tiny)
         about = np.clip(about, guess - prior, guess + prior)
-        lower, upper = np.where(np.isfinite(bounds).all(axis=0), bounds, np.clip(about, *bounds))
+        bounds = np.where(np.isfinite(stated).all(axis=0), stated, np.clip(about, *stated))
         return _Search(
             system=system,
             equations=equations,
-            start=np.clip(start, lower, upper),
-            lower=lower,
-            upper=upper,
+            start=np.clip(start, *bounds),
+            bounds=bounds,
             active=active,
         )
 
     def found(self) -> str:
         """The sentence about the error that explains the log; empty for none."""
-        count = self.system.model.nu + len(scalar_joints(self.system.model))
+        count = self.system.model.nu + len(self.joints)
         none = _Change(
             order=np.arange(count),
             factor=np.ones(count),
@@ -214,7 +205,11 @@ class _Search:
         scores = [self.fitted(change, is_quick=True)[0] for change in changes]
         ranked = [(k, changes[k]) for k in np.argsort(scores)[:FITTED_ERRORS].tolist()]
         # Where the parameters leave the size of a factor open, its sign alone explains as much.
-        ranked += [(-1, each.signs_alone) for _, each in ranked if each.unknown == "factor"]
+        ranked += [
+            (-1, replace(none, words=each.words, factor=np.sign(each.factor)))
+            for _, each in ranked
+            if each.unknown == "factor"
+        ]
         cures = []
         for k, tried in ranked:
             score, squares, change = self.fitted(tried)
@@ -242,17 +237,13 @@ class _Search:
         n, begin = len(active), getattr(change, change.unknown)[change.where]
         most = LARGEST_NUMBER * change.sizes
         z = np.concatenate([self.start[active], begin])
-        low = np.concatenate([self.lower[active], begin - most])
-        high = np.concatenate([self.upper[active], begin + most])
+        about = begin + np.array([-most, most])
+        low, high = np.concatenate([self.bounds[:, active], about], axis=1)
         steps = STEP * np.concatenate([self.system.parameters.magnitude[active], change.sizes])
         steps = np.where(high - z >= z - low, steps, -steps)
         friction = np.tile([0.0, 0.0, -np.inf], self.system.space.nv)
         unbounded = np.full(len(friction), np.inf)
-        of_row = self.equations.equation_of_row
-
-        def means(values: Array) -> Array:
-            """(E,) mean squares of values (R,) by equation."""
-            return np.asarray(np.bincount(of_row, values**2) / np.maximum(np.bincount(of_row), 1))
+        of_row = self.equations.places[1]
 
         def at(z: Array) -> tuple[_Change, Array, Array]:
             """The change, the rows and the slopes by the free forces at unknowns z."""
@@ -261,7 +252,8 @@ class _Search:
             changed = change.with_entries(change.unknown, change.where, z[n:])
             return changed, *self._rows(changed, theta)
 
-        best = np.inf, np.full(of_row.max() + 1, np.inf), change
+        means = self.equations.mean_squares
+        best = np.inf, np.full(len(self.equations.equations), np.inf), change
         for count in range(LINEARISATIONS):
             changed, rows, free = at(z)
             # A constant force is free, so that only changing ones count.

@@ -142,28 +142,25 @@ def _chosen(readings: Sequence[Readings], anchor: float, spacing: float | None) 
     times = np.unique(np.concatenate([reading.t for reading in readings]))
     duration = float(times[-1] - times[0])
     most = max(int(MOST_COEFFICIENTS * len(times)) - DEGREE, 1)
-    if spacing is not None:
-        count = int(np.clip(round(duration / spacing), 1, most))
-        return _fitted(readings, anchor, times, count)[1]
 
-    intervals, since = min(FEWEST_INTERVALS, most), 0
-    least, best, chosen = np.inf, None, intervals
-    while since < HALVINGS_WITHOUT_IMPROVEMENT:
-        criterion, spline = _fitted(readings, anchor, times, intervals)
-        since += 1
-        if best is None or criterion < least:
-            least, best, chosen, since = criterion, spline, intervals, 0
-        if intervals == most:
-            break
+    def tried(intervals: float) -> tuple[float, int, RegressionSpline]:
+        """The criterion of a spline with about so many intervals, their number, the spline."""
+        count = int(np.clip(round(intervals), 1, most))
+        criterion, spline = _fitted(readings, anchor, times, count)
+        return criterion, count, spline
+
+    if spacing is not None:
+        return tried(duration / spacing)[2]
+
+    best, since = tried(FEWEST_INTERVALS), 0
+    intervals = best[1]
+    while since < HALVINGS_WITHOUT_IMPROVEMENT and intervals < most:
         intervals = min(2 * intervals, most)
-    for factor in (np.sqrt(0.5), np.sqrt(2.0)):
-        criterion, spline = _fitted(
-            readings, anchor, times, int(np.clip(round(factor * chosen), 1, most))
-        )
-        if best is None or criterion < least:
-            least, best = criterion, spline
-    assert best is not None
-    return best
+        found, since = tried(intervals), since + 1
+        if found[0] < best[0]:
+            best, since = found, 0
+    others = [tried(factor * best[1]) for factor in (np.sqrt(0.5), np.sqrt(2.0))]
+    return min(best, *others, key=lambda each: each[0])[2]
 
 
 def _fitted(
@@ -296,11 +293,11 @@ class MeasuredMotion:
         # Before the first sample and after the last one, their controls are held.
         half = 0.5 * self.step
         middle = np.clip(self.t + self.lag - delay, half, edges[-1] - half)
+        ends = middle + np.array([[-half], [half]])
         mean = np.empty((len(self.t), recorded.shape[1]))
         for place, column in enumerate(recorded.T):
-            integral = np.concatenate([[0.0], dt * np.cumsum(column)])
-            before = np.interp(middle - half, edges, integral)
-            mean[:, place] = (np.interp(middle + half, edges, integral) - before) / self.step
+            integral = np.append(0.0, dt * np.cumsum(column))
+            mean[:, place] = np.diff(np.interp(ends, edges, integral), axis=0)[0] / self.step
         return mean
 
     def smoothed(self, values: Array) -> tuple[Array, np.ndarray]:
@@ -340,19 +337,18 @@ def measured_motion(
     curves = _curves(system, recording)
     y = recording.y - system.parameters.bias_derivative(recording.y.shape[1]) @ theta
     splines: dict[int, RegressionSpline] = {}
-    for key, curve in curves.items():
+    for key, (outputs, _) in curves.items():
         readings = []
-        for derivative, output in enumerate(curve[:2]):
-            if output is not None:
-                known = recording.measured[:, output]
-                readings.append(
-                    Readings(
-                        t=recording.t[known] - derivative * lag,
-                        values=y[known, output],
-                        sigma=float(system.noise.sigma[output]),
-                        derivative=derivative,
-                    )
+        for derivative, output in outputs.items():
+            known = recording.measured[:, output]
+            readings.append(
+                Readings(
+                    t=recording.t[known] - derivative * lag,
+                    values=y[known, output],
+                    sigma=float(system.noise.sigma[output]),
+                    derivative=derivative,
                 )
+            )
         # Where only its slope is measured, a curve begins as the experiment says.
         anchor = float(system.nominal_initial_state[key]) if key >= 0 else 0.0
         splines[key] = fit_spline(readings, anchor)
@@ -368,9 +364,9 @@ def measured_motion(
 
     usable = np.ones((len(t), space.nv), dtype=bool)
     spacing, speed_sigma = np.zeros(space.nv), np.zeros(space.nv)
-    for key, (*outputs, dofs) in curves.items():
+    for key, (outputs, dofs) in curves.items():
         spline, own = splines[key], list(dofs)
-        measured = recording.measured[:, [output for output in outputs if output is not None]]
+        measured = recording.measured[:, list(outputs.values())]
         reach = REACH * max(spline.spacing, step)
         usable[:, own] &= _is_near(t, recording.t[measured.any(axis=1)], reach)[:, None]
         spacing[own] = np.maximum(spacing[own], spline.spacing)
@@ -393,10 +389,10 @@ def measured_motion(
 # ---- curves
 
 
-# A number that changes with time: the outputs that measure it and its slope, if any does, and the
+# A number that changes with time: the outputs that measure it (0) and its slope (1), and the
 # degrees of freedom that it moves, three for a component of a quaternion. Its key is its address in
 # qpos, or negative for the integral of an angular velocity.
-Curves = dict[int, tuple[int | None, int | None, tuple[int, ...]]]
+Curves = dict[int, tuple[dict[int, int], tuple[int, ...]]]
 
 
 def _curves(system: System, recording: AlignedRecording) -> Curves:
@@ -404,24 +400,22 @@ def _curves(system: System, recording: AlignedRecording) -> Curves:
     space = system.space
     output_of = measured_states(system, recording)
 
+    def measured(*addresses: int) -> dict[int, int]:
+        """The outputs that measure a number of the state, and its slope, by the derivative."""
+        places = enumerate(addresses)
+        return {derivative: output_of[place] for derivative, place in places if place in output_of}
+
     curves: Curves = {
-        q: (output_of.get(q), output_of.get(space.nq + v), (v,))
+        q: (measured(q, space.nq + v), (v,))
         for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True)
     }
     for q, v in space.quaternions:
         dofs = tuple(range(v, v + 3))
-        curves |= {q + i: (output_of.get(q + i), None, dofs) for i in range(4)}
-        # Measured angular velocities replace the slopes of the quaternion.
-        rates = [output_of.get(space.nq + dof) for dof in dofs]
-        if None not in rates:
-            curves |= {
-                -1 - dof: (None, output, (dof,)) for dof, output in zip(dofs, rates, strict=True)
-            }
+        curves |= {q + i: (measured(q + i), dofs) for i in range(4)}
+        if all(space.nq + dof in output_of for dof in dofs):
+            curves |= {-1 - dof: ({1: output_of[space.nq + dof]}, (dof,)) for dof in dofs}
 
-    known = {
-        key: [output for output in curve[:2] if output is not None] for key, curve in curves.items()
-    }
-    missing = sorted({dof for key, curve in curves.items() if not known[key] for dof in curve[2]})
+    missing = sorted({dof for outputs, dofs in curves.values() if not outputs for dof in dofs})
     if missing:
         names = dof_names(system.model)
         unmeasured = listed([names[dof] for dof in missing])
@@ -431,7 +425,7 @@ def _curves(system: System, recording: AlignedRecording) -> Curves:
             'columns such as `qpos:<joint>`, or state fit.start = "measured"'
         )
     counts = recording.measured.sum(axis=0)
-    fewest = min(int(counts[output]) for outputs_of in known.values() for output in outputs_of)
+    fewest = min(int(counts[list(outputs.values())].min()) for outputs, _ in curves.values())
     if fewest < FEWEST_READINGS:
         raise RecordingError(
             f"{recording.name}: a degree of freedom has only {fewest} measured values; "
@@ -457,10 +451,13 @@ def _motion(
     qpos = np.empty((len(t), space.nq))
     qvel = np.empty((len(t), space.nv))
     qacc = np.empty((len(t), space.nv))
-    for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True):
+    # Measured angular velocities replace the slopes of a quaternion.
+    key_of = {v: q for q, v in zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True)}
+    key_of |= {-1 - key: key for key in splines if key < 0}
+    for q in space.scalar_q.tolist():
         qpos[:, q] = splines[q].at(t)
-        qvel[:, v] = splines[q].at(t - lag, 1)
-        qacc[:, v] = splines[q].at(t, 2)
+    for dof, key in key_of.items():
+        qvel[:, dof], qacc[:, dof] = splines[key].at(t - lag, 1), splines[key].at(t, 2)
 
     for q, v in space.quaternions:
 
@@ -471,11 +468,7 @@ def _motion(
 
         position = at(t)
         qpos[:, q : q + 4] = position / np.linalg.norm(position, axis=1, keepdims=True)
-        if -1 - v in splines:
-            for dof in range(v, v + 3):
-                qvel[:, dof] = splines[-1 - dof].at(t - lag, 1)
-                qacc[:, dof] = splines[-1 - dof].at(t, 2)
-        else:
+        if v not in key_of:
             qvel[:, v : v + 3] = _turning(at(t - lag), at(t - lag, 1))
             qacc[:, v : v + 3] = _turning(position, at(t, 2))
     return qpos, qvel, qacc
@@ -536,9 +529,11 @@ def measured_forces(
     for sensor in range(model.nsensor):
         output = by_address.get(int(model.sensor_adr[sensor]))
         kind, element = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
-        if output is None or kind not in (JOINT_FORCE, ACTUATOR_FORCE):
-            continue
-        if not any(recording.measured[:, output].any() for recording in recordings):
+        if (
+            output is None
+            or kind not in (JOINT_FORCE, ACTUATOR_FORCE)
+            or not any(recording.measured[:, output].any() for recording in recordings)
+        ):
             continue
         of_joint = kind == JOINT_FORCE
         found.append(
