@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,6 +21,7 @@ from mjfim.model.elements import identifier, names_of
 from mjfim.model.units import sensor_unit
 from mjfim.recordings.quantities import Unit, units_like
 from mjfim.recordings.section import LAW_PREFIXES, LogUnit, RecordingSpec
+from mjfim.records.base import record
 
 # Factor that converts each unit of a log to the model's unit.
 UNIT_FACTORS = {unit: Unit.parse(unit).factor for unit in get_args(LogUnit)}
@@ -41,7 +41,7 @@ SENSORS_OF_ANY_UNIT = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Channels:
     """Signals of an experiment by name, and everything else that is needed to read and check a log.
 

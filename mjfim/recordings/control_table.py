@@ -67,7 +67,7 @@ def read_control(
             f"{len(stamps)} rows, the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"
         )
     row = np.searchsorted(stamps, t + STAMP_TOLERANCE * dt, side="right") - 1
-    return np.asarray(values[np.clip(row, 0, len(stamps) - 1)])
+    return values[np.clip(row, 0, len(stamps) - 1)]
 
 
 def _check_columns(

@@ -19,7 +19,6 @@ import zlib
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError, listed, shortened, unknown
 from mjfim.files import read_arrays, read_json
 from mjfim.recordings.section import INPUT_PREFIXES, RecordingSpec
+from mjfim.records.base import record
 
 # File that makes a folder a dataset, and the column that says to which episode a frame belongs.
 INFO_FILE = "meta/info.json"
@@ -226,7 +226,7 @@ NUMERIC = (types.is_integer, types.is_floating, types.is_decimal, types.is_boole
 LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Table:
     """Columns of one file, all with M rows.
 

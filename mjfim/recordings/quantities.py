@@ -24,6 +24,7 @@ from pydantic_core import (
 )
 
 from mjfim.errors import listed, shortened, unknown
+from mjfim.records.base import record
 
 # One turn [rad].
 TURN = 2.0 * math.pi
@@ -69,7 +70,7 @@ FACTOR = re.compile(r"^([A-Za-zµμ°]+)(?:(?:\^|\*\*)?(-?\d)|([²³]))?$")
 EXPONENT_SIGNS = {"²": 2, "³": 3}
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Unit:
     """A unit of the closed table, or a product of such units.
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,13 +38,14 @@ from mjfim.recordings.checks import (
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
 from mjfim.recordings.quantities import TURN
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
+from mjfim.records.base import record
 from mjfim.records.trajectory import Recording
 
 # Differences below this fraction of the column's largest value are rounding errors.
 ROUNDING = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ColumnSummary:
     """Range and resolution of one column of a recording, in the model's unit.
 
@@ -66,7 +66,7 @@ class ColumnSummary:
     resolution: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class LogSummary:
     """Clock and columns of one log.
 
@@ -155,7 +155,7 @@ ANY_COLUMN = "<name of the column in the log>"
 WINDOW_TOLERANCE = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Log:
     """A recording, and a summary of the log from which it was read.
 
@@ -439,7 +439,7 @@ def _converted(table: Table, spec: ColumnSpec) -> Array:
         value = _unwrapped(value, TURN)
     for name in spec.multiply_by:
         value = value * table.column(name)
-    return np.asarray(value)
+    return value
 
 
 def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
@@ -453,7 +453,7 @@ def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
             f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
             f"not an integer of {bits} bits"
         )
-    return np.asarray(np.where(raw >= half, raw - 2.0 * half, raw))
+    return np.where(raw >= half, raw - 2.0 * half, raw)
 
 
 def _unwrapped(raw: Array, period: float) -> Array:

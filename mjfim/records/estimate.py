@@ -90,7 +90,7 @@ class HorizonStudy(Record):
     @property
     def relative_errors(self) -> Array:
         """(L,) error of each fit over the smallest one in each horizon, as root mean square."""
-        errors = np.asarray(self.errors)
+        errors = self.errors
         least = np.where(np.isfinite(errors), errors, np.inf).min(axis=0)
         ratios = errors / np.maximum(least, SMALLEST_ERROR)
         return np.asarray(np.sqrt(np.mean(ratios**2, axis=1)))

@@ -58,7 +58,7 @@ class FiniteSteps(Record):
         known = np.isfinite(self.predicted) & (self.predicted > 0.0)
         change = np.where(known, self.std, 1.0) / np.where(known, self.predicted, 1.0)
         low, high = CONFIRMED
-        return np.asarray((1.0 / high <= change) & (change <= 1.0 / low))
+        return (1.0 / high <= change) & (change <= 1.0 / low)
 
     @property
     def stated(self) -> Array:

@@ -8,7 +8,7 @@ derivatives and the barrier of a design, so that only the form of the excitation
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -24,6 +24,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
+from mjfim.records.base import record
 from mjfim.records.events import DesignEvent
 
 # Largest number of harmonics of a parametric multisine.
@@ -43,7 +44,7 @@ MAX_ROLL_OFF = 2.0
 SHORTEST_TRANSITION = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ExcitationSettings:
     """Settings of all parametric excitations of an experiment.
 
@@ -72,7 +73,7 @@ class ExcitationSettings:
         Returns:
             (...) frequencies [Hz].
         """
-        return np.asarray(self.min_frequency * (self.max_frequency / self.min_frequency) ** z)
+        return self.min_frequency * (self.max_frequency / self.min_frequency) ** z
 
 
 def relative_amplitudes(z: Array) -> Array:
@@ -110,7 +111,7 @@ def chirp(settings: ExcitationSettings, z: Array) -> Array:
     ]
 
     centred = np.stack(sweeps, axis=1) + (offset - 0.5)
-    return np.asarray(relative_amplitudes(amplitude) * centred)
+    return relative_amplitudes(amplitude) * centred
 
 
 def schroeder_phases(power: Array) -> Array:
@@ -123,7 +124,7 @@ def schroeder_phases(power: Array) -> Array:
         (K,) phases [rad].
     """
     share = power / power.sum()
-    return np.asarray(-2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(share))[:-1]]))
+    return -2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(share))[:-1]])
 
 
 def multisine(settings: ExcitationSettings, z: Array) -> Array:
@@ -210,7 +211,7 @@ SPREAD_AFTER_FAILURE = 0.93
 SearchCallback = Callable[[float], None]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class BaselineSearch:
     """Order for one search by a baseline. It can be pickled.
 
@@ -235,7 +236,7 @@ class BaselineSearch:
     threads: int | None = None
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class SearchResult:
     """The best control that a search has found.
 
@@ -322,7 +323,7 @@ def _search_at_random(
             continue
         if has_weights:
             scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
-        control = np.asarray(task.centre + scale * deviation)
+        control = task.centre + scale * deviation
         values = cost.values(control)
         is_inside = values is not None and cost.constraints.is_feasible(values)
         point = cost.point_along(values) if is_inside or not task.is_limited else None
@@ -362,7 +363,7 @@ def _settings(cost: LimitedCost) -> ExcitationSettings:
 
 def reflected(numbers: Array) -> Array:
     """Bring numbers, (n,), back between 0 and 1 by reflection at these ends."""
-    return np.asarray(1.0 - np.abs(1.0 - np.abs(numbers) % 2.0))
+    return 1.0 - np.abs(1.0 - np.abs(numbers) % 2.0)
 
 
 # ---- optimised series

@@ -242,7 +242,7 @@ def random_references(task: DesignTask, count: int) -> Iterator[Trajectory]:
                 reference = inputs[:, law.columns["reference"]]
                 inputs[:, law.columns["reference_velocity"]] = np.gradient(reference, task.dt)
         try:
-            yield task.plant.simulate(task.theta, np.asarray(inputs))
+            yield task.plant.simulate(task.theta, inputs)
         except SimulationDivergedError:
             continue
 
@@ -458,7 +458,7 @@ def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
     """(p, p) sum of information matrices about the parameters that all recordings share."""
     p = task.parameters
     every = [shared(each, p.prior_information, p.recording_specific) for each in matrices]
-    return np.asarray(sum(every, np.zeros_like(task.prior)))
+    return sum(every, np.zeros_like(task.prior))
 
 
 # ---- what is found

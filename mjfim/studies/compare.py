@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, carry_out
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import saturated_actuators
+from mjfim.records.base import record
 from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
 from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
@@ -177,7 +178,7 @@ def chosen_methods(system: System, methods: Sequence[str] | None) -> tuple[str, 
     return chosen
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _MethodRun:
     """One method of a comparison."""
 

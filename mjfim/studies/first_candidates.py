@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -29,6 +29,7 @@ from mjfim.model.loading import NO_PACKAGES, load_spec
 from mjfim.model.model_files import PACKAGE
 from mjfim.model.paths import unit_of
 from mjfim.model.units import servo_kind
+from mjfim.records.base import record
 from mjfim.studies import GROUPS, Group
 
 # Comment at the head of the MJCF.
@@ -102,7 +103,7 @@ def _velocities(path: Path) -> dict[str, float]:
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Wishes:
     """Wishes for a first experiment; what is None is proposed.
 
@@ -214,7 +215,7 @@ JOINT_FIELDS: dict[Group, tuple[tuple[str, str, str], ...]] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Candidate:
     """A parameter that may be proposed.
 
@@ -380,7 +381,7 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
         guess=0.0,
         scale=float(f"{scale:.2g}"),
     )
-    moments = mass * np.asarray(model.body_ipos[body])
+    moments = mass * model.body_ipos[body]
     for i, axis in enumerate(AXES):
         yield Candidate(
             name=f"payload_moment_{axis}",

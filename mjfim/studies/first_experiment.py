@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from mjfim.model.loading import ModelSource, resolve_packages, silence_mujoco_lo
 from mjfim.model.model_files import is_urdf
 from mjfim.model.paths import unit_of
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
+from mjfim.records.base import record
 from mjfim.studies.first_candidates import (
     Candidate,
     ProposedNoise,
@@ -104,7 +105,7 @@ NO_WISHES = Wishes()
 MOST_CANDIDATES = 24
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Proposal:
     """Everything that a first experiment file states.
 
@@ -334,7 +335,7 @@ def _with_amplitudes(draft: Proposal, amplitudes: Array) -> Proposal:
     return replace(draft, amplitudes=dict(zip(draft.amplitudes, amplitudes.tolist(), strict=True)))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Refinement:
     """Test of a draft by the package itself: feasible amplitudes and identifiable parameters.
 
@@ -566,7 +567,7 @@ class _Refinement:
             raise SimulationDivergedError(
                 "the simulation diverges when the parameters change a little"
             )
-        F = np.asarray(point.information - task.information.prior)
+        F = point.information - task.information.prior
         # The error of a release is a further unknown.
         n = len(draft.chosen)
         hidden = F[:n, n:] @ np.linalg.pinv(F[n:, n:], hermitian=True) @ F[n:, :n]

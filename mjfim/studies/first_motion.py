@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -15,6 +14,7 @@ from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs, tangent_components
 from mjfim.model.elements import control_sizes, is_rk4, translations
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
+from mjfim.records.base import record
 from mjfim.studies.first_candidates import require_keyframe, resting_keyframes
 
 # Samples in one characteristic period of the motion.
@@ -44,7 +44,7 @@ LINEARISATION_STEP = 1e-6
 STEPS_OF_FREE_MODEL = 1000
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TimeScale:
     """Times of an experiment.
 
@@ -218,7 +218,7 @@ SETTLING_PERIODS = 60.0
 VELOCITY_LEFT = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Start:
     """Initial state and resting control.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -25,6 +24,7 @@ from mjfim.identification.identify import least_squares
 from mjfim.information.identifiability import require_visible
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
+from mjfim.records.base import record
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.studies import MonteCarloStudy, TrialStatistics
 from mjfim.records.trajectory import Recording, Trajectory
@@ -41,7 +41,7 @@ OWN_STEPS = 12
 JACOBIAN_STEP = 1e-6
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class TrialSet:
     """Repetitions of one control, all of which are stepped together.
 
@@ -110,7 +110,7 @@ class TrialSet:
                 return None
             found = self._fitted(measured[i], centre)
             theta[i] = np.nan if found is None else found
-        return np.asarray(theta)
+        return theta
 
     @cached_property
     def _centre(self) -> tuple[Array, Array, Array]:
@@ -263,7 +263,7 @@ def monte_carlo(
             found = list(_estimates(trial_set, trials, generators[i], report, executor, token))
             # An interrupted set holds the trials that are finished.
             if found:
-                information[name] = np.asarray(J.T @ J)
+                information[name] = J.T @ J
                 crlb = np.asarray(np.linalg.inv(information[name]))
                 seconds = time.perf_counter() - begun
                 sets[name] = _statistics(np.concatenate(found), crlb, seconds)

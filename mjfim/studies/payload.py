@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.terms.library import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.records.base import record
 from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import PayloadEstimate
 from mjfim.records.events import begin_stage, shown_progress
@@ -49,7 +50,7 @@ FIELDS = ("mass", *AXES, "inertia")
 REPLACED_KEYS = ("guess", "prior", "cad_prior", "inertial", "coordinates", "scale")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class PayloadPlace:
     """Place at which a payload is fixed, and sizes of the robot from which its search starts.
 
@@ -70,7 +71,7 @@ class PayloadPlace:
     length: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RobotExperiment:
     """The experiment of a robot without its payload.
 
@@ -247,7 +248,7 @@ DETERMINED_SHARE = 0.5
 UNDETERMINED_SHARE = 0.5
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class KnownRobot:
     """Prior knowledge of a robot's parameters.
 
@@ -312,7 +313,7 @@ def identify_payload(
         return prepared.identify(recordings, without=without, callback=show, stop=stop)[0]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class PayloadTask:
     """A robot, what is known of it, and where its payload is.
 

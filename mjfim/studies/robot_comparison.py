@@ -138,7 +138,7 @@ def honest_std(estimate: Estimate) -> Array:
     # Where recordings disagree, the interval already contains their scatter.
     disagrees = (estimate.between_recordings > 0.0) & (estimate.recording_comparison is not None)
     widened = np.where(disagrees, 0.0, half_width / NORMAL_95)
-    return np.asarray(np.maximum(without_scatter, widened))
+    return np.maximum(without_scatter, widened)
 
 
 def _covariance(estimate: Estimate, index: Sequence[int], std: Array) -> Array:

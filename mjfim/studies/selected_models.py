@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -21,6 +21,7 @@ from mjfim.identification.assessment.term_tests import TermTests
 from mjfim.identification.left_out import HeldOutLosses
 from mjfim.model.parameters import Parameter, ParameterSet
 from mjfim.model.paths import ParameterPath
+from mjfim.records.base import record
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import (
     PooledParameter,
@@ -51,7 +52,7 @@ NO_LOSSES = HeldOutLosses(
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FittedModel:
     """A fitted model, with the losses of its predictions of left-out data.
 
