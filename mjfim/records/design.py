@@ -311,6 +311,8 @@ class CombinationAccuracy(Record):
     std_initial: float
     std_final: float
 
+    json_names = {"expression": "words"}
+
 
 @record
 class LimitUsage(Record):
@@ -394,13 +396,12 @@ class ScaledStart(Record):
 
 def _npz_names() -> dict[str, str]:
     """Return the short names of arrays in design.npz, by path in the record."""
-    names = {}
-    for evaluation, prefix in (("final", ""), ("initial", "initial_")):
-        for array in TRAJECTORY_ARRAYS:
-            names[f"{evaluation}.trajectory.{array}"] = f"{prefix}{array}"
-        for array in ("gain", "sensitivity"):
-            names[f"{evaluation}.{array}"] = f"{prefix}{array}"
-    return names
+    paths = (*(f"trajectory.{name}" for name in TRAJECTORY_ARRAYS), "gain", "sensitivity")
+    return {
+        f"{evaluation}.{path}": prefix + path.rpartition(".")[2]
+        for evaluation, prefix in (("final", ""), ("initial", "initial_"))
+        for path in paths
+    }
 
 
 @record
@@ -498,6 +499,7 @@ class Design(ShownRecord):
         "warnings",
         "nuisance",
         "combinations",
+        "combined",
         "prior",
         "data",
         "rehearsal",
@@ -591,13 +593,4 @@ class Design(ShownRecord):
                 "satisfied": self.within_limits,
                 "initial": [violation.summary() for violation in self.initial_violations],
             },
-            "combined": [
-                {
-                    "words": combination.expression,
-                    "value": combination.value,
-                    "std_initial": combination.std_initial,
-                    "std_final": combination.std_final,
-                }
-                for combination in self.combined
-            ],
         }
