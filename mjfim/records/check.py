@@ -92,9 +92,7 @@ class ParameterGroup(Record):
         if len(str(self)) <= COMBINATIONS_TEXT:
             return str(self)
         combinations = [combination.short for combination in self.combinations]
-        return self._sentence(
-            self.short_names, first_ones(combinations, longest=COMBINATIONS_TEXT)
-        )
+        return self._sentence(self.short_names, first_ones(combinations, longest=COMBINATIONS_TEXT))
 
     def _sentence(self, names: str, combinations: str) -> str:
         """The group with its names and combinations in words."""

@@ -105,18 +105,18 @@ def self_test(
         except np.linalg.LinAlgError:
             return np.inf
 
-    tests: dict[str, tuple[str, Callable[[], Any]]] = {
-        "recursion": ("recursion", lambda: recursion_error(task, trajectory, sensitivity)),
-        "slope": ("slope", slope),
+    tests: dict[str, Callable[[], Any]] = {
+        "recursion": lambda: recursion_error(task, trajectory, sensitivity),
+        "slope": slope,
     }
     tested = SelfTest(recursion=np.nan, slope=np.nan, finished=False)
-    for number, (key, (name, error)) in enumerate(tests.items()):
+    for number, (name, error) in enumerate(tests.items()):
         if stop():
             return tested
         # A state does not show what control laws remember: there is no recursion and no slope.
         is_possible = task.plant.laws is None
         begin_stage(f"testing the derivatives: {name}", number, len(tests))
-        found: dict[str, Any] = {key: error() if is_possible else 0.0}
+        found: dict[str, Any] = {name: error() if is_possible else 0.0}
         tested = replace(tested, **found)
     tested = replace(tested, finished=True)
 

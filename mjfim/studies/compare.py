@@ -341,7 +341,7 @@ class MethodEvaluation:
         if found.control is None:
             return nothing
 
-        evaluated = self._evaluate(nothing, found) or nothing
+        evaluated = self._evaluate(nothing, found)
         if method == DESIGN or evaluated.outcome is not MethodOutcome.OUTSIDE:
             return evaluated
 
@@ -354,10 +354,10 @@ class MethodEvaluation:
             return evaluated
         remark = ", ".join(filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"]))
         smaller = replace(found, control=inside.control)
-        return self._evaluate(replace(nothing, note=remark), smaller) or nothing
+        return self._evaluate(replace(nothing, note=remark), smaller)
 
-    def _evaluate(self, nothing: MethodResult, found: SearchResult) -> MethodResult | None:
-        """Evaluate a control without changing it; None where the simulation diverges.
+    def _evaluate(self, nothing: MethodResult, found: SearchResult) -> MethodResult:
+        """Evaluate a control without changing it; `nothing` where the simulation diverges.
 
         Args:
             nothing: The row of the method where it has no usable control.
@@ -368,9 +368,9 @@ class MethodEvaluation:
         if found.control is not None:
             point = point_at_stated_rate(self.stage, found.control)
         if point is None or point.trajectory is None:
-            return None
+            return nothing
         if point.criterion is None or point.information is None:
-            return None
+            return nothing
 
         # The outcome of the method, and a note for the user.
         verification = verify(task, point.trajectory)

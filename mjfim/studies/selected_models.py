@@ -279,10 +279,8 @@ def possible_pools(parameters: ParameterSet, names: Collection[str]) -> list[Poo
     taken = set(parameters.names)
     pools = []
     for (kind, field, _, _), members in groups.items():
-        pool = None
-        if len(members) >= MIN_MEMBERS:
-            pool = _pool(f"{kind}_{field}", members, taken)
-        if pool is not None:
+        pool = _pool(f"{kind}_{field}", members, taken)
+        if pool is not None and len(members) >= MIN_MEMBERS:
             taken.add(pool.name)
             pools.append(pool)
     return pools
