@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from mjfim.experiment.time_grid import rates_near, whole_number
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.elements import (
     actuator_force_sizes,
-    element_count,
     element_name,
     force_sizes,
     identifier,
@@ -126,6 +125,19 @@ class Wishes:
     horizon: float | None = None
     sigmas: Mapping[str, float] = field(default_factory=dict)
     packages: Mapping[str, str] = field(default_factory=dict)
+
+
+def rounded(value: float, digits: int = 2) -> float:
+    """A number with so many significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
+def free_name(stem: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: the stem, or `stem_2` and so on."""
+    name, number = stem, 2
+    while name in taken:
+        name, number = f"{stem}_{number}", number + 1
+    return name
 
 
 def groups_of(text: str) -> list[Group]:
@@ -327,14 +339,12 @@ def _tied(model: Any, found: Sequence[Candidate]) -> list[Candidate]:
     kinds = Counter(quantity for quantity, *_ in families)
     tied: dict[str, Candidate] = {}
     for first, *others in (list(family.values()) for family in families.values()):
-        name, number = first.name, 2
+        name = first.name
         if others:
             name = first.name.removeprefix(f"{first.owners[0]}_")
             if kinds[first.quantity] > 1:
                 name = f"{name}_{first.owners[0]}_and_{len(others)}_more"
-        base = name
-        while name in tied:
-            name, number = f"{base}_{number}", number + 1
+        name = free_name(name, tied)
         tied[name] = replace(
             first,
             name=name,
@@ -379,7 +389,7 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
         quantity=f"mass of the load at {name}",
         offset=mass,
         guess=0.0,
-        scale=float(f"{scale:.2g}"),
+        scale=rounded(scale),
     )
     moments = mass * model.body_ipos[body]
     for i, axis in enumerate(AXES):
@@ -390,7 +400,7 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
             quantity=f"mass times {axis} of the load's centre of mass, in the frame of {name}",
             offset=float(moments[i]),
             guess=0.0,
-            scale=float(f"{scale * radius:.2g}"),
+            scale=rounded(scale * radius),
         )
 
 
@@ -402,8 +412,8 @@ def _delay(rate: float) -> Candidate:
         paths=("output:delay",),
         quantity="delay of all measurements",
         guess=0.0,
-        scale=float(f"{1.0 / rate:.2g}"),
-        bounds=(0.0, float(f"{LONGEST_DELAY / rate:.2g}")),
+        scale=rounded(1.0 / rate),
+        bounds=(0.0, rounded(LONGEST_DELAY / rate)),
     )
 
 
@@ -426,7 +436,7 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
     alike: dict[tuple[int, float], list[int]] = {}
     for body in moving:
         if model.body_mass[body] >= SMALL_MASS * typical:
-            mass = float(f"{model.body_mass[body]:.6g}")
+            mass = rounded(model.body_mass[body], 6)
             alike.setdefault((-int(depth[body]), -mass), []).append(body)
     last = sorted(alike.items())[:families]
     return [(body, i) for i, (_, bodies) in enumerate(last) for body in bodies]
@@ -444,7 +454,7 @@ def _mass_and_centre(model: Any, body: int, family: int, group: Group) -> Iterat
         owners=(name,),
         value=mass,
         family=family,
-        bounds=(0.0, float(f"{10.0 * mass:.3g}")),
+        bounds=(0.0, rounded(10.0 * mass, 3)),
     )
     for i, axis in enumerate(AXES):
         yield Candidate(
@@ -497,8 +507,8 @@ def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate
                     quantity=meaning,
                     owners=(name,),
                     value=value,
-                    scale=None if value > 0.0 else float(f"{size:.2g}"),
-                    bounds=(0.0, float(f"{10.0 * (value or size):.3g}")),
+                    scale=None if value > 0.0 else rounded(size),
+                    bounds=(0.0, rounded(10.0 * (value or size), 3)),
                 )
 
 
@@ -543,20 +553,16 @@ def proposed_noise(
     """
     typical = {
         "angle": ANGLE_SIGMA,
-        "length": _rounded(LENGTH_SIGMA * length),
-        "angular velocity": _rounded(VELOCITY_SIGMA / period),
-        "velocity": _rounded(VELOCITY_SIGMA * length / period),
+        "length": rounded(LENGTH_SIGMA * length, 1),
+        "angular velocity": rounded(VELOCITY_SIGMA / period, 1),
+        "velocity": rounded(VELOCITY_SIGMA * length / period, 1),
     }
-    return list(_sensors(model)) or list(_joints(model, {**typical, **wanted}))
-
-
-def _sensors(model: Any) -> Iterator[ProposedNoise]:
-    """Sensors with a name whose noise the MJCF states."""
-    for i in range(element_count(model, "sensor")):
-        name = element_name(model, "sensor", i)
-        sigma = float(model.sensor_noise[i])
-        if name and sigma > 0.0:
-            yield name, sigma, ""
+    sensors = [
+        (name, float(model.sensor_noise[identifier(model, "sensor", name)]), "")
+        for name in names_of(model, "sensor")
+    ]
+    stated = [sensor for sensor in sensors if sensor[1] > 0.0]
+    return stated or list(_joints(model, {**typical, **wanted}))
 
 
 def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
@@ -572,8 +578,3 @@ def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
                 continue
             moved = length_kind if kind == mujoco.mjtJoint.mjJNT_SLIDE else angle_kind
             yield key, sigmas[moved], moved
-
-
-def _rounded(value: float) -> float:
-    """A number with one significant digit."""
-    return float(np.format_float_scientific(value, precision=0))

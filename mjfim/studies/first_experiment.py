@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import tomlkit
-from tomlkit.items import InlineTable, Table
+from tomlkit.items import Table
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDivergedError
@@ -36,6 +36,7 @@ from mjfim.studies.first_candidates import (
     proposed_noise,
     read_urdf,
     require_rate,
+    rounded,
 )
 from mjfim.studies.first_limits import playable_limits, played
 from mjfim.studies.first_motion import (
@@ -51,8 +52,8 @@ from mjfim.studies.first_motion import (
     influence_of_controls,
     propose_release,
     reach,
-    rounded,
     time_scale,
+    two_digits,
 )
 
 # First and last frequency of the chirp, in characteristic periods of the motion.
@@ -185,7 +186,7 @@ class Proposal:
             "frequency_end": self.chirp[1],
         }
         if "end" in self.boundary:
-            control["fade"] = float(f"{FADE * self.times.period:.2g}")
+            control["fade"] = rounded(FADE * self.times.period)
         offset = dict(zip(names, self.start.control.tolist(), strict=True))
         if any(offset.values()):
             control["offset"] = offset
@@ -252,7 +253,7 @@ def propose_experiment(
     # Ranges about the resting control for controls that have none in the MJCF.
     widths = CONTROL_LIMIT * wanted
     ranges = {
-        name: [float(f"{centre - width:.3g}"), float(f"{centre + width:.3g}")]
+        name: [rounded(centre - width, 3), rounded(centre + width, 3)]
         for name, centre, width, is_limited in zip(
             controls, start.control, widths, model.actuator_ctrllimited, strict=True
         )
@@ -271,8 +272,8 @@ def propose_experiment(
         start=start,
         amplitudes=dict(zip(controls, wanted.tolist(), strict=True)),
         chirp=(
-            float(f"{FIRST_FREQUENCY / times.period:.2g}"),
-            float(f"{LAST_FREQUENCY / times.period:.2g}"),
+            rounded(FIRST_FREQUENCY / times.period),
+            rounded(LAST_FREQUENCY / times.period),
         ),
         noise=proposed_noise(model, length, times.period, wishes.sigmas),
         chosen=found,
@@ -370,7 +371,7 @@ class _Refinement:
             if ended is not None and (ended >= SMALLEST_ENDED * kept).all():
                 kept = ended
         if kept is None:
-            smallest = rounded(amplitudes * SHRINKING**TRIALS)
+            smallest = two_digits(amplitudes * SHRINKING**TRIALS)
             draft, remark = self._within_limits(system, draft, smallest)
             remarks.append(remark)
 
@@ -410,7 +411,7 @@ class _Refinement:
         for least in (ROOM, 0.0):
             for trial in range(TRIALS + 1):
                 if room(SHRINKING**trial) >= least:
-                    return rounded(amplitudes * SHRINKING**trial)
+                    return two_digits(amplitudes * SHRINKING**trial)
         return None
 
     def _within_limits(
@@ -459,11 +460,10 @@ class _Refinement:
         """
         remarks = ["The model has no actuators: a design chooses the release, `initial.free`."]
         for trial in range(TRIALS):
-            share = float(rounded(np.array([FIRST_SHARE * SHRINKING**trial]))[0])
+            share = rounded(FIRST_SHARE * SHRINKING**trial)
             release = propose_release(self.source.model, draft.start.qpos, length, share)
             lean = replace(draft, chosen=draft.chosen[:1], release=release)
-            system = System.resolve(self._experiment(lean), source=self.source)
-            if self._room(self._task(system, lean), 1.0) >= 0.0:
+            if self._room(self._own_task(lean), 1.0) >= 0.0:
                 return self._with_parameters(replace(draft, release=release), remarks)
         remarks.append("Warning: no release near this start keeps all limits.")
         return self._with_parameters(draft, remarks)
@@ -490,6 +490,10 @@ class _Refinement:
         """The experiment that a draft states, with other tables."""
         values = {**draft.values(), **tables}
         return Experiment(**values, directory=self.folder, source="the proposed experiment")
+
+    def _own_task(self, draft: Proposal) -> DesignTask:
+        """The task of a draft on a plant of its own."""
+        return DesignTask.of(System.resolve(self._experiment(draft), source=self.source))
 
     def _task(self, system: System, draft: Proposal, **tables: Any) -> DesignTask:
         """The task of a draft on the plant of a system."""
@@ -560,8 +564,7 @@ class _Refinement:
         that never do. The test of a check knows the error of the derivatives; a parameter that it
         cannot tell apart makes room for later ones.
         """
-        system = System.resolve(self._experiment(draft), source=self.source)
-        task = self._task(system, draft)
+        task = self._own_task(draft)
         point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
         if point.information is None or point.sensitivity is None:
             raise SimulationDivergedError(
@@ -588,7 +591,7 @@ class _Refinement:
         while True:
             chosen = [left[i] for i in identifiable(F[np.ix_(left, left)], sizes[left], asked)]
             part = replace(draft, chosen=[draft.chosen[i] for i in chosen])
-            tried = self._task(System.resolve(self._experiment(part), source=self.source), part)
+            tried = self._own_task(part)
             columns = point.sensitivity.of_parameters([*chosen, *range(n, len(task.parameters))])
             # Other controls need not be tried, because this one has to show every parameter.
             found = tried.identifiability_test.along(tried.initial, columns, lambda: True)
@@ -770,14 +773,12 @@ def _table(
 def _inline(value: Any) -> Any:
     """A value whose tables are written in one line."""
     if isinstance(value, Mapping):
-        table: InlineTable = tomlkit.inline_table()
-        for key, entry in value.items():
-            table.add(key, _inline(entry))
+        table = tomlkit.inline_table()
+        table.update(value)
         return table
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+    if isinstance(value, list):
         array = tomlkit.array()
-        for entry in value:
-            array.append(_inline(entry))
+        array.extend(value)
         return array
     return value
 

@@ -15,7 +15,7 @@ from mjfim.model.coordinates import joint_dofs, tangent_components
 from mjfim.model.elements import control_sizes, is_rk4, translations
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.records.base import record
-from mjfim.studies.first_candidates import require_keyframe, resting_keyframes
+from mjfim.studies.first_candidates import require_keyframe, resting_keyframes, rounded
 
 # Samples in one characteristic period of the motion.
 SAMPLES_PER_PERIOD = 100
@@ -85,7 +85,7 @@ def time_scale(model: Any, data: Any) -> TimeScale:
         longest = max(LARGEST_GROWTH / growth, SHORTEST * period)
 
     # The horizon has two significant digits, and is a whole number of samples.
-    wanted = float(f"{longest:.2g}")
+    wanted = rounded(longest)
     samples = max(round(wanted * rate), 2)
     return TimeScale(period=period, rate=rate, samples=samples, unstable=unstable)
 
@@ -121,14 +121,11 @@ def reach(model: Any, data: Any) -> float:
 def _moved(model: Any, joint: int) -> Array:
     """(m,) numbers of the bodies with mass that a joint moves."""
     top = int(model.jnt_bodyid[joint])
-    found = []
-    for body in range(top, model.nbody):
-        above = body
-        while above > top:
-            above = int(model.body_parentid[above])
-        if above == top and model.body_mass[body] > 0.0:
-            found.append(body)
-    return np.array(found or [top])
+    below = [top]
+    for body in range(top + 1, model.nbody):
+        if model.body_parentid[body] in below:
+            below.append(body)
+    return np.array([body for body in below if model.body_mass[body] > 0.0] or [top])
 
 
 def pendulum_time(model: Any, data: Any) -> float | None:
@@ -192,7 +189,7 @@ def _rate(timestep: float, wanted: float) -> float:
         digits = len(f"{rate:.9g}".replace(".", "").strip("0"))
         return digits, abs(float(np.log(rate / wanted)))
 
-    return float(f"{1.0 / (min(steps, key=preference) * timestep):.12g}")
+    return rounded(1.0 / (min(steps, key=preference) * timestep), 12)
 
 
 # A state is held where the robot needs this many characteristic periods, sqrt(length / gravity), to
@@ -276,41 +273,42 @@ def _candidates(model: Any) -> Iterator[Start]:
     for name in resting_keyframes(model):
         yield _start_in_keyframe(model, int(model.key(name).id))
 
-    inside = _inside_ranges(model, model.qpos0)
-    reason = "the reference positions of the MJCF"
-    if not np.array_equal(inside, model.qpos0):
-        reason += MOVED_INSIDE
-    first = _start(model, inside, _resting_control(model, inside), keyframe=None, reason=reason)
+    resting = _resting_control(model, _inside_ranges(model, model.qpos0))
+    first = _start(model, model.qpos0, resting, "the reference positions of the MJCF")
     yield first
 
     driven = driven_dofs(model)
     for locked, how in ((driven, "while its driven joints are locked"), ((), "by itself")):
         settled = _settled(model, first, locked)
-        if settled is None:
-            continue
-
-        # A joint that rests on the end of its range has no room to move. But to move one joint of
-        # a closed chain would open it.
-        inside = settled if model.neq else _inside_ranges(model, settled)
-        reason = f"the state in which the model comes to rest {how}"
-        if not np.array_equal(inside, settled):
-            reason += MOVED_INSIDE
-        yield _start(model, inside, first.control, keyframe=None, reason=reason)
+        if settled is not None:
+            reason = f"the state in which the model comes to rest {how}"
+            # To move one joint of a closed chain would open it.
+            yield _start(model, settled, first.control, reason, moves_inside=not model.neq)
 
 
 def _start_in_keyframe(model: Any, number: int) -> Start:
-    """The start in a keyframe, whose joints are moved away from the ends of their ranges."""
-    qpos, ctrl = model.key_qpos[number], model.key_ctrl[number]
-    name = model.key(number).name
-    reason = f"the keyframe {name!r} of the MJCF"
-    inside = _inside_ranges(model, qpos)
-    if np.array_equal(inside, qpos):
-        return _start(model, qpos, ctrl, keyframe=name, reason=reason)
-    return _start(model, inside, ctrl, keyframe=None, reason=f"{reason}{MOVED_INSIDE}")
+    """The start in a keyframe."""
+    key = model.key(number)
+    reason = f"the keyframe {key.name!r} of the MJCF"
+    return _start(model, key.qpos, key.ctrl, reason, keyframe=key.name)
 
 
-def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reason: str) -> Start:
-    """A start with the control that holds it best."""
+def _start(
+    model: Any,
+    qpos: Array,
+    guess: Array,
+    reason: str,
+    *,
+    keyframe: str | None = None,
+    moves_inside: bool = True,
+) -> Start:
+    """A start with the control that holds it best.
+
+    A joint that rests on the end of its range has no room to move, so it is moved away from there.
+    """
+    inside = _inside_ranges(model, qpos) if moves_inside else qpos
+    if not np.array_equal(inside, qpos):
+        qpos, keyframe, reason = inside, None, reason + MOVED_INSIDE
     data = mujoco.MjData(model)
     control = _holding_control(model, data, qpos, guess)
     drift = _drift(model, data, qpos, control)
@@ -320,7 +318,7 @@ def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reaso
     shown = control
     if keyframe is None:
         _, _, width = _ranges(model, data, control)
-        values = np.array([float(f"{value:.6g}") for value in control])
+        values = np.array([rounded(value, 6) for value in control])
         shown = np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0)
     elif (by_guess := _drift(model, data, qpos, guess)) <= 1.0:
         control = shown = np.array(guess)
@@ -559,12 +557,12 @@ def first_amplitudes(
             gear = abs(actuator_gear(model, actuator))
             amplitudes[control] = gear * float(distance[int(model.jnt_dofadr[joint])])
 
-    return rounded(amplitudes)
+    return two_digits(amplitudes)
 
 
-def rounded(values: Array) -> Array:
+def two_digits(values: Array) -> Array:
     """Numbers with two significant digits."""
-    return np.array([float(f"{value:.2g}") for value in values])
+    return np.array([rounded(value) for value in values])
 
 
 # Angle by which a hinge or ball joint without a range may be released to each side of the start
@@ -620,7 +618,7 @@ def propose_release(
     for j in range(model.njnt):
         if joint_dofs(model, j) == 1:
             address = int(model.jnt_qposadr[j])
-            qpos[address] = _rounded(float(qpos[address]))
+            qpos[address] = rounded(qpos[address], 3)
     return qpos, free
 
 
@@ -637,13 +635,8 @@ def _range_of(model: Any, joint: int, start: Array, length: float) -> tuple[floa
     if model.jnt_limited[joint]:
         low, high = (float(end) for end in model.jnt_range[joint])
         gap = MARGIN * (high - low)
-        return at, _rounded(low + gap), _rounded(high - gap)
+        return at, rounded(low + gap, 3), rounded(high - gap, 3)
 
     slides = kind == int(mujoco.mjtJoint.mjJNT_SLIDE)
     width = LENGTH_SHARE * length if slides else RELEASE_ANGLE
-    return at, _rounded(at - width), _rounded(at + width)
-
-
-def _rounded(value: float) -> float:
-    """A number with three significant digits."""
-    return float(f"{value:.3g}")
+    return at, rounded(at - width, 3), rounded(at + width, 3)

@@ -37,8 +37,8 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import PayloadEstimate
 from mjfim.records.events import begin_stage, shown_progress
 from mjfim.records.trajectory import Recording
-from mjfim.studies.first_candidates import PAYLOAD_SHARE
-from mjfim.studies.selected_models import free_name, selected_experiment
+from mjfim.studies.first_candidates import PAYLOAD_SHARE, free_name
+from mjfim.studies.selected_models import selected_experiment
 
 # Kind of the term that is a payload, and the name of the one that is added.
 KIND = "payload"

@@ -28,6 +28,7 @@ from mjfim.records.terms import (
     Selection,
     Term,
 )
+from mjfim.studies.first_candidates import free_name, rounded
 
 # Smallest number of parameters that are pooled.
 MIN_MEMBERS = 2
@@ -100,7 +101,7 @@ def selected_term(candidate: Term, taken: Iterable[str]) -> Term:
         words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
         name = free_name("_".join(words), used)
         used.add(name)
-        numbers.append(replace(number, name=name, scale=float(f"{number.scale:.2g}")))
+        numbers.append(replace(number, name=name, scale=rounded(number.scale)))
     return replace(candidate, numbers=tuple(numbers))
 
 
@@ -205,14 +206,6 @@ def start_of(
         is_field = parameter.name in changes and parameter.targets[0].term is not None
         start[i] = change if is_field else values.get(parameter.name, start[i]) + change
     return np.clip(start, parameters.lower, parameters.upper)
-
-
-def free_name(stem: str, taken: Collection[str]) -> str:
-    """Return a name that is not taken: the stem, or `stem_2` and so on."""
-    name, number = stem, 2
-    while name in taken:
-        name, number = f"{stem}_{number}", number + 1
-    return name
 
 
 def with_selection(
