@@ -405,7 +405,8 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
                 "the simulation clamps it to the range"
             )
 
-        rough, correlation = _rough_share(u), float(np.corrcoef(u[1:], u[:-1])[0, 1])
+        rough = float(np.var(_rough_part(u)) / np.var(u))
+        correlation = float(np.corrcoef(u[1:], u[:-1])[0, 1])
         if rough > MAX_ROUGH_CONTROL_SHARE and correlation < MIN_CONTROL_CORRELATION:
             yield (
                 f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies "
@@ -518,11 +519,6 @@ def _sigma_by_name(channels: Channels) -> dict[str, float]:
 def _moves(x: Array) -> bool:
     """Whether a column x: (M,) is long enough to be inspected, and not constant."""
     return len(x) >= SHORTEST_COLUMN and float(np.ptp(x)) > 0.0
-
-
-def _rough_share(x: Array) -> float:
-    """Fraction of the variance of x: (M,) that a running median removes."""
-    return float(np.var(_rough_part(x)) / np.var(x))
 
 
 def _rough_part(x: Array) -> Array:

@@ -19,6 +19,7 @@ import zlib
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -49,8 +50,18 @@ DATA_FILES = {2: "data/chunk-*/episode_{episode:06d}.parquet", 3: "data/chunk-*/
 # Kinds of features that hold no numbers, and may be large.
 NO_NUMBERS = ("image", "video", "string")
 
-# Errors that pyarrow raises for a damaged file.
-UNREADABLE = (pyarrow.ArrowException, OSError, EOFError, ValueError)
+# Errors that libraries raise for a damaged file.
+UNREADABLE = (
+    pyarrow.ArrowException,
+    OSError,
+    EOFError,
+    ValueError,
+    RecursionError,
+    zlib.error,
+)
+
+# What a Parquet file should be, in words.
+PARQUET = "a readable Parquet file (damaged or truncated?)"
 
 # Rounding of a time stamp in single precision, relative to the time.
 SINGLE_PRECISION = 2.0 * float(np.finfo(np.float32).eps)
@@ -172,7 +183,7 @@ def _frames(folder: Path, info: Mapping[str, Any], episode: int, names: list[str
 
     parts = []
     for file in files:
-        try:
+        with _reading(file, PARQUET):
             schema = pyarrow.parquet.read_schema(file)
             parts.append(
                 pyarrow.parquet.read_table(
@@ -182,10 +193,6 @@ def _frames(folder: Path, info: Mapping[str, Any], episode: int, names: list[str
                     partitioning=None,
                 )
             )
-        except UNREADABLE as error:
-            raise RecordingError(
-                f"{file}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
-            ) from None
 
     rows = pyarrow.concat_tables(parts, promote_options="default")
     if not rows.num_rows:
@@ -390,6 +397,25 @@ def _is_text(value: object) -> bool:
         return True
 
 
+@contextmanager
+def _reading(
+    path: Path, kind: str, errors: tuple[type[Exception], ...] = UNREADABLE
+) -> Iterator[None]:
+    """Say that a file is damaged where a library cannot read it.
+
+    Args:
+        path: The file.
+        kind: What it should be, in words.
+        errors: Errors that the library raises for a damaged file.
+    """
+    try:
+        yield
+    except RecordingError:
+        raise
+    except errors as error:
+        raise RecordingError(f"{path}: not {kind}: {one_line(error)}") from None
+
+
 def one_line(error: Exception) -> str:
     """Quote another library's error message in one short line."""
     # A damaged file may hold control sequences of a terminal, which must not be printed.
@@ -446,17 +472,11 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
     rosbag2 = rosbags_module(path, "rosbags.rosbag2")
     typesys = rosbags_module(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    try:
-        with rosbag2.Reader(path) as reader:
-            connections = _connections(path, reader.connections, spec.topics)
-            samples = _samples(path, reader, connections, store)
-    except RecordingError:
-        raise
-    except Exception as error:
-        # The reader assumes an intact bag; a damaged one can cause any exception inside it.
-        raise RecordingError(
-            f"{path}: not a readable ROS 2 bag (damaged or truncated?): {one_line(error)}"
-        ) from None
+    # The reader assumes an intact bag; a damaged one can cause any exception inside it.
+    kind = "a readable ROS 2 bag (damaged or truncated?)"
+    with _reading(path, kind, (Exception,)), rosbag2.Reader(path) as reader:
+        connections = _connections(path, reader.connections, spec.topics)
+        samples = _samples(path, reader, connections, store)
 
     if not samples:
         topics = listed([connection.topic for connection in connections])
@@ -563,12 +583,8 @@ def _read_json(path: Path, spec: RecordingSpec) -> Table:
     Raises:
         RecordingError: The file is damaged, or it holds no records, or several lists of them.
     """
-    try:
+    with _reading(path, "readable JSON (damaged or truncated?)"):
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise RecordingError(
-            f"{path}: not readable JSON (damaged or truncated?): {one_line(error)}"
-        ) from None
 
     lists = dict(_lists_of_records(content))
     outside = dict(leaves(content)) if isinstance(content, Mapping) else {}
@@ -607,10 +623,6 @@ def _chosen(path: Path, lists: Mapping[str, Records], stated: str | None) -> Rec
             "holds one"
         )
     return next(iter(lists.values()))
-
-
-# Errors that pyarrow and gzip raise for a damaged file.
-DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
 
 
 def read_columns(path: Path, spec: RecordingSpec) -> Table:
@@ -662,24 +674,17 @@ def read_table(path: Path) -> dict[str, Array]:
 
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
     """Read a CSV file."""
-    try:
+    with _reading(path, "a readable CSV table"):
         packed = path.suffix.lower() == ".gz"
         # A thread of pyarrow that reads from Python can abort the process at its end.
         source = pyarrow.BufferReader(gzip.decompress(path.read_bytes())) if packed else str(path)
         return _table(path, pyarrow.csv.read_csv(source), spec)
-    except DAMAGED as error:
-        raise RecordingError(f"{path}: not a readable CSV table: {one_line(error)}") from None
 
 
 def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
     """Read a Parquet file."""
-    try:
-        with pyarrow.parquet.ParquetFile(path) as file:
-            return _table(path, file.read(), spec)
-    except DAMAGED as error:
-        raise RecordingError(
-            f"{path}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
-        ) from None
+    with _reading(path, PARQUET), pyarrow.parquet.ParquetFile(path) as file:
+        return _table(path, file.read(), spec)
 
 
 def _table(path: Path, rows: Any, spec: RecordingSpec) -> Table:
