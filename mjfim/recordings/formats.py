@@ -64,7 +64,7 @@ UNREADABLE = (
 PARQUET = "a readable Parquet file (damaged or truncated?)"
 
 # Rounding of a time stamp in single precision, relative to the time.
-SINGLE_PRECISION = 2.0 * float(np.finfo(np.float32).eps)
+SINGLE_PRECISION = 2.0 * np.finfo(np.float32).eps
 
 # How to state the units of a dataset, which its files do not name.
 UNIT_HINT = (
@@ -353,7 +353,7 @@ def _parts(values: Any) -> dict[str, Any]:
     lengths = pyarrow.compute.list_value_length(column).to_numpy(zero_copy_only=False)
     if (lengths == width).all():
         return {f"[{i}]": numbers[i::width] for i in range(width)}
-    row = int(np.argmax(lengths != width)) + 1
+    row = np.argmax(lengths != width) + 1
     fault = f"is ragged: row {row} does not have {width} numbers, as the first row has"
     return {f"[{i}]": fault for i in range(max(width, 1))}
 
@@ -558,7 +558,7 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
     ):
         steps = np.diff(own)
         if np.any(steps <= 0):
-            row = int(np.argmax(steps <= 0))
+            row = np.argmax(steps <= 0)
             raise RecordingError(
                 f"{path}: topic {topic!r}: {quantity} of {joint!r}, message {row + 2} is "
                 f"{steps[row] / NANOSECONDS:g} s after the previous one; time must increase"

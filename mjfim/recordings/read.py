@@ -38,7 +38,7 @@ from mjfim.recordings.checks import (
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
 from mjfim.recordings.quantities import TURN
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
-from mjfim.records.base import record
+from mjfim.records.base import Record, record
 from mjfim.records.trajectory import Recording
 
 # Differences below this fraction of the column's largest value are rounding errors.
@@ -46,7 +46,7 @@ ROUNDING = 1e-12
 
 
 @record
-class ColumnSummary:
+class ColumnSummary(Record):
     """Range and resolution of one column of a recording, in the model's unit.
 
     Attributes:
@@ -67,7 +67,7 @@ class ColumnSummary:
 
 
 @record
-class LogSummary:
+class LogSummary(Record):
     """Clock and columns of one log.
 
     Attributes:
@@ -448,7 +448,7 @@ def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
     outside = (raw < -half) | (raw >= 2.0 * half)
     invalid = np.isfinite(raw) & (outside | (raw != np.rint(raw)))
     if invalid.any():
-        row = int(np.argmax(invalid))
+        row = np.argmax(invalid)
         raise RecordingError(
             f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
             f"not an integer of {bits} bits"

@@ -231,7 +231,7 @@ def extended(history: tuple[HistoryRow, ...], rows: Iterable[HistoryRow]) -> tup
     while len(moving) > MAX_MOTIONS:
         # The iterate between the nearest neighbours goes; the first and the last one stay.
         numbers = np.array([joined[place].iteration for place in moving])
-        place = moving.pop(1 + int(np.argmin(numbers[2:] - numbers[:-2])))
+        place = moving.pop(1 + np.argmin(numbers[2:] - numbers[:-2]))
         joined[place] = replace(joined[place], motion=None)
     return tuple(joined)
 

@@ -141,7 +141,7 @@ def multisine(settings: ExcitationSettings, z: Array) -> Array:
     # The base frequency allows for two harmonics if the frequency range does.
     base, highest = settings.min_frequency, settings.max_frequency
     if highest > 2.0 * base:
-        base *= (0.5 * highest / base) ** float(z[0])
+        base *= (0.5 * highest / base) ** z[0]
     amplitude, delay = z[3:].reshape(2, settings.nu)
 
     most = min(MAX_HARMONICS, max(int(settings.max_frequency / base), 1))
@@ -332,7 +332,7 @@ def _search_at_random(
         # Widen the local search after a success, narrow it after a failure.
         if is_local:
             factor = SPREAD_AFTER_SUCCESS if found.cost > J else SPREAD_AFTER_FAILURE
-            spread = float(np.clip(spread * factor, *SPREAD_RANGE))
+            spread = np.clip(spread * factor, *SPREAD_RANGE)
         if found.cost > J:
             best, found = numbers, SearchResult(control=control, cost=J)
     return found, task.plant.engine_steps
@@ -340,8 +340,7 @@ def _search_at_random(
 
 def _keeps_share(cost: LimitedCost, deviation: Array, share: float) -> bool:
     """Check whether a share of a deviation from the centre keeps the limits."""
-    task = cost.level.task
-    return not task.is_limited or cost.nearly_keeps(task.centre + share * deviation)
+    return cost.nearly_keeps(cost.level.task.centre + share * deviation)
 
 
 def _settings(cost: LimitedCost) -> ExcitationSettings:

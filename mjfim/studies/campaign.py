@@ -150,7 +150,7 @@ def _restated_keys(
     keys: dict[str, Any] = {"guess": guess, "scale": parameter.scale}
 
     # Robust designs sample parameters that have a prior or bounds.
-    is_bounded = bool(np.isfinite(parameter.bounds).all())
+    is_bounded = np.isfinite(parameter.bounds).all()
     is_sampled = base.experiment.robust is not None and (parameter.prior is not None or is_bounded)
     if is_sampled and estimate is not None and np.isfinite(estimate.std[index]):
         reach = max(SAMPLING_RANGE * float(estimate.std[index]), MIN_SAMPLING_RANGE * size)

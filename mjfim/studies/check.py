@@ -630,7 +630,7 @@ def _repetitions(
 ) -> int:
     """Smallest number of repetitions that reaches the wanted standard deviation; 0 for none."""
     interest = task.parameters.interest
-    place = int(np.flatnonzero(interest == parameter)[0])
+    place = np.flatnonzero(interest == parameter)[0]
 
     def suffices(repetitions: int) -> bool:
         """Whether this number of repetitions reaches the wanted standard deviation."""

@@ -185,7 +185,7 @@ def require_rate(model: Any, rate: float) -> float:
         model: The compiled model (`mujoco.MjModel`).
         rate: The rate [Hz].
     """
-    timestep = float(model.opt.timestep)
+    timestep = model.opt.timestep
     steps = 1.0 / (rate * timestep) if rate > 0.0 else 0.0
     if whole_number(steps) is not None:
         return rate
@@ -378,10 +378,10 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
     radius = body_inertia(model, body).gyration_radius
     # A light wrist carries more than a share of its own mass.
     scale = PAYLOAD_SHARE * mass
-    gravity = float(np.linalg.norm(model.opt.gravity))
+    gravity = np.linalg.norm(model.opt.gravity)
     if gravity > 0.0 and model.nu:
         forces = np.abs(model.actuator_gear[:, 0]) * actuator_force_sizes(model, period)
-        scale = max(scale, STRENGTH_SHARE * float(forces.max()) / (gravity * length))
+        scale = max(scale, STRENGTH_SHARE * forces.max() / (gravity * length))
     yield Candidate(
         name="payload",
         group="payload",
@@ -424,7 +424,7 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
     """
     depth = np.zeros(model.nbody, dtype=int)
     for body in range(1, model.nbody):
-        depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body])
+        depth[body] = depth[model.body_parentid[body]] + model.body_jntnum[body]
     moving = [
         body
         for body in range(1, model.nbody)
@@ -432,12 +432,12 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
     ]
 
     # Fingers and markers are too light to matter.
-    typical = float(np.median(model.body_mass[moving])) if moving else 0.0
+    typical = np.median(model.body_mass[moving]) if moving else 0.0
     alike: dict[tuple[int, float], list[int]] = {}
     for body in moving:
         if model.body_mass[body] >= SMALL_MASS * typical:
             mass = rounded(model.body_mass[body], 6)
-            alike.setdefault((-int(depth[body]), -mass), []).append(body)
+            alike.setdefault((-depth[body], -mass), []).append(body)
     last = sorted(alike.items())[:families]
     return [(body, i) for i, (_, bodies) in enumerate(last) for body in bodies]
 

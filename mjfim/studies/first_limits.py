@@ -63,7 +63,7 @@ def played(
     for control in controls:
         data.ctrl[:] = control
         mujoco.mj_step(model, data)
-        if data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
+        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             break
         for rows, each in zip(seen, watched, strict=True):
             rows.append(each.copy())
@@ -96,8 +96,7 @@ def playable_limits(
     names = joint_names(model)
     driven = driven_dofs(model)
     derived = {
-        names[int(model.dof_jntid[dof])]: rounded(speeds[dof])
-        for dof in (driven if not stated else ())
+        names[model.dof_jntid[dof]]: rounded(speeds[dof]) for dof in (driven if not stated else ())
     }
     velocity: Any = dict(stated) or derived
     if len(driven) == model.nv and len(set(derived.values())) == 1:

@@ -39,6 +39,9 @@ SHORTEST = 0.2
 # Difference step of the linearisation.
 LINEARISATION_STEP = 1e-6
 
+# Types of joints that turn.
+HINGED = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL)
+
 # Engine steps in the characteristic period of a model that has neither gravity nor poles, and most
 # steps in that of a slow pole: a body that drifts in a thin fluid would need hours.
 STEPS_OF_FREE_MODEL = 1000
@@ -75,10 +78,10 @@ def time_scale(model: Any, data: Any) -> TimeScale:
     """
     eigenvalues = _eigenvalues(model, data)
     period = _period(model, data, eigenvalues)
-    rate = _rate(float(model.opt.timestep), SAMPLES_PER_PERIOD / period)
+    rate = _rate(model.opt.timestep, SAMPLES_PER_PERIOD / period)
 
     # Without feedback, a motion about an unstable state stays near it for a short time only.
-    growth = float(np.log(np.abs(eigenvalues).max(initial=1.0))) / float(model.opt.timestep)
+    growth = np.log(np.abs(eigenvalues).max(initial=1.0)) / model.opt.timestep
     longest = PERIODS * period
     unstable = growth * longest > LARGEST_GROWTH
     if unstable:
@@ -103,11 +106,7 @@ def reach(model: Any, data: Any) -> float:
     """
     largest = 0.0
     for joint in range(model.njnt):
-        hinged = model.jnt_type[joint] in (
-            int(mujoco.mjtJoint.mjJNT_HINGE),
-            int(mujoco.mjtJoint.mjJNT_BALL),
-        )
-        if hinged:
+        if mujoco.mjtJoint(model.jnt_type[joint]) in HINGED:
             arms = data.xipos[_moved(model, joint)] - data.xanchor[joint]
             largest = max(largest, float(np.linalg.norm(arms, axis=1).max()))
     if largest > 0.0:
@@ -135,8 +134,8 @@ def pendulum_time(model: Any, data: Any) -> float | None:
         model: The compiled model.
         data: Its data in the initial state, after `mj_forward`.
     """
-    gravity = float(np.linalg.norm(model.opt.gravity))
-    is_off = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY))
+    gravity = np.linalg.norm(model.opt.gravity)
+    is_off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     if gravity == 0.0 or is_off:
         return None
     return float(np.sqrt(reach(model, data) / gravity))
@@ -155,7 +154,7 @@ def _period(model: Any, data: Any, eigenvalues: Array) -> float:
 
     # An eigenvalue of zero is infinitely fast; it says nothing about the motion.
     moving = eigenvalues[np.abs(eigenvalues) > np.finfo(float).eps]
-    speeds = np.abs(np.log(moving.astype(complex))) / float(model.opt.timestep)
+    speeds = np.abs(np.log(moving.astype(complex))) / model.opt.timestep
     speeds = speeds[speeds > SLOWEST_POLE * speeds.max(initial=0.0)]
     if len(speeds):
         return min(2.0 * np.pi / float(speeds.min()), free_time(model))
@@ -170,7 +169,7 @@ def _eigenvalues(model: Any, data: Any) -> Array:
     # MuJoCo does not linearise RK4; the time scale is the same with Euler's method.
     euler = copy(model)
     if is_rk4(euler):
-        euler.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
+        euler.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     mujoco.mjd_transitionFD(euler, data, LINEARISATION_STEP, True, A, None, None, None)
     if not np.isfinite(A).all():
         return np.empty(0)
@@ -341,7 +340,7 @@ def _inside_ranges(model: Any, qpos: Array) -> Array:
             continue
         low, high = model.jnt_range[joint]
         margin = MARGIN * (high - low)
-        q = int(model.jnt_qposadr[joint])
+        q = model.jnt_qposadr[joint]
         inside[q] = np.clip(inside[q], low + margin, high - margin)
     return inside
 
@@ -357,10 +356,8 @@ def _resting_control(model: Any, qpos: Array) -> Array:
     for actuator in range(model.nactuator):
         joint = commanded_joint(model, actuator)
         if joint is not None:
-            position = qpos[int(model.jnt_qposadr[joint])]
-            control[int(model.actuator_ctrladr[actuator])] = (
-                actuator_gear(model, actuator) * position
-            )
+            position = qpos[model.jnt_qposadr[joint]]
+            control[model.actuator_ctrladr[actuator]] = actuator_gear(model, actuator) * position
     return control
 
 
@@ -380,9 +377,9 @@ def _activations(model: Any, data: Any, control: Array) -> Array:
         if count == 0:
             continue
         if is_integrated(model, i):
-            act[first : first + count] = data.actuator_length[int(model.actuator_outadr[i])]
-        elif int(model.actuator_ctrlnum[i]) in (1, count):
-            controls = int(model.actuator_ctrladr[i])
+            act[first : first + count] = data.actuator_length[model.actuator_outadr[i]]
+        elif model.actuator_ctrlnum[i] in (1, count):
+            controls = model.actuator_ctrladr[i]
             act[first : first + count] = control[controls : controls + count]
     return act
 
@@ -474,7 +471,7 @@ def driven_dofs(model: Any) -> list[int]:
         for i in range(model.nactuator)
         if mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT and model.actuator_ctrlnum[i]
     }
-    return [int(model.jnt_dofadr[j]) for j in sorted(joints) if joint_dofs(model, j) == 1]
+    return [model.jnt_dofadr[j] for j in sorted(joints) if joint_dofs(model, j) == 1]
 
 
 def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
@@ -485,11 +482,11 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
     """
     if len(locked) == model.nv:
         return None
-    kept = [int(model.jnt_qposadr[int(model.dof_jntid[v])]) for v in locked]
+    kept = [int(model.jnt_qposadr[model.dof_jntid[v]]) for v in locked]
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
     time = _time(model, data)
-    step = float(model.opt.timestep)
+    step = model.opt.timestep
     decay = VELOCITY_LEFT ** (step / time)
 
     for _ in range(int(SETTLING_PERIODS * time / step)):
@@ -499,7 +496,7 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
         data.qpos[kept] = start.qpos[kept]
         if (
             not np.isfinite(data.qpos).all()
-            or data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number
+            or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number
         ):
             return None
     return np.array(data.qpos)
@@ -547,15 +544,15 @@ def first_amplitudes(
             amplitudes[i] = RANGE_SHARE * max(room, 0.0)
         elif np.any(influence[:, i]):
             moved = np.abs(influence[:, i]) > 0.0
-            amplitudes[i] = float((wanted[moved] / np.abs(influence[moved, i])).min())
+            amplitudes[i] = (wanted[moved] / np.abs(influence[moved, i])).min()
 
     # The joint follows the control of a position servo.
     for actuator in range(model.nactuator):
-        control = int(model.actuator_ctrladr[actuator])
+        control = model.actuator_ctrladr[actuator]
         joint = commanded_joint(model, actuator)
         if joint is not None and not model.actuator_ctrllimited[control]:
             gear = abs(actuator_gear(model, actuator))
-            amplitudes[control] = gear * float(distance[int(model.jnt_dofadr[joint])])
+            amplitudes[control] = gear * distance[model.jnt_dofadr[joint]]
 
     return two_digits(amplitudes)
 
@@ -600,9 +597,9 @@ def propose_release(
     free: dict[str, tuple[float, float]] = {}
 
     for j in range(model.njnt):
-        if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE):
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
             continue
-        first = int(model.jnt_dofadr[j])
+        first = model.jnt_dofadr[j]
         for dof in range(first, first + joint_dofs(model, j)):
             component = components[dof]
             if not component.path or len(free) == MOST_COORDINATES:
@@ -617,7 +614,7 @@ def propose_release(
     # Slides and hinges have three significant digits.
     for j in range(model.njnt):
         if joint_dofs(model, j) == 1:
-            address = int(model.jnt_qposadr[j])
+            address = model.jnt_qposadr[j]
             qpos[address] = rounded(qpos[address], 3)
     return qpos, free
 
@@ -627,16 +624,16 @@ def _range_of(model: Any, joint: int, start: Array, length: float) -> tuple[floa
 
     The rotations of a ball joint are relative to the start.
     """
-    kind = int(model.jnt_type[joint])
-    if kind == int(mujoco.mjtJoint.mjJNT_BALL):
+    kind = model.jnt_type[joint]
+    if kind == mujoco.mjtJoint.mjJNT_BALL:
         return 0.0, -RELEASE_ANGLE, RELEASE_ANGLE
 
-    at = float(start[int(model.jnt_qposadr[joint])])
+    at = float(start[model.jnt_qposadr[joint]])
     if model.jnt_limited[joint]:
         low, high = (float(end) for end in model.jnt_range[joint])
         gap = MARGIN * (high - low)
         return at, rounded(low + gap, 3), rounded(high - gap, 3)
 
-    slides = kind == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    slides = kind == mujoco.mjtJoint.mjJNT_SLIDE
     width = LENGTH_SHARE * length if slides else RELEASE_ANGLE
     return at, rounded(at - width, 3), rounded(at + width, 3)

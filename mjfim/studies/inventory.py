@@ -174,7 +174,7 @@ def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
         kind = TRANSMISSIONS.get(int(model.actuator_trntype[i]), "")
         drives = ""
         if kind:
-            drives = f"{kind} {unique_names(model, kind)[int(model.actuator_trnid[i, 0])]}"
+            drives = f"{kind} {unique_names(model, kind)[model.actuator_trnid[i, 0]]}"
         yield ListedActuator(name=control, drives=drives, unit=control_unit(model, i))
 
 
@@ -191,14 +191,15 @@ def _listed(limit: Limit) -> ListedLimit:
 
 def _terms(model: Any) -> Iterator[ListedTerm]:
     """Kinds of terms that the model can have, with the elements on which they can act."""
-    period = SAMPLE_STEPS * float(model.opt.timestep)
+    period = SAMPLE_STEPS * model.opt.timestep
     for name, kind in KINDS.items():
         key = kind.acts_on
-        named = [(f"{key} {each}", ((key, each),)) for each in names_of(model, key)] if key else []
+        elements: dict[str, tuple[tuple[str, str], ...]] = {"the base": ()}
+        if key:
+            elements = {f"{key} {each}": ((key, each),) for each in names_of(model, key)}
 
         possible: dict[str, Term] = {}
-        base: list[tuple[str, tuple[tuple[str, str], ...]]] = [("the base", ())]
-        for words, element in named if key else base:
+        for words, element in elements.items():
             with suppress(ExperimentError):
                 table = TermTable(name=FREE_NAME, element=element)
                 possible[words] = kind.of(table, model, period)

@@ -168,7 +168,7 @@ class RobotExperiment:
         moving = [
             name
             for name in names_of(model, "body")
-            if int(model.body_weldid[identifier(model, "body", name)])
+            if model.body_weldid[identifier(model, "body", name)]
         ]
         if body is None:
             if len(set(self.stated)) != 1:
@@ -180,7 +180,7 @@ class RobotExperiment:
         number = identifier(model, "body", body)
         if number < 0:
             raise ExperimentError(f"body: {unknown('body', body, names_of(model, 'body'))}")
-        group = int(model.body_weldid[number])
+        group = model.body_weldid[number]
         if group == 0:
             raise ExperimentError(
                 f"body: {body!r} does not move, so that a payload has no effect; valid: "
