@@ -218,7 +218,12 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
 
 
 def check_angles(
-    where: str, channels: Channels, t: Array, columns: Mapping[str, Array], stated: Collection[str]
+    where: str,
+    channels: Channels,
+    t: Array,
+    columns: Mapping[str, Array],
+    stated: Collection[str],
+    hint: str,
 ) -> None:
     """Refuse angles of hinge joints, and references for them, that are probably in degrees.
 
@@ -228,6 +233,7 @@ def check_angles(
         t: (M,) times [s].
         columns: (M,) columns of the recording by name.
         stated: Names of columns whose unit the experiment file states; they are not doubted.
+        hint: How to state units that the file does not name; may be empty.
 
     Raises:
         RecordingError: A column is probably in degrees.
@@ -241,7 +247,7 @@ def check_angles(
             raise RecordingError(
                 f"{where}: {why}; {name!r} is probably in deg{per_second}: state unit = "
                 f'"deg{per_second}" for it in [recording.columns], or unit = "rad{per_second}" if '
-                "it is not"
+                f"it is not{hint and f'. {hint}'}"
             )
 
 

@@ -92,7 +92,7 @@ class LogSummary(Record):
 
 
 def summarize(
-    file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, str], dropped: int
+    file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, ColumnSpec], rows: int
 ) -> LogSummary:
     """Summarize a log.
 
@@ -100,24 +100,21 @@ def summarize(
         file: The log.
         t: (M,) times inside the window [s], M > 1.
         columns: (M,) values by name of the recording's column, NaN where empty.
-        sources: Name of the log's column, by name of the recording's column.
-        dropped: Number of rows outside the window.
-
-    Returns:
-        The summary.
+        sources: Rules of the columns, by name.
+        rows: Number of rows inside and outside the window.
     """
     steps = np.diff(t)
-    median = float(np.median(steps))
-
     return LogSummary(
         file=file,
         rows=len(t),
         duration=float(t[-1] - t[0]),
-        rate=1.0 / median,
+        rate=1.0 / float(np.median(steps)),
         jitter_std=float(steps.std()),
         longest_step=float(steps.max()),
-        dropped=dropped,
-        columns=tuple(_column(name, sources[name], values) for name, values in columns.items()),
+        dropped=rows - len(t),
+        columns=tuple(
+            _column(name, sources[name].column, values) for name, values in columns.items()
+        ),
     )
 
 
@@ -126,8 +123,7 @@ def _column(name: str, source: str, values: Array) -> ColumnSummary:
     present = np.sort(values[np.isfinite(values)])
 
     differences = np.diff(present)
-    rounding = ROUNDING * np.abs(present[[0, -1]]).max()
-    differences = differences[differences > rounding]
+    differences = differences[differences > ROUNDING * np.abs(present[[0, -1]]).max()]
 
     return ColumnSummary(
         name=name,
@@ -135,7 +131,7 @@ def _column(name: str, source: str, values: Array) -> ColumnSummary:
         minimum=float(present[0]),
         maximum=float(present[-1]),
         empty_share=1.0 - len(present) / len(values),
-        resolution=float(differences.min()) if len(differences) else 0.0,
+        resolution=min(differences.tolist(), default=0.0),
     )
 
 
@@ -206,13 +202,9 @@ def read_log(path: Path, channels: Channels) -> Log:
     stated = {name for name, source in sources.items() if source.unit is not None}
     if table.unit_hint:
         _check_units_of_controls(table, sources)
-    try:
-        check_angles(str(path), channels, t, columns, stated)
-    except RecordingError as error:
-        raise RecordingError(f"{error}. {table.unit_hint}" if table.unit_hint else error) from None
+    check_angles(str(path), channels, t, columns, stated, table.unit_hint)
 
-    column_names = {name: source.column for name, source in sources.items()}
-    summary = summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t))
+    summary = summarize(str(path), t, columns, sources, len(stamps))
     columns |= {name: np.full(len(t), value) for name, value in spec.constants.items()}
     recording = Recording(
         t=t,

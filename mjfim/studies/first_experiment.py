@@ -336,6 +336,11 @@ def _with_amplitudes(draft: Proposal, amplitudes: Array) -> Proposal:
     return replace(draft, amplitudes=dict(zip(draft.amplitudes, amplitudes.tolist(), strict=True)))
 
 
+def _lean(draft: Proposal) -> Proposal:
+    """The draft with one parameter, which is enough where only the motion matters, and quicker."""
+    return replace(draft, chosen=draft.chosen[:1])
+
+
 @record
 class _Refinement:
     """Test of a draft by the package itself: feasible amplitudes and identifiable parameters.
@@ -352,35 +357,31 @@ class _Refinement:
 
     def refined(self, draft: Proposal) -> Proposal:
         """The draft with amplitudes that keep all limits, and with identified parameters."""
-        # One parameter is enough where only the motion matters, and much quicker.
-        lean = replace(draft, chosen=draft.chosen[:1])
-        system = System.resolve(self._experiment(lean), source=self.source)
-        if self._begins_at_rest(system, lean):
-            draft = replace(draft, boundary=AT_REST)
-            lean = replace(lean, boundary=AT_REST)
+        system = System.resolve(self._experiment(_lean(draft)), source=self.source)
+        at_rest = replace(draft, boundary=AT_REST)
+        if draft.start.held and self._can_begin(system, at_rest):
+            draft = at_rest
         # Each joint of an arm is driven, so that the controls can stop it.
         is_arm = len(driven_dofs(self.source.model)) == self.source.model.nv
 
         remarks: list[str] = list(draft.remarks)
         amplitudes = np.array(list(draft.amplitudes.values()))
-        kept = self._kept_amplitudes(system, lean, amplitudes)
+        kept = self._kept_amplitudes(system, draft, amplitudes)
         if draft.boundary and kept is not None and is_arm:
             # Servos stop a motion that fades; under torques, the design has to find the end.
             draft = replace(draft, boundary=AT_REST | {"end": "rest"})
-            ended = self._kept_amplitudes(system, replace(draft, chosen=lean.chosen), kept)
+            ended = self._kept_amplitudes(system, draft, kept)
             if ended is not None and (ended >= SMALLEST_ENDED * kept).all():
                 kept = ended
         if kept is None:
             smallest = two_digits(amplitudes * SHRINKING**TRIALS)
-            draft, remark = self._within_limits(system, draft, smallest)
+            shorter, remark = self._within_limits(system, draft, smallest)
             remarks.append(remark)
 
             # During a shorter horizon, the motion may be larger.
-            kept = smallest
-            if draft.times != lean.times:
-                shorter = replace(lean, times=draft.times)
+            if shorter is not draft:
                 kept = self._kept_amplitudes(system, shorter, amplitudes)
-                kept = smallest if kept is None else kept
+            draft, kept = shorter, smallest if kept is None else kept
         moved = _with_amplitudes(draft, kept)
         if not draft.start.held:
             remarks.append(
@@ -427,8 +428,7 @@ class _Refinement:
         Returns:
             The draft, with a shorter horizon where that helps, and a remark that names the limit.
         """
-        still = replace(draft, chosen=draft.chosen[:1])
-        still = _with_amplitudes(still, smallest)
+        still = _with_amplitudes(draft, smallest)
         try:
             task = self._task(system, still)
             first = next(iter(violations_of(task, verify(task, task.initial))), None)
@@ -462,9 +462,9 @@ class _Refinement:
         for trial in range(TRIALS):
             share = rounded(FIRST_SHARE * SHRINKING**trial)
             release = propose_release(self.source.model, draft.start.qpos, length, share)
-            lean = replace(draft, chosen=draft.chosen[:1], release=release)
-            if self._room(self._own_task(lean), 1.0) >= 0.0:
-                return self._with_parameters(replace(draft, release=release), remarks)
+            released = replace(draft, release=release)
+            if self._room(self._own_task(_lean(released)), 1.0) >= 0.0:
+                return self._with_parameters(released, remarks)
         remarks.append("Warning: no release near this start keeps all limits.")
         return self._with_parameters(draft, remarks)
 
@@ -486,25 +486,22 @@ class _Refinement:
         remarks = [*remarks, *unnamed]
         return replace(draft, remarks=remarks, chosen=proposed, others=others)
 
-    def _experiment(self, draft: Proposal, **tables: Any) -> Experiment:
-        """The experiment that a draft states, with other tables."""
-        values = {**draft.values(), **tables}
-        return Experiment(**values, directory=self.folder, source="the proposed experiment")
+    def _experiment(self, draft: Proposal) -> Experiment:
+        """The experiment that a draft states."""
+        return Experiment(**draft.values(), directory=self.folder, source="the proposed experiment")
 
     def _own_task(self, draft: Proposal) -> DesignTask:
         """The task of a draft on a plant of its own."""
         return DesignTask.of(System.resolve(self._experiment(draft), source=self.source))
 
-    def _task(self, system: System, draft: Proposal, **tables: Any) -> DesignTask:
-        """The task of a draft on the plant of a system."""
-        return DesignTask.of(replace(system, experiment=self._experiment(draft, **tables)))
+    def _task(self, system: System, draft: Proposal) -> DesignTask:
+        """The task of the motion of a draft on the plant of a system."""
+        return DesignTask.of(replace(system, experiment=self._experiment(_lean(draft))))
 
-    def _begins_at_rest(self, system: System, draft: Proposal) -> bool:
-        """Whether a design can begin at rest."""
-        if not draft.start.held:
-            return False
+    def _can_begin(self, system: System, draft: Proposal) -> bool:
+        """Whether a design can begin at rest, as a draft states."""
         try:
-            task = self._task(system, draft, boundary=AT_REST)
+            task = self._task(system, draft)
             # A design searches without the stops of joints, too.
             holds = (task.initial_hold, task.relaxed().initial_hold)
             return bool(np.isfinite(holds).all())
