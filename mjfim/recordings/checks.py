@@ -313,8 +313,7 @@ def _slope_ratio(t: Array, q: Array, v: Array) -> float:
     both = np.isfinite(q) & np.isfinite(v)
     if both.sum() < MIN_ROWS:
         return float("nan")
-    lag = max(1, both.sum() // 10)
-    dq, dv, _ = displacements(t[both], q[both], v[both], DIFFERENCE_TIME, lag)
+    dq, dv, _ = displacements(t[both], q[both], v[both], DIFFERENCE_TIME, max(1, both.sum() // 10))
     return _ratio(dv, dq)
 
 

@@ -308,8 +308,7 @@ class Table:
         fault = values if isinstance(values, str) else _fault(values)
         if fault:
             raise RecordingError(f"{self.source}: column {name!r} {fault}")
-        numbers = values.cast(pyarrow.float64(), safe=False)
-        return np.asarray(numbers.to_numpy(zero_copy_only=False))
+        return np.asarray(values.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False))
 
     def measurement(self, name: str) -> Array:
         """Return one column that holds times or measured numbers.
@@ -345,7 +344,7 @@ def _parts(values: Any) -> dict[str, Any]:
         except (pyarrow.ArrowException, OverflowError):
             return {"": NOT_NUMERIC}
 
-    if not _is_any(LISTS, values.type):
+    if not any(is_list(values.type) for is_list in LISTS):
         return {"": values}
     column = values.combine_chunks() if isinstance(values, pyarrow.ChunkedArray) else values
     width = len(column[0]) if len(column) and column[0].is_valid else 0
@@ -375,14 +374,9 @@ def _kind(values: Any) -> Any:
     return kind.value_type if types.is_dictionary(kind) else kind
 
 
-def _is_any(tests: Sequence[Any], kind: Any) -> bool:
-    """Whether an arrow type passes one of several tests."""
-    return any(test(kind) for test in tests)
-
-
 def _fault(values: Any) -> str:
     """Why an arrow array holds no numbers, with its first text that is none; empty if it does."""
-    if _is_any(NUMERIC, _kind(values)):
+    if any(is_number(_kind(values)) for is_number in NUMERIC):
         return ""
     texts = enumerate(values[:MAX_SEARCHED_ROWS].to_pylist(), start=1)
     row, text = next(((row, text) for row, text in texts if _is_text(text)), (0, ""))
@@ -590,8 +584,7 @@ def _read_json(path: Path, spec: RecordingSpec) -> Table:
     outside = dict(leaves(content)) if isinstance(content, Mapping) else {}
     if not lists and any(isinstance(value, list) for value in outside.values()):
         return Table.of(path, outside, spec)
-    records = _chosen(path, lists, spec.records)
-    rows = [dict(leaves(record)) for record in records]
+    rows = [dict(leaves(record)) for record in _chosen(path, lists, spec.records)]
     names = dict.fromkeys(name for row in rows for name in row)
     constants = {n: value for n, value in outside.items() if not isinstance(value, list)}
     return Table.of(path, constants | {n: [row.get(n) for row in rows] for n in names}, spec)

@@ -263,8 +263,7 @@ class WithUnit:
 
 def _fault(kind: str, sentence: str) -> PydanticCustomError:
     """A fault of pydantic; braces would be places for values in its message."""
-    text = sentence.replace("{", "(").replace("}", ")")
-    return PydanticCustomError(kind, text)
+    return PydanticCustomError(kind, sentence.replace("{", "(").replace("}", ")"))
 
 
 def _number(value: Any) -> float:

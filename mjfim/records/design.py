@@ -47,11 +47,10 @@ class IterateMotion(Record):
         # A trajectory with fewer samples repeats some, so that all motions have the same size.
         last = trajectory.samples
         rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
-        held = np.minimum(rows, last - 1)
         return cls(
             t=_drawn(trajectory.t[rows]),
             qpos=_drawn(trajectory.qpos[rows]),
-            ctrl=_drawn(trajectory.ctrl[held]),
+            ctrl=_drawn(trajectory.ctrl[np.minimum(rows, last - 1)]),
         )
 
 

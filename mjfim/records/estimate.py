@@ -619,8 +619,7 @@ class Estimate(ShownRecord):
         if self.nominal:
             return ""
 
-        rows = sum(len(recording.t) for recording in self.recordings)
-        if rows > MAX_NOMINAL_ROWS:
+        if sum(len(recording.t) for recording in self.recordings) > MAX_NOMINAL_ROWS:
             return (
                 "The nominal model is not drawn for recordings of more than "
                 f"{MAX_NOMINAL_ROWS:,} rows together."
@@ -786,8 +785,7 @@ class Prediction(Record):
         if not comparable.any():
             return float("nan")
 
-        log_ratios = np.log(identified[comparable] / nominal[comparable])
-        return float(np.exp(np.mean(log_ratios)))
+        return float(np.exp(np.mean(np.log(identified[comparable] / nominal[comparable]))))
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""

@@ -469,8 +469,7 @@ class Selection(Record):
         """Kept steps in groups of comparable errors: whole recordings, then segments, if any."""
         kept = [step for step in self.steps if step.is_kept]
         begins = [i for i, step in enumerate(kept) if step.decision is Decision.SHORTENED]
-        edges = [0, *begins, len(kept)]
-        return tuple(tuple(kept[first:last]) for first, last in pairwise(edges))
+        return tuple(tuple(kept[first:last]) for first, last in pairwise([0, *begins, len(kept)]))
 
     @property
     def errors(self) -> tuple[float, float]:

@@ -116,8 +116,7 @@ class Trajectory(SavedRecord):
 
     def moves_as(self, other: Trajectory) -> bool:
         """Whether times, controls and states of another trajectory are exactly the same."""
-        same_times = np.array_equal(self.t, other.t)
-        same_control = same_times and np.array_equal(self.ctrl, other.ctrl)
+        same_control = np.array_equal(self.t, other.t) and np.array_equal(self.ctrl, other.ctrl)
         return same_control and np.array_equal(self.state, other.state)
 
     def summary(self) -> dict[str, Any]:

@@ -123,8 +123,7 @@ def schroeder_phases(power: Array) -> Array:
     Returns:
         (K,) phases [rad].
     """
-    share = power / power.sum()
-    return -2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(share))[:-1]])
+    return -2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power / power.sum()))[:-1]])
 
 
 def multisine(settings: ExcitationSettings, z: Array) -> Array:
@@ -145,7 +144,7 @@ def multisine(settings: ExcitationSettings, z: Array) -> Array:
     amplitude, delay = z[3:].reshape(2, settings.nu)
 
     most = min(MAX_HARMONICS, max(int(settings.max_frequency / base), 1))
-    count = max(round(most * float(z[1])), min(2, most))
+    count = max(round(most * z[1]), min(2, most))
     order = np.arange(1, 1 + count)
     power = order ** (-2.0 * MAX_ROLL_OFF * z[2])
 
@@ -270,8 +269,7 @@ def run_baseline(
     task = DesignTask.resolve(
         search.experiment, threads=search.threads, added_information=search.added_information
     )
-    show = callback or (lambda cost: None)
-    found, steps = METHODS[search.method](search, task, budget, show)
+    found, steps = METHODS[search.method](search, task, budget, callback or (lambda cost: None))
     return replace(found, seconds=budget.seconds_used, steps=steps)
 
 
@@ -309,8 +307,7 @@ def _search_at_random(
         numbers = rng.random(count)
         is_local = len(best) > 0 and rng.random() > GLOBAL_SHARE
         if is_local:
-            share = max(CHANGED_SHARE, MIN_CHANGED / len(numbers))
-            changed = rng.random(len(numbers)) < share
+            changed = rng.random(len(numbers)) < max(CHANGED_SHARE, MIN_CHANGED / len(numbers))
             numbers = reflected(best + spread * changed * rng.normal(size=len(numbers)))
 
         deviation = largest * window * wave(settings, numbers[1:]) * bounds.scale

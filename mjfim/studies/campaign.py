@@ -229,8 +229,7 @@ def run_campaign(
             executor=Workers.of_any(executor),
             stop=token,
         )
-        status = campaign.run(measure, done)
-        return campaign.record(status)
+        return campaign.record(campaign.run(measure, done))
 
 
 @dataclass(kw_only=True, eq=False)
@@ -346,8 +345,7 @@ class _CampaignRun:
         base, last = self.base, self.rounds[-1]
         known = last.estimate.data
         moved = restate_experiment(base, theta, last.estimate)
-        weight = _information_weight(base, moved, self.rounds)
-        moved = moved.replace(cost={"information": weight})
+        moved = moved.replace(cost={"information": _information_weight(base, moved, self.rounds)})
 
         task = base.restated(moved, added_information=known)
         first = self._designed(task, executor=self.executor)
@@ -429,14 +427,13 @@ class _CampaignRun:
             return
 
         ratio, j = largest_ratio_to_target(current.attained, self.wanted)
-        name = self.base.parameters.names[j]
         event = StudyEvent(
             study="campaign",
             part=f"round {current.number}",
             index=current.number - 1,
             count=self.count,
             share=1.0,
-            message=f"largest ratio of σ to target: {ratio:.3g} ({name})",
+            message=f"largest ratio of σ to target: {ratio:.3g} ({self.base.parameters.names[j]})",
             result=current,
         )
         self.callback(event)

@@ -227,8 +227,7 @@ class _MethodRun:
             replace(self.search, experiment=experiment, threads=1, part=(i, count))
             for i in range(count)
         ]
-        budget = Budget(stop=self.stop)
-        outcomes = list(carry_out(executor, run_baseline, parts, budget))
+        outcomes = list(carry_out(executor, run_baseline, parts, Budget(stop=self.stop)))
         results = [outcome.result for outcome in outcomes if not outcome.is_lost]
         if not results:
             return None
@@ -255,8 +254,7 @@ class _MethodRun:
                 best = best if event.row.margin < 0.0 else min(best, event.row.cost)
                 self.report(best)
 
-        descent = self.search.experiment.descent
-        iterations = max(descent.max_iterations, UNLIMITED_ITERATIONS)
+        iterations = max(self.search.experiment.descent.max_iterations, UNLIMITED_ITERATIONS)
         stated = self.search.experiment.replace(
             descent={"seconds": self.search.seconds, "max_iterations": iterations}
         )
@@ -306,8 +304,7 @@ class MethodEvaluation:
         self.stage = DescentLevel(task, combinations)
 
         cost = task.experiment.cost
-        interest = len(task.parameters.interest)
-        count = interest if combinations is None else combinations.shape[1]
+        count = len(task.parameters.interest) if combinations is None else combinations.shape[1]
         self.nats = cost.information * count if cost.criterion == "D" else 0.0
 
     def result(self, method: str, found: SearchResult, note: str = "") -> MethodResult:
@@ -353,8 +350,7 @@ class MethodEvaluation:
         if inside is None:
             return evaluated
         remark = ", ".join(filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"]))
-        smaller = replace(found, control=inside.control)
-        return self._evaluate(replace(nothing, note=remark), smaller)
+        return self._evaluate(replace(nothing, note=remark), replace(found, control=inside.control))
 
     def _evaluate(self, nothing: MethodResult, found: SearchResult) -> MethodResult:
         """Evaluate a control without changing it; `nothing` where the simulation diverges.

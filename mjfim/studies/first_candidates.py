@@ -61,25 +61,24 @@ def read_urdf(
 
     def mjcf(file: str) -> str:
         """Text of the MJCF; the path of the URDF is relative to it or absolute."""
+        element = ElementTree.SubElement
         root = ElementTree.Element("mujoco", model=f"{spec.modelname} with motors")
         root.append(ElementTree.Comment(COMMENT))
         if packages:
-            custom = ElementTree.SubElement(root, "custom")
+            custom = element(root, "custom")
             for name, folder in packages.items():
-                ElementTree.SubElement(custom, "text", name=f"{PACKAGE}{name}", data=folder)
-        asset = ElementTree.SubElement(root, "asset")
-        ElementTree.SubElement(asset, "model", name="robot", file=file)
-        world = ElementTree.SubElement(root, "worldbody")
-        ElementTree.SubElement(world, "attach", model="robot", prefix="")
+                element(custom, "text", name=f"{PACKAGE}{name}", data=folder)
+        element(element(root, "asset"), "model", name="robot", file=file)
+        element(element(root, "worldbody"), "attach", model="robot", prefix="")
 
         # The range of a motor is that of the force of its joint, where the URDF states one.
-        actuators = ElementTree.SubElement(root, "actuator")
+        actuators = element(root, "actuator")
         for joint in joints:
             attributes = {"name": joint.name, "joint": joint.name}
             low, high = map(float, joint.actfrcrange)
             if low < high:
                 attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
-            ElementTree.SubElement(actuators, "motor", attributes)
+            element(actuators, "motor", attributes)
 
         ElementTree.indent(root)
         return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -436,8 +435,7 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
     alike: dict[tuple[int, float], list[int]] = {}
     for body in moving:
         if model.body_mass[body] >= SMALL_MASS * typical:
-            mass = rounded(model.body_mass[body], 6)
-            alike.setdefault((-depth[body], -mass), []).append(body)
+            alike.setdefault((-depth[body], -rounded(model.body_mass[body], 6)), []).append(body)
     last = sorted(alike.items())[:families]
     return [(body, i) for i, (_, bodies) in enumerate(last) for body in bodies]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDivergedError
 from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.excitation.limits.verification import verify, violations_of
@@ -138,8 +138,8 @@ class Proposal:
     chosen: Sequence[Candidate]
     others: Sequence[Candidate]
     limits: dict[str, Any]
-    boundary: dict[str, str]
-    remarks: Sequence[str]
+    boundary: Mapping[str, str] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
     release: ProposedRelease | None = None
 
     def values(self) -> dict[str, Any]:
@@ -279,8 +279,6 @@ def propose_experiment(
         chosen=found,
         others=absent,
         limits=limits,
-        boundary={},
-        remarks=(),
         release=release,
     )
     refinement = _Refinement(source=source, folder=folder, wishes=wishes)
@@ -364,7 +362,7 @@ class _Refinement:
         # Each joint of an arm is driven, so that the controls can stop it.
         is_arm = len(driven_dofs(self.source.model)) == self.source.model.nv
 
-        remarks: list[str] = list(draft.remarks)
+        remarks = []
         amplitudes = np.array(list(draft.amplitudes.values()))
         kept = self._kept_amplitudes(system, draft, amplitudes)
         if draft.boundary and kept is not None and is_arm:
@@ -431,10 +429,8 @@ class _Refinement:
         still = _with_amplitudes(draft, smallest)
         try:
             task = self._task(system, still)
-            first = next(iter(violations_of(task, verify(task, task.initial))), None)
-        except SimulationDivergedError:
-            first = None
-        if first is None:
+            first = next(iter(violations_of(task, verify(task, task.initial))))
+        except (SimulationDivergedError, StopIteration):
             return draft, f"Warning: {NO_MOTION}; choose another start."
 
         # A horizon that the user wants stays.
@@ -587,8 +583,7 @@ class _Refinement:
             )
         while True:
             chosen = [left[i] for i in identifiable(F[np.ix_(left, left)], sizes[left], asked)]
-            part = replace(draft, chosen=[draft.chosen[i] for i in chosen])
-            tried = self._own_task(part)
+            tried = self._own_task(replace(draft, chosen=[draft.chosen[i] for i in chosen]))
             columns = point.sensitivity.of_parameters([*chosen, *range(n, len(task.parameters))])
             # Other controls need not be tried, because this one has to show every parameter.
             found = tried.identifiability_test.along(tried.initial, columns, lambda: True)
@@ -637,12 +632,11 @@ def identifiable(F: Array, sizes: Array, asked: Sequence[int] = ()) -> Sequence[
 def _largest_std(F: Array, members: list[int]) -> float:
     """Largest standard deviation of some parameters that are estimated together."""
     part = F[np.ix_(members, members)]
-    diagonal = np.sqrt(np.diag(part))
-    if not np.isfinite(part).all() or not (diagonal > 0.0).all():
+    if not np.isfinite(part).all() or not (np.diag(part) > 0.0).all():
         return np.inf
 
     # Scaling by the diagonal keeps the eigenvalues comparable.
-    correlation = part / np.outer(diagonal, diagonal)
+    correlation, diagonal = scaled_to_unit_diagonal(part)
     values, vectors = np.linalg.eigh(correlation)
     if values[0] <= len(members) * np.finfo(float).eps * 1e3:
         return np.inf
@@ -707,7 +701,8 @@ def experiment_text(proposal: Proposal) -> str:
             continue
         entry = tomlkit.item(value)
         document.add(key, entry.comment(behind[key]) if key in behind else entry)
-    _add_others(document["parameters"], proposal)
+    if proposal.others:
+        _add_others(document["parameters"], proposal)
     return tomlkit.dumps(document).rstrip() + "\n"
 
 
@@ -782,15 +777,12 @@ def _inline(value: Any) -> Any:
 
 def _add_others(table: Any, proposal: Proposal) -> None:
     """Add the parameters that are not proposed as comments."""
-    if not proposal.others:
-        return
     table.add(tomlkit.nl())
     table.add(tomlkit.comment("Further parameters. Uncomment those that you do not trust;"))
     table.add(tomlkit.comment("`mjfim check` says which ones can be identified together."))
     for each in proposal.others:
         name, written = tomlkit.key(each.name).as_string(), _inline(each.table()).as_string()
-        meaning = _meaning(proposal.compiled, each)
-        table.add(tomlkit.comment(f"{name} = {written}  # {meaning}"))
+        table.add(tomlkit.comment(f"{name} = {written}  # {_meaning(proposal.compiled, each)}"))
 
 
 def _meaning(model: Any, each: Candidate) -> str:

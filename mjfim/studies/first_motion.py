@@ -179,14 +179,12 @@ def _eigenvalues(model: Any, data: Any) -> Array:
 def _rate(timestep: float, wanted: float) -> float:
     """A rate [Hz] whose period is a whole number of timesteps [s], preferably a round number."""
     nearest = max(round(1.0 / (wanted * timestep)), 1)
-    first = int(np.ceil(nearest / RATE_RANGE))
-    steps = range(first, int(nearest * RATE_RANGE) + 1)
+    steps = range(int(np.ceil(nearest / RATE_RANGE)), int(nearest * RATE_RANGE) + 1)
 
     def preference(k: int) -> tuple[int, float]:
         """Number of digits of the rate, then its distance from the wanted one."""
         rate = 1.0 / (k * timestep)
-        digits = len(f"{rate:.9g}".replace(".", "").strip("0"))
-        return digits, abs(float(np.log(rate / wanted)))
+        return len(f"{rate:.9g}".replace(".", "").strip("0")), abs(float(np.log(rate / wanted)))
 
     return rounded(1.0 / (min(steps, key=preference) * timestep), 12)
 
@@ -256,8 +254,7 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
         ExperimentError: There is no such keyframe at rest.
     """
     if keyframe is not None:
-        number = model.key(require_keyframe(model, keyframe)).id
-        return _start_in_keyframe(model, int(number))
+        return _start_in_keyframe(model, int(model.key(require_keyframe(model, keyframe)).id))
 
     candidates = []
     for start in _candidates(model):

@@ -201,8 +201,7 @@ def _terms(model: Any) -> Iterator[ListedTerm]:
         possible: dict[str, Term] = {}
         for words, element in elements.items():
             with suppress(ExperimentError):
-                table = TermTable(name=FREE_NAME, element=element)
-                possible[words] = kind.of(table, model, period)
+                possible[words] = kind.of(TermTable(name=FREE_NAME, element=element), model, period)
         if not possible:
             continue
 

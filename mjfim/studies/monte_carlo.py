@@ -165,8 +165,7 @@ class TrialSet:
             outputs=self.system.outputs.names,
             name="trial",
         )
-        problem = FitProblem.of(self.system, [recording], data_only=True)
-        found = least_squares(problem, start)
+        found = least_squares(FitProblem.of(self.system, [recording], data_only=True), start)
         return found.unknowns.theta if found.success else None
 
 
@@ -296,8 +295,7 @@ def _estimates(
         """Return what makes the trials in a worker."""
         return partial(_made_trials, SystemOrder.of(trial_set.system, threads), trial_set.ctrl)
 
-    results = results_on(trial_set, make, _estimated, chunks, executor, stop)
-    for number, found in enumerate(results):
+    for number, found in enumerate(results_on(trial_set, make, _estimated, chunks, executor, stop)):
         report((number + 1) / len(chunks))
         if found is not None:
             yield found

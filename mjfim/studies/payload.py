@@ -210,8 +210,7 @@ def parameters_of(name: str, spec: ParameterSpec) -> list[tuple[str, str | None]
 
     kind = spec.coordinates or "logcholesky"
     fields = BARYCENTRIC_FIELDS if kind == "barycentric" else LOGCHOLESKY_FIELDS
-    coordinates = INERTIA_PARAMETRISATIONS[kind].names
-    pairs = zip(coordinates, fields, strict=True)
+    pairs = zip(INERTIA_PARAMETRISATIONS[kind].names, fields, strict=True)
     return [(f"{name}.{each}", f"body/{spec.inertial}:{field}") for each, field in pairs]
 
 
@@ -515,8 +514,7 @@ class PayloadTask:
             inertia: Assumed rotational inertia, known to as much [kg m²]; None where it is free.
         """
         place = self.place
-        edge = self._edge(place.mass)
-        default = {"mass": place.mass, "inertia": place.mass * edge**2 / 6.0}
+        default = {"mass": place.mass, "inertia": place.mass * self._edge(place.mass) ** 2 / 6.0}
         start = {**default, **dict(zip(AXES, place.centre, strict=True)), **(values or {})}
         tables: dict[str, Any] = {}
         for field, name in place.names.items():
@@ -580,8 +578,7 @@ class PayloadTask:
         self, estimate: Estimate, known: KnownRobot, edge: float | None
     ) -> PayloadEstimate:
         """The payload of an estimate."""
-        names = self.place.names
-        index = {field: estimate.parameters.index(name) for field, name in names.items()}
+        index = {field: estimate.parameters.index(name) for field, name in self.place.names.items()}
         axes = [index[axis] for axis in AXES]
         half_widths = 0.5 * np.diff(estimate.interval[axes], axis=1).ravel()
         is_determined = half_widths < UNDETERMINED_SHARE * NORMAL_95 * self.place.length

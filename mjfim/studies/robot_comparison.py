@@ -89,8 +89,7 @@ def compare_estimates(
     tau2, freedom, numbers = np.stack([_scatter(each, compared) for each, _ in both], axis=1)
     total = freedom.sum(axis=0)
     between = (freedom * tau2).sum(axis=0) / np.maximum(total, 1.0) / numbers
-    honest = np.array([honest_std(each)[index] for each, index in both])
-    std = np.sqrt(honest**2 + between)
+    std = np.sqrt(np.array([honest_std(each)[index] for each, index in both]) ** 2 + between)
 
     # Few recordings determine this variance, so the degrees of freedom of Student's test are few.
     difference = values[1] - values[0]
@@ -138,8 +137,7 @@ def honest_std(estimate: Estimate) -> Array:
 
     # Where recordings disagree, the interval already contains their scatter.
     disagrees = (estimate.between_recordings > 0.0) & (estimate.recording_comparison is not None)
-    widened = np.where(disagrees, 0.0, half_width / NORMAL_95)
-    return np.maximum(without_scatter, widened)
+    return np.maximum(without_scatter, np.where(disagrees, 0.0, half_width / NORMAL_95))
 
 
 def _covariance(estimate: Estimate, index: Sequence[int], std: Array) -> Array:

@@ -266,8 +266,7 @@ def possible_pools(parameters: ParameterSet, names: Collection[str]) -> list[Poo
         if parameter.name not in names or not _is_plain(parameter):
             continue
         path = ParameterPath.parse(parameter.targets[0].path)
-        key = (path.kind, path.field, path.index, parameter.unit)
-        groups.setdefault(key, []).append(parameter)
+        groups.setdefault((path.kind, path.field, path.index, parameter.unit), []).append(parameter)
 
     taken = set(parameters.names)
     pools = []

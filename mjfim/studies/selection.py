@@ -417,8 +417,7 @@ class _Selector:
     def _simplified(self, model: FittedModel) -> FittedModel:
         """Pool or hold poorly known parameters as long as the prediction stays as good."""
         begin_stage("testing whether poorly known parameters are needed")
-        parameters = self.first.result.task.system.parameters
-        for pool in possible_pools(parameters, poorly_known(model)):
+        for pool in possible_pools(self.first.result.task.system.parameters, poorly_known(model)):
             words = f"one value of {pool.name} for {listed(pool.members)}"
             changed = replace(model, pooled=(*model.pooled, pool))
             model = self._simpler(model, changed, Decision.POOLED, words)
