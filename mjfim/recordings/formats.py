@@ -560,7 +560,7 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
         is_control = topic == CONTROL_TOPIC
         prefix = f"{topic}:" if with_topic or is_control else ""
         label = "ctrl" if is_control and quantity == "effort" else f"{prefix}{quantity}"
-        column: Array = np.full(len(stamps), np.nan)
+        column = np.full(len(stamps), np.nan)
         column[np.searchsorted(stamps, own)] = np.frombuffer(numbers, dtype=np.float64)
         columns[f"{label}:{joint}"] = column
     return Table.of(path, columns, RecordingSpec(time="t"))
@@ -692,7 +692,7 @@ def _table(path: Path, rows: Any, spec: RecordingSpec) -> Table:
 
 def _read_npz(path: Path, spec: RecordingSpec) -> Table:
     """Read the numbers, vectors and matrices of an archive; nothing is unpickled."""
-    contents: dict[str, Any] = {}
+    contents = {}
     for name, values in read_arrays(path, "log").items():
         if values.ndim == 2 and values.size:
             flat = pyarrow.array(values.ravel())

@@ -227,7 +227,7 @@ def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
     Raises:
         RecordingError: A dataset is damaged, or has no such episode.
     """
-    found: list[Path] = []
+    found = []
     for path in paths:
         is_dataset = is_lerobot_dataset(path)
         found += lerobot_episodes(path, channels.spec) if is_dataset else [path]

@@ -114,7 +114,7 @@ class Term(Record):
     def summary(self) -> dict[str, Any]:
         """Return the term in estimate.json, as a suspect or with the names of its parameters."""
         main, *further = self.numbers
-        found: dict[str, Any] = {
+        found = {
             "words": self.description,
             "path": main.path,
             "value": main.value,
@@ -289,7 +289,7 @@ class PooledParameter(Record):
             {"path": path, "scale": scale}
             for path, scale in zip(self.paths, self.scales, strict=True)
         ]
-        table: dict[str, object] = {"targets": targets, "guess": self.guess, "scale": self.scale}
+        table = {"targets": targets, "guess": self.guess, "scale": self.scale}
         if self.unit:
             table["unit"] = self.unit
         if isfinite(self.bounds[0]) and isfinite(self.bounds[1]):

@@ -96,7 +96,7 @@ def restate_experiment(
         estimate: Estimate from the recordings so far, or None.
     """
     experiment, p = base.experiment, base.parameters
-    tables: dict[str, dict[str, Any]] = {}
+    tables = {}
 
     for name, spec in experiment.parameters.items():
         table = spec.model_dump(exclude_unset=True)
@@ -117,7 +117,7 @@ def restate_experiment(
             continue
         for j in members:
             parameter = p.parameters[j]
-            member: dict[str, Any] = {
+            member = {
                 "target": parameter.targets[0].path,
                 "unit": parameter.unit,
                 "nuisance": parameter.nuisance,
@@ -519,7 +519,7 @@ def identify_all(
         SimulationDivergedError: The model diverges at `start` and at the guess.
     """
     found: list[Estimate] = []
-    first_error: SimulationDivergedError | None = None
+    first_error = None
     for begin in (start, base.parameters.guess):
         # The guess is needed only where the first fit is bad.
         if found and (not found[0].misfit or np.array_equal(begin, start)):

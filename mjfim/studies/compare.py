@@ -106,7 +106,7 @@ def compare(
         threads=task.system.threads,
     )
 
-    rows: list[MethodResult] = []
+    rows = []
     workers = Workers.of_any(executor)
     with (
         stop_on_interrupt(stop) as token,

@@ -88,9 +88,9 @@ def read_urdf(
 
 def _velocities(path: Path) -> dict[str, float]:
     """Velocity limits of a URDF by joint name."""
-    found: dict[str, float] = {}
+    found = {}
     for joint in ElementTree.parse(path).getroot().iter("joint"):
-        limit: Any = joint.find("limit")
+        limit = joint.find("limit")
         text = None if limit is None else limit.get("velocity")
         name = joint.get("name")
         if text is None or name is None:
@@ -145,7 +145,7 @@ def groups_of(text: str) -> list[Group]:
     Args:
         text: The names.
     """
-    found: list[Group] = []
+    found = []
     for name in (part.strip() for part in text.split(",")):
         group = next((each for each in GROUPS if each == name), None)
         if group is None:

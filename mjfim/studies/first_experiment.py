@@ -144,7 +144,7 @@ class Proposal:
 
     def values(self) -> dict[str, Any]:
         """Keys and tables of the experiment file."""
-        initial: dict[str, Any] = {}
+        initial = {}
         if self.release is not None:
             qpos, free = self.release
             initial["qpos"] = qpos.tolist()
@@ -156,7 +156,7 @@ class Proposal:
             if self.start.act.any():
                 initial["act"] = self.start.act.tolist()
 
-        values: dict[str, Any] = {
+        values = {
             "model": self.model,
             "rate": self.times.rate,
             "horizon": self.times.horizon,
@@ -179,7 +179,7 @@ class Proposal:
     def control(self) -> dict[str, Any]:
         """The key `initial.control`."""
         names = list(self.amplitudes)
-        control: dict[str, Any] = {
+        control = {
             "kind": "chirp",
             "amplitude": dict(self.amplitudes),
             "frequency": self.chirp[0],

@@ -149,7 +149,7 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
     bases = set(model.body_parentid[moves].tolist()) - {0, *np.flatnonzero(moves).tolist()}
     around = [b for b in model.geom_bodyid.tolist() if not moves[b] and b not in bases]
     height = min((float(data.xpos[body, 2]) for body in bases), default=0.0)
-    stated: dict[str, Any] = {"clearance": least}
+    stated = {"clearance": least}
     is_fixed = not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
     lowest = data.geom_xpos[moves[model.geom_bodyid], 2].min(initial=np.inf)
     if is_fixed and not around and lowest > height:

@@ -234,8 +234,8 @@ def monte_carlo(
             suited = system.released_as(curve.state[0]).calibrated(system.theta, curve.ctrl)
         trial_sets[name] = TrialSet.of(suited, curve.ctrl)
 
-    sets: dict[str, TrialStatistics] = {}
-    information: dict[str, Array] = {}
+    sets = {}
+    information = {}
     generators = np.random.default_rng(seed).spawn(len(named))
     with (
         one_blas_thread(),

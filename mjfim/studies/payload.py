@@ -140,7 +140,7 @@ class RobotExperiment:
         Args:
             theta: Values by name of the parameter [theta-unit].
         """
-        tables: dict[str, Any] = {}
+        tables = {}
         shared = self.shared
         for name, table in self.values["parameters"].items():
             if name not in shared:
@@ -516,7 +516,7 @@ class PayloadTask:
         place = self.place
         default = {"mass": place.mass, "inertia": place.mass * self._edge(place.mass) ** 2 / 6.0}
         start = {**default, **dict(zip(AXES, place.centre, strict=True)), **(values or {})}
-        tables: dict[str, Any] = {}
+        tables = {}
         for field, name in place.names.items():
             table = {"target": f"term/{place.term}:{field}", "guess": start[field]}
             if field in AXES:

@@ -24,7 +24,7 @@ from mjfim.identification.assessment.term_tests import find_missing_terms
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
-from mjfim.identification.left_out import Reduction, held_out_losses
+from mjfim.identification.left_out import held_out_losses
 from mjfim.identification.search import FitSearch, FitTask, with_length
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
@@ -394,7 +394,7 @@ class _Selector:
         """
         while tested := model.terms if tests_last else model.terms[:-1]:
             begin_stage("testing whether all added terms are needed")
-            needless: list[tuple[Reduction, Term, FittedModel]] = []
+            needless = []
             for term in tested:
                 fewer = self._without(model, term)
                 reduction = None if fewer is None else fewer.losses.reduction(model.losses)
