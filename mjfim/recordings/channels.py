@@ -122,7 +122,7 @@ def _units_of(channels: Channels) -> dict[str, str]:
     units = {component.name: component.unit for component in state_components(model)}
     for name in names_of(model, "sensor"):
         number = identifier(model, "sensor", name)
-        of_any_unit = mujoco.mjtSensor(int(model.sensor_type[number])) in SENSORS_OF_ANY_UNIT
+        of_any_unit = mujoco.mjtSensor(model.sensor_type[number]) in SENSORS_OF_ANY_UNIT
         unit = ANY if of_any_unit else sensor_unit(model, number)
         units.update(dict.fromkeys(sensor_columns(model, name), unit))
 

@@ -516,7 +516,6 @@ def displacements(
 
 
 def _sigma_by_name(channels: Channels) -> dict[str, float]:
-    """Standard deviation of the noise by name of the output."""
     return dict(zip(channels.outputs, channels.sigma.tolist(), strict=True))
 
 

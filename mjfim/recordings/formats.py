@@ -666,7 +666,6 @@ def read_table(path: Path) -> dict[str, Array]:
 
 
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
-    """Read a CSV file."""
     with _reading(path, "a readable CSV table"):
         packed = path.suffix.lower() == ".gz"
         # A thread of pyarrow that reads from Python can abort the process at its end.
@@ -675,7 +674,6 @@ def _read_csv(path: Path, spec: RecordingSpec) -> Table:
 
 
 def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
-    """Read a Parquet file."""
     with _reading(path, PARQUET), pyarrow.parquet.ParquetFile(path) as file:
         return _table(path, file.read(), spec)
 

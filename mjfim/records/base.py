@@ -287,7 +287,6 @@ class _ShortRepr(Repr):
         self.maxtuple = MAX_ENTRIES
 
     def repr1(self, value: Any, level: int) -> str:
-        """The text of one value."""
         if isinstance(value, np.ndarray):
             return f"<array of shape {value.shape}>"
         if isinstance(value, Enum):

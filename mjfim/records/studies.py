@@ -271,7 +271,6 @@ def _verdict(comparison: Comparison) -> str:
 
 
 def _percent(fraction: float) -> str:
-    """Return a fraction in percent, to two digits."""
     return f"{100.0 * fraction:.2g} %"
 
 

@@ -380,7 +380,6 @@ def _optimise(
     best = np.inf
 
     def watch(event: DesignEvent) -> None:
-        """Report the lowest J within the limits."""
         nonlocal best
         if not event.row.margin < 0.0:
             best = min(best, event.row.cost)

@@ -422,7 +422,6 @@ class _CampaignRun:
         return True
 
     def _report(self, current: Round) -> None:
-        """Report a complete round."""
         if self.callback is None:
             return
 

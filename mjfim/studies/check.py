@@ -446,7 +446,6 @@ def _made_test(system: SystemOrder, theta: Array, earlier: Array) -> Identifiabi
 
 
 def _rows_along(test: IdentifiabilityTest, probe: Trajectory, _: StopToken) -> RowsAndError | None:
-    """Differentiate one motion."""
     return test.rows_along(probe)
 
 
@@ -627,7 +626,6 @@ def _repetitions(
     place = np.flatnonzero(task.parameters.interest == parameter)[0]
 
     def suffices(repetitions: int) -> bool:
-        """Whether this number of repetitions reaches the wanted standard deviation."""
         covariance = information.covariance(repetitions * data + task.prior)
         return bool(covariance[place, place] <= wanted**2)
 

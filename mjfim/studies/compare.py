@@ -246,7 +246,6 @@ class _MethodRun:
         best = np.inf
 
         def watch(event: Event) -> None:
-            """Report an iterate."""
             nonlocal best
             if self.callback is not None:
                 self.callback(event)
@@ -318,11 +317,11 @@ class MethodEvaluation:
             found: The best control of its search.
             note: Remark about the result.
         """
-        has_control = found.control is not None
+        control = found.control
         nothing = MethodResult(
             method=method,
             title=METHOD_TITLES[method],
-            outcome=MethodOutcome.NOTHING if has_control else MethodOutcome.NONE,
+            outcome=MethodOutcome.NONE if control is None else MethodOutcome.NOTHING,
             control=None,
             cost=np.nan,
             criterion=np.nan,
@@ -335,10 +334,10 @@ class MethodEvaluation:
             relative_margins={},
             note=note,
         )
-        if found.control is None:
+        if control is None:
             return nothing
 
-        evaluated = self._evaluate(nothing, found)
+        evaluated = self._evaluate(nothing, found, control)
         if method == DESIGN or evaluated.outcome is not MethodOutcome.OUTSIDE:
             return evaluated
 
@@ -346,23 +345,22 @@ class MethodEvaluation:
         centre = self.task.centre
         relaxed = DescentLevel(self.task.relaxed(), self.stage.basis)
         search = InsideSearch(LimitedCost(level=relaxed), 0)
-        inside = search.largest(centre, found.control - centre, Budget())
+        inside = search.largest(centre, control - centre, Budget())
         if inside is None:
             return evaluated
         remark = ", ".join(filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"]))
-        return self._evaluate(replace(nothing, note=remark), replace(found, control=inside.control))
+        return self._evaluate(replace(nothing, note=remark), found, inside.control)
 
-    def _evaluate(self, nothing: MethodResult, found: SearchResult) -> MethodResult:
+    def _evaluate(self, nothing: MethodResult, found: SearchResult, control: Array) -> MethodResult:
         """Evaluate a control without changing it; `nothing` where the simulation diverges.
 
         Args:
             nothing: The row of the method where it has no usable control.
-            found: The control.
+            found: The result of the search.
+            control: (N, nu) its control, perhaps made smaller [u-unit].
         """
         task, note = self.task, nothing.note
-        point = None
-        if found.control is not None:
-            point = point_at_stated_rate(self.stage, found.control)
+        point = point_at_stated_rate(self.stage, control)
         if point is None or point.trajectory is None:
             return nothing
         if point.criterion is None or point.information is None:
@@ -388,7 +386,7 @@ class MethodEvaluation:
         return replace(
             nothing,
             outcome=outcome,
-            control=found.control,
+            control=control,
             cost=point.cost,
             criterion=point.criterion.value,
             std=self.stage.problem.information.std(point.information),

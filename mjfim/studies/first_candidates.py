@@ -87,7 +87,6 @@ def read_urdf(
 
 
 def _velocities(path: Path) -> dict[str, float]:
-    """Velocity limits of a URDF by joint name."""
     found = {}
     for joint in ElementTree.parse(path).getroot().iter("joint"):
         limit = joint.find("limit")
@@ -441,7 +440,6 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
 
 
 def _mass_and_centre(model: Any, body: int, family: int, group: Group) -> Iterator[Candidate]:
-    """Mass and centre of mass of a body."""
     name = element_name(model, "body", body)
     mass = float(model.body_mass[body])
     yield Candidate(
@@ -493,7 +491,7 @@ def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate
         # A force of friction, over a natural speed or acceleration.
         power = {"damping": 1, "armature": 2}.get(quantity, 0)
         for joint in range(model.njnt):
-            name, dof = element_name(model, "joint", joint), int(model.jnt_dofadr[joint])
+            name, dof = element_name(model, "joint", joint), model.jnt_dofadr[joint]
             value = float(getattr(model, array)[dof])
             is_single = joint_dofs(model, joint) == 1
             size = float(forces[dof] * period**power / sizes[dof] ** (power > 0))
@@ -568,7 +566,7 @@ def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
     kinds = {"qpos": ("length", "angle"), "qvel": ("velocity", "angular velocity")}
     for quantity, (length_kind, angle_kind) in kinds.items():
         for joint, name in enumerate(joint_names(model)):
-            kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+            kind = mujoco.mjtJoint(model.jnt_type[joint])
             key = f"{quantity}:{name}"
             if kind == mujoco.mjtJoint.mjJNT_FREE:
                 yield f"{key}.pos", sigmas[length_kind], length_kind

@@ -483,7 +483,6 @@ class _Refinement:
         return replace(draft, remarks=remarks, chosen=proposed, others=others)
 
     def _experiment(self, draft: Proposal) -> Experiment:
-        """The experiment that a draft states."""
         return Experiment(**draft.values(), directory=self.folder, source="the proposed experiment")
 
     def _own_task(self, draft: Proposal) -> DesignTask:
@@ -786,6 +785,5 @@ def _add_others(table: Any, proposal: Proposal) -> None:
 
 
 def _meaning(model: Any, each: Candidate) -> str:
-    """Meaning of a parameter, with its unit."""
     unit = unit_of(model, each.paths[0])
     return f"{each.meaning} [{unit}]" if unit else each.meaning

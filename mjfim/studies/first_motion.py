@@ -184,7 +184,7 @@ def _rate(timestep: float, wanted: float) -> float:
     def preference(k: int) -> tuple[int, float]:
         """Number of digits of the rate, then its distance from the wanted one."""
         rate = 1.0 / (k * timestep)
-        return len(f"{rate:.9g}".replace(".", "").strip("0")), abs(float(np.log(rate / wanted)))
+        return len(f"{rate:.9g}".replace(".", "").strip("0")), abs(np.log(rate / wanted))
 
     return rounded(1.0 / (min(steps, key=preference) * timestep), 12)
 
@@ -254,7 +254,7 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
         ExperimentError: There is no such keyframe at rest.
     """
     if keyframe is not None:
-        return _start_in_keyframe(model, int(model.key(require_keyframe(model, keyframe)).id))
+        return _start_in_keyframe(model, model.key(require_keyframe(model, keyframe)).id)
 
     candidates = []
     for start in _candidates(model):
@@ -267,7 +267,7 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
 def _candidates(model: Any) -> Iterator[Start]:
     """Starts in the order of preference."""
     for name in resting_keyframes(model):
-        yield _start_in_keyframe(model, int(model.key(name).id))
+        yield _start_in_keyframe(model, model.key(name).id)
 
     resting = _resting_control(model, _inside_ranges(model, model.qpos0))
     first = _start(model, model.qpos0, resting, "the reference positions of the MJCF")
@@ -283,7 +283,6 @@ def _candidates(model: Any) -> Iterator[Start]:
 
 
 def _start_in_keyframe(model: Any, number: int) -> Start:
-    """The start in a keyframe."""
     key = model.key(number)
     reason = f"the keyframe {key.name!r} of the MJCF"
     return _start(model, key.qpos, key.ctrl, reason, keyframe=key.name)
@@ -370,7 +369,7 @@ def _activations(model: Any, data: Any, control: Array) -> Array:
     """(na,) activations in which actuators with a state rest under a control."""
     act = np.zeros(model.na)
     for i in range(model.nactuator):
-        first, count = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
+        first, count = model.actuator_actadr[i], model.actuator_actnum[i]
         if count == 0:
             continue
         if is_integrated(model, i):
@@ -466,7 +465,7 @@ def driven_dofs(model: Any) -> list[int]:
     joints = {
         int(model.actuator_trnid[i, 0])
         for i in range(model.nactuator)
-        if mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT and model.actuator_ctrlnum[i]
+        if mujoco.mjtTrn(model.actuator_trntype[i]) in AT_JOINT and model.actuator_ctrlnum[i]
     }
     return [model.jnt_dofadr[j] for j in sorted(joints) if joint_dofs(model, j) == 1]
 

@@ -59,12 +59,12 @@ FURTHER_WIDTHS = {
 
 # What an actuator acts on, by MuJoCo's type of transmission, with the kind of the element.
 TRANSMISSIONS = {
-    int(mujoco.mjtTrn.mjTRN_JOINT): "joint",
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT): "joint",
-    int(mujoco.mjtTrn.mjTRN_SLIDERCRANK): "site",
-    int(mujoco.mjtTrn.mjTRN_TENDON): "tendon",
-    int(mujoco.mjtTrn.mjTRN_SITE): "site",
-    int(mujoco.mjtTrn.mjTRN_BODY): "body",
+    mujoco.mjtTrn.mjTRN_JOINT: "joint",
+    mujoco.mjtTrn.mjTRN_JOINTINPARENT: "joint",
+    mujoco.mjtTrn.mjTRN_SLIDERCRANK: "site",
+    mujoco.mjtTrn.mjTRN_TENDON: "tendon",
+    mujoco.mjtTrn.mjTRN_SITE: "site",
+    mujoco.mjtTrn.mjTRN_BODY: "body",
 }
 
 
@@ -156,7 +156,7 @@ def _outputs(source: ModelSource) -> Iterator[ListedOutput]:
 
     for number in coordinates.sensors:
         sensor = identifier(model, "sensor", number.sensor)
-        kind = mujoco.mjtSensor(int(model.sensor_type[sensor]))
+        kind = mujoco.mjtSensor(model.sensor_type[sensor])
         yield ListedOutput(
             name=number.name,
             source=kind.name.removeprefix("mjSENS_").lower(),
@@ -171,7 +171,7 @@ def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
     counts = np.asarray(model.actuator_ctrlnum, dtype=int)
     numbers = np.repeat(np.arange(len(counts)), counts).tolist()
     for control, i in zip(source.coordinates.controls, numbers, strict=True):
-        kind = TRANSMISSIONS.get(int(model.actuator_trntype[i]), "")
+        kind = TRANSMISSIONS.get(mujoco.mjtTrn(model.actuator_trntype[i]), "")
         drives = ""
         if kind:
             drives = f"{kind} {unique_names(model, kind)[model.actuator_trnid[i, 0]]}"

@@ -292,7 +292,6 @@ def _estimates(
         rng.standard_normal((count, len(trial_set.exact)))  # the numbers of this chunk
 
     def make(threads: int) -> Callable[[], TrialSet]:
-        """Return what makes the trials in a worker."""
         return partial(_made_trials, SystemOrder.of(trial_set.system, threads), trial_set.ctrl)
 
     for number, found in enumerate(results_on(trial_set, make, _estimated, chunks, executor, stop)):
@@ -302,7 +301,6 @@ def _estimates(
 
 
 def _made_trials(system: SystemOrder, ctrl: Array) -> TrialSet:
-    """Make the trials of a study."""
     return TrialSet.of(system.system(), ctrl)
 
 

@@ -531,7 +531,6 @@ class PayloadTask:
         return self.size if self.size is not None else float(np.cbrt(mass / DENSITY))
 
     def _determines_inertia(self, fit: FitResult) -> bool:
-        """Whether the recordings determine the rotational inertia of the payload."""
         j = fit.task.system.parameters.names.index(self.place.names["inertia"])
         value = float(fit.theta[j])
         half_width = np.abs(fit.accuracy.interval[j] - value).max()

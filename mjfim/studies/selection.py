@@ -557,9 +557,7 @@ class _Selector:
         return None if losses is None else replace(model, losses=losses, tests=None)
 
     def _search(self, task: FitTask) -> FitSearch:
-        """Searches of a task."""
         return FitSearch(task=task, budget=self.budget, callback=self.callback)
 
     def _is_stopped(self) -> bool:
-        """True after a request to stop."""
         return self.budget.stop.requested
