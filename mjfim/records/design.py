@@ -91,9 +91,10 @@ class IterateMotions(Record):
             return None
         return cls(
             iteration=np.array([iteration for iteration, _ in motions], dtype=np.float64),
-            t=np.stack([motion.t for _, motion in motions]),
-            qpos=np.stack([motion.qpos for _, motion in motions]),
-            ctrl=np.stack([motion.ctrl for _, motion in motions]),
+            **{
+                name: np.stack([getattr(motion, name) for _, motion in motions])
+                for name in ("t", "qpos", "ctrl")
+            },
         )
 
 

@@ -124,8 +124,8 @@ class HorizonStudy(Record):
         return np.column_stack([np.minimum(interval[:, 0], low), np.maximum(interval[:, 1], high)])
 
     def __str__(self) -> str:
-        uses = () if self.is_used else (self.about_use,)
-        return " ".join([self.about_choice, *uses, self.about_growth, *self.findings])
+        sentences = [self.about_choice, self.about_use, self.about_growth, *self.findings]
+        return " ".join(filter(None, sentences))
 
     @property
     def about_choice(self) -> str:

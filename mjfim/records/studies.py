@@ -183,12 +183,13 @@ class Comparison(ShownRecord):
         if design is None:
             return ()
 
-        better = []
-        for row in self.rows:
-            if row is design or not row.sound:
-                continue
-            if not design.sound or self.gain(row, design) > TIE_TOLERANCE:
-                better.append(row)
+        better = [
+            row
+            for row in self.rows
+            if row is not design
+            and row.sound
+            and (not design.sound or self.gain(row, design) > TIE_TOLERANCE)
+        ]
         return tuple(sorted(better, key=lambda row: row.cost))
 
     def gain(self, row: MethodResult, other: MethodResult) -> float:

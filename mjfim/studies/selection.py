@@ -394,12 +394,13 @@ class _Selector:
         """
         while tested := model.terms if tests_last else model.terms[:-1]:
             begin_stage("testing whether all added terms are needed")
-            needless = []
-            for term in tested:
-                fewer = self._without(model, term)
-                reduction = None if fewer is None else fewer.losses.reduction(model.losses)
-                if fewer is not None and reduction is not None and not reduction.is_clear:
-                    needless.append((reduction, term, fewer))
+            tried = [(term, self._without(model, term)) for term in tested]
+            needless = [
+                (reduction, term, fewer)
+                for term, fewer in tried
+                if fewer is not None
+                and not (reduction := fewer.losses.reduction(model.losses)).is_clear
+            ]
             if not needless:
                 break
             reduction, term, model = min(needless, key=lambda found: found[0].mean)
