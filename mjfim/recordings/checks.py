@@ -507,11 +507,8 @@ def displacements(
         (M-lag,) differences of the position, (M-lag,) integrals of the velocity by the trapezoidal
         rule, and lag, the number of rows of a displacement.
     """
-    steps = np.diff(t)
-    lag = int(np.clip(round(duration / np.median(steps)), 1, max_lag))
-
-    means = 0.5 * (v[1:] + v[:-1])
-    integral = np.concatenate([[0.0], np.cumsum(means * steps)])
+    lag = int(np.clip(round(duration / np.median(np.diff(t))), 1, max_lag))
+    integral = scipy.integrate.cumulative_trapezoid(v, t, initial=0.0)
     return q[lag:] - q[:-lag], integral[lag:] - integral[:-lag], lag
 
 

@@ -390,7 +390,7 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
 
 def _first_true(condition: np.ndarray) -> int:
     """Index of the first True of condition: (M,); M if there is none."""
-    return int(np.argmax(condition)) if condition.any() else len(condition)
+    return int(np.argmax(np.append(condition, True)))
 
 
 def _columns(
