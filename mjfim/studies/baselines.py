@@ -173,8 +173,7 @@ def random_steps(settings: ExcitationSettings, z: Array) -> Array:
     levels = np.concatenate([np.zeros((1, settings.nu)), levels])
 
     # Progress of the transition from the previous level to the present one, 0 to 1.
-    duration = max(float(z[1]), SHORTEST_TRANSITION)
-    progress = (settings.t / held - index) / duration
+    progress = (settings.t / held - index) / max(float(z[1]), SHORTEST_TRANSITION)
     smooth = 0.5 - 0.5 * np.cos(np.pi * np.clip(progress, 0.0, 1.0))
     share = np.where(settings.may_jump, 1.0, smooth)[:, None]
     return np.asarray((1.0 - share) * levels[index] + share * levels[index + 1])

@@ -251,11 +251,10 @@ def propose_experiment(
                 "joints"
             )
     # Ranges about the resting control for controls that have none in the MJCF.
-    widths = CONTROL_LIMIT * wanted
     ranges = {
         name: [rounded(centre - width, 3), rounded(centre + width, 3)]
         for name, centre, width, is_limited in zip(
-            controls, start.control, widths, model.actuator_ctrllimited, strict=True
+            controls, start.control, CONTROL_LIMIT * wanted, model.actuator_ctrllimited, strict=True
         )
         if not is_limited
     }
@@ -498,8 +497,7 @@ class _Refinement:
         try:
             task = self._task(system, draft)
             # A design searches without the stops of joints, too.
-            holds = (task.initial_hold, task.relaxed().initial_hold)
-            return bool(np.isfinite(holds).all())
+            return bool(np.isfinite((task.initial_hold, task.relaxed().initial_hold)).all())
         except MjfimError:
             return False
 

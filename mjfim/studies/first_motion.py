@@ -88,8 +88,7 @@ def time_scale(model: Any, data: Any) -> TimeScale:
         longest = max(LARGEST_GROWTH / growth, SHORTEST * period)
 
     # The horizon has two significant digits, and is a whole number of samples.
-    wanted = rounded(longest)
-    samples = max(round(wanted * rate), 2)
+    samples = max(round(rounded(longest) * rate), 2)
     return TimeScale(period=period, rate=rate, samples=samples, unstable=unstable)
 
 

@@ -206,10 +206,9 @@ def _terms(model: Any) -> Iterator[ListedTerm]:
             continue
 
         # Units differ between slides and hinges.
-        first = next(iter(possible.values()))
         fields = tuple(
             f"{field} [{quantity.unit}]" if quantity.unit else field
-            for field, quantity in first.quantities
+            for field, quantity in next(iter(possible.values())).quantities
         )
         yield ListedTerm(
             kind=name, description=kind.description, elements=tuple(possible), fields=fields

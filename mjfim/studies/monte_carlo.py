@@ -225,8 +225,7 @@ def monte_carlo(
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
 
     # A trajectory that cannot be simulated fails before the first trial.
-    first = next(iter(named.values()))
-    calibrated = system.calibrated(system.theta, first.ctrl)
+    calibrated = system.calibrated(system.theta, next(iter(named.values())).ctrl)
     trial_sets = {}
     for name, curve in named.items():
         suited = calibrated

@@ -104,7 +104,7 @@ class RobotExperiment:
         gone = set()
         for name, spec in experiment.parameters.items():
             of_load = [target.path.startswith(prefixes) for target in spec.all_targets]
-            if loads and any(of_load):
+            if any(of_load):
                 if not all(of_load):
                     raise ExperimentError(
                         f"{experiment.source}: parameters.{name}: sets numbers of the payload and "
