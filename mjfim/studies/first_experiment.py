@@ -178,16 +178,15 @@ class Proposal:
 
     def control(self) -> dict[str, Any]:
         """The key `initial.control`."""
-        names = list(self.amplitudes)
         control = {
             "kind": "chirp",
-            "amplitude": dict(self.amplitudes),
+            "amplitude": self.amplitudes,
             "frequency": self.chirp[0],
             "frequency_end": self.chirp[1],
         }
         if "end" in self.boundary:
             control["fade"] = rounded(FADE * self.times.period)
-        offset = dict(zip(names, self.start.control.tolist(), strict=True))
+        offset = dict(zip(self.amplitudes, self.start.control.tolist(), strict=True))
         if any(offset.values()):
             control["offset"] = offset
         return control

@@ -1,8 +1,7 @@
 """Monte-Carlo studies that compare the estimator with the Cramér-Rao bound.
 
-The trials are divided into chunks. The trials of a chunk are stepped together
-(`mjfim/studies/monte_carlo.py`), in this process or by a worker; every chunk has its part of one
-sequence of random numbers.
+The trials are divided into chunks. The trials of a chunk are stepped together, in this process or
+by a worker. Every chunk has its part of one sequence of random numbers.
 """
 
 from __future__ import annotations
@@ -204,7 +203,7 @@ def monte_carlo(
         trials: Number of repetitions per trajectory.
         seed: Seed of the noise.
         measure_rate: Measurement rate [Hz] instead of that of the experiment.
-        callback: Called with a `StudyEvent` whenever all trials have made a step.
+        callback: Called with a `StudyEvent` whenever a chunk of trials is done.
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the study early, as Ctrl-C does; the trials that are finished are returned.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
