@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,6 +21,7 @@ from mjfim.model.elements import identifier, names_of
 from mjfim.model.units import sensor_unit
 from mjfim.recordings.quantities import Unit, units_like
 from mjfim.recordings.section import LAW_PREFIXES, LogUnit, RecordingSpec
+from mjfim.records.base import record
 
 # Factor that converts each unit of a log to the model's unit.
 UNIT_FACTORS = {unit: Unit.parse(unit).factor for unit in get_args(LogUnit)}
@@ -41,7 +41,7 @@ SENSORS_OF_ANY_UNIT = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Channels:
     """Signals of an experiment by name, and everything else that is needed to read and check a log.
 
@@ -122,7 +122,7 @@ def _units_of(channels: Channels) -> dict[str, str]:
     units = {component.name: component.unit for component in state_components(model)}
     for name in names_of(model, "sensor"):
         number = identifier(model, "sensor", name)
-        of_any_unit = mujoco.mjtSensor(int(model.sensor_type[number])) in SENSORS_OF_ANY_UNIT
+        of_any_unit = mujoco.mjtSensor(model.sensor_type[number]) in SENSORS_OF_ANY_UNIT
         unit = ANY if of_any_unit else sensor_unit(model, number)
         units.update(dict.fromkeys(sensor_columns(model, name), unit))
 

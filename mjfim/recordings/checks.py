@@ -81,18 +81,18 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
             f"{where}: too few rows ({len(t)}); an identification needs at least {MIN_ROWS}"
         )
     if not np.isfinite(t).all():
-        row = int(np.argmax(~np.isfinite(t)))
+        row = np.argmax(~np.isfinite(t))
         fault = "NaN" if np.isnan(t[row]) else "an infinite time"
         raise RecordingError(f"{where} holds {fault} in data row {first + row + 1}")
 
     steps = np.diff(t)
     if np.any(steps <= 0.0):
-        row = int(np.argmax(steps <= 0.0))
+        row = np.argmax(steps <= 0.0)
         raise RecordingError(
             f"{where} does not increase in data row {first + row + 2}: {t[row]:.9g} s, then "
             f"{t[row + 1]:.9g} s {_why_not_later(t, steps, row)}"
         )
-    median = float(np.median(steps))
+    median = np.median(steps)
     if not MIN_MEDIAN_STEP <= median <= MAX_MEDIAN_STEP:
         # Logarithms neither vanish nor overflow where a step is extremely short or long.
         size = np.log(median) - np.log(SECONDS[unit] * TYPICAL_STEP)
@@ -103,7 +103,7 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
         )
 
     limit = longest_bridged_gap(t, gap)
-    row = int(np.argmax(steps))
+    row = np.argmax(steps)
     if steps[row] > limit:
         raise RecordingError(
             f"{where}: a gap of {steps[row]:g} s after data row {first + row + 1} "
@@ -117,10 +117,10 @@ def longest_bridged_gap(t: Array, gap: float) -> float:
     return max(gap, MIN_GAP_STEPS * float(np.median(np.diff(t))))
 
 
-def _why_not_later(t: Array, steps: Array, row: int) -> str:
+def _why_not_later(t: Array, steps: Array, row: np.intp) -> str:
     """Probable cause of a time that is not later than the one before, and its cure."""
     if steps[row] == 0.0:
-        count = int(np.sum(steps == 0.0))
+        count = np.sum(steps == 0.0)
         others = f", one of {count}" if count > 1 else ""
         return f"(a duplicate{others}); every row needs a different time"
     # A clock that restarts jumps back to the beginning and continues from there.
@@ -141,7 +141,7 @@ def check_finite(where: str, values: Array, first: int) -> None:
     """
     too_large = np.abs(values) > LARGEST_VALUE
     if too_large.any():
-        at = int(np.argmax(too_large))
+        at = np.argmax(too_large)
         raise RecordingError(
             f"{where} is {values[at]:g} in data row {first + at + 1}, which is too large to be a "
             "measured number; leave the field empty if there is no number"
@@ -173,7 +173,7 @@ def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
     # A column with a low rate is empty in most rows, so its gaps are compared with its median step.
     limit = longest_bridged_gap(t[present], gap) if len(present) > 1 else gap
     edges = np.concatenate([t[:1], t[present], t[-1:]])
-    longest = int(np.argmax(np.diff(edges)))
+    longest = np.argmax(np.diff(edges))
     if edges[longest + 1] - edges[longest] > limit:
         begin, end = edges[longest] - t[0], edges[longest + 1] - t[0]
         raise RecordingError(
@@ -198,7 +198,7 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
     if np.isnan(values[0]):
         reason = "it holds no number"
         if np.isfinite(values).any():
-            row = int(np.argmax(~np.isnan(values)))
+            row = np.argmax(~np.isnan(values))
             reason = f"it begins {t[row] - t[0]:g} s later"
         raise RecordingError(
             f"{where} has no value in the first row; {reason}; every control is needed from the "
@@ -206,7 +206,7 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
         )
     limit = longest_bridged_gap(t, gap)
     if age.max() > limit:
-        end = int(np.argmax(age))
+        end = np.argmax(age)
         raise RecordingError(
             f"{where} is empty for {age[end]:g} s until {t[end] - t[0]:g} s; a control is not held "
             f"longer than {limit:g} s: exclude this time by recording.window, or raise "
@@ -218,7 +218,12 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
 
 
 def check_angles(
-    where: str, channels: Channels, t: Array, columns: Mapping[str, Array], stated: Collection[str]
+    where: str,
+    channels: Channels,
+    t: Array,
+    columns: Mapping[str, Array],
+    stated: Collection[str],
+    hint: str,
 ) -> None:
     """Refuse angles of hinge joints, and references for them, that are probably in degrees.
 
@@ -228,6 +233,7 @@ def check_angles(
         t: (M,) times [s].
         columns: (M,) columns of the recording by name.
         stated: Names of columns whose unit the experiment file states; they are not doubted.
+        hint: How to state units that the file does not name; may be empty.
 
     Raises:
         RecordingError: A column is probably in degrees.
@@ -241,7 +247,7 @@ def check_angles(
             raise RecordingError(
                 f"{where}: {why}; {name!r} is probably in deg{per_second}: state unit = "
                 f'"deg{per_second}" for it in [recording.columns], or unit = "rad{per_second}" if '
-                "it is not"
+                f"it is not{hint and f'. {hint}'}"
             )
 
 
@@ -250,7 +256,7 @@ def _doubtful_angles(
 ) -> Iterator[tuple[str, str]]:
     """Columns of hinge joints that look like degrees, and why."""
     for j, joint in enumerate(joint_names(model)):
-        if int(model.jnt_type[j]) != int(mujoco.mjtJoint.mjJNT_HINGE):
+        if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
             continue
         position, velocity = f"qpos:{joint}", f"qvel:{joint}"
         q, v = columns.get(position), columns.get(velocity)
@@ -307,8 +313,7 @@ def _slope_ratio(t: Array, q: Array, v: Array) -> float:
     both = np.isfinite(q) & np.isfinite(v)
     if both.sum() < MIN_ROWS:
         return float("nan")
-    lag = max(1, int(both.sum()) // 10)
-    dq, dv, _ = displacements(t[both], q[both], v[both], DIFFERENCE_TIME, lag)
+    dq, dv, _ = displacements(t[both], q[both], v[both], DIFFERENCE_TIME, max(1, both.sum() // 10))
     return _ratio(dv, dq)
 
 
@@ -397,7 +402,7 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
         i = channels.controls.index(name)
         low, high = model.actuator_ctrlrange[i]
         tolerance = RANGE_TOLERANCE * (high - low)
-        share = float(np.mean((u < low - tolerance) | (u > high + tolerance)))
+        share = np.mean((u < low - tolerance) | (u > high + tolerance))
         if model.actuator_ctrllimited[i] and share > MAX_SHARE_OUTSIDE_RANGE:
             yield (
                 f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in "
@@ -405,7 +410,8 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
                 "the simulation clamps it to the range"
             )
 
-        rough, correlation = _rough_share(u), float(np.corrcoef(u[1:], u[:-1])[0, 1])
+        rough = np.var(_rough_part(u)) / np.var(u)
+        correlation = np.corrcoef(u[1:], u[:-1])[0, 1]
         if rough > MAX_ROUGH_CONTROL_SHARE and correlation < MIN_CONTROL_CORRELATION:
             yield (
                 f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies "
@@ -428,18 +434,17 @@ def _roughness_remarks(
             continue
 
         rough, explanation = _rough_part(y), "is too quick for a smooth motion"
-        unexplained, least = float(np.var(rough)), MAX_ROUGH_SHARE * float(np.var(y))
+        unexplained, least = float(np.var(rough)), MAX_ROUGH_SHARE * np.var(y)
         if predicted is not None and name in channels.outputs and unexplained > least:
             motion = predicted[:MAX_ROWS, channels.outputs.index(name)][present]
             quick, explanation = _rough_part(motion), "is not explained by the identified motion"
-            correlation = float(np.corrcoef(quick, rough)[0, 1]) if quick.any() else 0.0
+            correlation = np.corrcoef(quick, rough)[0, 1] if quick.any() else 0.0
             unexplained *= 1.0 - correlation**2
             # A model whose motion is another one shows at least how quick it is.
             if correlation < MIN_SAME_MOTION:
-                power = float(np.var(rough) - MODEL_FACTOR * np.var(quick))
-                unexplained = min(unexplained, power)
+                unexplained = min(unexplained, float(np.var(rough) - MODEL_FACTOR * np.var(quick)))
         noise = SIGNIFICANT_SIGMAS * sigma.get(name, 0.0)
-        if unexplained > max(least, noise**2):
+        if unexplained > least and unexplained > noise**2:
             share = unexplained / np.var(y)
             yield (
                 f"{name} is rough: {100 * share:.0f} % of its variance lies within {MEDIAN_ROWS} "
@@ -464,9 +469,9 @@ def contradiction_remarks(
 
         q, v = columns[position][both], columns[velocity][both]
         dq, dv, lag = displacements(t[both], q, v, COMPARISON_TIME, len(q) // 4)
-        size, difference = float(np.std(dq)), float(np.std(dq - dv))
+        size, difference = np.std(dq), np.std(dq - dv)
         # Noise of a difference of positions, and of an integral of velocities.
-        integral = np.sqrt(lag) * float(np.median(np.diff(t[both])))
+        integral = np.sqrt(lag) * np.median(np.diff(t[both]))
         expected = SIGNIFICANT_SIGMAS * np.hypot(
             np.sqrt(2.0) * sigma.get(position, 0.0), integral * sigma.get(velocity, 0.0)
         )
@@ -477,7 +482,7 @@ def contradiction_remarks(
                 for name in (position, velocity)
             )
             of_model = np.subtract(*displacements(t[both], q, v, COMPARISON_TIME, len(q) // 4)[:2])
-            expected += MODEL_FACTOR * float(np.std(of_model))
+            expected += MODEL_FACTOR * np.std(of_model)
         if size > 0.0 and difference > max(MAX_DISAGREEMENT * size, expected):
             yield (
                 f"{position} and the integral of {velocity} differ by "
@@ -502,27 +507,18 @@ def displacements(
         (M-lag,) differences of the position, (M-lag,) integrals of the velocity by the trapezoidal
         rule, and lag, the number of rows of a displacement.
     """
-    steps = np.diff(t)
-    lag = int(np.clip(round(duration / float(np.median(steps))), 1, max_lag))
-
-    means = 0.5 * (v[1:] + v[:-1])
-    integral = np.concatenate([[0.0], np.cumsum(means * steps)])
+    lag = int(np.clip(round(duration / np.median(np.diff(t))), 1, max_lag))
+    integral = scipy.integrate.cumulative_trapezoid(v, t, initial=0.0)
     return q[lag:] - q[:-lag], integral[lag:] - integral[:-lag], lag
 
 
 def _sigma_by_name(channels: Channels) -> dict[str, float]:
-    """Standard deviation of the noise by name of the output."""
     return dict(zip(channels.outputs, channels.sigma.tolist(), strict=True))
 
 
 def _moves(x: Array) -> bool:
     """Whether a column x: (M,) is long enough to be inspected, and not constant."""
     return len(x) >= SHORTEST_COLUMN and float(np.ptp(x)) > 0.0
-
-
-def _rough_share(x: Array) -> float:
-    """Fraction of the variance of x: (M,) that a running median removes."""
-    return float(np.var(_rough_part(x)) / np.var(x))
 
 
 def _rough_part(x: Array) -> Array:

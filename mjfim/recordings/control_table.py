@@ -49,7 +49,7 @@ def read_control(
     rows = len(columns["t"])
     if f"ctrl:{names[0]}" in keys:
         held = ~np.isnan([columns[key] for key in keys]).all(axis=0)
-        rows = int(np.flatnonzero(held)[-1]) + 1 if held.any() else 0
+        rows = np.flatnonzero(held)[-1] + 1 if held.any() else 0
     stamps = _finite(path, columns, ["t"], rows)[:, 0]
     values = _finite(path, columns, keys, rows)
     if len(stamps) < 2 or np.any(np.diff(stamps) <= 0):
@@ -58,7 +58,7 @@ def read_control(
         )
 
     # The last row is held for the typical period of the table.
-    end = stamps[-1] + float(np.median(np.diff(stamps)))
+    end = stamps[-1] + np.median(np.diff(stamps))
     if repeat:
         t = stamps[0] + np.mod(t - t[0] + STAMP_TOLERANCE * dt, end - stamps[0])
     elif stamps[0] > t[0] + TIME_TOLERANCE or end < t[-1] + dt - TIME_TOLERANCE:
@@ -67,7 +67,7 @@ def read_control(
             f"{len(stamps)} rows, the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"
         )
     row = np.searchsorted(stamps, t + STAMP_TOLERANCE * dt, side="right") - 1
-    return np.asarray(values[np.clip(row, 0, len(stamps) - 1)])
+    return values[np.clip(row, 0, len(stamps) - 1)]
 
 
 def _check_columns(

@@ -19,7 +19,7 @@ import zlib
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError, listed, shortened, unknown
 from mjfim.files import read_arrays, read_json
 from mjfim.recordings.section import INPUT_PREFIXES, RecordingSpec
+from mjfim.records.base import record
 
 # File that makes a folder a dataset, and the column that says to which episode a frame belongs.
 INFO_FILE = "meta/info.json"
@@ -49,11 +50,21 @@ DATA_FILES = {2: "data/chunk-*/episode_{episode:06d}.parquet", 3: "data/chunk-*/
 # Kinds of features that hold no numbers, and may be large.
 NO_NUMBERS = ("image", "video", "string")
 
-# Errors that pyarrow raises for a damaged file.
-UNREADABLE = (pyarrow.ArrowException, OSError, EOFError, ValueError)
+# Errors that libraries raise for a damaged file.
+UNREADABLE = (
+    pyarrow.ArrowException,
+    OSError,
+    EOFError,
+    ValueError,
+    RecursionError,
+    zlib.error,
+)
+
+# What a Parquet file should be, in words.
+PARQUET = "a readable Parquet file (damaged or truncated?)"
 
 # Rounding of a time stamp in single precision, relative to the time.
-SINGLE_PRECISION = 2.0 * float(np.finfo(np.float32).eps)
+SINGLE_PRECISION = 2.0 * np.finfo(np.float32).eps
 
 # How to state the units of a dataset, which its files do not name.
 UNIT_HINT = (
@@ -172,7 +183,7 @@ def _frames(folder: Path, info: Mapping[str, Any], episode: int, names: list[str
 
     parts = []
     for file in files:
-        try:
+        with _reading(file, PARQUET):
             schema = pyarrow.parquet.read_schema(file)
             parts.append(
                 pyarrow.parquet.read_table(
@@ -182,10 +193,6 @@ def _frames(folder: Path, info: Mapping[str, Any], episode: int, names: list[str
                     partitioning=None,
                 )
             )
-        except UNREADABLE as error:
-            raise RecordingError(
-                f"{file}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
-            ) from None
 
     rows = pyarrow.concat_tables(parts, promote_options="default")
     if not rows.num_rows:
@@ -226,7 +233,7 @@ NUMERIC = (types.is_integer, types.is_floating, types.is_decimal, types.is_boole
 LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Table:
     """Columns of one file, all with M rows.
 
@@ -301,8 +308,7 @@ class Table:
         fault = values if isinstance(values, str) else _fault(values)
         if fault:
             raise RecordingError(f"{self.source}: column {name!r} {fault}")
-        numbers = values.cast(pyarrow.float64(), safe=False)
-        return np.asarray(numbers.to_numpy(zero_copy_only=False))
+        return np.asarray(values.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False))
 
     def measurement(self, name: str) -> Array:
         """Return one column that holds times or measured numbers.
@@ -338,7 +344,7 @@ def _parts(values: Any) -> dict[str, Any]:
         except (pyarrow.ArrowException, OverflowError):
             return {"": NOT_NUMERIC}
 
-    if not _is_any(LISTS, values.type):
+    if not any(is_list(values.type) for is_list in LISTS):
         return {"": values}
     column = values.combine_chunks() if isinstance(values, pyarrow.ChunkedArray) else values
     width = len(column[0]) if len(column) and column[0].is_valid else 0
@@ -346,7 +352,7 @@ def _parts(values: Any) -> dict[str, Any]:
     lengths = pyarrow.compute.list_value_length(column).to_numpy(zero_copy_only=False)
     if (lengths == width).all():
         return {f"[{i}]": numbers[i::width] for i in range(width)}
-    row = int(np.argmax(lengths != width)) + 1
+    row = np.argmax(lengths != width) + 1
     fault = f"is ragged: row {row} does not have {width} numbers, as the first row has"
     return {f"[{i}]": fault for i in range(max(width, 1))}
 
@@ -368,14 +374,9 @@ def _kind(values: Any) -> Any:
     return kind.value_type if types.is_dictionary(kind) else kind
 
 
-def _is_any(tests: Sequence[Any], kind: Any) -> bool:
-    """Whether an arrow type passes one of several tests."""
-    return any(test(kind) for test in tests)
-
-
 def _fault(values: Any) -> str:
     """Why an arrow array holds no numbers, with its first text that is none; empty if it does."""
-    if _is_any(NUMERIC, _kind(values)):
+    if any(is_number(_kind(values)) for is_number in NUMERIC):
         return ""
     texts = enumerate(values[:MAX_SEARCHED_ROWS].to_pylist(), start=1)
     row, text = next(((row, text) for row, text in texts if _is_text(text)), (0, ""))
@@ -388,6 +389,25 @@ def _is_text(value: object) -> bool:
         return isinstance(value, str) and bool(value) and float(value) is None
     except ValueError:
         return True
+
+
+@contextmanager
+def _reading(
+    path: Path, kind: str, errors: tuple[type[Exception], ...] = UNREADABLE
+) -> Iterator[None]:
+    """Say that a file is damaged where a library cannot read it.
+
+    Args:
+        path: The file.
+        kind: What it should be, in words.
+        errors: Errors that the library raises for a damaged file.
+    """
+    try:
+        yield
+    except RecordingError:
+        raise
+    except errors as error:
+        raise RecordingError(f"{path}: not {kind}: {one_line(error)}") from None
 
 
 def one_line(error: Exception) -> str:
@@ -446,17 +466,11 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
     rosbag2 = rosbags_module(path, "rosbags.rosbag2")
     typesys = rosbags_module(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    try:
-        with rosbag2.Reader(path) as reader:
-            connections = _connections(path, reader.connections, spec.topics)
-            samples = _samples(path, reader, connections, store)
-    except RecordingError:
-        raise
-    except Exception as error:
-        # The reader assumes an intact bag; a damaged one can cause any exception inside it.
-        raise RecordingError(
-            f"{path}: not a readable ROS 2 bag (damaged or truncated?): {one_line(error)}"
-        ) from None
+    # The reader assumes an intact bag; a damaged one can cause any exception inside it.
+    kind = "a readable ROS 2 bag (damaged or truncated?)"
+    with _reading(path, kind, (Exception,)), rosbag2.Reader(path) as reader:
+        connections = _connections(path, reader.connections, spec.topics)
+        samples = _samples(path, reader, connections, store)
 
     if not samples:
         topics = listed([connection.topic for connection in connections])
@@ -538,7 +552,7 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
     ):
         steps = np.diff(own)
         if np.any(steps <= 0):
-            row = int(np.argmax(steps <= 0))
+            row = np.argmax(steps <= 0)
             raise RecordingError(
                 f"{path}: topic {topic!r}: {quantity} of {joint!r}, message {row + 2} is "
                 f"{steps[row] / NANOSECONDS:g} s after the previous one; time must increase"
@@ -546,7 +560,7 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
         is_control = topic == CONTROL_TOPIC
         prefix = f"{topic}:" if with_topic or is_control else ""
         label = "ctrl" if is_control and quantity == "effort" else f"{prefix}{quantity}"
-        column: Array = np.full(len(stamps), np.nan)
+        column = np.full(len(stamps), np.nan)
         column[np.searchsorted(stamps, own)] = np.frombuffer(numbers, dtype=np.float64)
         columns[f"{label}:{joint}"] = column
     return Table.of(path, columns, RecordingSpec(time="t"))
@@ -563,19 +577,14 @@ def _read_json(path: Path, spec: RecordingSpec) -> Table:
     Raises:
         RecordingError: The file is damaged, or it holds no records, or several lists of them.
     """
-    try:
+    with _reading(path, "readable JSON (damaged or truncated?)"):
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise RecordingError(
-            f"{path}: not readable JSON (damaged or truncated?): {one_line(error)}"
-        ) from None
 
     lists = dict(_lists_of_records(content))
     outside = dict(leaves(content)) if isinstance(content, Mapping) else {}
     if not lists and any(isinstance(value, list) for value in outside.values()):
         return Table.of(path, outside, spec)
-    records = _chosen(path, lists, spec.records)
-    rows = [dict(leaves(record)) for record in records]
+    rows = [dict(leaves(record)) for record in _chosen(path, lists, spec.records)]
     names = dict.fromkeys(name for row in rows for name in row)
     constants = {n: value for n, value in outside.items() if not isinstance(value, list)}
     return Table.of(path, constants | {n: [row.get(n) for row in rows] for n in names}, spec)
@@ -607,10 +616,6 @@ def _chosen(path: Path, lists: Mapping[str, Records], stated: str | None) -> Rec
             "holds one"
         )
     return next(iter(lists.values()))
-
-
-# Errors that pyarrow and gzip raise for a damaged file.
-DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
 
 
 def read_columns(path: Path, spec: RecordingSpec) -> Table:
@@ -661,25 +666,16 @@ def read_table(path: Path) -> dict[str, Array]:
 
 
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
-    """Read a CSV file."""
-    try:
+    with _reading(path, "a readable CSV table"):
         packed = path.suffix.lower() == ".gz"
         # A thread of pyarrow that reads from Python can abort the process at its end.
         source = pyarrow.BufferReader(gzip.decompress(path.read_bytes())) if packed else str(path)
         return _table(path, pyarrow.csv.read_csv(source), spec)
-    except DAMAGED as error:
-        raise RecordingError(f"{path}: not a readable CSV table: {one_line(error)}") from None
 
 
 def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
-    """Read a Parquet file."""
-    try:
-        with pyarrow.parquet.ParquetFile(path) as file:
-            return _table(path, file.read(), spec)
-    except DAMAGED as error:
-        raise RecordingError(
-            f"{path}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
-        ) from None
+    with _reading(path, PARQUET), pyarrow.parquet.ParquetFile(path) as file:
+        return _table(path, file.read(), spec)
 
 
 def _table(path: Path, rows: Any, spec: RecordingSpec) -> Table:
@@ -694,7 +690,7 @@ def _table(path: Path, rows: Any, spec: RecordingSpec) -> Table:
 
 def _read_npz(path: Path, spec: RecordingSpec) -> Table:
     """Read the numbers, vectors and matrices of an archive; nothing is unpickled."""
-    contents: dict[str, Any] = {}
+    contents = {}
     for name, values in read_arrays(path, "log").items():
         if values.ndim == 2 and values.size:
             flat = pyarrow.array(values.ravel())

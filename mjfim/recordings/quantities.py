@@ -24,12 +24,13 @@ from pydantic_core import (
 )
 
 from mjfim.errors import listed, shortened, unknown
+from mjfim.records.base import record
 
 # One turn [rad].
 TURN = 2.0 * math.pi
 
 # Exponents of angle, length, mass, time and electric current in a unit.
-Exponents = tuple[int, int, int, int, int]
+Exponents = tuple[int, ...]
 NO_DIMENSION: Exponents = (0, 0, 0, 0, 0)
 MASS = 2
 
@@ -55,6 +56,11 @@ SYMBOLS: dict[str, tuple[float, Exponents]] = {
 WITH_PREFIX = ("rad", "m", "g", "s", "Hz", "N", "Nm", "Pa", "T")
 PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
 
+for _prefix, _size in PREFIXES.items():
+    for _symbol in WITH_PREFIX:
+        _factor, _exponents = SYMBOLS[_symbol]
+        SYMBOLS.setdefault(_prefix + _symbol, (_size * _factor, _exponents))
+
 # Units that messages propose, where they fit.
 USUAL_UNITS = (
     *("rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "rad/s²", "deg/s²"),
@@ -69,7 +75,7 @@ FACTOR = re.compile(r"^([A-Za-zµμ°]+)(?:(?:\^|\*\*)?(-?\d)|([²³]))?$")
 EXPONENT_SIGNS = {"²": 2, "³": 3}
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Unit:
     """A unit of the closed table, or a product of such units.
 
@@ -104,9 +110,11 @@ class Unit:
 
             power = int(symbol[2] or EXPONENT_SIGNS.get(symbol[3], 1))
             power = -power if sign == "/" else power
-            size, of_symbol = _symbol(symbol[1])
+            if symbol[1] not in SYMBOLS:
+                raise ValueError(unknown("unit", symbol[1], USUAL_UNITS))
+            size, of_symbol = SYMBOLS[symbol[1]]
             factor *= size**power
-            exponents = _sum(exponents, of_symbol, power)
+            exponents = tuple(a + power * b for a, b in zip(exponents, of_symbol, strict=True))
         return cls(factor=factor, exponents=exponents)
 
     def measures(self, other: Unit) -> bool:
@@ -128,22 +136,6 @@ def units_like(unit: str) -> list[str]:
     """
     wanted = Unit.parse(unit)
     return [name for name in USUAL_UNITS if Unit.parse(name).measures(wanted)]
-
-
-def _symbol(name: str) -> tuple[float, Exponents]:
-    """Factor and exponents of a symbol, with or without a prefix. Raises ValueError if unknown."""
-    if name in SYMBOLS:
-        return SYMBOLS[name]
-    if name[1:] in WITH_PREFIX and name[0] in PREFIXES:
-        factor, exponents = SYMBOLS[name[1:]]
-        return PREFIXES[name[0]] * factor, exponents
-    raise ValueError(unknown("unit", name, USUAL_UNITS))
-
-
-def _sum(left: Exponents, right: Exponents, times: int) -> Exponents:
-    """Exponents of a product with a power of another unit."""
-    angle, length, mass, time, current = (a + times * b for a, b in zip(left, right, strict=True))
-    return angle, length, mass, time, current
 
 
 class Quantity(float):
@@ -271,8 +263,7 @@ class WithUnit:
 
 def _fault(kind: str, sentence: str) -> PydanticCustomError:
     """A fault of pydantic; braces would be places for values in its message."""
-    text = sentence.replace("{", "(").replace("}", ")")
-    return PydanticCustomError(kind, text)
+    return PydanticCustomError(kind, sentence.replace("{", "(").replace("}", ")"))
 
 
 def _number(value: Any) -> float:

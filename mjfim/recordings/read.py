@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +38,15 @@ from mjfim.recordings.checks import (
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
 from mjfim.recordings.quantities import TURN
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
+from mjfim.records.base import Record, record
 from mjfim.records.trajectory import Recording
 
 # Differences below this fraction of the column's largest value are rounding errors.
 ROUNDING = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True)
-class ColumnSummary:
+@record
+class ColumnSummary(Record):
     """Range and resolution of one column of a recording, in the model's unit.
 
     Attributes:
@@ -66,8 +66,8 @@ class ColumnSummary:
     resolution: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class LogSummary:
+@record
+class LogSummary(Record):
     """Clock and columns of one log.
 
     Attributes:
@@ -92,7 +92,7 @@ class LogSummary:
 
 
 def summarize(
-    file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, str], dropped: int
+    file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, ColumnSpec], rows: int
 ) -> LogSummary:
     """Summarize a log.
 
@@ -100,24 +100,21 @@ def summarize(
         file: The log.
         t: (M,) times inside the window [s], M > 1.
         columns: (M,) values by name of the recording's column, NaN where empty.
-        sources: Name of the log's column, by name of the recording's column.
-        dropped: Number of rows outside the window.
-
-    Returns:
-        The summary.
+        sources: Rules of the columns, by name.
+        rows: Number of rows inside and outside the window.
     """
     steps = np.diff(t)
-    median = float(np.median(steps))
-
     return LogSummary(
         file=file,
         rows=len(t),
         duration=float(t[-1] - t[0]),
-        rate=1.0 / median,
+        rate=1.0 / float(np.median(steps)),
         jitter_std=float(steps.std()),
         longest_step=float(steps.max()),
-        dropped=dropped,
-        columns=tuple(_column(name, sources[name], values) for name, values in columns.items()),
+        dropped=rows - len(t),
+        columns=tuple(
+            _column(name, sources[name].column, values) for name, values in columns.items()
+        ),
     )
 
 
@@ -126,8 +123,7 @@ def _column(name: str, source: str, values: Array) -> ColumnSummary:
     present = np.sort(values[np.isfinite(values)])
 
     differences = np.diff(present)
-    rounding = ROUNDING * np.abs(present[[0, -1]]).max()
-    differences = differences[differences > rounding]
+    differences = differences[differences > ROUNDING * np.abs(present[[0, -1]]).max()]
 
     return ColumnSummary(
         name=name,
@@ -135,7 +131,7 @@ def _column(name: str, source: str, values: Array) -> ColumnSummary:
         minimum=float(present[0]),
         maximum=float(present[-1]),
         empty_share=1.0 - len(present) / len(values),
-        resolution=float(differences.min()) if len(differences) else 0.0,
+        resolution=min(differences.tolist(), default=0.0),
     )
 
 
@@ -155,7 +151,7 @@ ANY_COLUMN = "<name of the column in the log>"
 WINDOW_TOLERANCE = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Log:
     """A recording, and a summary of the log from which it was read.
 
@@ -206,13 +202,9 @@ def read_log(path: Path, channels: Channels) -> Log:
     stated = {name for name, source in sources.items() if source.unit is not None}
     if table.unit_hint:
         _check_units_of_controls(table, sources)
-    try:
-        check_angles(str(path), channels, t, columns, stated)
-    except RecordingError as error:
-        raise RecordingError(f"{error}. {table.unit_hint}" if table.unit_hint else error) from None
+    check_angles(str(path), channels, t, columns, stated, table.unit_hint)
 
-    column_names = {name: source.column for name, source in sources.items()}
-    summary = summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t))
+    summary = summarize(str(path), t, columns, sources, len(stamps))
     columns |= {name: np.full(len(t), value) for name, value in spec.constants.items()}
     recording = Recording(
         t=t,
@@ -235,7 +227,7 @@ def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
     Raises:
         RecordingError: A dataset is damaged, or has no such episode.
     """
-    found: list[Path] = []
+    found = []
     for path in paths:
         is_dataset = is_lerobot_dataset(path)
         found += lerobot_episodes(path, channels.spec) if is_dataset else [path]
@@ -398,7 +390,7 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
 
 def _first_true(condition: np.ndarray) -> int:
     """Index of the first True of condition: (M,); M if there is none."""
-    return int(np.argmax(condition)) if condition.any() else len(condition)
+    return int(np.argmax(np.append(condition, True)))
 
 
 def _columns(
@@ -439,7 +431,7 @@ def _converted(table: Table, spec: ColumnSpec) -> Array:
         value = _unwrapped(value, TURN)
     for name in spec.multiply_by:
         value = value * table.column(name)
-    return np.asarray(value)
+    return value
 
 
 def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
@@ -448,12 +440,12 @@ def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
     outside = (raw < -half) | (raw >= 2.0 * half)
     invalid = np.isfinite(raw) & (outside | (raw != np.rint(raw)))
     if invalid.any():
-        row = int(np.argmax(invalid))
+        row = np.argmax(invalid)
         raise RecordingError(
             f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
             f"not an integer of {bits} bits"
         )
-    return np.asarray(np.where(raw >= half, raw - 2.0 * half, raw))
+    return np.where(raw >= half, raw - 2.0 * half, raw)
 
 
 def _unwrapped(raw: Array, period: float) -> Array:

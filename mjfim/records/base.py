@@ -287,7 +287,6 @@ class _ShortRepr(Repr):
         self.maxtuple = MAX_ENTRIES
 
     def repr1(self, value: Any, level: int) -> str:
-        """The text of one value."""
         if isinstance(value, np.ndarray):
             return f"<array of shape {value.shape}>"
         if isinstance(value, Enum):
@@ -296,7 +295,7 @@ class _ShortRepr(Repr):
             return f"<{type(value).__name__}>"
         if isinstance(value, Mapping) and value:
             return f"<{len(value)} entries>"
-        text: str = super().repr1(value, level)
+        text = super().repr1(value, level)
         is_long = isinstance(value, (tuple, list)) and len(text) > MAX_VALUE_LENGTH
         return f"<{len(value)} values>" if is_long else text
 

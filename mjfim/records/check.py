@@ -84,22 +84,21 @@ class ParameterGroup(Record):
     )
 
     def __str__(self) -> str:
-        names = join_names(self.members)
-        if not self.combinations:
-            return f"{names}: no effect on any measured output"
-        return f"{names} only as {', '.join(str(c) for c in self.combinations)}"
+        return self._sentence(join_names(self.members), ", ".join(map(str, self.combinations)))
 
     @property
     def short(self) -> str:
         """The group in a message; of many names and terms the first ones are shown."""
         if len(str(self)) <= COMBINATIONS_TEXT:
             return str(self)
+        combinations = [combination.short for combination in self.combinations]
+        return self._sentence(self.short_names, first_ones(combinations, longest=COMBINATIONS_TEXT))
 
-        names = self.short_names
+    def _sentence(self, names: str, combinations: str) -> str:
+        """The group with its names and combinations in words."""
         if not self.combinations:
             return f"{names}: no effect on any measured output"
-        combinations = [combination.short for combination in self.combinations]
-        return f"{names} only as {first_ones(combinations, longest=COMBINATIONS_TEXT)}"
+        return f"{names} only as {combinations}"
 
     @property
     def short_names(self) -> str:
@@ -116,10 +115,7 @@ class ParameterGroup(Record):
         identifiable = [
             dict(zip(c.members, c.coefficients, strict=True)) for c in self.combinations
         ]
-        return {
-            **super().summary(),
-            "identifiable": identifiable,
-        }
+        return {**super().summary(), "identifiable": identifiable}
 
 
 def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -> Array:
@@ -137,8 +133,7 @@ def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -
 
     matrix = np.zeros((len(combinations), len(names)))
     for row, combination in zip(matrix, combinations, strict=True):
-        for member, coefficient in zip(combination.members, combination.coefficients, strict=True):
-            row[column_of[member]] = coefficient
+        row[[column_of[member] for member in combination.members]] = combination.coefficients
     return matrix
 
 
@@ -238,6 +233,8 @@ class ConfoundedPair(Record):
     first: str
     second: str
     correlation: float
+
+    json_names = {"first": "a", "second": "b"}
 
 
 @record
@@ -339,6 +336,7 @@ class Check(ShownRecord):
         "information",
         "wanted",
         "correlation",
+        "confounded",
         "not_separable",
         "not_excited",
         "self_test",
@@ -380,17 +378,12 @@ class Check(ShownRecord):
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
-        confounded = [
-            {"a": pair.first, "b": pair.second, "correlation": pair.correlation}
-            for pair in self.confounded
-        ]
         combined = [
             {"words": c.expression, "value": c.value, "std": c.std_final} for c in self.combined
         ]
         return {
             **super().summary(),
             "complete": not self.missing,
-            "confounded": confounded,
             "combined": combined,
         }
 

@@ -47,11 +47,10 @@ class IterateMotion(Record):
         # A trajectory with fewer samples repeats some, so that all motions have the same size.
         last = trajectory.samples
         rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
-        held = np.minimum(rows, last - 1)
         return cls(
             t=_drawn(trajectory.t[rows]),
             qpos=_drawn(trajectory.qpos[rows]),
-            ctrl=_drawn(trajectory.ctrl[held]),
+            ctrl=_drawn(trajectory.ctrl[np.minimum(rows, last - 1)]),
         )
 
 
@@ -92,9 +91,10 @@ class IterateMotions(Record):
             return None
         return cls(
             iteration=np.array([iteration for iteration, _ in motions], dtype=np.float64),
-            t=np.stack([motion.t for _, motion in motions]),
-            qpos=np.stack([motion.qpos for _, motion in motions]),
-            ctrl=np.stack([motion.ctrl for _, motion in motions]),
+            **{
+                name: np.stack([getattr(motion, name) for _, motion in motions])
+                for name in ("t", "qpos", "ctrl")
+            },
         )
 
 
@@ -231,7 +231,7 @@ def extended(history: tuple[HistoryRow, ...], rows: Iterable[HistoryRow]) -> tup
     while len(moving) > MAX_MOTIONS:
         # The iterate between the nearest neighbours goes; the first and the last one stay.
         numbers = np.array([joined[place].iteration for place in moving])
-        place = moving.pop(1 + int(np.argmin(numbers[2:] - numbers[:-2])))
+        place = moving.pop(1 + np.argmin(numbers[2:] - numbers[:-2]))
         joined[place] = replace(joined[place], motion=None)
     return tuple(joined)
 
@@ -310,6 +310,8 @@ class CombinationAccuracy(Record):
     value: float
     std_initial: float
     std_final: float
+
+    json_names = {"expression": "words"}
 
 
 @record
@@ -394,13 +396,12 @@ class ScaledStart(Record):
 
 def _npz_names() -> dict[str, str]:
     """Return the short names of arrays in design.npz, by path in the record."""
-    names = {}
-    for evaluation, prefix in (("final", ""), ("initial", "initial_")):
-        for array in TRAJECTORY_ARRAYS:
-            names[f"{evaluation}.trajectory.{array}"] = f"{prefix}{array}"
-        for array in ("gain", "sensitivity"):
-            names[f"{evaluation}.{array}"] = f"{prefix}{array}"
-    return names
+    paths = (*(f"trajectory.{name}" for name in TRAJECTORY_ARRAYS), "gain", "sensitivity")
+    return {
+        f"{evaluation}.{path}": prefix + path.rpartition(".")[2]
+        for evaluation, prefix in (("final", ""), ("initial", "initial_"))
+        for path in paths
+    }
 
 
 @record
@@ -498,6 +499,7 @@ class Design(ShownRecord):
         "warnings",
         "nuisance",
         "combinations",
+        "combined",
         "prior",
         "data",
         "rehearsal",
@@ -518,7 +520,7 @@ class Design(ShownRecord):
     @property
     def outcome(self) -> str:
         """How the optimisation ended, in a sentence; at its budget, with the last improvement."""
-        sentence: str = self.status.value
+        sentence = self.status.value
         if self.status is not Status.MAX_ITERATIONS or not np.isfinite(self.improvement):
             return sentence
 
@@ -591,13 +593,4 @@ class Design(ShownRecord):
                 "satisfied": self.within_limits,
                 "initial": [violation.summary() for violation in self.initial_violations],
             },
-            "combined": [
-                {
-                    "words": combination.expression,
-                    "value": combination.value,
-                    "std_initial": combination.std_initial,
-                    "std_final": combination.std_final,
-                }
-                for combination in self.combined
-            ],
         }

@@ -90,7 +90,7 @@ class HorizonStudy(Record):
     @property
     def relative_errors(self) -> Array:
         """(L,) error of each fit over the smallest one in each horizon, as root mean square."""
-        errors = np.asarray(self.errors)
+        errors = self.errors
         least = np.where(np.isfinite(errors), errors, np.inf).min(axis=0)
         ratios = errors / np.maximum(least, SMALLEST_ERROR)
         return np.asarray(np.sqrt(np.mean(ratios**2, axis=1)))
@@ -124,8 +124,8 @@ class HorizonStudy(Record):
         return np.column_stack([np.minimum(interval[:, 0], low), np.maximum(interval[:, 1], high)])
 
     def __str__(self) -> str:
-        uses = () if self.is_used else (self.about_use,)
-        return " ".join([self.about_choice, *uses, self.about_growth, *self.findings])
+        sentences = [self.about_choice, self.about_use, self.about_growth, *self.findings]
+        return " ".join(filter(None, sentences))
 
     @property
     def about_choice(self) -> str:
@@ -619,8 +619,7 @@ class Estimate(ShownRecord):
         if self.nominal:
             return ""
 
-        rows = sum(len(recording.t) for recording in self.recordings)
-        if rows > MAX_NOMINAL_ROWS:
+        if sum(len(recording.t) for recording in self.recordings) > MAX_NOMINAL_ROWS:
             return (
                 "The nominal model is not drawn for recordings of more than "
                 f"{MAX_NOMINAL_ROWS:,} rows together."
@@ -786,8 +785,7 @@ class Prediction(Record):
         if not comparable.any():
             return float("nan")
 
-        log_ratios = np.log(identified[comparable] / nominal[comparable])
-        return float(np.exp(np.mean(log_ratios)))
+        return float(np.exp(np.mean(np.log(identified[comparable] / nominal[comparable]))))
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""

@@ -259,7 +259,7 @@ class PayloadEstimate(Record):
 
 def _with_half_width(value: float, interval: Array) -> str:
     """A value with the longer half of its interval, both to the digits of the latter."""
-    half_width = float(np.max(np.abs(np.asarray(interval) - value)))
+    half_width = np.max(np.abs(interval - value))
     if not np.isfinite(half_width) or half_width <= 0.0:
         return f"{value:.4g}"
 

@@ -9,8 +9,15 @@ from typing import Any
 from mjfim.records.base import Record, record
 from mjfim.records.estimate import ControlLawInLoop
 
-# Kinds of entries, the names of the fields of `Inventory` that hold them.
-KINDS = ("parameters", "outputs", "actuators", "keyframes", "limits", "terms")
+# Kinds of entries, the names of the fields of `Inventory` that hold them, and what names an entry.
+KINDS = {
+    "parameters": "path",
+    "outputs": "name",
+    "actuators": "name",
+    "keyframes": "name",
+    "limits": "path",
+    "terms": "kind",
+}
 
 
 @record
@@ -95,6 +102,11 @@ class ListedLimit(Record):
     upper: float
     unit: str
 
+    @property
+    def path(self) -> str:
+        """What names the limit in a list."""
+        return f"{self.quantity}/{self.name}"
+
 
 @record
 class ListedTerm(Record):
@@ -147,17 +159,11 @@ class Inventory(Record):
         Returns:
             The selection; the remarks stay.
         """
-        return replace(
-            self,
-            parameters=tuple(entry for entry in self.parameters if matches(entry.path)),
-            outputs=tuple(entry for entry in self.outputs if matches(entry.name)),
-            actuators=tuple(entry for entry in self.actuators if matches(entry.name)),
-            keyframes=tuple(entry for entry in self.keyframes if matches(entry.name)),
-            limits=tuple(
-                entry for entry in self.limits if matches(f"{entry.quantity}/{entry.name}")
-            ),
-            terms=tuple(entry for entry in self.terms if matches(entry.kind)),
-        )
+        chosen: dict[str, Any] = {
+            kind: tuple(entry for entry in getattr(self, kind) if matches(getattr(entry, key)))
+            for kind, key in KINDS.items()
+        }
+        return replace(self, **chosen)
 
     def only(self, kind: str) -> Inventory:
         """The entries of one kind.

@@ -58,7 +58,7 @@ class FiniteSteps(Record):
         known = np.isfinite(self.predicted) & (self.predicted > 0.0)
         change = np.where(known, self.std, 1.0) / np.where(known, self.predicted, 1.0)
         low, high = CONFIRMED
-        return np.asarray((1.0 / high <= change) & (change <= 1.0 / low))
+        return (1.0 / high <= change) & (change <= 1.0 / low)
 
     @property
     def stated(self) -> Array:
@@ -242,7 +242,7 @@ class Rehearsal(ShownRecord):
         allowed = MAX_BROKEN * self.robots
         is_model_safe = bool(self.kept[0].all()) and not self.passes_floor[0]
         is_inside = (self.kept | self.is_clamped).all(axis=1) & ~np.isnan(self.end_height)
-        broken = int((~is_inside[1:]).sum())
+        broken = (~is_inside[1:]).sum()
         worst = max(self.unbraked.values(), default=0)
         has_few = max(broken, self.below_floor, worst) < max(allowed, 1.0)
         return is_model_safe and has_few
@@ -263,13 +263,11 @@ class Rehearsal(ShownRecord):
         clamped = [i for i in broken if self.is_clamped[i]]
         for i in clamped or broken:
             kind, margins = self.limits[i].kind, self.margins[:, i]
-            worst = float(np.min(margins[np.isfinite(margins)], initial=0.0))
-            used = 1.0 - float(margins[0])
+            worst = np.min(margins[np.isfinite(margins)], initial=0.0)
+            used = 1.0 - margins[0]
             growth = max((1.0 - worst) / used, 1.0 + self.wrong * late[i]) if used > 0.0 else 2.0
             growth = 1.0 + self.wrong if clamped else growth
-            share = (
-                float(margins[0]) - worst if kind == "clearance" else 1.0 - used / min(growth, 2.0)
-            )
+            share = margins[0] - worst if kind == "clearance" else 1.0 - used / min(growth, 2.0)
             share = np.ceil(100.0 * share) / 100.0
             if 0.0 < share < 1.0:
                 found[kind] = max(float(share), found.get(kind, 0.0))

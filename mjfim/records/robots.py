@@ -383,7 +383,7 @@ class RobotComparison(ShownRecord):
     def relative_detectable(self) -> Array:
         """(q,) differences that would have been found, over the value of the first robot."""
         size = np.abs(self.values[0])
-        return np.asarray(self.detectable / np.where(size > 0.0, size, np.nan))
+        return self.detectable / np.where(size > 0.0, size, np.nan)
 
     def __str__(self) -> str:
         first, second = self.names

@@ -71,6 +71,7 @@ class MethodResult(Record):
         "method",
         "title",
         "outcome",
+        "outcome.value",
         "cost",
         "criterion",
         "min_eigenvalue",
@@ -82,6 +83,7 @@ class MethodResult(Record):
         "note",
     )
     json_names = {
+        "outcome.value": "message",
         "min_eigenvalue": "smallest_eigenvalue",
         "worst_relative_std": "worst_relative_sigma",
     }
@@ -100,7 +102,6 @@ class MethodResult(Record):
         """The contents of the record in JSON."""
         return {
             **super().summary(),
-            "message": self.outcome.value,
             "limits": {"margins": self.margins, "shares": self.relative_margins},
         }
 
@@ -182,12 +183,13 @@ class Comparison(ShownRecord):
         if design is None:
             return ()
 
-        better = []
-        for row in self.rows:
-            if row is design or not row.sound:
-                continue
-            if not design.sound or self.gain(row, design) > TIE_TOLERANCE:
-                better.append(row)
+        better = [
+            row
+            for row in self.rows
+            if row is not design
+            and row.sound
+            and (not design.sound or self.gain(row, design) > TIE_TOLERANCE)
+        ]
         return tuple(sorted(better, key=lambda row: row.cost))
 
     def gain(self, row: MethodResult, other: MethodResult) -> float:
@@ -270,7 +272,6 @@ def _verdict(comparison: Comparison) -> str:
 
 
 def _percent(fraction: float) -> str:
-    """Return a fraction in percent, to two digits."""
     return f"{100.0 * fraction:.2g} %"
 
 
@@ -301,6 +302,17 @@ class TrialStatistics(Record):
     failed: int
     seconds: float = 0.0
 
+    in_json = (
+        "mean",
+        "covariance",
+        "crlb",
+        "efficiency",
+        "efficiency_interval",
+        "trials",
+        "failed",
+        "seconds",
+    )
+
 
 @record
 class MonteCarloStudy(ShownRecord):
@@ -324,24 +336,12 @@ class MonteCarloStudy(ShownRecord):
 
     file_stem = "montecarlo"
     made_by = "`mjfim montecarlo EXPERIMENT DESIGN.npz -o DIR`"
+    in_json = ("parameters", "theta", "measure_rate")
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of montecarlo.json."""
-        values: dict[str, Any] = {
-            "parameters": list(self.parameters),
-            "theta": self.theta,
-            "measure_rate": self.measure_rate,
+        """The contents of the record in JSON; each trajectory has its name as a key."""
+        sets = {
+            name: {**trials.summary(), "information": self.information[name]}
+            for name, trials in self.sets.items()
         }
-        for name, trials in self.sets.items():
-            values[name] = {
-                "mean": trials.mean,
-                "covariance": trials.covariance,
-                "crlb": trials.crlb,
-                "efficiency": trials.efficiency,
-                "efficiency_interval": trials.efficiency_interval,
-                "information": self.information[name],
-                "trials": trials.trials,
-                "failed": trials.failed,
-                "seconds": trials.seconds,
-            }
-        return values
+        return {**super().summary(), **sets}

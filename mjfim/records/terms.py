@@ -114,7 +114,7 @@ class Term(Record):
     def summary(self) -> dict[str, Any]:
         """Return the term in estimate.json, as a suspect or with the names of its parameters."""
         main, *further = self.numbers
-        found: dict[str, Any] = {
+        found = {
             "words": self.description,
             "path": main.path,
             "value": main.value,
@@ -289,7 +289,7 @@ class PooledParameter(Record):
             {"path": path, "scale": scale}
             for path, scale in zip(self.paths, self.scales, strict=True)
         ]
-        table: dict[str, object] = {"targets": targets, "guess": self.guess, "scale": self.scale}
+        table = {"targets": targets, "guess": self.guess, "scale": self.scale}
         if self.unit:
             table["unit"] = self.unit
         if isfinite(self.bounds[0]) and isfinite(self.bounds[1]):
@@ -469,8 +469,7 @@ class Selection(Record):
         """Kept steps in groups of comparable errors: whole recordings, then segments, if any."""
         kept = [step for step in self.steps if step.is_kept]
         begins = [i for i, step in enumerate(kept) if step.decision is Decision.SHORTENED]
-        edges = [0, *begins, len(kept)]
-        return tuple(tuple(kept[first:last]) for first, last in pairwise(edges))
+        return tuple(tuple(kept[first:last]) for first, last in pairwise([0, *begins, len(kept)]))
 
     @property
     def errors(self) -> tuple[float, float]:

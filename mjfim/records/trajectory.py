@@ -116,9 +116,8 @@ class Trajectory(SavedRecord):
 
     def moves_as(self, other: Trajectory) -> bool:
         """Whether times, controls and states of another trajectory are exactly the same."""
-        same_times = np.array_equal(self.t, other.t)
-        same_control = same_times and np.array_equal(self.ctrl, other.ctrl)
-        return same_control and np.array_equal(self.state, other.state)
+        names = ("t", "ctrl", "state")
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""

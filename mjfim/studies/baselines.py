@@ -8,7 +8,7 @@ derivatives and the barrier of a design, so that only the form of the excitation
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -24,6 +24,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
+from mjfim.records.base import record
 from mjfim.records.events import DesignEvent
 
 # Largest number of harmonics of a parametric multisine.
@@ -43,7 +44,7 @@ MAX_ROLL_OFF = 2.0
 SHORTEST_TRANSITION = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ExcitationSettings:
     """Settings of all parametric excitations of an experiment.
 
@@ -72,7 +73,7 @@ class ExcitationSettings:
         Returns:
             (...) frequencies [Hz].
         """
-        return np.asarray(self.min_frequency * (self.max_frequency / self.min_frequency) ** z)
+        return self.min_frequency * (self.max_frequency / self.min_frequency) ** z
 
 
 def relative_amplitudes(z: Array) -> Array:
@@ -110,7 +111,7 @@ def chirp(settings: ExcitationSettings, z: Array) -> Array:
     ]
 
     centred = np.stack(sweeps, axis=1) + (offset - 0.5)
-    return np.asarray(relative_amplitudes(amplitude) * centred)
+    return relative_amplitudes(amplitude) * centred
 
 
 def schroeder_phases(power: Array) -> Array:
@@ -122,8 +123,7 @@ def schroeder_phases(power: Array) -> Array:
     Returns:
         (K,) phases [rad].
     """
-    share = power / power.sum()
-    return np.asarray(-2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(share))[:-1]]))
+    return -2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power / power.sum()))[:-1]])
 
 
 def multisine(settings: ExcitationSettings, z: Array) -> Array:
@@ -140,11 +140,11 @@ def multisine(settings: ExcitationSettings, z: Array) -> Array:
     # The base frequency allows for two harmonics if the frequency range does.
     base, highest = settings.min_frequency, settings.max_frequency
     if highest > 2.0 * base:
-        base *= (0.5 * highest / base) ** float(z[0])
+        base *= (0.5 * highest / base) ** z[0]
     amplitude, delay = z[3:].reshape(2, settings.nu)
 
     most = min(MAX_HARMONICS, max(int(settings.max_frequency / base), 1))
-    count = max(round(most * float(z[1])), min(2, most))
+    count = max(round(most * z[1]), min(2, most))
     order = np.arange(1, 1 + count)
     power = order ** (-2.0 * MAX_ROLL_OFF * z[2])
 
@@ -173,8 +173,7 @@ def random_steps(settings: ExcitationSettings, z: Array) -> Array:
     levels = np.concatenate([np.zeros((1, settings.nu)), levels])
 
     # Progress of the transition from the previous level to the present one, 0 to 1.
-    duration = max(float(z[1]), SHORTEST_TRANSITION)
-    progress = (settings.t / held - index) / duration
+    progress = (settings.t / held - index) / max(float(z[1]), SHORTEST_TRANSITION)
     smooth = 0.5 - 0.5 * np.cos(np.pi * np.clip(progress, 0.0, 1.0))
     share = np.where(settings.may_jump, 1.0, smooth)[:, None]
     return np.asarray((1.0 - share) * levels[index] + share * levels[index + 1])
@@ -210,7 +209,7 @@ SPREAD_AFTER_FAILURE = 0.93
 SearchCallback = Callable[[float], None]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class BaselineSearch:
     """Order for one search by a baseline. It can be pickled.
 
@@ -235,7 +234,7 @@ class BaselineSearch:
     threads: int | None = None
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class SearchResult:
     """The best control that a search has found.
 
@@ -269,8 +268,7 @@ def run_baseline(
     task = DesignTask.resolve(
         search.experiment, threads=search.threads, added_information=search.added_information
     )
-    show = callback or (lambda cost: None)
-    found, steps = METHODS[search.method](search, task, budget, show)
+    found, steps = METHODS[search.method](search, task, budget, callback or (lambda cost: None))
     return replace(found, seconds=budget.seconds_used, steps=steps)
 
 
@@ -308,8 +306,7 @@ def _search_at_random(
         numbers = rng.random(count)
         is_local = len(best) > 0 and rng.random() > GLOBAL_SHARE
         if is_local:
-            share = max(CHANGED_SHARE, MIN_CHANGED / len(numbers))
-            changed = rng.random(len(numbers)) < share
+            changed = rng.random(len(numbers)) < max(CHANGED_SHARE, MIN_CHANGED / len(numbers))
             numbers = reflected(best + spread * changed * rng.normal(size=len(numbers)))
 
         deviation = largest * window * wave(settings, numbers[1:]) * bounds.scale
@@ -322,7 +319,7 @@ def _search_at_random(
             continue
         if has_weights:
             scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
-        control = np.asarray(task.centre + scale * deviation)
+        control = task.centre + scale * deviation
         values = cost.values(control)
         is_inside = values is not None and cost.constraints.is_feasible(values)
         point = cost.point_along(values) if is_inside or not task.is_limited else None
@@ -331,7 +328,7 @@ def _search_at_random(
         # Widen the local search after a success, narrow it after a failure.
         if is_local:
             factor = SPREAD_AFTER_SUCCESS if found.cost > J else SPREAD_AFTER_FAILURE
-            spread = float(np.clip(spread * factor, *SPREAD_RANGE))
+            spread = np.clip(spread * factor, *SPREAD_RANGE)
         if found.cost > J:
             best, found = numbers, SearchResult(control=control, cost=J)
     return found, task.plant.engine_steps
@@ -339,8 +336,7 @@ def _search_at_random(
 
 def _keeps_share(cost: LimitedCost, deviation: Array, share: float) -> bool:
     """Check whether a share of a deviation from the centre keeps the limits."""
-    task = cost.level.task
-    return not task.is_limited or cost.nearly_keeps(task.centre + share * deviation)
+    return cost.nearly_keeps(cost.level.task.centre + share * deviation)
 
 
 def _settings(cost: LimitedCost) -> ExcitationSettings:
@@ -362,7 +358,7 @@ def _settings(cost: LimitedCost) -> ExcitationSettings:
 
 def reflected(numbers: Array) -> Array:
     """Bring numbers, (n,), back between 0 and 1 by reflection at these ends."""
-    return np.asarray(1.0 - np.abs(1.0 - np.abs(numbers) % 2.0))
+    return 1.0 - np.abs(1.0 - np.abs(numbers) % 2.0)
 
 
 # ---- optimised series
@@ -383,7 +379,6 @@ def _optimise(
     best = np.inf
 
     def watch(event: DesignEvent) -> None:
-        """Report the lowest J within the limits."""
         nonlocal best
         if not event.row.margin < 0.0:
             best = min(best, event.row.cost)

@@ -15,6 +15,7 @@ effort than the one before, and a round at values below the guess less than the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -95,14 +96,13 @@ def restate_experiment(
         estimate: Estimate from the recordings so far, or None.
     """
     experiment, p = base.experiment, base.parameters
-    index_of = {name: j for j, name in enumerate(p.names)}
-    tables: dict[str, dict[str, Any]] = {}
+    tables = {}
 
     for name, spec in experiment.parameters.items():
         table = spec.model_dump(exclude_unset=True)
         table.pop("true", None)
         if spec.inertial is None:
-            tables[name] = {**table, **_restated_keys(base, index_of[name], theta, estimate)}
+            tables[name] = {**table, **_restated_keys(base, p.names.index(name), theta, estimate)}
             continue
 
         # A declared inertia is either kept, or replaced by its individual parameters.
@@ -117,7 +117,7 @@ def restate_experiment(
             continue
         for j in members:
             parameter = p.parameters[j]
-            member: dict[str, Any] = {
+            member = {
                 "target": parameter.targets[0].path,
                 "unit": parameter.unit,
                 "nuisance": parameter.nuisance,
@@ -150,7 +150,7 @@ def _restated_keys(
     keys: dict[str, Any] = {"guess": guess, "scale": parameter.scale}
 
     # Robust designs sample parameters that have a prior or bounds.
-    is_bounded = bool(np.isfinite(parameter.bounds).all())
+    is_bounded = np.isfinite(parameter.bounds).all()
     is_sampled = base.experiment.robust is not None and (parameter.prior is not None or is_bounded)
     if is_sampled and estimate is not None and np.isfinite(estimate.std[index]):
         reach = max(SAMPLING_RANGE * float(estimate.std[index]), MIN_SAMPLING_RANGE * size)
@@ -221,11 +221,18 @@ def run_campaign(
         stop_on_interrupt(stop) as token,
         shown_progress("campaign", callback, progress) as show,
     ):
-        campaign = _CampaignRun(task, rounds, show, Workers.of_any(executor), token)
-        status = campaign.run(measure, done)
-        return campaign.record(status)
+        campaign = _CampaignRun(
+            base=task,
+            wanted=target_accuracies(task),
+            count=rounds,
+            callback=show,
+            executor=Workers.of_any(executor),
+            stop=token,
+        )
+        return campaign.record(campaign.run(measure, done))
 
 
+@dataclass(kw_only=True, eq=False)
 class _CampaignRun:
     """A campaign while it runs.
 
@@ -233,26 +240,21 @@ class _CampaignRun:
         base: Task of the experiment as stated, with which all estimates are made.
         wanted: (p,) target standard deviations [theta-unit], infinite where there is none.
         count: Largest number of rounds.
+        callback: Called with all events.
+        executor: Where the work is done.
+        stop: Ends the campaign early.
         rounds: Complete rounds.
         pending: Design that is not recorded yet.
     """
 
-    def __init__(
-        self,
-        base: DesignTask,
-        count: int,
-        callback: Callback | None,
-        executor: ExecutorLike | None,
-        stop: StopToken,
-    ) -> None:
-        self.base = base
-        self.wanted = target_accuracies(base)
-        self.count = count
-        self.rounds: list[Round] = []
-        self.pending: Design | None = None
-        self._callback = callback
-        self._executor = executor
-        self._stop = stop
+    base: DesignTask
+    wanted: Array
+    count: int
+    callback: Callback | None
+    executor: ExecutorLike | None
+    stop: StopToken
+    rounds: list[Round] = field(default_factory=list)
+    pending: Design | None = None
 
     def run(self, measure: Measure, done: Sequence[EarlierRound]) -> CampaignStatus:
         """Make all rounds.
@@ -265,7 +267,7 @@ class _CampaignRun:
             The reason for which the campaign ended.
         """
         for earlier in done:
-            if not self._add_round(earlier, earlier.design):
+            if not self._add_round(earlier):
                 return CampaignStatus.INTERRUPTED
 
         while not self._targets_reached() and len(self.rounds) < self.count:
@@ -297,7 +299,7 @@ class _CampaignRun:
         recordings = (answer,) if isinstance(answer, Recording) else tuple(answer or ())
 
         # A recording that the user interrupted is not used.
-        if self._stop.requested:
+        if self.stop.requested:
             return CampaignStatus.INTERRUPTED
         if not recordings:
             return CampaignStatus.WAITING
@@ -307,8 +309,9 @@ class _CampaignRun:
             theta=design.theta,
             predicted=design.final.std,
             control=design.trajectory.ctrl,
+            design=design,
         )
-        if not self._add_round(recorded, design, remarks):
+        if not self._add_round(recorded, remarks):
             return CampaignStatus.INTERRUPTED
         self.pending = None
         return None
@@ -321,7 +324,7 @@ class _CampaignRun:
         """
         if not self.rounds:
             task = self.base.restated(restate_experiment(self.base))
-            return self._designed(task, executor=self._executor), ()
+            return self._designed(task, executor=self.executor), ()
 
         last = self.rounds[-1]
         try:
@@ -342,11 +345,10 @@ class _CampaignRun:
         base, last = self.base, self.rounds[-1]
         known = last.estimate.data
         moved = restate_experiment(base, theta, last.estimate)
-        weight = _information_weight(base, moved, self.rounds)
-        moved = moved.replace(cost={"information": weight})
+        moved = moved.replace(cost={"information": _information_weight(base, moved, self.rounds)})
 
         task = base.restated(moved, added_information=known)
-        first = self._designed(task, executor=self._executor)
+        first = self._designed(task, executor=self.executor)
         if last.control.shape != task.control.shape or first.status is Status.INTERRUPTED:
             return first
 
@@ -368,23 +370,20 @@ class _CampaignRun:
 
     def _designed(self, task: DesignTask, **further: Any) -> Design:
         """Design within the budget of a task."""
-        budget = design_budget(task, self._stop)
-        return design_task(task, callback=self._callback, budget=budget, **further)
+        budget = design_budget(task, self.stop)
+        return design_task(task, callback=self.callback, budget=budget, **further)
 
-    def _add_round(
-        self, recorded: EarlierRound, design: Design | None = None, remarks: Sequence[str] = ()
-    ) -> bool:
+    def _add_round(self, recorded: EarlierRound, remarks: Sequence[str] = ()) -> bool:
         """Identify from all recordings and keep the round.
 
         Args:
             recorded: Recordings of the round, and what is known about their design.
-            design: The design, where it is known.
             remarks: Remarks about the design.
 
         Returns:
             False where the identification was interrupted.
         """
-        p = self.base.parameters
+        p, design = self.base.parameters, recorded.design
         theta = p.guess if recorded.theta is None else recorded.theta
         start = self.rounds[-1].estimate.theta if self.rounds else theta
 
@@ -393,9 +392,9 @@ class _CampaignRun:
             self.base,
             [*earlier, *recorded.recordings],
             start,
-            callback=self._callback,
-            stop=self._stop,
-            executor=self._executor,
+            callback=self.callback,
+            stop=self.stop,
+            executor=self.executor,
         )
         if estimate is None:
             return False
@@ -423,22 +422,20 @@ class _CampaignRun:
         return True
 
     def _report(self, current: Round) -> None:
-        """Report a complete round."""
-        if self._callback is None:
+        if self.callback is None:
             return
 
         ratio, j = largest_ratio_to_target(current.attained, self.wanted)
-        name = self.base.parameters.names[j]
         event = StudyEvent(
             study="campaign",
             part=f"round {current.number}",
             index=current.number - 1,
             count=self.count,
             share=1.0,
-            message=f"largest ratio of σ to target: {ratio:.3g} ({name})",
+            message=f"largest ratio of σ to target: {ratio:.3g} ({self.base.parameters.names[j]})",
             result=current,
         )
-        self._callback(event)
+        self.callback(event)
 
     def _suspicions(self, current: Estimate) -> Iterator[str]:
         """Reasons to doubt the model, or to expect nothing of further rounds.
@@ -521,7 +518,7 @@ def identify_all(
         SimulationDivergedError: The model diverges at `start` and at the guess.
     """
     found: list[Estimate] = []
-    first_error: SimulationDivergedError | None = None
+    first_error = None
     for begin in (start, base.parameters.guess):
         # The guess is needed only where the first fit is bad.
         if found and (not found[0].misfit or np.array_equal(begin, start)):

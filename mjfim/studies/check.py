@@ -105,18 +105,18 @@ def self_test(
         except np.linalg.LinAlgError:
             return np.inf
 
-    tests: dict[str, tuple[str, Callable[[], Any]]] = {
-        "recursion": ("recursion", lambda: recursion_error(task, trajectory, sensitivity)),
-        "slope": ("slope", slope),
+    tests: dict[str, Callable[[], Any]] = {
+        "recursion": lambda: recursion_error(task, trajectory, sensitivity),
+        "slope": slope,
     }
     tested = SelfTest(recursion=np.nan, slope=np.nan, finished=False)
-    for number, (key, (name, error)) in enumerate(tests.items()):
+    for number, (name, error) in enumerate(tests.items()):
         if stop():
             return tested
         # A state does not show what control laws remember: there is no recursion and no slope.
         is_possible = task.plant.laws is None
         begin_stage(f"testing the derivatives: {name}", number, len(tests))
-        found: dict[str, Any] = {key: error() if is_possible else 0.0}
+        found: dict[str, Any] = {name: error() if is_possible else 0.0}
         tested = replace(tested, **found)
     tested = replace(tested, finished=True)
 
@@ -158,8 +158,7 @@ def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensi
     if not visible.any():
         return 0.0
 
-    error = np.abs(expected - psi).max(axis=(0, 1))
-    return float((error[visible] / size[visible]).max())
+    return float((np.abs(expected - psi).max(axis=(0, 1))[visible] / size[visible]).max())
 
 
 def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> float:
@@ -242,7 +241,7 @@ def random_references(task: DesignTask, count: int) -> Iterator[Trajectory]:
                 reference = inputs[:, law.columns["reference"]]
                 inputs[:, law.columns["reference_velocity"]] = np.gradient(reference, task.dt)
         try:
-            yield task.plant.simulate(task.theta, np.asarray(inputs))
+            yield task.plant.simulate(task.theta, inputs)
         except SimulationDivergedError:
             continue
 
@@ -329,12 +328,11 @@ def check_task(
 
     # From here on, there is something to report when the check is stopped.
     with stop_on_interrupt(stop) as token:
-        test = _identifiability_test(task, executor, token)
         return _checked(
             task,
             problem,
             point,
-            partial(test.along, curve, sensitivity),
+            partial(_identifiability_test(task, executor, token).along, curve, sensitivity),
             _common_information(task, [information - task.information.prior]),
             token,
             source=source,
@@ -383,12 +381,11 @@ def check_recordings(
     count = len(recordings)
     # From here on, there is something to report when the check is stopped.
     with stop_on_interrupt(stop) as token:
-        test = _identifiability_test(task, executor, token)
         return _checked(
             task,
             problem,
             point,
-            partial(test.of_rows, task.initial, J, error),
+            partial(_identifiability_test(task, executor, token).of_rows, task.initial, J, error),
             _common_information(task, [rows.T @ rows for rows, _ in recorded]),
             token,
             source=f"{count} recording{'s' if count > 1 else ''}",
@@ -426,8 +423,7 @@ def _identifiability_test(
 
     def make(threads: int) -> Callable[[], IdentifiabilityTest]:
         """Return what makes the test in a worker."""
-        system = SystemOrder.of(task.system, threads)
-        return partial(_made_test, system, test.theta, test.earlier)
+        return partial(_made_test, SystemOrder.of(task.system, threads), test.theta, test.earlier)
 
     def differentiated(probes: Iterable[Trajectory]) -> Iterator[RowsAndError | None]:
         """Differentiate motions on the workers."""
@@ -450,7 +446,6 @@ def _made_test(system: SystemOrder, theta: Array, earlier: Array) -> Identifiabi
 
 
 def _rows_along(test: IdentifiabilityTest, probe: Trajectory, _: StopToken) -> RowsAndError | None:
-    """Differentiate one motion."""
     return test.rows_along(probe)
 
 
@@ -458,7 +453,7 @@ def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
     """(p, p) sum of information matrices about the parameters that all recordings share."""
     p = task.parameters
     every = [shared(each, p.prior_information, p.recording_specific) for each in matrices]
-    return np.asarray(sum(every, np.zeros_like(task.prior)))
+    return sum(every, np.zeros_like(task.prior))
 
 
 # ---- what is found
@@ -546,12 +541,11 @@ def _checked(
     groups = found.groups_along_trajectory if here.count > everywhere.count else ()
     not_excited = tuple(group for group in groups if str(group) not in never)
     values = task.theta[task.parameters.interest]
-    strong = np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)
     pairs = [
         ConfoundedPair(
             first=found.names[i], second=found.names[j], correlation=float(correlation[i, j])
         )
-        for i, j in np.argwhere(strong).tolist()
+        for i, j in np.argwhere(np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)).tolist()
     ]
 
     check = Check(
@@ -629,11 +623,9 @@ def _repetitions(
     task: DesignTask, data: Array, information: FisherInformation, parameter: int, wanted: float
 ) -> int:
     """Smallest number of repetitions that reaches the wanted standard deviation; 0 for none."""
-    interest = task.parameters.interest
-    place = int(np.flatnonzero(interest == parameter)[0])
+    place = np.flatnonzero(task.parameters.interest == parameter)[0]
 
     def suffices(repetitions: int) -> bool:
-        """Whether this number of repetitions reaches the wanted standard deviation."""
         covariance = information.covariance(repetitions * data + task.prior)
         return bool(covariance[place, place] <= wanted**2)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, carry_out
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import saturated_actuators
+from mjfim.records.base import record
 from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
 from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
@@ -105,7 +106,7 @@ def compare(
         threads=task.system.threads,
     )
 
-    rows: list[MethodResult] = []
+    rows = []
     workers = Workers.of_any(executor)
     with (
         stop_on_interrupt(stop) as token,
@@ -177,7 +178,7 @@ def chosen_methods(system: System, methods: Sequence[str] | None) -> tuple[str, 
     return chosen
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _MethodRun:
     """One method of a comparison."""
 
@@ -226,8 +227,7 @@ class _MethodRun:
             replace(self.search, experiment=experiment, threads=1, part=(i, count))
             for i in range(count)
         ]
-        budget = Budget(stop=self.stop)
-        outcomes = list(carry_out(executor, run_baseline, parts, budget))
+        outcomes = list(carry_out(executor, run_baseline, parts, Budget(stop=self.stop)))
         results = [outcome.result for outcome in outcomes if not outcome.is_lost]
         if not results:
             return None
@@ -246,7 +246,6 @@ class _MethodRun:
         best = np.inf
 
         def watch(event: Event) -> None:
-            """Report an iterate."""
             nonlocal best
             if self.callback is not None:
                 self.callback(event)
@@ -254,8 +253,7 @@ class _MethodRun:
                 best = best if event.row.margin < 0.0 else min(best, event.row.cost)
                 self.report(best)
 
-        descent = self.search.experiment.descent
-        iterations = max(descent.max_iterations, UNLIMITED_ITERATIONS)
+        iterations = max(self.search.experiment.descent.max_iterations, UNLIMITED_ITERATIONS)
         stated = self.search.experiment.replace(
             descent={"seconds": self.search.seconds, "max_iterations": iterations}
         )
@@ -305,8 +303,7 @@ class MethodEvaluation:
         self.stage = DescentLevel(task, combinations)
 
         cost = task.experiment.cost
-        interest = len(task.parameters.interest)
-        count = interest if combinations is None else combinations.shape[1]
+        count = len(task.parameters.interest) if combinations is None else combinations.shape[1]
         self.nats = cost.information * count if cost.criterion == "D" else 0.0
 
     def result(self, method: str, found: SearchResult, note: str = "") -> MethodResult:
@@ -320,11 +317,11 @@ class MethodEvaluation:
             found: The best control of its search.
             note: Remark about the result.
         """
-        has_control = found.control is not None
+        control = found.control
         nothing = MethodResult(
             method=method,
             title=METHOD_TITLES[method],
-            outcome=MethodOutcome.NOTHING if has_control else MethodOutcome.NONE,
+            outcome=MethodOutcome.NONE if control is None else MethodOutcome.NOTHING,
             control=None,
             cost=np.nan,
             criterion=np.nan,
@@ -337,10 +334,10 @@ class MethodEvaluation:
             relative_margins={},
             note=note,
         )
-        if found.control is None:
+        if control is None:
             return nothing
 
-        evaluated = self._evaluate(nothing, found) or nothing
+        evaluated = self._evaluate(nothing, found, control)
         if method == DESIGN or evaluated.outcome is not MethodOutcome.OUTSIDE:
             return evaluated
 
@@ -348,28 +345,26 @@ class MethodEvaluation:
         centre = self.task.centre
         relaxed = DescentLevel(self.task.relaxed(), self.stage.basis)
         search = InsideSearch(LimitedCost(level=relaxed), 0)
-        inside = search.largest(centre, found.control - centre, Budget())
+        inside = search.largest(centre, control - centre, Budget())
         if inside is None:
             return evaluated
         remark = ", ".join(filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"]))
-        smaller = replace(found, control=inside.control)
-        return self._evaluate(replace(nothing, note=remark), smaller) or nothing
+        return self._evaluate(replace(nothing, note=remark), found, inside.control)
 
-    def _evaluate(self, nothing: MethodResult, found: SearchResult) -> MethodResult | None:
-        """Evaluate a control without changing it; None where the simulation diverges.
+    def _evaluate(self, nothing: MethodResult, found: SearchResult, control: Array) -> MethodResult:
+        """Evaluate a control without changing it; `nothing` where the simulation diverges.
 
         Args:
             nothing: The row of the method where it has no usable control.
-            found: The control.
+            found: The result of the search.
+            control: (N, nu) its control, perhaps made smaller [u-unit].
         """
         task, note = self.task, nothing.note
-        point = None
-        if found.control is not None:
-            point = point_at_stated_rate(self.stage, found.control)
+        point = point_at_stated_rate(self.stage, control)
         if point is None or point.trajectory is None:
-            return None
+            return nothing
         if point.criterion is None or point.information is None:
-            return None
+            return nothing
 
         # The outcome of the method, and a note for the user.
         verification = verify(task, point.trajectory)
@@ -391,7 +386,7 @@ class MethodEvaluation:
         return replace(
             nothing,
             outcome=outcome,
-            control=found.control,
+            control=control,
             cost=point.cost,
             criterion=point.criterion.value,
             std=self.stage.problem.information.std(point.information),

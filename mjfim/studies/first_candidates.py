@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,9 +17,9 @@ from mjfim.experiment.time_grid import rates_near, whole_number
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.elements import (
     actuator_force_sizes,
-    element_count,
     element_name,
     force_sizes,
+    free_name,
     identifier,
     names_of,
     position_sizes,
@@ -29,6 +29,7 @@ from mjfim.model.loading import NO_PACKAGES, load_spec
 from mjfim.model.model_files import PACKAGE
 from mjfim.model.paths import unit_of
 from mjfim.model.units import servo_kind
+from mjfim.records.base import record
 from mjfim.studies import GROUPS, Group
 
 # Comment at the head of the MJCF.
@@ -61,25 +62,24 @@ def read_urdf(
 
     def mjcf(file: str) -> str:
         """Text of the MJCF; the path of the URDF is relative to it or absolute."""
+        element = ElementTree.SubElement
         root = ElementTree.Element("mujoco", model=f"{spec.modelname} with motors")
         root.append(ElementTree.Comment(COMMENT))
         if packages:
-            custom = ElementTree.SubElement(root, "custom")
+            custom = element(root, "custom")
             for name, folder in packages.items():
-                ElementTree.SubElement(custom, "text", name=f"{PACKAGE}{name}", data=folder)
-        asset = ElementTree.SubElement(root, "asset")
-        ElementTree.SubElement(asset, "model", name="robot", file=file)
-        world = ElementTree.SubElement(root, "worldbody")
-        ElementTree.SubElement(world, "attach", model="robot", prefix="")
+                element(custom, "text", name=f"{PACKAGE}{name}", data=folder)
+        element(element(root, "asset"), "model", name="robot", file=file)
+        element(element(root, "worldbody"), "attach", model="robot", prefix="")
 
         # The range of a motor is that of the force of its joint, where the URDF states one.
-        actuators = ElementTree.SubElement(root, "actuator")
+        actuators = element(root, "actuator")
         for joint in joints:
             attributes = {"name": joint.name, "joint": joint.name}
             low, high = map(float, joint.actfrcrange)
             if low < high:
                 attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
-            ElementTree.SubElement(actuators, "motor", attributes)
+            element(actuators, "motor", attributes)
 
         ElementTree.indent(root)
         return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -88,10 +88,9 @@ def read_urdf(
 
 
 def _velocities(path: Path) -> dict[str, float]:
-    """Velocity limits of a URDF by joint name."""
-    found: dict[str, float] = {}
+    found = {}
     for joint in ElementTree.parse(path).getroot().iter("joint"):
-        limit: Any = joint.find("limit")
+        limit = joint.find("limit")
         text = None if limit is None else limit.get("velocity")
         name = joint.get("name")
         if text is None or name is None:
@@ -102,7 +101,7 @@ def _velocities(path: Path) -> dict[str, float]:
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Wishes:
     """Wishes for a first experiment; what is None is proposed.
 
@@ -127,13 +126,18 @@ class Wishes:
     packages: Mapping[str, str] = field(default_factory=dict)
 
 
+def rounded(value: float, digits: int = 2) -> float:
+    """A number with so many significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
 def groups_of(text: str) -> list[Group]:
     """Groups of parameters from a list with commas. Raises ExperimentError for an unknown one.
 
     Args:
         text: The names.
     """
-    found: list[Group] = []
+    found = []
     for name in (part.strip() for part in text.split(",")):
         group = next((each for each in GROUPS if each == name), None)
         if group is None:
@@ -172,7 +176,7 @@ def require_rate(model: Any, rate: float) -> float:
         model: The compiled model (`mujoco.MjModel`).
         rate: The rate [Hz].
     """
-    timestep = float(model.opt.timestep)
+    timestep = model.opt.timestep
     steps = 1.0 / (rate * timestep) if rate > 0.0 else 0.0
     if whole_number(steps) is not None:
         return rate
@@ -214,7 +218,7 @@ JOINT_FIELDS: dict[Group, tuple[tuple[str, str, str], ...]] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Candidate:
     """A parameter that may be proposed.
 
@@ -326,14 +330,12 @@ def _tied(model: Any, found: Sequence[Candidate]) -> list[Candidate]:
     kinds = Counter(quantity for quantity, *_ in families)
     tied: dict[str, Candidate] = {}
     for first, *others in (list(family.values()) for family in families.values()):
-        name, number = first.name, 2
+        name = first.name
         if others:
             name = first.name.removeprefix(f"{first.owners[0]}_")
             if kinds[first.quantity] > 1:
                 name = f"{name}_{first.owners[0]}_and_{len(others)}_more"
-        base = name
-        while name in tied:
-            name, number = f"{base}_{number}", number + 1
+        name = free_name(name, tied)
         tied[name] = replace(
             first,
             name=name,
@@ -367,10 +369,10 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
     radius = body_inertia(model, body).gyration_radius
     # A light wrist carries more than a share of its own mass.
     scale = PAYLOAD_SHARE * mass
-    gravity = float(np.linalg.norm(model.opt.gravity))
+    gravity = np.linalg.norm(model.opt.gravity)
     if gravity > 0.0 and model.nu:
         forces = np.abs(model.actuator_gear[:, 0]) * actuator_force_sizes(model, period)
-        scale = max(scale, STRENGTH_SHARE * float(forces.max()) / (gravity * length))
+        scale = max(scale, STRENGTH_SHARE * forces.max() / (gravity * length))
     yield Candidate(
         name="payload",
         group="payload",
@@ -378,9 +380,9 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
         quantity=f"mass of the load at {name}",
         offset=mass,
         guess=0.0,
-        scale=float(f"{scale:.2g}"),
+        scale=rounded(scale),
     )
-    moments = mass * np.asarray(model.body_ipos[body])
+    moments = mass * model.body_ipos[body]
     for i, axis in enumerate(AXES):
         yield Candidate(
             name=f"payload_moment_{axis}",
@@ -389,7 +391,7 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
             quantity=f"mass times {axis} of the load's centre of mass, in the frame of {name}",
             offset=float(moments[i]),
             guess=0.0,
-            scale=float(f"{scale * radius:.2g}"),
+            scale=rounded(scale * radius),
         )
 
 
@@ -401,8 +403,8 @@ def _delay(rate: float) -> Candidate:
         paths=("output:delay",),
         quantity="delay of all measurements",
         guess=0.0,
-        scale=float(f"{1.0 / rate:.2g}"),
-        bounds=(0.0, float(f"{LONGEST_DELAY / rate:.2g}")),
+        scale=rounded(1.0 / rate),
+        bounds=(0.0, rounded(LONGEST_DELAY / rate)),
     )
 
 
@@ -413,7 +415,7 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
     """
     depth = np.zeros(model.nbody, dtype=int)
     for body in range(1, model.nbody):
-        depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body])
+        depth[body] = depth[model.body_parentid[body]] + model.body_jntnum[body]
     moving = [
         body
         for body in range(1, model.nbody)
@@ -421,18 +423,16 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
     ]
 
     # Fingers and markers are too light to matter.
-    typical = float(np.median(model.body_mass[moving])) if moving else 0.0
+    typical = np.median(model.body_mass[moving]) if moving else 0.0
     alike: dict[tuple[int, float], list[int]] = {}
     for body in moving:
         if model.body_mass[body] >= SMALL_MASS * typical:
-            mass = float(f"{model.body_mass[body]:.6g}")
-            alike.setdefault((-int(depth[body]), -mass), []).append(body)
+            alike.setdefault((-depth[body], -rounded(model.body_mass[body], 6)), []).append(body)
     last = sorted(alike.items())[:families]
     return [(body, i) for i, (_, bodies) in enumerate(last) for body in bodies]
 
 
 def _mass_and_centre(model: Any, body: int, family: int, group: Group) -> Iterator[Candidate]:
-    """Mass and centre of mass of a body."""
     name = element_name(model, "body", body)
     mass = float(model.body_mass[body])
     yield Candidate(
@@ -443,7 +443,7 @@ def _mass_and_centre(model: Any, body: int, family: int, group: Group) -> Iterat
         owners=(name,),
         value=mass,
         family=family,
-        bounds=(0.0, float(f"{10.0 * mass:.3g}")),
+        bounds=(0.0, rounded(10.0 * mass, 3)),
     )
     for i, axis in enumerate(AXES):
         yield Candidate(
@@ -484,7 +484,7 @@ def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate
         # A force of friction, over a natural speed or acceleration.
         power = {"damping": 1, "armature": 2}.get(quantity, 0)
         for joint in range(model.njnt):
-            name, dof = element_name(model, "joint", joint), int(model.jnt_dofadr[joint])
+            name, dof = element_name(model, "joint", joint), model.jnt_dofadr[joint]
             value = float(getattr(model, array)[dof])
             is_single = joint_dofs(model, joint) == 1
             size = float(forces[dof] * period**power / sizes[dof] ** (power > 0))
@@ -496,8 +496,8 @@ def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate
                     quantity=meaning,
                     owners=(name,),
                     value=value,
-                    scale=None if value > 0.0 else float(f"{size:.2g}"),
-                    bounds=(0.0, float(f"{10.0 * (value or size):.3g}")),
+                    scale=None if value > 0.0 else rounded(size),
+                    bounds=(0.0, rounded(10.0 * (value or size), 3)),
                 )
 
 
@@ -542,20 +542,16 @@ def proposed_noise(
     """
     typical = {
         "angle": ANGLE_SIGMA,
-        "length": _rounded(LENGTH_SIGMA * length),
-        "angular velocity": _rounded(VELOCITY_SIGMA / period),
-        "velocity": _rounded(VELOCITY_SIGMA * length / period),
+        "length": rounded(LENGTH_SIGMA * length, 1),
+        "angular velocity": rounded(VELOCITY_SIGMA / period, 1),
+        "velocity": rounded(VELOCITY_SIGMA * length / period, 1),
     }
-    return list(_sensors(model)) or list(_joints(model, {**typical, **wanted}))
-
-
-def _sensors(model: Any) -> Iterator[ProposedNoise]:
-    """Sensors with a name whose noise the MJCF states."""
-    for i in range(element_count(model, "sensor")):
-        name = element_name(model, "sensor", i)
-        sigma = float(model.sensor_noise[i])
-        if name and sigma > 0.0:
-            yield name, sigma, ""
+    sensors = [
+        (name, float(model.sensor_noise[identifier(model, "sensor", name)]), "")
+        for name in names_of(model, "sensor")
+    ]
+    stated = [sensor for sensor in sensors if sensor[1] > 0.0]
+    return stated or list(_joints(model, {**typical, **wanted}))
 
 
 def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
@@ -563,7 +559,7 @@ def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
     kinds = {"qpos": ("length", "angle"), "qvel": ("velocity", "angular velocity")}
     for quantity, (length_kind, angle_kind) in kinds.items():
         for joint, name in enumerate(joint_names(model)):
-            kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+            kind = mujoco.mjtJoint(model.jnt_type[joint])
             key = f"{quantity}:{name}"
             if kind == mujoco.mjtJoint.mjJNT_FREE:
                 yield f"{key}.pos", sigmas[length_kind], length_kind
@@ -571,8 +567,3 @@ def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
                 continue
             moved = length_kind if kind == mujoco.mjtJoint.mjJNT_SLIDE else angle_kind
             yield key, sigmas[moved], moved
-
-
-def _rounded(value: float) -> float:
-    """A number with one significant digit."""
-    return float(np.format_float_scientific(value, precision=0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import tomlkit
-from tomlkit.items import InlineTable, Table
+from tomlkit.items import Table
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDivergedError
 from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.excitation.limits.verification import verify, violations_of
@@ -27,6 +27,7 @@ from mjfim.model.loading import ModelSource, resolve_packages, silence_mujoco_lo
 from mjfim.model.model_files import is_urdf
 from mjfim.model.paths import unit_of
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
+from mjfim.records.base import record
 from mjfim.studies.first_candidates import (
     Candidate,
     ProposedNoise,
@@ -35,6 +36,7 @@ from mjfim.studies.first_candidates import (
     proposed_noise,
     read_urdf,
     require_rate,
+    rounded,
 )
 from mjfim.studies.first_limits import playable_limits, played
 from mjfim.studies.first_motion import (
@@ -50,8 +52,8 @@ from mjfim.studies.first_motion import (
     influence_of_controls,
     propose_release,
     reach,
-    rounded,
     time_scale,
+    two_digits,
 )
 
 # First and last frequency of the chirp, in characteristic periods of the motion.
@@ -104,7 +106,7 @@ NO_WISHES = Wishes()
 MOST_CANDIDATES = 24
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Proposal:
     """Everything that a first experiment file states.
 
@@ -136,13 +138,13 @@ class Proposal:
     chosen: Sequence[Candidate]
     others: Sequence[Candidate]
     limits: dict[str, Any]
-    boundary: dict[str, str]
-    remarks: Sequence[str]
+    boundary: Mapping[str, str] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
     release: ProposedRelease | None = None
 
     def values(self) -> dict[str, Any]:
         """Keys and tables of the experiment file."""
-        initial: dict[str, Any] = {}
+        initial = {}
         if self.release is not None:
             qpos, free = self.release
             initial["qpos"] = qpos.tolist()
@@ -154,7 +156,7 @@ class Proposal:
             if self.start.act.any():
                 initial["act"] = self.start.act.tolist()
 
-        values: dict[str, Any] = {
+        values = {
             "model": self.model,
             "rate": self.times.rate,
             "horizon": self.times.horizon,
@@ -176,16 +178,15 @@ class Proposal:
 
     def control(self) -> dict[str, Any]:
         """The key `initial.control`."""
-        names = list(self.amplitudes)
-        control: dict[str, Any] = {
+        control = {
             "kind": "chirp",
-            "amplitude": dict(self.amplitudes),
+            "amplitude": self.amplitudes,
             "frequency": self.chirp[0],
             "frequency_end": self.chirp[1],
         }
         if "end" in self.boundary:
-            control["fade"] = float(f"{FADE * self.times.period:.2g}")
-        offset = dict(zip(names, self.start.control.tolist(), strict=True))
+            control["fade"] = rounded(FADE * self.times.period)
+        offset = dict(zip(self.amplitudes, self.start.control.tolist(), strict=True))
         if any(offset.values()):
             control["offset"] = offset
         return control
@@ -249,11 +250,10 @@ def propose_experiment(
                 "joints"
             )
     # Ranges about the resting control for controls that have none in the MJCF.
-    widths = CONTROL_LIMIT * wanted
     ranges = {
-        name: [float(f"{centre - width:.3g}"), float(f"{centre + width:.3g}")]
+        name: [rounded(centre - width, 3), rounded(centre + width, 3)]
         for name, centre, width, is_limited in zip(
-            controls, start.control, widths, model.actuator_ctrllimited, strict=True
+            controls, start.control, CONTROL_LIMIT * wanted, model.actuator_ctrllimited, strict=True
         )
         if not is_limited
     }
@@ -270,15 +270,13 @@ def propose_experiment(
         start=start,
         amplitudes=dict(zip(controls, wanted.tolist(), strict=True)),
         chirp=(
-            float(f"{FIRST_FREQUENCY / times.period:.2g}"),
-            float(f"{LAST_FREQUENCY / times.period:.2g}"),
+            rounded(FIRST_FREQUENCY / times.period),
+            rounded(LAST_FREQUENCY / times.period),
         ),
         noise=proposed_noise(model, length, times.period, wishes.sigmas),
         chosen=found,
         others=absent,
         limits=limits,
-        boundary={},
-        remarks=(),
         release=release,
     )
     refinement = _Refinement(source=source, folder=folder, wishes=wishes)
@@ -334,7 +332,12 @@ def _with_amplitudes(draft: Proposal, amplitudes: Array) -> Proposal:
     return replace(draft, amplitudes=dict(zip(draft.amplitudes, amplitudes.tolist(), strict=True)))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+def _lean(draft: Proposal) -> Proposal:
+    """The draft with one parameter, which is enough where only the motion matters, and quicker."""
+    return replace(draft, chosen=draft.chosen[:1])
+
+
+@record
 class _Refinement:
     """Test of a draft by the package itself: feasible amplitudes and identifiable parameters.
 
@@ -350,35 +353,31 @@ class _Refinement:
 
     def refined(self, draft: Proposal) -> Proposal:
         """The draft with amplitudes that keep all limits, and with identified parameters."""
-        # One parameter is enough where only the motion matters, and much quicker.
-        lean = replace(draft, chosen=draft.chosen[:1])
-        system = System.resolve(self._experiment(lean), source=self.source)
-        if self._begins_at_rest(system, lean):
-            draft = replace(draft, boundary=AT_REST)
-            lean = replace(lean, boundary=AT_REST)
+        system = System.resolve(self._experiment(_lean(draft)), source=self.source)
+        at_rest = replace(draft, boundary=AT_REST)
+        if draft.start.held and self._can_begin(system, at_rest):
+            draft = at_rest
         # Each joint of an arm is driven, so that the controls can stop it.
         is_arm = len(driven_dofs(self.source.model)) == self.source.model.nv
 
-        remarks: list[str] = list(draft.remarks)
+        remarks = []
         amplitudes = np.array(list(draft.amplitudes.values()))
-        kept = self._kept_amplitudes(system, lean, amplitudes)
+        kept = self._kept_amplitudes(system, draft, amplitudes)
         if draft.boundary and kept is not None and is_arm:
             # Servos stop a motion that fades; under torques, the design has to find the end.
             draft = replace(draft, boundary=AT_REST | {"end": "rest"})
-            ended = self._kept_amplitudes(system, replace(draft, chosen=lean.chosen), kept)
+            ended = self._kept_amplitudes(system, draft, kept)
             if ended is not None and (ended >= SMALLEST_ENDED * kept).all():
                 kept = ended
         if kept is None:
-            smallest = rounded(amplitudes * SHRINKING**TRIALS)
-            draft, remark = self._within_limits(system, draft, smallest)
+            smallest = two_digits(amplitudes * SHRINKING**TRIALS)
+            shorter, remark = self._within_limits(system, draft, smallest)
             remarks.append(remark)
 
             # During a shorter horizon, the motion may be larger.
-            kept = smallest
-            if draft.times != lean.times:
-                shorter = replace(lean, times=draft.times)
+            if shorter is not draft:
                 kept = self._kept_amplitudes(system, shorter, amplitudes)
-                kept = smallest if kept is None else kept
+            draft, kept = shorter, smallest if kept is None else kept
         moved = _with_amplitudes(draft, kept)
         if not draft.start.held:
             remarks.append(
@@ -409,7 +408,7 @@ class _Refinement:
         for least in (ROOM, 0.0):
             for trial in range(TRIALS + 1):
                 if room(SHRINKING**trial) >= least:
-                    return rounded(amplitudes * SHRINKING**trial)
+                    return two_digits(amplitudes * SHRINKING**trial)
         return None
 
     def _within_limits(
@@ -425,14 +424,11 @@ class _Refinement:
         Returns:
             The draft, with a shorter horizon where that helps, and a remark that names the limit.
         """
-        still = replace(draft, chosen=draft.chosen[:1])
-        still = _with_amplitudes(still, smallest)
+        still = _with_amplitudes(draft, smallest)
         try:
             task = self._task(system, still)
-            first = next(iter(violations_of(task, verify(task, task.initial))), None)
-        except SimulationDivergedError:
-            first = None
-        if first is None:
+            first = next(iter(violations_of(task, verify(task, task.initial))))
+        except (SimulationDivergedError, StopIteration):
             return draft, f"Warning: {NO_MOTION}; choose another start."
 
         # A horizon that the user wants stays.
@@ -458,12 +454,11 @@ class _Refinement:
         """
         remarks = ["The model has no actuators: a design chooses the release, `initial.free`."]
         for trial in range(TRIALS):
-            share = float(rounded(np.array([FIRST_SHARE * SHRINKING**trial]))[0])
+            share = rounded(FIRST_SHARE * SHRINKING**trial)
             release = propose_release(self.source.model, draft.start.qpos, length, share)
-            lean = replace(draft, chosen=draft.chosen[:1], release=release)
-            system = System.resolve(self._experiment(lean), source=self.source)
-            if self._room(self._task(system, lean), 1.0) >= 0.0:
-                return self._with_parameters(replace(draft, release=release), remarks)
+            released = replace(draft, release=release)
+            if self._room(self._own_task(_lean(released)), 1.0) >= 0.0:
+                return self._with_parameters(released, remarks)
         remarks.append("Warning: no release near this start keeps all limits.")
         return self._with_parameters(draft, remarks)
 
@@ -485,24 +480,23 @@ class _Refinement:
         remarks = [*remarks, *unnamed]
         return replace(draft, remarks=remarks, chosen=proposed, others=others)
 
-    def _experiment(self, draft: Proposal, **tables: Any) -> Experiment:
-        """The experiment that a draft states, with other tables."""
-        values = {**draft.values(), **tables}
-        return Experiment(**values, directory=self.folder, source="the proposed experiment")
+    def _experiment(self, draft: Proposal) -> Experiment:
+        return Experiment(**draft.values(), directory=self.folder, source="the proposed experiment")
 
-    def _task(self, system: System, draft: Proposal, **tables: Any) -> DesignTask:
-        """The task of a draft on the plant of a system."""
-        return DesignTask.of(replace(system, experiment=self._experiment(draft, **tables)))
+    def _own_task(self, draft: Proposal) -> DesignTask:
+        """The task of a draft on a plant of its own."""
+        return DesignTask.of(System.resolve(self._experiment(draft), source=self.source))
 
-    def _begins_at_rest(self, system: System, draft: Proposal) -> bool:
-        """Whether a design can begin at rest."""
-        if not draft.start.held:
-            return False
+    def _task(self, system: System, draft: Proposal) -> DesignTask:
+        """The task of the motion of a draft on the plant of a system."""
+        return DesignTask.of(replace(system, experiment=self._experiment(_lean(draft))))
+
+    def _can_begin(self, system: System, draft: Proposal) -> bool:
+        """Whether a design can begin at rest, as a draft states."""
         try:
-            task = self._task(system, draft, boundary=AT_REST)
+            task = self._task(system, draft)
             # A design searches without the stops of joints, too.
-            holds = (task.initial_hold, task.relaxed().initial_hold)
-            return bool(np.isfinite(holds).all())
+            return bool(np.isfinite((task.initial_hold, task.relaxed().initial_hold)).all())
         except MjfimError:
             return False
 
@@ -559,14 +553,13 @@ class _Refinement:
         that never do. The test of a check knows the error of the derivatives; a parameter that it
         cannot tell apart makes room for later ones.
         """
-        system = System.resolve(self._experiment(draft), source=self.source)
-        task = self._task(system, draft)
+        task = self._own_task(draft)
         point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
         if point.information is None or point.sensitivity is None:
             raise SimulationDivergedError(
                 "the simulation diverges when the parameters change a little"
             )
-        F = np.asarray(point.information - task.information.prior)
+        F = point.information - task.information.prior
         # The error of a release is a further unknown.
         n = len(draft.chosen)
         hidden = F[:n, n:] @ np.linalg.pinv(F[n:, n:], hermitian=True) @ F[n:, :n]
@@ -586,8 +579,7 @@ class _Refinement:
             )
         while True:
             chosen = [left[i] for i in identifiable(F[np.ix_(left, left)], sizes[left], asked)]
-            part = replace(draft, chosen=[draft.chosen[i] for i in chosen])
-            tried = self._task(System.resolve(self._experiment(part), source=self.source), part)
+            tried = self._own_task(replace(draft, chosen=[draft.chosen[i] for i in chosen]))
             columns = point.sensitivity.of_parameters([*chosen, *range(n, len(task.parameters))])
             # Other controls need not be tried, because this one has to show every parameter.
             found = tried.identifiability_test.along(tried.initial, columns, lambda: True)
@@ -636,12 +628,11 @@ def identifiable(F: Array, sizes: Array, asked: Sequence[int] = ()) -> Sequence[
 def _largest_std(F: Array, members: list[int]) -> float:
     """Largest standard deviation of some parameters that are estimated together."""
     part = F[np.ix_(members, members)]
-    diagonal = np.sqrt(np.diag(part))
-    if not np.isfinite(part).all() or not (diagonal > 0.0).all():
+    if not np.isfinite(part).all() or not (np.diag(part) > 0.0).all():
         return np.inf
 
     # Scaling by the diagonal keeps the eigenvalues comparable.
-    correlation = part / np.outer(diagonal, diagonal)
+    correlation, diagonal = scaled_to_unit_diagonal(part)
     values, vectors = np.linalg.eigh(correlation)
     if values[0] <= len(members) * np.finfo(float).eps * 1e3:
         return np.inf
@@ -706,7 +697,8 @@ def experiment_text(proposal: Proposal) -> str:
             continue
         entry = tomlkit.item(value)
         document.add(key, entry.comment(behind[key]) if key in behind else entry)
-    _add_others(document["parameters"], proposal)
+    if proposal.others:
+        _add_others(document["parameters"], proposal)
     return tomlkit.dumps(document).rstrip() + "\n"
 
 
@@ -769,32 +761,26 @@ def _table(
 def _inline(value: Any) -> Any:
     """A value whose tables are written in one line."""
     if isinstance(value, Mapping):
-        table: InlineTable = tomlkit.inline_table()
-        for key, entry in value.items():
-            table.add(key, _inline(entry))
+        table = tomlkit.inline_table()
+        table.update(value)
         return table
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+    if isinstance(value, list):
         array = tomlkit.array()
-        for entry in value:
-            array.append(_inline(entry))
+        array.extend(value)
         return array
     return value
 
 
 def _add_others(table: Any, proposal: Proposal) -> None:
     """Add the parameters that are not proposed as comments."""
-    if not proposal.others:
-        return
     table.add(tomlkit.nl())
     table.add(tomlkit.comment("Further parameters. Uncomment those that you do not trust;"))
     table.add(tomlkit.comment("`mjfim check` says which ones can be identified together."))
     for each in proposal.others:
         name, written = tomlkit.key(each.name).as_string(), _inline(each.table()).as_string()
-        meaning = _meaning(proposal.compiled, each)
-        table.add(tomlkit.comment(f"{name} = {written}  # {meaning}"))
+        table.add(tomlkit.comment(f"{name} = {written}  # {_meaning(proposal.compiled, each)}"))
 
 
 def _meaning(model: Any, each: Candidate) -> str:
-    """Meaning of a parameter, with its unit."""
     unit = unit_of(model, each.paths[0])
     return f"{each.meaning} [{unit}]" if unit else each.meaning

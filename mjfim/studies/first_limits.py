@@ -15,6 +15,7 @@ from mjfim.model.clearance import GeomDistances, find_geom_pairs, with_floor
 from mjfim.model.coordinates import joint_names
 from mjfim.model.elements import translations, unique_names
 from mjfim.model.loading import ModelSource
+from mjfim.studies.first_candidates import rounded
 from mjfim.studies.first_motion import Start, TimeScale, driven_dofs
 
 # Derived limit of a speed, relative to the largest speed of the motion at rest, where that is
@@ -57,14 +58,16 @@ def played(
     if moved is not None:
         mujoco.mj_integratePos(model, data.qpos, moved, 1.0)
     mujoco.mj_forward(model, data)
-    seen = [(data.qpos.copy(), data.qvel.copy(), data.ten_length.copy())]
+    watched = (data.qpos, data.qvel, data.ten_length)
+    seen = [[each.copy()] for each in watched]
     for control in controls:
         data.ctrl[:] = control
         mujoco.mj_step(model, data)
-        if data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
+        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             break
-        seen.append((data.qpos.copy(), data.qvel.copy(), data.ten_length.copy()))
-    positions, velocities, lengths = (np.stack(each) for each in zip(*seen, strict=True))
+        for rows, each in zip(seen, watched, strict=True):
+            rows.append(each.copy())
+    positions, velocities, lengths = map(np.stack, seen)
     return positions, velocities, lengths
 
 
@@ -93,8 +96,7 @@ def playable_limits(
     names = joint_names(model)
     driven = driven_dofs(model)
     derived = {
-        names[int(model.dof_jntid[dof])]: float(f"{speeds[dof]:.2g}")
-        for dof in (driven if not stated else ())
+        names[model.dof_jntid[dof]]: rounded(speeds[dof]) for dof in (driven if not stated else ())
     }
     velocity: Any = dict(stated) or derived
     if len(driven) == model.nv and len(set(derived.values())) == 1:
@@ -103,10 +105,10 @@ def playable_limits(
     limits: dict[str, Any] = {"velocity": velocity} if velocity else {}
     limits |= _widened(model, positions, lengths)
     step = -(-len(positions) // MOST_CONFIGURATIONS)
-    limits |= _clearance(source, positions[::step], float(f"{CLEARANCE_SHARE * length:.1g}"))
+    limits |= _clearance(source, positions[::step], rounded(CLEARANCE_SHARE * length, 1))
     bandwidth = max(BANDWIDTH / times.period, FEWEST_PERIODS / times.horizon)
     if bandwidth < 0.5 * times.rate:
-        limits["bandwidth"] = float(f"{bandwidth:.2g}")
+        limits["bandwidth"] = rounded(bandwidth)
     return limits
 
 
@@ -126,7 +128,7 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
         begins_outside = not limit.lower <= values[0] <= limit.upper
         if begins_outside and (np.abs(excess) < most).all():
             wider = ends + np.clip(SOFT_ROOM * excess, -most, most)
-            found.setdefault(limit.kind, {})[limit.name] = [float(f"{end:.6g}") for end in wider]
+            found.setdefault(limit.kind, {})[limit.name] = [rounded(end, 6) for end in wider]
     return {**found}
 
 
@@ -147,11 +149,11 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
     bases = set(model.body_parentid[moves].tolist()) - {0, *np.flatnonzero(moves).tolist()}
     around = [b for b in model.geom_bodyid.tolist() if not moves[b] and b not in bases]
     height = min((float(data.xpos[body, 2]) for body in bases), default=0.0)
-    stated: dict[str, Any] = {"clearance": least}
+    stated = {"clearance": least}
     is_fixed = not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
     lowest = data.geom_xpos[moves[model.geom_bodyid], 2].min(initial=np.inf)
     if is_fixed and not around and lowest > height:
-        stated["floor"] = float(f"{height:.6g}")
+        stated["floor"] = rounded(height, 6)
         model = with_floor(source, stated["floor"]).model
     try:
         pairs = find_geom_pairs(model, ())

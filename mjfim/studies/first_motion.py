@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -15,7 +14,8 @@ from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs, tangent_components
 from mjfim.model.elements import control_sizes, is_rk4, translations
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
-from mjfim.studies.first_candidates import require_keyframe, resting_keyframes
+from mjfim.records.base import record
+from mjfim.studies.first_candidates import require_keyframe, resting_keyframes, rounded
 
 # Samples in one characteristic period of the motion.
 SAMPLES_PER_PERIOD = 100
@@ -39,12 +39,15 @@ SHORTEST = 0.2
 # Difference step of the linearisation.
 LINEARISATION_STEP = 1e-6
 
+# Types of joints that turn.
+HINGED = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL)
+
 # Engine steps in the characteristic period of a model that has neither gravity nor poles, and most
 # steps in that of a slow pole: a body that drifts in a thin fluid would need hours.
 STEPS_OF_FREE_MODEL = 1000
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TimeScale:
     """Times of an experiment.
 
@@ -75,18 +78,17 @@ def time_scale(model: Any, data: Any) -> TimeScale:
     """
     eigenvalues = _eigenvalues(model, data)
     period = _period(model, data, eigenvalues)
-    rate = _rate(float(model.opt.timestep), SAMPLES_PER_PERIOD / period)
+    rate = _rate(model.opt.timestep, SAMPLES_PER_PERIOD / period)
 
     # Without feedback, a motion about an unstable state stays near it for a short time only.
-    growth = float(np.log(np.abs(eigenvalues).max(initial=1.0))) / float(model.opt.timestep)
+    growth = np.log(np.abs(eigenvalues).max(initial=1.0)) / model.opt.timestep
     longest = PERIODS * period
     unstable = growth * longest > LARGEST_GROWTH
     if unstable:
         longest = max(LARGEST_GROWTH / growth, SHORTEST * period)
 
     # The horizon has two significant digits, and is a whole number of samples.
-    wanted = float(f"{longest:.2g}")
-    samples = max(round(wanted * rate), 2)
+    samples = max(round(rounded(longest) * rate), 2)
     return TimeScale(period=period, rate=rate, samples=samples, unstable=unstable)
 
 
@@ -103,11 +105,7 @@ def reach(model: Any, data: Any) -> float:
     """
     largest = 0.0
     for joint in range(model.njnt):
-        hinged = model.jnt_type[joint] in (
-            int(mujoco.mjtJoint.mjJNT_HINGE),
-            int(mujoco.mjtJoint.mjJNT_BALL),
-        )
-        if hinged:
+        if mujoco.mjtJoint(model.jnt_type[joint]) in HINGED:
             arms = data.xipos[_moved(model, joint)] - data.xanchor[joint]
             largest = max(largest, float(np.linalg.norm(arms, axis=1).max()))
     if largest > 0.0:
@@ -121,14 +119,11 @@ def reach(model: Any, data: Any) -> float:
 def _moved(model: Any, joint: int) -> Array:
     """(m,) numbers of the bodies with mass that a joint moves."""
     top = int(model.jnt_bodyid[joint])
-    found = []
-    for body in range(top, model.nbody):
-        above = body
-        while above > top:
-            above = int(model.body_parentid[above])
-        if above == top and model.body_mass[body] > 0.0:
-            found.append(body)
-    return np.array(found or [top])
+    below = [top]
+    for body in range(top + 1, model.nbody):
+        if model.body_parentid[body] in below:
+            below.append(body)
+    return np.array([body for body in below if model.body_mass[body] > 0.0] or [top])
 
 
 def pendulum_time(model: Any, data: Any) -> float | None:
@@ -138,8 +133,8 @@ def pendulum_time(model: Any, data: Any) -> float | None:
         model: The compiled model.
         data: Its data in the initial state, after `mj_forward`.
     """
-    gravity = float(np.linalg.norm(model.opt.gravity))
-    is_off = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY))
+    gravity = np.linalg.norm(model.opt.gravity)
+    is_off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     if gravity == 0.0 or is_off:
         return None
     return float(np.sqrt(reach(model, data) / gravity))
@@ -158,7 +153,7 @@ def _period(model: Any, data: Any, eigenvalues: Array) -> float:
 
     # An eigenvalue of zero is infinitely fast; it says nothing about the motion.
     moving = eigenvalues[np.abs(eigenvalues) > np.finfo(float).eps]
-    speeds = np.abs(np.log(moving.astype(complex))) / float(model.opt.timestep)
+    speeds = np.abs(np.log(moving.astype(complex))) / model.opt.timestep
     speeds = speeds[speeds > SLOWEST_POLE * speeds.max(initial=0.0)]
     if len(speeds):
         return min(2.0 * np.pi / float(speeds.min()), free_time(model))
@@ -173,7 +168,7 @@ def _eigenvalues(model: Any, data: Any) -> Array:
     # MuJoCo does not linearise RK4; the time scale is the same with Euler's method.
     euler = copy(model)
     if is_rk4(euler):
-        euler.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
+        euler.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     mujoco.mjd_transitionFD(euler, data, LINEARISATION_STEP, True, A, None, None, None)
     if not np.isfinite(A).all():
         return np.empty(0)
@@ -183,16 +178,14 @@ def _eigenvalues(model: Any, data: Any) -> Array:
 def _rate(timestep: float, wanted: float) -> float:
     """A rate [Hz] whose period is a whole number of timesteps [s], preferably a round number."""
     nearest = max(round(1.0 / (wanted * timestep)), 1)
-    first = int(np.ceil(nearest / RATE_RANGE))
-    steps = range(first, int(nearest * RATE_RANGE) + 1)
+    steps = range(int(np.ceil(nearest / RATE_RANGE)), int(nearest * RATE_RANGE) + 1)
 
     def preference(k: int) -> tuple[int, float]:
         """Number of digits of the rate, then its distance from the wanted one."""
         rate = 1.0 / (k * timestep)
-        digits = len(f"{rate:.9g}".replace(".", "").strip("0"))
-        return digits, abs(float(np.log(rate / wanted)))
+        return len(f"{rate:.9g}".replace(".", "").strip("0")), abs(np.log(rate / wanted))
 
-    return float(f"{1.0 / (min(steps, key=preference) * timestep):.12g}")
+    return rounded(1.0 / (min(steps, key=preference) * timestep), 12)
 
 
 # A state is held where the robot needs this many characteristic periods, sqrt(length / gravity), to
@@ -218,7 +211,7 @@ SETTLING_PERIODS = 60.0
 VELOCITY_LEFT = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Start:
     """Initial state and resting control.
 
@@ -260,8 +253,7 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
         ExperimentError: There is no such keyframe at rest.
     """
     if keyframe is not None:
-        number = model.key(require_keyframe(model, keyframe)).id
-        return _start_in_keyframe(model, int(number))
+        return _start_in_keyframe(model, model.key(require_keyframe(model, keyframe)).id)
 
     candidates = []
     for start in _candidates(model):
@@ -274,43 +266,43 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
 def _candidates(model: Any) -> Iterator[Start]:
     """Starts in the order of preference."""
     for name in resting_keyframes(model):
-        yield _start_in_keyframe(model, int(model.key(name).id))
+        yield _start_in_keyframe(model, model.key(name).id)
 
-    inside = _inside_ranges(model, model.qpos0)
-    reason = "the reference positions of the MJCF"
-    if not np.array_equal(inside, model.qpos0):
-        reason += MOVED_INSIDE
-    first = _start(model, inside, _resting_control(model, inside), keyframe=None, reason=reason)
+    resting = _resting_control(model, _inside_ranges(model, model.qpos0))
+    first = _start(model, model.qpos0, resting, "the reference positions of the MJCF")
     yield first
 
     driven = driven_dofs(model)
     for locked, how in ((driven, "while its driven joints are locked"), ((), "by itself")):
         settled = _settled(model, first, locked)
-        if settled is None:
-            continue
-
-        # A joint that rests on the end of its range has no room to move. But to move one joint of
-        # a closed chain would open it.
-        inside = settled if model.neq else _inside_ranges(model, settled)
-        reason = f"the state in which the model comes to rest {how}"
-        if not np.array_equal(inside, settled):
-            reason += MOVED_INSIDE
-        yield _start(model, inside, first.control, keyframe=None, reason=reason)
+        if settled is not None:
+            reason = f"the state in which the model comes to rest {how}"
+            # To move one joint of a closed chain would open it.
+            yield _start(model, settled, first.control, reason, moves_inside=not model.neq)
 
 
 def _start_in_keyframe(model: Any, number: int) -> Start:
-    """The start in a keyframe, whose joints are moved away from the ends of their ranges."""
-    qpos, ctrl = model.key_qpos[number], model.key_ctrl[number]
-    name = model.key(number).name
-    reason = f"the keyframe {name!r} of the MJCF"
-    inside = _inside_ranges(model, qpos)
-    if np.array_equal(inside, qpos):
-        return _start(model, qpos, ctrl, keyframe=name, reason=reason)
-    return _start(model, inside, ctrl, keyframe=None, reason=f"{reason}{MOVED_INSIDE}")
+    key = model.key(number)
+    reason = f"the keyframe {key.name!r} of the MJCF"
+    return _start(model, key.qpos, key.ctrl, reason, keyframe=key.name)
 
 
-def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reason: str) -> Start:
-    """A start with the control that holds it best."""
+def _start(
+    model: Any,
+    qpos: Array,
+    guess: Array,
+    reason: str,
+    *,
+    keyframe: str | None = None,
+    moves_inside: bool = True,
+) -> Start:
+    """A start with the control that holds it best.
+
+    A joint that rests on the end of its range has no room to move, so it is moved away from there.
+    """
+    inside = _inside_ranges(model, qpos) if moves_inside else qpos
+    if not np.array_equal(inside, qpos):
+        qpos, keyframe, reason = inside, None, reason + MOVED_INSIDE
     data = mujoco.MjData(model)
     control = _holding_control(model, data, qpos, guess)
     drift = _drift(model, data, qpos, control)
@@ -320,7 +312,7 @@ def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reaso
     shown = control
     if keyframe is None:
         _, _, width = _ranges(model, data, control)
-        values = np.array([float(f"{value:.6g}") for value in control])
+        values = np.array([rounded(value, 6) for value in control])
         shown = np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0)
     elif (by_guess := _drift(model, data, qpos, guess)) <= 1.0:
         control = shown = np.array(guess)
@@ -343,7 +335,7 @@ def _inside_ranges(model: Any, qpos: Array) -> Array:
             continue
         low, high = model.jnt_range[joint]
         margin = MARGIN * (high - low)
-        q = int(model.jnt_qposadr[joint])
+        q = model.jnt_qposadr[joint]
         inside[q] = np.clip(inside[q], low + margin, high - margin)
     return inside
 
@@ -359,10 +351,8 @@ def _resting_control(model: Any, qpos: Array) -> Array:
     for actuator in range(model.nactuator):
         joint = commanded_joint(model, actuator)
         if joint is not None:
-            position = qpos[int(model.jnt_qposadr[joint])]
-            control[int(model.actuator_ctrladr[actuator])] = (
-                actuator_gear(model, actuator) * position
-            )
+            position = qpos[model.jnt_qposadr[joint]]
+            control[model.actuator_ctrladr[actuator]] = actuator_gear(model, actuator) * position
     return control
 
 
@@ -378,13 +368,13 @@ def _activations(model: Any, data: Any, control: Array) -> Array:
     """(na,) activations in which actuators with a state rest under a control."""
     act = np.zeros(model.na)
     for i in range(model.nactuator):
-        first, count = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
+        first, count = model.actuator_actadr[i], model.actuator_actnum[i]
         if count == 0:
             continue
         if is_integrated(model, i):
-            act[first : first + count] = data.actuator_length[int(model.actuator_outadr[i])]
-        elif int(model.actuator_ctrlnum[i]) in (1, count):
-            controls = int(model.actuator_ctrladr[i])
+            act[first : first + count] = data.actuator_length[model.actuator_outadr[i]]
+        elif model.actuator_ctrlnum[i] in (1, count):
+            controls = model.actuator_ctrladr[i]
             act[first : first + count] = control[controls : controls + count]
     return act
 
@@ -474,9 +464,9 @@ def driven_dofs(model: Any) -> list[int]:
     joints = {
         int(model.actuator_trnid[i, 0])
         for i in range(model.nactuator)
-        if mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT and model.actuator_ctrlnum[i]
+        if mujoco.mjtTrn(model.actuator_trntype[i]) in AT_JOINT and model.actuator_ctrlnum[i]
     }
-    return [int(model.jnt_dofadr[j]) for j in sorted(joints) if joint_dofs(model, j) == 1]
+    return [model.jnt_dofadr[j] for j in sorted(joints) if joint_dofs(model, j) == 1]
 
 
 def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
@@ -487,11 +477,11 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
     """
     if len(locked) == model.nv:
         return None
-    kept = [int(model.jnt_qposadr[int(model.dof_jntid[v])]) for v in locked]
+    kept = [int(model.jnt_qposadr[model.dof_jntid[v]]) for v in locked]
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
     time = _time(model, data)
-    step = float(model.opt.timestep)
+    step = model.opt.timestep
     decay = VELOCITY_LEFT ** (step / time)
 
     for _ in range(int(SETTLING_PERIODS * time / step)):
@@ -501,7 +491,7 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
         data.qpos[kept] = start.qpos[kept]
         if (
             not np.isfinite(data.qpos).all()
-            or data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number
+            or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number
         ):
             return None
     return np.array(data.qpos)
@@ -549,22 +539,22 @@ def first_amplitudes(
             amplitudes[i] = RANGE_SHARE * max(room, 0.0)
         elif np.any(influence[:, i]):
             moved = np.abs(influence[:, i]) > 0.0
-            amplitudes[i] = float((wanted[moved] / np.abs(influence[moved, i])).min())
+            amplitudes[i] = (wanted[moved] / np.abs(influence[moved, i])).min()
 
     # The joint follows the control of a position servo.
     for actuator in range(model.nactuator):
-        control = int(model.actuator_ctrladr[actuator])
+        control = model.actuator_ctrladr[actuator]
         joint = commanded_joint(model, actuator)
         if joint is not None and not model.actuator_ctrllimited[control]:
             gear = abs(actuator_gear(model, actuator))
-            amplitudes[control] = gear * float(distance[int(model.jnt_dofadr[joint])])
+            amplitudes[control] = gear * distance[model.jnt_dofadr[joint]]
 
-    return rounded(amplitudes)
+    return two_digits(amplitudes)
 
 
-def rounded(values: Array) -> Array:
+def two_digits(values: Array) -> Array:
     """Numbers with two significant digits."""
-    return np.array([float(f"{value:.2g}") for value in values])
+    return np.array([rounded(value) for value in values])
 
 
 # Angle by which a hinge or ball joint without a range may be released to each side of the start
@@ -602,9 +592,9 @@ def propose_release(
     free: dict[str, tuple[float, float]] = {}
 
     for j in range(model.njnt):
-        if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE):
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
             continue
-        first = int(model.jnt_dofadr[j])
+        first = model.jnt_dofadr[j]
         for dof in range(first, first + joint_dofs(model, j)):
             component = components[dof]
             if not component.path or len(free) == MOST_COORDINATES:
@@ -619,8 +609,8 @@ def propose_release(
     # Slides and hinges have three significant digits.
     for j in range(model.njnt):
         if joint_dofs(model, j) == 1:
-            address = int(model.jnt_qposadr[j])
-            qpos[address] = _rounded(float(qpos[address]))
+            address = model.jnt_qposadr[j]
+            qpos[address] = rounded(qpos[address], 3)
     return qpos, free
 
 
@@ -629,21 +619,16 @@ def _range_of(model: Any, joint: int, start: Array, length: float) -> tuple[floa
 
     The rotations of a ball joint are relative to the start.
     """
-    kind = int(model.jnt_type[joint])
-    if kind == int(mujoco.mjtJoint.mjJNT_BALL):
+    kind = model.jnt_type[joint]
+    if kind == mujoco.mjtJoint.mjJNT_BALL:
         return 0.0, -RELEASE_ANGLE, RELEASE_ANGLE
 
-    at = float(start[int(model.jnt_qposadr[joint])])
+    at = float(start[model.jnt_qposadr[joint]])
     if model.jnt_limited[joint]:
         low, high = (float(end) for end in model.jnt_range[joint])
         gap = MARGIN * (high - low)
-        return at, _rounded(low + gap), _rounded(high - gap)
+        return at, rounded(low + gap, 3), rounded(high - gap, 3)
 
-    slides = kind == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    slides = kind == mujoco.mjtJoint.mjJNT_SLIDE
     width = LENGTH_SHARE * length if slides else RELEASE_ANGLE
-    return at, _rounded(at - width), _rounded(at + width)
-
-
-def _rounded(value: float) -> float:
-    """A number with three significant digits."""
-    return float(f"{value:.3g}")
+    return at, rounded(at - width, 3), rounded(at + width, 3)

@@ -59,12 +59,12 @@ FURTHER_WIDTHS = {
 
 # What an actuator acts on, by MuJoCo's type of transmission, with the kind of the element.
 TRANSMISSIONS = {
-    int(mujoco.mjtTrn.mjTRN_JOINT): "joint",
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT): "joint",
-    int(mujoco.mjtTrn.mjTRN_SLIDERCRANK): "site",
-    int(mujoco.mjtTrn.mjTRN_TENDON): "tendon",
-    int(mujoco.mjtTrn.mjTRN_SITE): "site",
-    int(mujoco.mjtTrn.mjTRN_BODY): "body",
+    mujoco.mjtTrn.mjTRN_JOINT: "joint",
+    mujoco.mjtTrn.mjTRN_JOINTINPARENT: "joint",
+    mujoco.mjtTrn.mjTRN_SLIDERCRANK: "site",
+    mujoco.mjtTrn.mjTRN_TENDON: "tendon",
+    mujoco.mjtTrn.mjTRN_SITE: "site",
+    mujoco.mjtTrn.mjTRN_BODY: "body",
 }
 
 
@@ -156,7 +156,7 @@ def _outputs(source: ModelSource) -> Iterator[ListedOutput]:
 
     for number in coordinates.sensors:
         sensor = identifier(model, "sensor", number.sensor)
-        kind = mujoco.mjtSensor(int(model.sensor_type[sensor]))
+        kind = mujoco.mjtSensor(model.sensor_type[sensor])
         yield ListedOutput(
             name=number.name,
             source=kind.name.removeprefix("mjSENS_").lower(),
@@ -171,10 +171,10 @@ def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
     counts = np.asarray(model.actuator_ctrlnum, dtype=int)
     numbers = np.repeat(np.arange(len(counts)), counts).tolist()
     for control, i in zip(source.coordinates.controls, numbers, strict=True):
-        kind = TRANSMISSIONS.get(int(model.actuator_trntype[i]), "")
+        kind = TRANSMISSIONS.get(mujoco.mjtTrn(model.actuator_trntype[i]), "")
         drives = ""
         if kind:
-            drives = f"{kind} {unique_names(model, kind)[int(model.actuator_trnid[i, 0])]}"
+            drives = f"{kind} {unique_names(model, kind)[model.actuator_trnid[i, 0]]}"
         yield ListedActuator(name=control, drives=drives, unit=control_unit(model, i))
 
 
@@ -191,25 +191,24 @@ def _listed(limit: Limit) -> ListedLimit:
 
 def _terms(model: Any) -> Iterator[ListedTerm]:
     """Kinds of terms that the model can have, with the elements on which they can act."""
-    period = SAMPLE_STEPS * float(model.opt.timestep)
+    period = SAMPLE_STEPS * model.opt.timestep
     for name, kind in KINDS.items():
         key = kind.acts_on
-        named = [(f"{key} {each}", ((key, each),)) for each in names_of(model, key)] if key else []
+        elements: dict[str, tuple[tuple[str, str], ...]] = {"the base": ()}
+        if key:
+            elements = {f"{key} {each}": ((key, each),) for each in names_of(model, key)}
 
         possible: dict[str, Term] = {}
-        base: list[tuple[str, tuple[tuple[str, str], ...]]] = [("the base", ())]
-        for words, element in named if key else base:
+        for words, element in elements.items():
             with suppress(ExperimentError):
-                table = TermTable(name=FREE_NAME, element=element)
-                possible[words] = kind.of(table, model, period)
+                possible[words] = kind.of(TermTable(name=FREE_NAME, element=element), model, period)
         if not possible:
             continue
 
         # Units differ between slides and hinges.
-        first = next(iter(possible.values()))
         fields = tuple(
             f"{field} [{quantity.unit}]" if quantity.unit else field
-            for field, quantity in first.quantities
+            for field, quantity in next(iter(possible.values())).quantities
         )
         yield ListedTerm(
             kind=name, description=kind.description, elements=tuple(possible), fields=fields

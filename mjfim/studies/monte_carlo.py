@@ -1,15 +1,13 @@
 """Monte-Carlo studies that compare the estimator with the Cramér-Rao bound.
 
-The trials are divided into chunks. The trials of a chunk are stepped together
-(`mjfim/studies/monte_carlo.py`), in this process or by a worker; every chunk has its part of one
-sequence of random numbers.
+The trials are divided into chunks. The trials of a chunk are stepped together, in this process or
+by a worker. Every chunk has its part of one sequence of random numbers.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -25,6 +23,7 @@ from mjfim.identification.identify import least_squares
 from mjfim.information.identifiability import require_visible
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
+from mjfim.records.base import record
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.studies import MonteCarloStudy, TrialStatistics
 from mjfim.records.trajectory import Recording, Trajectory
@@ -41,7 +40,7 @@ OWN_STEPS = 12
 JACOBIAN_STEP = 1e-6
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class TrialSet:
     """Repetitions of one control, all of which are stepped together.
 
@@ -110,7 +109,7 @@ class TrialSet:
                 return None
             found = self._fitted(measured[i], centre)
             theta[i] = np.nan if found is None else found
-        return np.asarray(theta)
+        return theta
 
     @cached_property
     def _centre(self) -> tuple[Array, Array, Array]:
@@ -165,8 +164,7 @@ class TrialSet:
             outputs=self.system.outputs.names,
             name="trial",
         )
-        problem = FitProblem.of(self.system, [recording], data_only=True)
-        found = least_squares(problem, start)
+        found = least_squares(FitProblem.of(self.system, [recording], data_only=True), start)
         return found.unknowns.theta if found.success else None
 
 
@@ -205,7 +203,7 @@ def monte_carlo(
         trials: Number of repetitions per trajectory.
         seed: Seed of the noise.
         measure_rate: Measurement rate [Hz] instead of that of the experiment.
-        callback: Called with a `StudyEvent` whenever all trials have made a step.
+        callback: Called with a `StudyEvent` whenever a chunk of trials is done.
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the study early, as Ctrl-C does; the trials that are finished are returned.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
@@ -226,8 +224,7 @@ def monte_carlo(
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
 
     # A trajectory that cannot be simulated fails before the first trial.
-    first = next(iter(named.values()))
-    calibrated = system.calibrated(system.theta, first.ctrl)
+    calibrated = system.calibrated(system.theta, next(iter(named.values())).ctrl)
     trial_sets = {}
     for name, curve in named.items():
         suited = calibrated
@@ -235,8 +232,8 @@ def monte_carlo(
             suited = system.released_as(curve.state[0]).calibrated(system.theta, curve.ctrl)
         trial_sets[name] = TrialSet.of(suited, curve.ctrl)
 
-    sets: dict[str, TrialStatistics] = {}
-    information: dict[str, Array] = {}
+    sets = {}
+    information = {}
     generators = np.random.default_rng(seed).spawn(len(named))
     with (
         one_blas_thread(),
@@ -263,7 +260,7 @@ def monte_carlo(
             found = list(_estimates(trial_set, trials, generators[i], report, executor, token))
             # An interrupted set holds the trials that are finished.
             if found:
-                information[name] = np.asarray(J.T @ J)
+                information[name] = J.T @ J
                 crlb = np.asarray(np.linalg.inv(information[name]))
                 seconds = time.perf_counter() - begun
                 sets[name] = _statistics(np.concatenate(found), crlb, seconds)
@@ -293,18 +290,15 @@ def _estimates(
         rng.standard_normal((count, len(trial_set.exact)))  # the numbers of this chunk
 
     def make(threads: int) -> Callable[[], TrialSet]:
-        """Return what makes the trials in a worker."""
         return partial(_made_trials, SystemOrder.of(trial_set.system, threads), trial_set.ctrl)
 
-    results = results_on(trial_set, make, _estimated, chunks, executor, stop)
-    for number, found in enumerate(results):
+    for number, found in enumerate(results_on(trial_set, make, _estimated, chunks, executor, stop)):
         report((number + 1) / len(chunks))
         if found is not None:
             yield found
 
 
 def _made_trials(system: SystemOrder, ctrl: Array) -> TrialSet:
-    """Make the trials of a study."""
     return TrialSet.of(system.system(), ctrl)
 
 

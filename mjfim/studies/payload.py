@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, Array
+from mjfim.arrays import NORMAL_95, Array, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, listed, unknown
 from mjfim.experiment.packing import model_of
 from mjfim.experiment.parameters import BARYCENTRIC_FIELDS, LOGCHOLESKY_FIELDS
@@ -32,6 +32,7 @@ from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.terms.library import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.records.base import record
 from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import PayloadEstimate
 from mjfim.records.events import begin_stage, shown_progress
@@ -49,7 +50,7 @@ FIELDS = ("mass", *AXES, "inertia")
 REPLACED_KEYS = ("guess", "prior", "cad_prior", "inertial", "coordinates", "scale")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class PayloadPlace:
     """Place at which a payload is fixed, and sizes of the robot from which its search starts.
 
@@ -70,7 +71,7 @@ class PayloadPlace:
     length: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RobotExperiment:
     """The experiment of a robot without its payload.
 
@@ -103,7 +104,7 @@ class RobotExperiment:
         gone = set()
         for name, spec in experiment.parameters.items():
             of_load = [target.path.startswith(prefixes) for target in spec.all_targets]
-            if loads and any(of_load):
+            if any(of_load):
                 if not all(of_load):
                     raise ExperimentError(
                         f"{experiment.source}: parameters.{name}: sets numbers of the payload and "
@@ -114,43 +115,40 @@ class RobotExperiment:
         values["terms"] = {k: v for k, v in values.get("terms", {}).items() if k not in loads}
         parameters = {k: v for k, v in values["parameters"].items() if k not in gone}
         values["parameters"] = {name: _of_interest(table) for name, table in parameters.items()}
-        fit = dict(values.get("fit", {}))
-        fit["hold"] = tuple(name for name in fit.get("hold", ()) if name not in gone)
-        values["fit"] = fit
+        hold = tuple(name for name in experiment.fit.hold if name not in gone)
+        values["fit"] = {**values.get("fit", {}), "hold": hold}
         bodies = tuple(spec.body or "" for spec in loads.values())
         return cls(values=values, stated=bodies, stated_by=experiment)
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the robot's tables of parameters."""
-        return tuple(self.values["parameters"])
+    def shared(self) -> dict[str, list[tuple[str, str | None]]]:
+        """Parameters that have one value in all recordings, by table; see `parameters_of`."""
+        specs = [(name, self.stated_by.parameters[name]) for name in self.values["parameters"]]
+        return {name: parameters_of(name, spec) for name, spec in specs if not spec.per_recording}
 
     @property
     def experiment(self) -> Experiment:
         """The checked experiment of the robot alone, which needs a parameter."""
         return self.stated_by.restated(self.values)
 
-    def known(self, names: tuple[str, ...], theta: Mapping[str, float]) -> dict[str, Any]:
-        """Tables of parameters whose guesses are those of an earlier estimate.
+    def known(self, theta: Mapping[str, float]) -> dict[str, Any]:
+        """All tables of the robot's parameters, whose guesses are those of an earlier estimate.
 
-        The ten coordinates of an inertia become ten parameters with a path each.
+        The ten coordinates of an inertia become ten parameters with a path each. Values that differ
+        from recording to recording keep their guesses.
 
         Args:
-            names: Names of the tables that the estimate knows.
             theta: Values by name of the parameter [theta-unit].
-
-        Returns:
-            All tables of the robot's parameters.
         """
-        tables: dict[str, Any] = {}
+        tables = {}
+        shared = self.shared
         for name, table in self.values["parameters"].items():
-            spec = self.stated_by.parameters[name]
-            if name not in names:
+            if name not in shared:
                 tables[name] = table
                 continue
             kept = {key: value for key, value in table.items() if key not in REPLACED_KEYS}
-            for parameter, path in parameters_of(name, spec):
-                low, high = spec.bounds or (-np.inf, np.inf)
+            low, high = self.stated_by.parameters[name].bounds or (-np.inf, np.inf)
+            for parameter, path in shared[name]:
                 guess = float(np.clip(theta[parameter], low, high))
                 place = {} if path is None else {"target": path}
                 tables[parameter] = {**kept, **place, "guess": guess}
@@ -167,32 +165,33 @@ class RobotExperiment:
             ModelError: The model cannot be used.
         """
         model = model_of(self.stated_by).model
+        moving = [
+            name
+            for name in names_of(model, "body")
+            if model.body_weldid[identifier(model, "body", name)]
+        ]
         if body is None:
             if len(set(self.stated)) != 1:
                 raise ExperimentError(
-                    "body: name the body that carries the payload; valid: "
-                    f"{listed(_carriers(model))}"
+                    f"body: name the body that carries the payload; valid: {listed(moving)}"
                 )
-            (body,) = set(self.stated)
+            body = self.stated[0]
 
         number = identifier(model, "body", body)
         if number < 0:
             raise ExperimentError(f"body: {unknown('body', body, names_of(model, 'body'))}")
-        group = int(model.body_weldid[number])
+        group = model.body_weldid[number]
         if group == 0:
             raise ExperimentError(
                 f"body: {body!r} does not move, so that a payload has no effect; valid: "
-                f"{listed(_carriers(model))}"
+                f"{listed(moving)}"
             )
 
-        taken = {*names_of(model, "body"), *self.values["terms"]}
-        term = free_name(KIND, taken)
-        used = set(self.values["parameters"])
-        names = {field: free_name(f"payload_{field}", used) for field in FIELDS}
+        used = self.values["parameters"]
         return PayloadPlace(
             body=body,
-            term=term,
-            names=names,
+            term=free_name(KIND, {*names_of(model, "body"), *self.values["terms"]}),
+            names={field: free_name(f"payload_{field}", used) for field in FIELDS},
             mass=PAYLOAD_SHARE * float(model.body_subtreemass[group]),
             centre=tuple(model.body_ipos[number].tolist()),
             length=model_length(model),
@@ -211,8 +210,7 @@ def parameters_of(name: str, spec: ParameterSpec) -> list[tuple[str, str | None]
 
     kind = spec.coordinates or "logcholesky"
     fields = BARYCENTRIC_FIELDS if kind == "barycentric" else LOGCHOLESKY_FIELDS
-    coordinates = INERTIA_PARAMETRISATIONS[kind].names
-    pairs = zip(coordinates, fields, strict=True)
+    pairs = zip(INERTIA_PARAMETRISATIONS[kind].names, fields, strict=True)
     return [(f"{name}.{each}", f"body/{spec.inertial}:{field}") for each, field in pairs]
 
 
@@ -224,15 +222,6 @@ def _of_interest(table: Mapping[str, Any]) -> dict[str, Any]:
     if table.get("per_recording"):
         return dict(table)
     return {key: value for key, value in table.items() if key != "nuisance"}
-
-
-def _carriers(model: Any) -> list[str]:
-    """Names of the bodies that move."""
-    return [
-        name
-        for name in names_of(model, "body")
-        if int(model.body_weldid[identifier(model, "body", name)])
-    ]
 
 
 # Density of the uniform cube whose size is assumed where none is stated [kg/m³]: that of water, and
@@ -247,7 +236,7 @@ DETERMINED_SHARE = 0.5
 UNDETERMINED_SHARE = 0.5
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class KnownRobot:
     """Prior knowledge of a robot's parameters.
 
@@ -312,7 +301,7 @@ def identify_payload(
         return prepared.identify(recordings, without=without, callback=show, stop=stop)[0]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class PayloadTask:
     """A robot, what is known of it, and where its payload is.
 
@@ -363,8 +352,13 @@ class PayloadTask:
             threads=threads,
             source=source,
         )
-        if robot is not None:
-            task.require_parameters(robot)
+        known = task.robot_names if robot is None else robot.parameters
+        lacking = [name for name in task.robot_names if name not in known]
+        if lacking:
+            raise ExperimentError(
+                f"{source} lacks the robot's {listed(lacking)} of {experiment.source}; it has "
+                f"{listed(known)}. Identify the robot with this experiment"
+            )
         return task
 
     def system(self, known: KnownRobot | None = None) -> System:
@@ -374,23 +368,7 @@ class PayloadTask:
             known: What is known of the robot; default: what its experiment and the earlier
                 estimate state.
         """
-        known = self.known_robot() if known is None else known
-        return self._system(known, self._payload_tables())
-
-    def require_parameters(self, estimate: Estimate) -> None:
-        """Raise ExperimentError unless an estimate has the parameters of the robot.
-
-        Args:
-            estimate: An estimate of the robot.
-        """
-        wanted = self._robot_names()
-        lacking = [name for name in wanted if name not in estimate.parameters]
-        if lacking:
-            raise ExperimentError(
-                f"{self.source} lacks the robot's {listed(lacking)} of "
-                f"{self.robot.stated_by.source}; it has {listed(estimate.parameters)}. Identify "
-                "the robot with this experiment"
-            )
+        return self._system(known or self.known_robot(), self._payload_tables())
 
     def identify(
         self,
@@ -442,11 +420,10 @@ class PayloadTask:
             covariance = honest_covariance(system.parameters, self.earlier)
             return self._known_from(self.earlier, covariance)
 
-        held = list(self.robot.values["fit"].get("hold", ()))
-        for name in self._robot_tables():
-            spec = self.robot.stated_by.parameters[name]
-            if spec.prior is None and not spec.per_recording:
-                held += [each for each, _ in parameters_of(name, spec)]
+        held = list(self.robot.values["fit"]["hold"])
+        for name, parameters in self.robot.shared.items():
+            if self.robot.stated_by.parameters[name].prior is None:
+                held += [each for each, _ in parameters]
         return KnownRobot(
             tables=dict(self.robot.values["parameters"]),
             known=(),
@@ -462,7 +439,7 @@ class PayloadTask:
             estimate: The estimate.
             covariance: (p, p) its honest covariance [products of theta-units].
         """
-        names = self._robot_names()
+        names = self.robot_names
         index = np.array([estimate.parameters.index(name) for name in names], dtype=int)
         variance = np.diag(covariance)[index]
         is_known = np.isfinite(variance) & (variance > 0.0)
@@ -470,7 +447,7 @@ class PayloadTask:
         theta = dict(zip(estimate.parameters, estimate.theta.tolist(), strict=True))
         known = tuple(name for name, flag in zip(names, is_known, strict=True) if flag)
         return KnownRobot(
-            tables=self.robot.known(self._robot_tables(), theta),
+            tables=self.robot.known(theta),
             known=known,
             covariance=covariance[np.ix_(chosen, chosen)],
             held=tuple(name for name in names if name not in known),
@@ -493,23 +470,17 @@ class PayloadTask:
             token: Token that ends the search.
         """
         if self.earlier is None:
-            known = replace(known, held=tuple(self.robot.values["fit"].get("hold", ())))
+            known = replace(known, held=self.robot.values["fit"]["hold"])
         begin_stage("fitting the robot without the payload")
         system = self._system(known, {})
         estimate = identify_system(system, without, callback=callback, stop=token)
-        now = replace(self, source="the recordings without the payload")
-        return now._known_from(estimate, honest_covariance(system.parameters, estimate))
+        found = self._known_from(estimate, honest_covariance(system.parameters, estimate))
+        return replace(found, source="the recordings without the payload")
 
-    def _robot_tables(self) -> tuple[str, ...]:
-        """Names of the robot's tables of parameters that have one value in all recordings."""
-        parameters = self.robot.stated_by.parameters
-        return tuple(name for name in self.robot.parameters if not parameters[name].per_recording)
-
-    def _robot_names(self) -> tuple[str, ...]:
+    @property
+    def robot_names(self) -> tuple[str, ...]:
         """Names of the robot's parameters that have one value in all recordings."""
-        parameters = self.robot.stated_by.parameters
-        tables = [(name, parameters[name]) for name in self._robot_tables()]
-        return tuple(each for name, spec in tables for each, _ in parameters_of(name, spec))
+        return tuple(name for each in self.robot.shared.values() for name, _ in each)
 
     # ---- the robot with its payload
 
@@ -543,10 +514,9 @@ class PayloadTask:
             inertia: Assumed rotational inertia, known to as much [kg m²]; None where it is free.
         """
         place = self.place
-        edge = self._edge(place.mass)
-        default = {"mass": place.mass, "inertia": place.mass * edge**2 / 6.0}
+        default = {"mass": place.mass, "inertia": place.mass * self._edge(place.mass) ** 2 / 6.0}
         start = {**default, **dict(zip(AXES, place.centre, strict=True)), **(values or {})}
-        tables: dict[str, Any] = {}
+        tables = {}
         for field, name in place.names.items():
             table = {"target": f"term/{place.term}:{field}", "guess": start[field]}
             if field in AXES:
@@ -561,13 +531,11 @@ class PayloadTask:
         return self.size if self.size is not None else float(np.cbrt(mass / DENSITY))
 
     def _determines_inertia(self, fit: FitResult) -> bool:
-        """Whether the recordings determine the rotational inertia of the payload."""
-        names = fit.task.system.parameters.names
-        j = names.index(self.place.names["inertia"])
+        j = fit.task.system.parameters.names.index(self.place.names["inertia"])
         value = float(fit.theta[j])
-        half_width = float(np.max(np.abs(fit.accuracy.interval[j] - value)))
-        is_known = bool(np.isfinite(fit.accuracy.std[j]))
-        return is_known and value > 0.0 and half_width <= DETERMINED_SHARE * value
+        half_width = np.abs(fit.accuracy.interval[j] - value).max()
+        is_known = np.isfinite(fit.accuracy.std[j]) and value > 0.0
+        return bool(is_known and half_width <= DETERMINED_SHARE * value)
 
     def _with_assumed_inertia(
         self, known: KnownRobot, fit: FitResult, search: FitSearch
@@ -609,12 +577,10 @@ class PayloadTask:
         self, estimate: Estimate, known: KnownRobot, edge: float | None
     ) -> PayloadEstimate:
         """The payload of an estimate."""
-        names = self.place.names
-        index = {field: estimate.parameters.index(name) for field, name in names.items()}
+        index = {field: estimate.parameters.index(name) for field, name in self.place.names.items()}
         axes = [index[axis] for axis in AXES]
         half_widths = 0.5 * np.diff(estimate.interval[axes], axis=1).ravel()
-        limit = UNDETERMINED_SHARE * NORMAL_95 * self.place.length
-        is_determined = half_widths < limit
+        is_determined = half_widths < UNDETERMINED_SHARE * NORMAL_95 * self.place.length
         return PayloadEstimate(
             body=self.place.body,
             mass=float(estimate.theta[index["mass"]]),
@@ -641,10 +607,10 @@ def _whitening(covariance: Array) -> Array:
     Args:
         covariance: (k, k) covariance with positive variances.
     """
-    std = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
+    correlation, std = scaled_to_unit_diagonal(covariance)
+    values, vectors = np.linalg.eigh(correlation)
 
     # Rounding may make the smallest eigenvalues of a nearly singular correlation negative.
-    smallest = len(values) * np.finfo(np.float64).eps * float(values.max())
+    smallest = len(values) * np.finfo(np.float64).eps * values[-1]
     weights = 1.0 / np.sqrt(np.maximum(values, smallest))
     return np.asarray((weights[:, None] * vectors.T) / std)

@@ -8,7 +8,8 @@ the method of Holm (1979). `mjfim compare-robots` calls `compare_estimates`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import permutations
 
 import numpy as np
 import scipy
@@ -63,6 +64,7 @@ def compare_estimates(
     if len(names) != 2 or names[0] == names[1]:
         raise ExperimentError(f"names: {names} must be two different names, one for each robot")
 
+    robots = dict(zip(names, (first, second), strict=True))
     common = [name for name in first.parameters if name in second.parameters]
     if not common:
         raise ExperimentError(
@@ -77,19 +79,17 @@ def compare_estimates(
             "can differ but the experiments; record each robot"
         )
 
-    compared = [name for name in common if not _why_not_compared(name, first, second, names)]
-    both = (first, second)
-    index = [[each.parameters.index(name) for name in compared] for each in both]
-    values = np.array([each.theta[place] for each, place in zip(both, index, strict=True)])
-    is_single = [(each.sizes == np.abs(each.theta))[k] for each, k in zip(both, index, strict=True)]
+    compared = [name for name in common if not _why_not_compared(name, robots)]
+    both = [(each, [each.parameters.index(name) for name in compared]) for each in robots.values()]
+    values = np.array([each.theta[index] for each, index in both])
+    is_single = np.array([(each.sizes == np.abs(each.theta))[index] for each, index in both])
 
     # Both robots share one variance between recordings, because a few recordings of one robot
     # determine it poorly.
-    tau2, freedom, numbers = np.stack([_scatter(each, compared) for each in both], axis=1)
+    tau2, freedom, numbers = np.stack([_scatter(each, compared) for each, _ in both], axis=1)
     total = freedom.sum(axis=0)
     between = (freedom * tau2).sum(axis=0) / np.maximum(total, 1.0) / numbers
-    honest = [honest_std(each)[place] for each, place in zip(both, index, strict=True)]
-    std = np.sqrt(np.array(honest) ** 2 + between)
+    std = np.sqrt(np.array([honest_std(each)[index] for each, index in both]) ** 2 + between)
 
     # Few recordings determine this variance, so the degrees of freedom of Student's test are few.
     difference = values[1] - values[0]
@@ -99,16 +99,16 @@ def compare_estimates(
     p = 2.0 * scipy.special.stdtr(degrees, -np.abs(difference) / known)
     t = scipy.special.stdtrit(degrees, 0.975)
     found = scipy.special.stdtrit(degrees, 1.0 - 0.5 * LEVEL / (len(compared) + 1))
-    covariance = sum(_covariance(*each) for each in zip(both, index, std, strict=True))
+    covariance = _covariance(*both[0], std[0]) + _covariance(*both[1], std[1])
     middle = float(np.median(degrees)) if compared else MANY_DEGREES
-    corrected = holm(np.append(p, f_tail(*_wald(difference, np.asarray(covariance)), middle)))
+    corrected = holm(np.append(p, f_tail(*_wald(difference, covariance), middle)))
 
     return RobotComparison(
         names=names,
         recordings=(len(first.recordings), len(second.recordings)),
         parameters=tuple(compared),
-        units=tuple(first.units[j] for j in index[0]),
-        is_single=np.array(is_single[0] & is_single[1], dtype=np.float64),
+        units=tuple(first.units[j] for j in both[0][1]),
+        is_single=np.array(is_single.all(axis=0), dtype=np.float64),
         values=values,
         std=std,
         interval=np.column_stack([difference - t * width, difference + t * width]),
@@ -116,8 +116,8 @@ def compare_estimates(
         detectable=(found + scipy.special.stdtrit(degrees, POWER)) * width,
         joint_p=float(corrected[-1]),
         level=LEVEL,
-        remarks=tuple(_remarks(first, second, names, common)),
-        is_reliable=all(estimate.success and not estimate.misfit for estimate in both),
+        remarks=tuple(_remarks(robots, common)),
+        is_reliable=all(each.success and not each.misfit for each, _ in both),
     )
 
 
@@ -137,8 +137,7 @@ def honest_std(estimate: Estimate) -> Array:
 
     # Where recordings disagree, the interval already contains their scatter.
     disagrees = (estimate.between_recordings > 0.0) & (estimate.recording_comparison is not None)
-    widened = np.where(disagrees, 0.0, half_width / NORMAL_95)
-    return np.asarray(np.maximum(without_scatter, widened))
+    return np.maximum(without_scatter, np.where(disagrees, 0.0, half_width / NORMAL_95))
 
 
 def _covariance(estimate: Estimate, index: Sequence[int], std: Array) -> Array:
@@ -179,7 +178,7 @@ def _scatter(estimate: Estimate, parameters: Sequence[str]) -> Array:
             continue
         k = comparison.parameters.index(name)
         found[0, j] = variance[k]
-        found[1, j] = max(int(np.isfinite(comparison.values[:, k]).sum()) - 1, 0)
+        found[1, j] = max(np.isfinite(comparison.values[:, k]).sum() - 1, 0)
         std = comparison.std[:, k]
         weights = std[np.isfinite(std) & (std > 0.0)] ** -2.0
         if weights.size:
@@ -221,14 +220,14 @@ def _wald(difference: Array, covariance: Array) -> tuple[float, int]:
 # ---- what limits the comparison
 
 
-def _why_not_compared(name: str, first: Estimate, second: Estimate, names: Sequence[str]) -> str:
+def _why_not_compared(name: str, robots: Mapping[str, Estimate]) -> str:
     """Reason why a parameter of both estimates is not compared; empty where it is."""
     if name.startswith(INITIAL_STATE_PREFIX):
         return "it belongs to a recording"
-    units = [estimate.units[estimate.parameters.index(name)] for estimate in (first, second)]
+    units = [each.units[each.parameters.index(name)] or "none" for each in robots.values()]
     if units[0] != units[1]:
-        return f"its units differ ({units[0] or 'none'} and {units[1] or 'none'})"
-    for robot, estimate in zip(names, (first, second), strict=True):
+        return f"its units differ ({units[0]} and {units[1]})"
+    for robot, estimate in robots.items():
         if name in estimate.per_recording:
             return f"{robot} has a value for each recording"
         if not np.isfinite(estimate.std[estimate.parameters.index(name)]):
@@ -236,12 +235,9 @@ def _why_not_compared(name: str, first: Estimate, second: Estimate, names: Seque
     return ""
 
 
-def _remarks(
-    first: Estimate, second: Estimate, names: Sequence[str], common: Sequence[str]
-) -> Iterator[str]:
+def _remarks(robots: Mapping[str, Estimate], common: Sequence[str]) -> Iterator[str]:
     """Sentences that limit the comparison, the most serious ones first."""
-    both = list(zip(names, (first, second), strict=True))
-    for robot, estimate in both:
+    for robot, estimate in robots.items():
         if not estimate.success:
             yield f"the estimate of {robot} is not reliable: {estimate.status}"
         if estimate.misfit:
@@ -250,8 +246,8 @@ def _remarks(
                 "like a difference, and the intervals do not cover it"
             )
 
-    yield from _remarks_on_recordings(first, second, names)
-    for (robot, estimate), (other, another) in (both, both[::-1]):
+    yield from _remarks_on_recordings(robots)
+    for (robot, estimate), (other, another) in permutations(robots.items()):
         missing = [
             name
             for name in estimate.parameters
@@ -262,22 +258,19 @@ def _remarks(
                 f"{first_ones(missing)}: a parameter of {robot}, but fixed for {other}, which can "
                 "shift other parameters"
             )
-    yield from _remarks_on_parameters(first, second, names, common)
+    yield from _remarks_on_parameters(robots, common)
 
 
-def _remarks_on_recordings(
-    first: Estimate, second: Estimate, names: Sequence[str]
-) -> Iterator[str]:
+def _remarks_on_recordings(robots: Mapping[str, Estimate]) -> Iterator[str]:
     """Sentences on recordings that both estimates contain, and on robots with one recording."""
-    shared = _shared_recordings(first, second)
+    shared = _shared_recordings(*robots.values())
     if shared:
         yield (
             f"both estimates contain {first_ones(shared)}, which makes them alike; identify each "
             "robot from its own recordings"
         )
 
-    counts = zip(names, (len(first.recordings), len(second.recordings)), strict=True)
-    single = [robot for robot, count in counts if count < 2]
+    single = [robot for robot, estimate in robots.items() if len(estimate.recordings) < 2]
     if len(single) == 2:
         yield (
             "single recordings say nothing about the scatter between recordings of one robot, "
@@ -287,20 +280,18 @@ def _remarks_on_recordings(
         yield f"of {single[0]} there is a single recording; it is taken to scatter like the other"
 
 
-def _remarks_on_parameters(
-    first: Estimate, second: Estimate, names: Sequence[str], common: Sequence[str]
-) -> Iterator[str]:
+def _remarks_on_parameters(robots: Mapping[str, Estimate], common: Sequence[str]) -> Iterator[str]:
     """Sentences on parameters that are not compared, and on priors."""
     for name in common:
-        why = _why_not_compared(name, first, second, names)
+        why = _why_not_compared(name, robots)
         if why and not name.startswith(INITIAL_STATE_PREFIX):
             yield f"{name} is not compared: {why}"
 
-    with_prior = []
-    for name in common:
-        index = [each.parameters.index(name) for each in (first, second)]
-        if first.prior[index[0], index[0]] > 0.0 and second.prior[index[1], index[1]] > 0.0:
-            with_prior.append(name)
+    with_prior = [
+        name
+        for name in common
+        if all(np.diag(each.prior)[each.parameters.index(name)] > 0.0 for each in robots.values())
+    ]
     if with_prior:
         yield (
             f"{first_ones(with_prior)}: the priors of both estimates draw them to one value, so "
@@ -308,9 +299,7 @@ def _remarks_on_parameters(
         )
 
     with_model = [
-        robot
-        for robot, estimate in zip(names, (first, second), strict=True)
-        if estimate.prior_directions is not None
+        robot for robot, estimate in robots.items() if estimate.prior_directions is not None
     ]
     if with_model:
         yield (

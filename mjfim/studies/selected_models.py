@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -22,12 +22,14 @@ from mjfim.identification.left_out import HeldOutLosses
 from mjfim.model.elements import free_name
 from mjfim.model.parameters import Parameter, ParameterSet
 from mjfim.model.paths import ParameterPath
+from mjfim.records.base import record
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import (
     PooledParameter,
     Selection,
     Term,
 )
+from mjfim.studies.first_candidates import rounded
 
 # Smallest number of parameters that are pooled.
 MIN_MEMBERS = 2
@@ -52,7 +54,7 @@ NO_LOSSES = HeldOutLosses(
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FittedModel:
     """A fitted model, with the losses of its predictions of left-out data.
 
@@ -100,7 +102,7 @@ def selected_term(candidate: Term, taken: Iterable[str]) -> Term:
         words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
         name = free_name("_".join(words), used)
         used.add(name)
-        numbers.append(replace(number, name=name, scale=float(f"{number.scale:.2g}")))
+        numbers.append(replace(number, name=name, scale=rounded(number.scale)))
     return replace(candidate, numbers=tuple(numbers))
 
 
@@ -265,16 +267,13 @@ def possible_pools(parameters: ParameterSet, names: Collection[str]) -> list[Poo
         if parameter.name not in names or not _is_plain(parameter):
             continue
         path = ParameterPath.parse(parameter.targets[0].path)
-        key = (path.kind, path.field, path.index, parameter.unit)
-        groups.setdefault(key, []).append(parameter)
+        groups.setdefault((path.kind, path.field, path.index, parameter.unit), []).append(parameter)
 
     taken = set(parameters.names)
     pools = []
     for (kind, field, _, _), members in groups.items():
-        pool = None
-        if len(members) >= MIN_MEMBERS:
-            pool = _pool(f"{kind}_{field}", members, taken)
-        if pool is not None:
+        pool = _pool(f"{kind}_{field}", members, taken)
+        if pool is not None and len(members) >= MIN_MEMBERS:
             taken.add(pool.name)
             pools.append(pool)
     return pools

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from mjfim.identification.assessment.term_tests import find_missing_terms
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
-from mjfim.identification.left_out import Reduction, held_out_losses
+from mjfim.identification.left_out import held_out_losses
 from mjfim.identification.search import FitSearch, FitTask, with_length
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
@@ -135,27 +135,18 @@ def select_terms(
     return replace(found, seconds=seconds, steps=system.plant.engine_steps)
 
 
+@dataclass(kw_only=True)
 class _Selector:
     """One selection: its searches share a budget, and every attempt is kept as a step."""
 
-    first: FittedModel
-
-    def __init__(
-        self,
-        *,
-        held_out: tuple[Recording, ...],
-        budget: Budget,
-        callback: Callback | None,
-        workers: FitWorkers | None,
-        max_terms: int,
-    ) -> None:
-        self.held_out = held_out
-        self.budget = budget
-        self.callback = callback
-        self.workers = workers
-        self.max_terms = max_terms
-        self.steps: list[SelectionStep] = []
-        self.ending = ""
+    held_out: tuple[Recording, ...]
+    budget: Budget
+    callback: Callback | None
+    workers: FitWorkers | None
+    max_terms: int
+    steps: list[SelectionStep] = field(default_factory=list)
+    ending: str = ""
+    first: FittedModel = field(init=False)
 
     def selected(self, task: FitTask) -> Estimate:
         """Estimate of the extended model.
@@ -190,14 +181,13 @@ class _Selector:
 
     def _selected(self, model: FittedModel, is_free: bool) -> Estimate:
         """Estimate of the chosen model."""
-        result = _reported(model.result, is_free)
-        selection = Selection(
-            terms=model.terms,
-            steps=tuple(self.steps),
-            ending=self.ending,
-            pooled=model.pooled,
-            held=model.held,
-        )
+        # The fit is reported as one that began at the guess.
+        result, task = model.result, model.result.task
+        task = replace(task, start=task.system.parameters.guess)
+        if is_free and task.settings.segment_length is None:
+            task = with_length(task, None)
+        result = replace(result, task=task)
+        selection = self._selection(model)
         tests = None if result.quality.unexplained or self._is_stopped() else model.tests
         estimate = estimate_from(result, self.budget, selection.refuted, tests)
         if selection.is_changed:
@@ -212,18 +202,15 @@ class _Selector:
 
     def _unselected(self, result: FitResult, is_free: bool) -> Estimate:
         """Estimate of the stated model where no term could be tried."""
-        ending = "The selection was interrupted before a term was tried."
+        self.ending = "The selection was interrupted before a term was tried."
         if not self._is_stopped():
-            ending = (
+            self.ending = (
                 "No part of the recordings could be predicted from the others, so that no term "
                 "was tried."
             )
-            result = self._final(result, is_free, is_changed=False)
-        result = _reported(result, is_free)
-        steps = (SelectionStep(decision=Decision.BEGUN, error=np.nan),)
-        selection = Selection(terms=(), steps=steps, ending=ending)
-        estimate = estimate_from(result, self.budget, refuted=())
-        return replace(estimate, selection=selection)
+        final = self._final(result, is_free, is_changed=False)
+        self.steps.append(SelectionStep(decision=Decision.BEGUN, error=np.nan))
+        return self._selected(replace(self.first, result=final), is_free)
 
     def _refit_to_held_out(self, result: FitResult, estimate: Estimate) -> HeldOutRefit | None:
         """Fit the selected model to the held-out recordings; None without any, or after a stop."""
@@ -280,7 +267,7 @@ class _Selector:
         if counts[0] == counts[1] and abs(final.cost - model.cost) <= EQUAL_COST:
             return final
         cut = self._assessed(final) if model.is_changed else None
-        return replace(final, tests=None) if cut is None else self._grown(cut, self._refuted)
+        return replace(final, tests=None) if cut is None else self._grown_again(cut)
 
     # ---- steps
 
@@ -296,10 +283,15 @@ class _Selector:
         )
         self.steps.append(replace(step, **changes))  # type: ignore[arg-type]
 
-    @property
-    def _refuted(self) -> Collection[str]:
-        """Terms that the steps have refuted (`Selection.refuted`)."""
-        return Selection(terms=(), steps=tuple(self.steps), ending="").refuted
+    def _selection(self, model: FittedModel) -> Selection:
+        """The changes of a model, and the steps so far."""
+        return Selection(
+            terms=model.terms,
+            steps=tuple(self.steps),
+            ending=self.ending,
+            pooled=model.pooled,
+            held=model.held,
+        )
 
     def _chosen(self, model: FittedModel) -> FittedModel:
         """Add terms, remove needless ones, and simplify the parameters."""
@@ -308,8 +300,12 @@ class _Selector:
         # Terms may have stood in for parameters that are held or pooled now. Without them, others
         # may be significant that were not tried before.
         if simpler is not model:
-            simpler = self._grown(self._pruned(simpler, tests_last=True), self._refuted)
+            simpler = self._grown_again(self._pruned(simpler, tests_last=True))
         return simpler
+
+    def _grown_again(self, model: FittedModel) -> FittedModel:
+        """Add terms that no step has refuted."""
+        return self._grown(model, self._selection(model).refuted)
 
     def _grown(self, model: FittedModel, refuted: Collection[str] = ()) -> FittedModel:
         """Add terms while they improve the prediction of left-out data, and say why it ended.
@@ -398,12 +394,13 @@ class _Selector:
         """
         while tested := model.terms if tests_last else model.terms[:-1]:
             begin_stage("testing whether all added terms are needed")
-            needless: list[tuple[Reduction, Term, FittedModel]] = []
-            for term in tested:
-                fewer = self._without(model, term)
-                reduction = None if fewer is None else fewer.losses.reduction(model.losses)
-                if fewer is not None and reduction is not None and not reduction.is_clear:
-                    needless.append((reduction, term, fewer))
+            tried = [(term, self._without(model, term)) for term in tested]
+            needless = [
+                (reduction, term, fewer)
+                for term, fewer in tried
+                if fewer is not None
+                and not (reduction := fewer.losses.reduction(model.losses)).is_clear
+            ]
             if not needless:
                 break
             reduction, term, model = min(needless, key=lambda found: found[0].mean)
@@ -421,8 +418,7 @@ class _Selector:
     def _simplified(self, model: FittedModel) -> FittedModel:
         """Pool or hold poorly known parameters as long as the prediction stays as good."""
         begin_stage("testing whether poorly known parameters are needed")
-        parameters = self.first.result.task.system.parameters
-        for pool in possible_pools(parameters, poorly_known(model)):
+        for pool in possible_pools(self.first.result.task.system.parameters, poorly_known(model)):
             words = f"one value of {pool.name} for {listed(pool.members)}"
             changed = replace(model, pooled=(*model.pooled, pool))
             model = self._simpler(model, changed, Decision.POOLED, words)
@@ -526,11 +522,8 @@ class _Selector:
             simulated, and after a request to stop.
         """
         stated = self.first.result.task.system
-        selection = Selection(
-            terms=model.terms, steps=(), ending="", pooled=model.pooled, held=model.held
-        )
         system = System.resolve(
-            selected_experiment(stated.experiment, selection),
+            selected_experiment(stated.experiment, self._selection(model)),
             threads=stated.threads,
             source=stated.source,
         )
@@ -565,22 +558,7 @@ class _Selector:
         return None if losses is None else replace(model, losses=losses, tests=None)
 
     def _search(self, task: FitTask) -> FitSearch:
-        """Searches of a task."""
         return FitSearch(task=task, budget=self.budget, callback=self.callback)
 
     def _is_stopped(self) -> bool:
-        """True after a request to stop."""
         return self.budget.stop.requested
-
-
-def _reported(result: FitResult, is_free: bool) -> FitResult:
-    """A fit as it is reported.
-
-    Args:
-        result: The fit, whose task begins at a fit of the selection.
-        is_free: Whether the length of the segments is left to the fit.
-    """
-    task = replace(result.task, start=result.task.system.parameters.guess)
-    if is_free and task.settings.segment_length is None:
-        task = with_length(task, None)
-    return replace(result, task=task)

@@ -158,7 +158,7 @@ def test_a_payload_that_the_experiment_states_is_left_out_of_the_robot(tmp_path:
         parameters={"load": {"target": "term/load:mass", "guess": 0.1}}, fit={"hold": ["load"]}
     )
     robot = RobotExperiment.of(stated)
-    assert robot.parameters == tuple(ROBOT)
+    assert tuple(robot.shared) == tuple(ROBOT)
     assert robot.experiment.terms == {}
     assert robot.experiment.fit.hold == ()
     assert robot.place(None).body == "hand"
@@ -175,7 +175,7 @@ def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Pat
     whole = stated.restated(values)
     system = System.resolve(whole)
     names, theta = system.parameters.names, system.parameters.guess
-    tables = RobotExperiment.of(whole).known(("hand",), dict(zip(names, theta, strict=True)))
+    tables = RobotExperiment.of(whole).known(dict(zip(names, theta, strict=True)))
     again = System.resolve(whole.restated({**values, "parameters": tables}))
     assert again.parameters.names == names
     moved = theta + 0.1 * system.parameters.magnitude
