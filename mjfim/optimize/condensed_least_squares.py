@@ -514,10 +514,8 @@ def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Arr
     # An unknown that the solver holds at a bound is placed exactly there; the scaling by the norms
     # has round-off.
     inside = np.clip(solved.x / norms, low, high)
-    inside = np.where(solved.active_mask < 0, low, inside)
-    inside = np.where(solved.active_mask > 0, high, inside)
-
-    d[~fixed] = inside
+    held = [solved.active_mask < 0, solved.active_mask > 0]
+    d[~fixed] = np.select(held, [low, high], inside)
     return d
 
 

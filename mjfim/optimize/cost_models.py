@@ -288,7 +288,6 @@ class StepCurvature(Protocol):
             factors of the curvature at the beginning of the step, by kind of limit; largest ratio
             of a factor to that in the model that led to the step, at least 1.
         """
-        ...
 
     def scaled(self, mu: float) -> StepCurvature:
         """Return the curvature of a multiple of the barrier.
@@ -296,7 +295,6 @@ class StepCurvature(Protocol):
         Args:
             mu: Factor of the barrier.
         """
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -451,40 +449,20 @@ class EigenvalueModel:
 
             H = np.eye(len(y)) + L.T @ here.hessian @ L
             step = -np.linalg.solve(0.5 * (H + H.T), g)
-            y, here = self._line_search(y, here, step, float(g @ step), L, d0)
+
+            # The step is halved until the model plus `1/2 |y|^2` falls sufficiently.
+            before, slope = here.value + 0.5 * float(y @ y), float(g @ step)
+            fraction = 2.0
+            while fraction > 2.0 * MIN_NEWTON_FRACTION:
+                fraction *= 0.5
+                new = y + fraction * step
+                here = self._changed(d0 + L @ new)
+                after = here.value + 0.5 * float(new @ new)
+                if after <= before + SUFFICIENT_DECREASE * fraction * slope:
+                    break
+            y = new
 
         return here.gradient
-
-    def _line_search(
-        self, y: Array, here: _ChangedLogs, step: Array, slope: float, L: Array, d0: Array
-    ) -> tuple[Array, _ChangedLogs]:
-        """Halve a step until the proximal objective falls sufficiently.
-
-        The objective is the model at `d0 + L y` plus `1/2 |y|^2`.
-
-        Args:
-            y: (m,) point at which the step begins.
-            here: The model at this point.
-            step: (m,) Newton step.
-            slope: Directional derivative of the objective along the step, negative.
-            L: (m, m) square root of spread.
-            d0: (m,) centre of the proximal term.
-
-        Returns:
-            The point after the step, and the model there.
-        """
-        before = here.value + 0.5 * float(y @ y)
-        fraction = 1.0
-        while True:
-            new = y + fraction * step
-            there = self._changed(d0 + L @ new)
-            after = there.value + 0.5 * float(new @ new)
-            if after <= before + SUFFICIENT_DECREASE * fraction * slope:
-                return new, there
-
-            fraction *= 0.5
-            if fraction <= MIN_NEWTON_FRACTION:
-                return new, there
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -44,7 +44,7 @@ class LinearRecursion:
         """Solve the recursion.
 
         Args:
-            z0: (n,) first state.
+            z0: (n,) first state, or (m, n).
             c: (N, n) inputs, or (m, N, n) for m recursions.
 
         Returns:
@@ -112,26 +112,22 @@ def products_at_samples(matrices: Array, vectors: Array) -> Array:
     return (matrices @ columns).transpose(2, 0, 1)
 
 
-def largest_amplification(A: Array, sizes: Array | None = None) -> float:
+def largest_amplification(A: Array, sizes: Array | float = 1.0) -> float:
     """Largest amplification of a deviation of the state.
 
     It covers deviations from the first sample to any other, and from any sample to the last.
 
     Args:
         A: (N, nx, nx) transition matrices.
-        sizes: (nx,) sizes of the state's components, in which deviations are measured [x-unit];
-            default: 1.
+        sizes: (nx,) sizes of the state's components, in which deviations are measured [x-unit].
 
     Returns:
         The largest spectral norm of the products of transition matrices; at least 1.
     """
-    if sizes is not None:
-        A = A * (sizes / sizes[:, None])
-
-    return _largest_norm(_products(A))
+    return _largest_norm(_products(A, sizes))
 
 
-def amplification_in_best_units(A: Array, sizes: Array | None = None) -> float:
+def amplification_in_best_units(A: Array, sizes: Array | float = 1.0) -> float:
     """Upper bound of the amplification of deviations, in units of the state that make it small.
 
     It is the smaller one of two bounds. The first bound is `largest_amplification` in units of the
@@ -149,15 +145,12 @@ def amplification_in_best_units(A: Array, sizes: Array | None = None) -> float:
 
     Args:
         A: (N, nx, nx) transition matrices.
-        sizes: (nx,) sizes of the state's components [x-unit]; default: 1.
+        sizes: (nx,) sizes of the state's components [x-unit].
 
     Returns:
         The bound, at least 1; infinite where a deviation overflows.
     """
-    if sizes is not None:
-        A = A * (sizes / sizes[:, None])
-
-    products = _products(A)
+    products = _products(A, sizes)
     largest = np.max([np.abs(each).max(axis=0) for each in products], axis=0)
     if not np.isfinite(largest).all():
         return np.inf
@@ -171,20 +164,21 @@ def _largest_norm(products: tuple[Array, Array]) -> float:
     return float(max(np.linalg.norm(each, 2, axis=(1, 2)).max() for each in products))
 
 
-def _products(A: Array) -> tuple[Array, Array]:
-    """Products of transition matrices: (N, nx, nx).
+def _products(A: Array, sizes: Array | float) -> tuple[Array, Array]:
+    """Products of transition matrices: (N, nx, nx), in units of (nx,) sizes of the state.
 
     Returns:
         (N+1, nx, nx) products from the first sample to each one, and from each one to the last.
     """
     N, nx, _ = A.shape
-    recursion = LinearRecursion(A)
-    zero = np.zeros((N, nx))
+    units = np.ones(nx) * sizes
+    recursion = LinearRecursion(A * (units / units[:, None]))
+    zero = np.zeros((nx, N, nx))
     unit = np.eye(nx)
 
-    from_start = np.stack([recursion.forward(e, zero) for e in unit], axis=2)
-    to_end = np.stack([recursion.adjoint(np.concatenate([zero, e[None]])) for e in unit], axis=1)
-    return from_start, to_end
+    from_start = recursion.forward(unit, zero)
+    to_end = recursion.adjoint(np.concatenate([zero, unit[:, None]], axis=1))
+    return from_start.transpose(1, 2, 0), to_end.swapaxes(0, 1)
 
 
 def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
@@ -209,7 +203,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
     if not B.shape[2]:
         return np.zeros((len(A), 0, A.shape[1]))
 
-    return RiccatiSolution.solve(A, B, _constant_weights(len(A), Q, R, terminal)).K
+    return RiccatiSolution.solve(A, B, Weights.constant(len(A), Q, R, terminal)).K
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -249,19 +243,32 @@ class Weights:
     R: Array
     W: Array
 
-    def plus(self, other: Weights, factor: float = 1.0) -> Weights:
+    @staticmethod
+    def constant(N: int, Q: Array, R: Array, terminal: Array) -> Weights:
+        """The form with the same weights at N samples, and a weight of its own of the last state.
+
+        Args:
+            N: Number of samples.
+            Q: (nx, nx) weight of the state.
+            R: (nu, nu) weight of the control.
+            terminal: (nx, nx) weight of the last state.
+        """
+        return Weights(
+            Q=np.stack([*[Q] * N, terminal]),
+            S=np.zeros((N, len(R), len(Q))),
+            R=np.stack([R] * N),
+            W=np.zeros((N + 1, len(R))),
+        )
+
+    def plus(self, other: Weights, factor: float) -> Weights:
         """Sum of this form and a multiple of another one.
 
         Args:
             other: The form to add.
             factor: Number with which the other form is multiplied.
         """
-        return Weights(
-            Q=self.Q + factor * other.Q,
-            S=self.S + factor * other.S,
-            R=self.R + factor * other.R,
-            W=self.W + factor * other.W,
-        )
+        arrays = vars(other)
+        return Weights(**{name: own + factor * arrays[name] for name, own in vars(self).items()})
 
     def scaled(self, factor: float) -> Weights:
         """This form multiplied by a number.
@@ -269,7 +276,7 @@ class Weights:
         Args:
             factor: The number.
         """
-        return Weights(Q=factor * self.Q, S=factor * self.S, R=factor * self.R, W=factor * self.W)
+        return Weights(**{name: factor * array for name, array in vars(self).items()})
 
     def half_gradient(self, zeta: TangentCurve) -> tuple[Array, Array]:
         """Half of the form's gradient (a, b) at a tangent curve zeta.
@@ -282,54 +289,16 @@ class Weights:
         Returns:
             a: (N+1, nx) and b: (N, nu), or (m, N+1, nx) and (m, N, nu).
         """
-        z = zeta.z
-        v = zeta.v
-
+        z, v = zeta.z, zeta.v
         a = products_at_samples(self.Q, z)
         a[..., :-1, :] += products_at_samples(self.S.swapaxes(1, 2), v)
         b = products_at_samples(self.S, z[..., :-1, :])
         b += products_at_samples(self.R, v)
-        if not self.W.any():
-            return a, b
 
         # A change of the control between two samples involves both of them.
         changes = np.diff(v, axis=-2, prepend=0.0, append=0.0)
         weighted = self.W * changes
         return a, b + weighted[..., :-1, :] - weighted[..., 1:, :]
-
-
-def descent(
-    A: Array, B: Array, a: Array, b: Array, *, Q: Array, R: Array, terminal: Array
-) -> TangentCurve:
-    """Steepest descent on the tangent space: the paper's problem (8), by Riccati equations.
-
-    It minimises `sum a'z + b'v + 1/2 z'Qz + 1/2 v'Rv` subject to `z_{k+1} = A_k z_k + B_k v_k` and
-    `z_0 = 0`.
-
-    Args:
-        A: (N, nx, nx) transition matrices.
-        B: (N, nx, nu) input matrices.
-        a: (N+1, nx) derivative of the cost by the state.
-        b: (N, nu) derivative of the cost by the control.
-        Q: (nx, nx) metric on z_k for k < N.
-        R: (nu, nu) metric on v_k.
-        terminal: (nx, nx) metric on z_N.
-
-    Returns:
-        The minimiser.
-    """
-    weights = _constant_weights(len(B), Q, R, terminal)
-    return RiccatiSolution.solve(A, B, weights).descent(a, b)
-
-
-def _constant_weights(N: int, Q: Array, R: Array, terminal: Array) -> Weights:
-    """The form with the same weights at N samples, and a weight of its own for the last state."""
-    return Weights(
-        Q=np.stack([*[Q] * N, terminal]),
-        S=np.zeros((N, len(R), len(Q))),
-        R=np.stack([R] * N),
-        W=np.zeros((N + 1, len(R))),
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -404,6 +373,9 @@ class RiccatiSolution:
 
     def descent(self, a: Array, b: Array) -> TangentCurve:
         """Minimiser of the linear cost `sum a'z + b'v` plus half of the quadratic form.
+
+        It is the solution of the paper's problem (8), with `z_{k+1} = A_k z_k + B_k v_k` and
+        `z_0 = 0`.
 
         Args:
             a: (N+1, nx) derivative of the cost by the state, or (m, N+1, nx) for m costs.

@@ -212,6 +212,7 @@ class _LocalModel:
 
     Attributes:
         expansion: Expansion at the point.
+        barrier: Its barrier.
         coordinates: Curve coordinates of its trajectory.
         weights: The barrier's Gauss-Newton Hessian and the ridge, as a form on tangent curves.
         gradient: Gradient of cost and barrier.
@@ -222,6 +223,7 @@ class _LocalModel:
     """
 
     expansion: Expansion
+    barrier: BarrierExpansion
     coordinates: CurveCoordinates
     weights: Weights
     gradient: Array
@@ -241,7 +243,7 @@ class _LocalModel:
         if self.basis is None:
             weights = self.weights
             if damping > 0.0:
-                weights = weights.plus(_barrier(self.expansion).uniform_weights, damping)
+                weights = weights.plus(self.barrier.uniform_weights, damping)
             return CurveMetric(coordinates=self.coordinates, weights=weights)
 
         H, uniform_H = self._matrices
@@ -254,10 +256,9 @@ class _LocalModel:
         """(M nu, M nu) matrices of the weights and of the uniform weights on the coefficients."""
         assert self.basis is not None
         response = basis_response(self.expansion, self.basis)
-        uniform = _barrier(self.expansion).uniform_weights
         return (
             basis_matrix(self.basis, response, self.weights),
-            basis_matrix(self.basis, response, uniform),
+            basis_matrix(self.basis, response, self.barrier.uniform_weights),
         )
 
     def predicted_change(self, s: Array) -> Array:
@@ -361,7 +362,7 @@ class StructuredBFGS:
         Returns:
             The model with the last curvature, its minimum, and the length of that.
         """
-        curvature = _barrier(here.expansion).curvature
+        curvature = here.barrier.curvature
         if curvature is None:
             return here, zeta, relative_length
 
@@ -377,18 +378,14 @@ class StructuredBFGS:
 
     def _with_ridge(self, form: Weights) -> Weights:
         """Weights of the barrier plus those of the ridge."""
-        return Weights(Q=form.Q, S=form.S, R=form.R + np.diag(self.ridge), W=form.W)
+        return replace(form, R=form.R + np.diag(self.ridge))
 
     def _damped_curve(self, here: _LocalModel) -> tuple[TangentCurve, float]:
         """Tangent curve of the model's minimum, and its length over the trusted length."""
         step = self._step(here)
         c = step if self.basis is None else self.basis @ step
         zeta = here.coordinates.lift(c)
-        return zeta, self._relative_length(here.expansion, zeta)
-
-    def _relative_length(self, expansion: Expansion, zeta: TangentCurve) -> float:
-        """Length of a tangent curve over the trusted length."""
-        return _barrier(expansion).largest_relative_move(zeta) / self.reach
+        return zeta, here.barrier.largest_relative_move(zeta) / self.reach
 
     def _step(self, here: _LocalModel) -> Array:
         """Minimum of the model, in its coordinates, with the present damping."""
@@ -453,11 +450,11 @@ class StructuredBFGS:
 
         # The curvature along the step is tried after a step that was much too long, and given up
         # after one that was too long in spite of it.
-        if taken_fraction < MUCH_SHORTENED and _barrier(before.expansion).curvature is not None:
+        if taken_fraction < MUCH_SHORTENED and before.barrier.curvature is not None:
             self.is_bent = not self.is_bent
 
         if taken_fraction > MIN_TAKEN_FRACTION:
-            relative_length = self._relative_length(before.expansion, proposed)
+            relative_length = before.barrier.largest_relative_move(proposed) / self.reach
             factor = float(np.clip(DAMPING_GAIN * relative_length, *LOWER_LIMITS))
             self.damping = self.damping * factor if self.damping > MIN_DAMPING else 0.0
             return
@@ -481,9 +478,10 @@ class StructuredBFGS:
         if last is not None and last.expansion is expansion and last.coordinates.K is K:
             return last
 
-        barrier = _barrier(expansion)
-        weights = self._with_ridge(barrier.weights)
-        coordinates = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
+        barrier = expansion.barrier
+        if barrier is None:
+            raise ValueError("a direction under hard limits needs their expansion")
+        coordinates = expansion.coordinates(K)
 
         # Gradients of the sum, of the cost alone, and of the coordinates of the eigenvalue model.
         a = [expansion.a[None], (expansion.a - barrier.a)[None]]
@@ -498,19 +496,12 @@ class StructuredBFGS:
 
         self._last = _LocalModel(
             expansion=expansion,
+            barrier=barrier,
             coordinates=coordinates,
-            weights=weights,
+            weights=self._with_ridge(barrier.weights),
             gradient=gradients[0],
             cost_gradient=gradients[1],
             eigenvalue_slopes=gradients[2:],
             basis=self.basis,
         )
         return self._last
-
-
-def _barrier(expansion: Expansion) -> BarrierExpansion:
-    """Expansion of the barrier. Raises ValueError where there is none."""
-    if expansion.barrier is None:
-        raise ValueError("a direction under hard limits needs their expansion")
-
-    return expansion.barrier
