@@ -235,17 +235,17 @@ class Segment:
     rows: slice
     start: Array
 
-    def first_part(self, t: Array, dt: float, share: float) -> Segment:
+    def first_part(self, recording: AlignedRecording, share: float) -> Segment:
         """The first rows of this segment, and the samples that they need.
 
         Args:
-            t: (M,) times of the rows of the recording [s].
-            dt: Sample period [s].
+            recording: Its recording.
             share: Share of the rows.
         """
         count = self.rows.stop - self.rows.start
         last = self.rows.start + max(int(np.ceil(share * count)), min(count, MIN_SAMPLES))
-        samples = int(np.ceil(t[last - 1] / dt - EDGE_TOLERANCE)) - self.begin
+        end = recording.t[last - 1] / recording.dt
+        samples = int(np.ceil(end - EDGE_TOLERANCE)) - self.begin
         return replace(
             self,
             samples=min(max(samples, MIN_SAMPLES), self.samples),

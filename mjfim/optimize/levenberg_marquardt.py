@@ -471,12 +471,18 @@ class _Search:
             return self._solution("near the minimum", success=True, rough=True, slow=not near)
         if futile:
             return self._solution("stopped: another minimum costs less")
+        return self._linearise(trial.ratio)
+
+    def _linearise(self, ratio: float) -> Solution | None:
+        """Adapt the damping to the ratio of actual to predicted decrease, and linearise.
+
+        Return the solution where the search ends.
+        """
         if self.settings.damped:
             # Source: Nielsen (1999), eq. 2.5.
-            factor = max(1.0 / 3.0, 1.0 - (2.0 * trial.ratio - 1.0) ** 3)
+            factor = max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
             self.damping = max(self.damping * factor, MIN_DAMPING)
             self.damping_growth = 2.0
-
         if (reason := self.budget.exhausted) is not None:
             return self._stopped(reason)
         linearised = self.problem.condense(self.unknowns)

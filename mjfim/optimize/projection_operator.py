@@ -187,6 +187,7 @@ class Direction(Protocol):
             K: (N, nu, nx) gain of the projection operator.
             moved: Difference between the new and the old point.
         """
+        return
 
     def reset(self) -> bool:
         """Clear the memory; True if there was something to clear."""
