@@ -59,15 +59,16 @@ def _measured_sums(system: System, law: ControlLaw, t: Array, inputs: Array, y: 
     unknown = np.zeros((N, len(MEASURED_SUMS)))
     unknown[:, -1] = 1.0
     output = outputs_by_state(system.model, system.outputs).get(law.q)
-    measured = np.isfinite(y[:, output]) if output is not None else np.zeros(len(y), dtype=bool)
-    if output is None or not measured.any():
+    position = np.full(len(y), np.nan) if output is None else y[:, output]
+    measured = np.isfinite(position)
+    if not measured.any():
         return unknown
 
     # Errors at all evaluations of the law in the recording.
     substeps, timestep = system.grid.substeps, float(system.model.opt.timestep)
     steps = np.arange(0, N * substeps, law.tick)
     sample = steps // substeps
-    q = np.interp(steps * timestep, t[measured], y[measured, output])
+    q = np.interp(steps * timestep, t[measured], position[measured])
     reference = inputs[sample, law.columns["reference"]]
     if law.interpolated:
         points = np.arange(N) * substeps
@@ -87,15 +88,7 @@ def _measured_sums(system: System, law: ControlLaw, t: Array, inputs: Array, y: 
     count = -(-(np.arange(N) * substeps) // law.tick)
     since = begun[count]
     place = np.minimum(since, len(steps) - 1)
-    first = since == 0
-    return np.column_stack(
-        [
-            total[count] - total[since],
-            reference[place],
-            q[place],
-            np.where(first, 1.0, 0.0),
-        ]
-    )
+    return np.column_stack([total[count] - total[since], reference[place], q[place], since == 0])
 
 
 # Largest distance from the grid [sample periods] at which a time stamp counts as lying on it.
@@ -197,12 +190,12 @@ def on_grid_of(system: System, recordings: Sequence[Recording]) -> System:
         return system
 
     # Engine steps after which there are rows; their common divisors are possible samples.
+    substeps = 1
     if all(_lie_on_grid(t, timestep) for t in times):
         steps = np.concatenate([np.rint(t / timestep).astype(np.int64) for t in times])
         common = int(np.gcd.reduce(steps))
-        divisors = (k for k in range(min(common, stated), 0, -1) if common % k == 0)
-        return system.with_substeps(next(divisors, 1))
-    return system.with_substeps(1)
+        substeps = max(k for k in range(1, stated + 1) if common % k == 0)
+    return system.with_substeps(substeps)
 
 
 def _lie_on_grid(t: Array, dt: float) -> bool:
@@ -362,12 +355,10 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     edges = np.arange(N + 1) * dt
 
     # Integral of the control at every row; the last control is held beyond the last edge.
-    integral = np.concatenate(
-        [np.zeros((1, ctrl.shape[1])), np.cumsum(ctrl * np.diff(t)[:, None], axis=0)]
-    )
     extended_t = np.append(t, max(edges[-1], t[-1]) + dt)
-    last_interval = extended_t[-1] - t[-1]
-    integral = np.concatenate([integral, integral[-1:] + ctrl[-1:] * last_interval])
+    held = np.concatenate([ctrl, ctrl[-1:]])
+    integral = np.cumsum(held * np.diff(extended_t)[:, None], axis=0)
+    integral = np.concatenate([np.zeros((1, ctrl.shape[1])), integral])
 
     # Means over the samples are differences of the integral at their edges.
     at_edges = np.column_stack([np.interp(edges, extended_t, column) for column in integral.T])
@@ -378,10 +369,8 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     margin = EDGE_TOLERANCE * dt
     first = np.searchsorted(t, edges[:-1] + margin, side="right") - 1
     last = np.searchsorted(t, edges[1:] - margin, side="left") - 1
-    first = np.clip(first, 0, len(ctrl) - 1)
-    last = np.clip(last, 0, len(ctrl) - 1)
-    constant = first == last
-    return np.where(constant[:, None], ctrl[first], mean)
+    first, last = np.clip([first, last], 0, len(ctrl) - 1)
+    return np.where((first == last)[:, None], ctrl[first], mean)
 
 
 def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array:

@@ -21,6 +21,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import jackknife_std
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
+from mjfim.identification.search import of_subset
 from mjfim.optimize.levenberg_marquardt import (
     WEAK_DAMPING,
     SearchSettings,
@@ -152,10 +153,9 @@ def affordable_part(problem: FitProblem, solution: Solution) -> tuple[FitProblem
 
     wanted = max(MAX_SAMPLES * count // problem.sample_count, 2)
     subset = evenly_spread_indices(count, wanted)
-    unknowns = solution.unknowns
     part = replace(
         solution,
-        unknowns=replace(unknowns, private=unknowns.private[subset]),
+        unknowns=of_subset(solution.unknowns, subset),
         condensed=solution.condensed.of_segments(subset),
     )
     return problem.of_segments(subset), part
@@ -175,13 +175,8 @@ def with_initial_states(
         return problem, at
 
     # Deviations of the initial state that were fitted belong to other recordings.
-    private = np.zeros_like(at.private)
-    if not problem.free_starts:
-        guess = problem.parameters.guess[problem.private]
-        private = np.tile(guess, (len(problem.segments), 1))
-
+    begin = replace(at, private=problem.begin(problem.parameters.guess).private)
     known = problem.masked(_masks_for_initial_states(problem, masks))
-    begin = replace(at, private=private)
     found = minimise(known.with_shared_held(), begin, INITIAL_STATES, budget)
     return problem, at if found is None else found.unknowns
 
@@ -224,14 +219,11 @@ def fit_without(
         return None
     others = others.of_segments(segments)
 
-    def own(at: UnknownValues) -> UnknownValues:
-        """The unknowns of the segments with other data."""
-        return replace(at, private=at.private[segments])
-
     # A step is the fit if it lowers the cost nearly as far as the linearisation predicts.
     at, condensed = solution.unknowns, solution.condensed
-    cost = others.cost(own(at))
-    starts = [(cost, own(at))]
+    begin = of_subset(at, segments)
+    cost = others.cost(begin)
+    starts = [(cost, begin)]
     remaining = condensed.without_blocks(problem.blocks_containing(masks))
     values = problem.common_values(at)
     lower, upper = problem.lower - values, problem.upper - values
@@ -242,11 +234,12 @@ def fit_without(
         if step.predicted_decrease < ENOUGH_SHARE * first:
             break
         moved = problem.moved(at, step, 1.0)
-        cost_at_end = others.cost(own(moved))
+        end = of_subset(moved, segments)
+        cost_at_end = others.cost(end)
         missed = cost_at_end - (cost - step.predicted_decrease)
         if missed <= max(ALLOWED_SHARE * step.predicted_decrease, SEARCH.rough_share * cost):
             return None if budget.exhausted is not None else moved
-        starts.append((cost_at_end, own(moved)))
+        starts.append((cost_at_end, end))
 
     # The data that are left out may have led the estimate to a minimum that the others lack.
     guess = others.begin(problem.parameters.guess)
@@ -559,18 +552,11 @@ def _predict_held_out(held_out: FitProblem, theta: Array, budget: Budget) -> Ite
         if budget.exhausted is not None:
             return
         begin_stage("predicting held-out recordings", i, len(held_out.recordings))
-        name = held_out.recordings[i].name
-        masks = masks_of(held_out.masks, [i])
-        errors, outputs = _predicted(held_out, theta, masks, name, budget)
-        guess = held_out.system.parameters.guess
-        nominal_errors, nominal_outputs = _predicted(held_out, guess, masks, name, budget)
-        yield Prediction(
-            name=name,
-            identified=errors,
-            nominal=nominal_errors,
-            held_out=True,
-            identified_outputs=outputs[i],
-            nominal_outputs=nominal_outputs[i],
+        name, masks = held_out.recordings[i].name, masks_of(held_out.masks, [i])
+        prediction, outputs = _prediction(held_out, theta, masks, name, budget)
+        identified, nominal = (each[i] for each in outputs)
+        yield replace(
+            prediction, held_out=True, identified_outputs=identified, nominal_outputs=nominal
         )
 
 
@@ -607,13 +593,21 @@ def _prediction_by_others(
     others = fit_without(problem, budget, solution=solution, part=part)
     if others is None:
         return None
-    guess, masks = problem.parameters.guess, part.masks(problem)
-    return Prediction(
-        name=part.name,
-        identified=_predicted(problem, others.theta, masks, part.name, budget)[0],
-        nominal=_predicted(problem, guess, masks, part.name, budget)[0],
-        held_out=False,
-    )
+    return _prediction(problem, others.theta, part.masks(problem), part.name, budget)[0]
+
+
+def _prediction(
+    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget
+) -> tuple[Prediction, tuple[list[Array], list[Array]]]:
+    """The prediction of the values in some masks, and the outputs of both models; see `_predicted`.
+
+    The models are those at theta: (p,) and at the guess.
+    """
+    errors, outputs = _predicted(problem, theta, masks, name, budget)
+    guess = problem.parameters.guess
+    nominal, nominal_outputs = _predicted(problem, guess, masks, name, budget)
+    prediction = Prediction(name=name, identified=errors, nominal=nominal, held_out=False)
+    return prediction, (outputs, nominal_outputs)
 
 
 def _predicted(

@@ -125,12 +125,12 @@ class FitUnknowns:
     @cached_property
     def lower(self) -> Array:
         """(c,) lower bounds of the common unknowns [theta-unit]."""
-        return self.parameters.lower[self.parameter_of_column] if self.bounded else -self._infinite
+        return np.where(self.bounded, self.parameters.lower[self.parameter_of_column], -np.inf)
 
     @cached_property
     def upper(self) -> Array:
         """(c,) upper bounds of the common unknowns [theta-unit]."""
-        return self.parameters.upper[self.parameter_of_column] if self.bounded else self._infinite
+        return np.where(self.bounded, self.parameters.upper[self.parameter_of_column], np.inf)
 
     @cached_property
     def _of_inertias(self) -> np.ndarray:
@@ -176,11 +176,6 @@ class FitUnknowns:
                         inside = middle
                 bounds[side, column] = inside
         return bounds[0], bounds[1]
-
-    @property
-    def _infinite(self) -> Array:
-        """(c,) upper bounds where there are none."""
-        return np.full(self.column_count, np.inf)
 
     @property
     def first_columns(self) -> np.ndarray:
@@ -437,8 +432,6 @@ class FitUnknowns:
             rows[:, diagonal, diagonal] = 1.0 / sigma
             rows[:, :, -1] = at.private / sigma
             return rows
-        if not n:
-            return np.zeros((count, 0, m))
 
         # Stated priors on the deviations of the initial state.
         parameters, private = self.parameters, self.private
