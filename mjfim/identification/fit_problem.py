@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -40,6 +40,9 @@ from mjfim.plant.outputs import Noise
 from mjfim.plant.plant import SENSITIVITY_STEP
 from mjfim.records.trajectory import Recording
 
+if TYPE_CHECKING:
+    from mjfim.identification.fit_workers import FitWorkers
+
 T = TypeVar("T")
 
 # Work on one batch of a problem, at values of the unknowns. It raises `DivergedSegmentError`.
@@ -47,22 +50,6 @@ BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T]
 
 # A task on a whole problem, which ends early when the budget is exhausted.
 ProblemWork = Callable[["FitProblem", Budget], T]
-
-
-class ProblemWorkers(Protocol):
-    """Workers that do tasks on a problem."""
-
-    @property
-    def count(self) -> int:
-        """Number of workers."""
-
-    def of_batches(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> Sequence[T]:
-        """Do works that are one pass over the data."""
-
-    def of_whole(
-        self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
-    ) -> Iterator[T]:
-        """Do works that do not depend on each other, each of them in one worker."""
 
 
 # Number of stated samples of the longest recording along which difference steps are calibrated.
@@ -86,7 +73,7 @@ class FitProblem(SegmentSimulation):
     masks: tuple[np.ndarray, ...]
     noise: Noise
     loss: RobustLoss
-    workers: ProblemWorkers | None = None
+    workers: FitWorkers | None = None
 
     @classmethod
     def of(
@@ -160,7 +147,7 @@ class FitProblem(SegmentSimulation):
 
     # ---- variants
 
-    def on_workers(self, workers: ProblemWorkers) -> FitProblem:
+    def on_workers(self, workers: FitWorkers) -> FitProblem:
         """This problem, the batches of which are simulated by workers.
 
         Args:

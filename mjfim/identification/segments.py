@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -125,18 +126,14 @@ class KnownActivations:
             columns = dict(zip(controls.tolist(), inputs.tolist(), strict=True))
 
         # No recording shows the control that a law computes, so that its lag is an unknown.
-        def is_shown(actuator: int) -> bool:
-            """Whether the recording shows what moves the activation of an actuator."""
-            is_lag = int(model.actuator_dyntype[actuator]) in FILTERS
-            return not is_lag or int(model.actuator_ctrladr[actuator]) in columns
-
-        stated = set(layout.act.tolist())
-        found = [
+        is_shown = ~np.isin(model.actuator_dyntype, FILTERS)
+        is_shown |= np.isin(model.actuator_ctrladr, list(columns))
+        is_added = (model.actuator_actnum > 0) & ~np.isin(model.actuator_actadr, layout.act)
+        found = tuple(
             (actuator, int(model.actuator_actadr[actuator]))
-            for actuator in np.flatnonzero(model.actuator_actnum).tolist()
-            if int(model.actuator_actadr[actuator]) not in stated and is_shown(actuator)
-        ]
-        return KnownActivations(model=model, actuators=tuple(found), columns=columns)
+            for actuator in np.flatnonzero(is_added & is_shown).tolist()
+        )
+        return KnownActivations(model=model, actuators=found, columns=columns)
 
     @property
     def addresses(self) -> list[int]:
@@ -428,7 +425,7 @@ def cut_into_segments(
     Raises:
         RecordingError: The length is too short.
     """
-    segments = []
+    segments: list[Segment] = []
     ticks = system.plant.tick_samples
     for i, recording in enumerate(recordings):
         N = len(recording.ctrl)
@@ -459,19 +456,13 @@ def cut_into_segments(
         row_bounds = np.searchsorted(recording.t, times)
         row_bounds[-1] = len(recording.t)
 
-        for k, begin in enumerate(begins.tolist()):
-            first, last = int(row_bounds[k]), int(row_bounds[k + 1])
-            if last <= first:
-                continue
-            segments.append(
-                Segment(
-                    recording=i,
-                    begin=begin,
-                    samples=int(bounds[k + 1]) - begin,
-                    rows=slice(first, last),
-                    start=starts[k],
-                )
-            )
+        rows = [slice(*each) for each in pairwise(row_bounds.tolist())]
+        places = zip(rows, begins.tolist(), bounds[1:].tolist(), starts, strict=True)
+        segments += [
+            Segment(recording=i, begin=begin, samples=end - begin, rows=own, start=start)
+            for own, begin, end, start in places
+            if own.stop > own.start
+        ]
     return tuple(segments)
 
 
@@ -483,9 +474,6 @@ def _max_delay(parameters: ParameterSet, duration: float) -> float:
         duration: Duration of the shortest recording [s].
     """
     per_parameter = parameters.delay_derivative
-    if not per_parameter.any():
-        return 0.0
-
     growth = MAX_DELAY_GROWTH * np.array([p.prior or p.scale for p in parameters.parameters])
     has_prior = np.array([p.prior is not None for p in parameters.parameters])
     grows = ~has_prior & (per_parameter != 0.0)
