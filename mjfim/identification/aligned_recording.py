@@ -407,18 +407,13 @@ def _quaternion_outputs(system: System) -> list[list[int]]:
     model = system.model
     kinds = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
 
-    found = []
-    for q, _ in system.space.quaternions:
-        addresses = range(q, q + 4)
-        found.append([i for i, output in enumerate(outputs) if output.state in addresses])
-
-    for sensor in range(model.nsensor):
-        if int(model.sensor_type[sensor]) not in kinds:
-            continue
-        first = int(model.sensor_adr[sensor])
-        addresses = range(first, first + 4)
-        found.append([i for i, output in enumerate(outputs) if output.sensor in addresses])
-
+    states = [q for q, _ in system.space.quaternions]
+    sensors = model.sensor_adr[np.isin(model.sensor_type, kinds)].tolist()
+    found = [[i for i, each in enumerate(outputs) if each.state in range(q, q + 4)] for q in states]
+    found += [
+        [i for i, each in enumerate(outputs) if each.sensor in range(first, first + 4)]
+        for first in sensors
+    ]
     return [columns for columns in found if len(columns) == 4]
 
 

@@ -526,9 +526,8 @@ def sensitivity_rows(
     if wanted is None:
         wanted = np.ones(len(problem.parameters), dtype=bool)
     work: BatchWork[dict[int, Array]] = partial(_of_batch, with_error=with_error)
-    batches = list(
-        problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)
-    )
+    accurate = replace(problem, central=with_error, difference_step=SENSITIVITY_STEP)
+    batches = list(accurate.batches(derivatives=True, wanted=wanted))
     condensed: dict[int, Array] = {}
     for batch, of_batch in zip(batches, problem.of_batches(work, batches, at), strict=True):
         if of_batch is None:

@@ -155,10 +155,7 @@ class SegmentSimulation(FitUnknowns):
 
         # Samples without a segment get the first known state.
         gap = np.isnan(states[:, 0])
-        if gap.all():
-            states[:] = plant.nominal_initial_state
-        elif gap.any():
-            states[gap] = states[np.flatnonzero(~gap)[0]]
+        states[gap] = plant.nominal_initial_state if gap.all() else states[np.argmin(gap)]
         return replace(plant.trajectory(states, ctrl[:, :0]), ctrl=ctrl)
 
     def clipped_shares(self, at: UnknownValues) -> dict[str, float]:
@@ -202,17 +199,12 @@ class SegmentSimulation(FitUnknowns):
         self,
         *,
         derivatives: bool,
-        central: bool | None = None,
-        step: float | None = None,
         wanted: np.ndarray | None = None,
     ) -> Iterator[SegmentBatch]:
         """Divide all segments into batches that fit into memory; every segment is in one of them.
 
         Args:
             derivatives: Whether to compute derivatives.
-            central: True for two-sided differences; default: as this simulation states, and
-                two-sided unless there is much data where it does not.
-            step: Relative step of two-sided differences; default: the stated one.
             wanted: (p,) True for the parameters by which to differentiate; default: those that have
                 common columns.
 
@@ -224,10 +216,9 @@ class SegmentSimulation(FitUnknowns):
 
         # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
-        central = self.central if central is None else central
+        central, step = self.central, self.difference_step
         if central is None:
             central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
-        step = self.difference_step if step is None else step
         if not central:
             step = ONE_SIDED_STEP_FACTOR * step
 

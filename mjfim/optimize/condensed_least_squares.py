@@ -171,12 +171,9 @@ class Condensed:
         n = self.private_count
 
         # Where a segment has no full rank, the best private unknowns do not cancel these rows.
-        private = R[:, :n, :n]
-        residual = R[:, :n, -1:]
-        remaining_jacobian = private @ self.private_response + R[:, :n, n:-1]
-        remaining_residual = residual - private @ (self._private_inverse @ residual)
-        remaining = np.concatenate([remaining_jacobian, remaining_residual], axis=2)
-
+        J, residual = self._following(R[:, :n], self.private_response)
+        residual = residual - R[:, :n, :n] @ (self._private_inverse @ residual)
+        remaining = np.concatenate([J, residual], axis=2)
         rows = np.concatenate([remaining, R[:, n:, n:]], axis=1)
         return rows.reshape(-1, rows.shape[2])
 
@@ -233,24 +230,14 @@ class Condensed:
     @property
     def rank(self) -> int:
         """Number of unknowns, private and common, that the rows determine."""
-        n = self.private_count
-        private_rank = 0
-        if n:
-            columns = self.triangles[:, :, :n]
-            norms = np.linalg.norm(columns, axis=1, keepdims=True)
-            scaled = columns / np.maximum(norms, SMALLEST_NORM)
-            ranks = np.linalg.matrix_rank(scaled, tol=PRIVATE_RANK_COUNT_TOLERANCE)
-            private_rank = int(ranks.sum())
+        columns = self.triangles[:, :, : self.private_count]
+        norms = np.linalg.norm(columns, axis=1, keepdims=True)
+        private = columns / np.maximum(norms, SMALLEST_NORM)
+        of_segments = np.linalg.matrix_rank(private, tol=PRIVATE_RANK_COUNT_TOLERANCE)
 
-        common_rank = 0
-        H = self.information()
-        if len(H):
-            scaled, _ = scaled_to_unit_diagonal(H)
-            common_rank = int(
-                np.linalg.matrix_rank(scaled, tol=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
-            )
-
-        return private_rank + common_rank
+        common, _ = scaled_to_unit_diagonal(self.information())
+        of_common = np.linalg.matrix_rank(common, tol=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
+        return int(of_segments.sum() + of_common)
 
     def information(self, with_common_rows: bool = True) -> Array:
         """Information about the common unknowns, the private ones marginalised.
@@ -432,23 +419,23 @@ class Condensed:
 
         The private unknowns follow the common ones at their optimum.
         """
-        n = self.private_count
-        rows = self.private_rows
-        through_private = rows[:, :, :n] @ self.private_response
-        J = rows[:, :, n:-1] + through_private
-        return np.concatenate([J, rows[:, :, -1:]], axis=2)
+        J, r = self._following(self.private_rows, self.private_response)
+        return np.concatenate([J, r], axis=2)
 
     @property
     def _reduced_blocks(self) -> tuple[Array, Array]:
-        """(B, m, c) Jacobian of each block by the common unknowns, and its (B, m, 1) residuals.
+        """(B, m, c) Jacobian of each block by the common unknowns, and its (B, m, 1) residuals."""
+        return self._following(self.blocks, self.private_response[self.segment_of_block])
 
-        The private unknowns follow the common ones at their optimum.
+    def _following(self, rows: Array, response: Array) -> tuple[Array, Array]:
+        """Rows of the common unknowns and residuals; private unknowns follow at their optimum.
+
+        Args:
+            rows: (..., k, m) rows of all unknowns.
+            response: (..., n, c) derivatives of the private unknowns by the common ones.
         """
         n = self.private_count
-        response = self.private_response[self.segment_of_block]
-        through_private = self.blocks[:, :, :n] @ response
-        J = self.blocks[:, :, n:-1] + through_private
-        return J, self.blocks[:, :, -1:]
+        return rows[..., n:-1] + rows[..., :n] @ response, rows[..., -1:]
 
 
 def triangle(rows: Array) -> Array:

@@ -413,15 +413,10 @@ class EigenvalueModel:
         """
         return self._changed(d).gradient
 
-    @cached_property
-    def _logs(self) -> Array:
-        """(r, r) diagonal matrix of the logarithms of the eigenvalues over the smallest one."""
-        return np.diag(np.log(self.eigenvalues / self.eigenvalues[0]))
-
     def _changed(self, d: Array) -> _ChangedLogs:
         """Eigenvalues of the changed logarithm at coordinates d: (m,)."""
-        changed = self._logs + symmetric_matrix(d, len(self.eigenvalues))
-        logs, vectors = np.linalg.eigh(changed)
+        before = np.diag(np.log(self.eigenvalues / self.eigenvalues[0]))
+        logs, vectors = np.linalg.eigh(before + symmetric_matrix(d, len(before)))
         return _ChangedLogs(logs=logs, vectors=vectors, power=self.power, weight=self.weight)
 
     def minimising_gradient(self, d0: Array, spread: Array) -> Array:

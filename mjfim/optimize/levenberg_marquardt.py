@@ -621,11 +621,8 @@ class _Search:
             most = MAX_ROUGH_ITERATIONS
         else:
             negligible = min(negligible, PREDICTED_STAGNATION * predicted.predicted_decrease)
-        if self.cost - trial.cost <= negligible:
-            self.stagnant_iterations += 1
-        else:
-            self.stagnant_iterations = 0
-
+        is_stagnant = self.cost - trial.cost <= negligible
+        self.stagnant_iterations = self.stagnant_iterations + 1 if is_stagnant else 0
         return self.stagnant_iterations >= most
 
     def _converged(self, trial: _Trial, predicted: Step) -> bool:
@@ -669,10 +666,8 @@ class _Search:
     def _is_slow(self, trial: _Trial) -> bool:
         """Count consecutive iterations of little use; True after too many of them."""
         share = self.settings.stagnant_share
-        if self.cost - trial.cost <= share * self.cost:
-            self.slow_iterations += 1
-        else:
-            self.slow_iterations = 0
+        is_slow = self.cost - trial.cost <= share * self.cost
+        self.slow_iterations = self.slow_iterations + 1 if is_slow else 0
         return share > 0.0 and self.slow_iterations >= MAX_ROUGH_ITERATIONS
 
     def _is_futile(self, trial: _Trial, predicted: Step) -> bool:

@@ -345,7 +345,8 @@ class RiccatiSolution:
         # Each step of the recursion is one quadratic form of (v_k, z_k). It adds the weights of the
         # sample and those of the next state, which the matrix [B A] gives.
         to_next = np.concatenate([B, A], axis=2)
-        forms = _forms_of_samples(weights)
+        coupling = weights.S.swapaxes(1, 2)
+        forms = np.block([[weights.R, weights.S], [coupling, weights.Q[:-1]]])
         factors = np.empty((N, nu, forms.shape[2]))
         P = weights.Q[N]
 
@@ -401,17 +402,6 @@ class RiccatiSolution:
         return TangentCurve(z=z[..., : self.nx], v=v)
 
 
-def _forms_of_samples(weights: Weights) -> Array:
-    """(N, nu+nx, nu+nx) matrices of a form without W, one for (v_k, z_k) of each sample."""
-    N, nu, nx = weights.S.shape
-    forms = np.empty((N, nu + nx, nu + nx))
-    forms[:, :nu, :nu] = weights.R
-    forms[:, :nu, nu:] = weights.S
-    forms[:, nu:, :nu] = weights.S.swapaxes(1, 2)
-    forms[:, nu:, nu:] = weights.Q[:-1]
-    return forms
-
-
 def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array, Array, Weights]:
     """The problem with the state extended by the previous control.
 
@@ -426,28 +416,20 @@ def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array,
         Transition and input matrices of the state (x_k, v_{k-1}), and the form without W.
     """
     N, nx, nu = B.shape
-    n = nx + nu
     unit = np.eye(nu)
     change_weights = unit * weights.W[:, None]
 
     # Dynamics of the extended state; its last part becomes the present control.
-    wide_A = np.zeros((N, n, n))
-    wide_A[:, :nx, :nx] = A
-    wide_B = np.zeros((N, n, nu))
-    wide_B[:, :nx] = B
-    wide_B[:, nx:] = unit
+    room = ((0, 0), (0, nu), (0, nu))
+    wide_A = np.pad(A, room)
+    wide_B = np.concatenate([B, np.broadcast_to(unit, (N, nu, nu))], axis=1)
 
     # Terms of W (v_k - v_{k-1})^2 with the previous control, with both, and with the present one.
-    Q = np.zeros((N + 1, n, n))
-    Q[:, :nx, :nx] = weights.Q
+    Q = np.pad(weights.Q, room)
     Q[:, nx:, nx:] = change_weights
-    S = np.zeros((N, nu, n))
-    S[:, :, :nx] = weights.S
-    S[:, :, nx:] = -change_weights[:-1]
+    S = np.concatenate([weights.S, -change_weights[:-1]], axis=2)
     R = weights.R + change_weights[:-1]
-
-    wide = Weights(Q=Q, S=S, R=R, W=np.zeros_like(weights.W))
-    return wide_A, wide_B, wide
+    return wide_A, wide_B, Weights(Q=Q, S=S, R=R, W=np.zeros_like(weights.W))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

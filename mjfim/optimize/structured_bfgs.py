@@ -78,11 +78,6 @@ class CurveMetric:
     coordinates: CurveCoordinates
     weights: Weights
 
-    @cached_property
-    def _riccati(self) -> RiccatiSolution:
-        """Factored linear-quadratic problem of the form."""
-        return RiccatiSolution.solve(self.coordinates.A, self.coordinates.B, self.weights)
-
     def apply(self, s: Array) -> Array:
         """Product of the metric's matrix with a curve coordinate.
 
@@ -104,11 +99,12 @@ class CurveMetric:
         Returns:
             (N, nu) curve coordinate s with `apply(s) = g`, or (m, N, nu).
         """
-        K = self.coordinates.K
+        A, B, K = self.coordinates.A, self.coordinates.B, self.coordinates.K
         *m, N, _ = g.shape
         a = np.zeros((*m, N + 1, K.shape[2]))
         a[..., :-1, :] = -products_at_samples(K.swapaxes(1, 2), g)
-        return self.coordinates.coordinate(self._riccati.descent(a, -g))
+        curve = RiccatiSolution.solve(A, B, self.weights).descent(a, -g)
+        return self.coordinates.coordinate(curve)
 
 
 def basis_response(expansion: Expansion, basis: Array) -> Array:
@@ -174,12 +170,6 @@ class BasisMetric:
 
     H: Array
 
-    @cached_property
-    def _factor(self) -> tuple[Array, bool]:
-        """Cholesky factor of H, and whether it is the lower one."""
-        factor, lower = scipy.linalg.cho_factor(self.H, lower=True)
-        return factor, bool(lower)
-
     def apply(self, s: Array) -> Array:
         """Product of the matrix with coefficients.
 
@@ -201,7 +191,8 @@ class BasisMetric:
             (M, nu) coefficients s with `apply(s) = g`, or (m, M, nu).
         """
         columns = g.reshape(-1, len(self.H)).T
-        return np.asarray(scipy.linalg.cho_solve(self._factor, columns).T.reshape(g.shape))
+        factor = scipy.linalg.cho_factor(self.H, lower=True)
+        return np.asarray(scipy.linalg.cho_solve(factor, columns).T.reshape(g.shape))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
