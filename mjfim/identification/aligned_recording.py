@@ -310,9 +310,9 @@ def _in_order(system: System, recording: Recording) -> Array:
     """(M, ny) measured values in the order of the outputs, NaN for those without a column."""
     names = system.outputs.names
     y = np.full((len(recording.t), len(names)), np.nan)
-    for name in recording.outputs:
+    for name, column in zip(recording.outputs, recording.y.T, strict=True):
         if name in names:
-            y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
+            y[:, names.index(name)] = column
     return y
 
 

@@ -222,9 +222,7 @@ class SegmentSimulation(FitUnknowns):
         if not central:
             step = ONE_SIDED_STEP_FACTOR * step
 
-        simulations = 1
-        if derivatives:
-            simulations += directions * (2 if central else 1)
+        simulations = 1 + derivatives * directions * (1 + central)
 
         # The states of a batch have to fit into memory.
         numbers_per_step = 1 + self.system.plant.nominal_initial_state.size

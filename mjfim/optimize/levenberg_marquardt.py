@@ -292,8 +292,7 @@ class SearchSettings:
         max_iterations: Largest number of iterations.
         tolerance: Length of a step below which the search has converged: the root mean square over
             the common unknowns [standard deviations].
-        damped: True for Levenberg-Marquardt inside the bounds, False for Gauss-Newton without
-            bounds.
+        damped: True for Levenberg-Marquardt, False for Gauss-Newton.
         relinearise_at_end: Whether to linearise once more at the solution. False saves one
             linearisation: the search ends when the next step is expected to be below the tolerance.
         rough_share: Predicted decrease of the cost, as a share of the cost, below which a step is
@@ -361,8 +360,7 @@ def minimise(
     if condensed is None:
         return None
 
-    budget = Budget() if budget is None else budget
-    return _Search(problem, settings, budget, callback, start, cost, condensed).run()
+    return _Search(problem, settings, budget or Budget(), callback, start, cost, condensed).run()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -564,14 +562,9 @@ class _Search:
         )
 
     def _step(self, damping: float) -> Step:
-        """Minimiser of the damped linearised cost, within the bounds where the search is damped."""
-        if self.settings.damped:
-            values = self.problem.common_values(self.unknowns)
-            lower, upper = (bound - values for bound in self.problem.bounds_at(self.unknowns))
-        else:
-            upper = np.full(self.condensed.common_count, np.inf)
-            lower = -upper
-
+        """Minimiser of the damped linearised cost, within the bounds."""
+        values = self.problem.common_values(self.unknowns)
+        lower, upper = (bound - values for bound in self.problem.bounds_at(self.unknowns))
         curved = self.settings.curved_rows
         if curved is None:
             return self.condensed.step(damping, self.scale, lower, upper)
