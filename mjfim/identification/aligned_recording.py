@@ -222,7 +222,15 @@ def align(system: System, recording: Recording) -> AlignedRecording:
     dt = system.dt
     t = _times(recording)
     rows = _control(system, recording)
-    y = _outputs(system, recording)
+    names = system.outputs.names
+    if not set(names) & set(recording.outputs):
+        raise RecordingError(
+            f"{recording.name}: no measured column; "
+            f"{unknown('column', listed(recording.outputs), names)}"
+        )
+
+    # An array in the order of the outputs is shared.
+    y = recording.y if recording.outputs == tuple(names) else _in_order(system, recording)
 
     # Time stamps that nearly lie on the grid are moved onto it.
     sample = np.rint(t / dt)
@@ -288,22 +296,6 @@ def _control(system: System, recording: Recording) -> Array:
             f"{recording.name}: the control in data row {row} is NaN; only the last row may omit it"
         )
     return np.asarray(ctrl)
-
-
-def _outputs(system: System, recording: Recording) -> Array:
-    """(M, ny) measured values in the order of the outputs.
-
-    Raises RecordingError where the recording has none of them.
-    """
-    names = system.outputs.names
-    if not set(names) & set(recording.outputs):
-        raise RecordingError(
-            f"{recording.name}: no measured column; "
-            f"{unknown('column', listed(recording.outputs), names)}"
-        )
-
-    # An array in the order of the outputs is shared.
-    return recording.y if recording.outputs == tuple(names) else _in_order(system, recording)
 
 
 def _in_order(system: System, recording: Recording) -> Array:

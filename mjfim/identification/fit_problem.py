@@ -240,7 +240,6 @@ class FitProblem(SegmentSimulation):
             segments=segments,
             shared=np.flatnonzero(~parameters.recording_specific & ~is_held),
             free_starts=True,
-            bounded=True,
             start_directions=directions,
             masks=tuple(np.array(recording.measured) for recording in self.recordings),
             pins=self.pins[:0],

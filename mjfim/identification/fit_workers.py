@@ -128,11 +128,12 @@ class FitWorkers:
         if len(works) < 2:
             return [work(problem, Budget()) for work in works]
         orders = self._orders(problem, works)
-        found: dict[int, T] = {}
         budget = Budget(stop=StopToken(also=hurried))
-        for outcome in carry_out(self._executor, _carry_out, orders, budget):
-            if not outcome.is_lost:
-                found[outcome.index] = self._counted(problem, outcome.result)
+        found = {
+            outcome.index: self._counted(problem, outcome.result)
+            for outcome in carry_out(self._executor, _carry_out, orders, budget)
+            if not outcome.is_lost
+        }
         alone = replace(problem, workers=None)
         return [
             found[index] if index in found else work(alone, Budget())

@@ -302,9 +302,9 @@ class HeldOutLosses:
         # Blocks of one recording are alike where something differs from recording to recording, so
         # that the scatter between the parts counts as well.
         difference = self.losses - other.losses
-        n_parts = int(self.parts.max()) + 1
-        by_part = np.bincount(self.parts, difference, n_parts).astype(float)
-        counts_by_part = np.bincount(self.parts, self.counts, n_parts).astype(float)
+        by_part, counts_by_part = (
+            np.bincount(self.parts, each).astype(float) for each in (difference, self.counts)
+        )
         standard_error = max(
             _standard_error(difference, self.counts), _standard_error(by_part, counts_by_part)
         )
@@ -392,13 +392,11 @@ def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
     # Stretches begin with a segment where there are enough of them, because a segment whose initial
     # state is free is then predicted as a whole. Otherwise they have equal numbers of rows.
     recording = problem.recordings[0]
-    rows = np.array([segment.rows.start for segment in problem.segments])
+    rows, least = np.array([each.rows.start for each in problem.segments]), MIN_SEGMENTS_PER_PART
     if len(rows) < MIN_SEGMENTS_PER_PART * MIN_STRETCHES:
-        rows = np.flatnonzero(problem.masks[0].any(axis=1))
-        groups = min(MAX_FOLDS, len(rows))
-    else:
-        groups = min(MAX_FOLDS, len(rows) // MIN_SEGMENTS_PER_PART)
-    times = [float(recording.t[group[0]]) for group in np.array_split(rows, groups)]
+        rows, least = np.flatnonzero(problem.masks[0].any(axis=1)), 1
+    groups = np.array_split(rows, min(MAX_FOLDS, len(rows) // least))
+    times = [float(recording.t[group[0]]) for group in groups]
     return stretches_of(recording.name, 0, times)
 
 

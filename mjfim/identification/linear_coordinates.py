@@ -311,8 +311,8 @@ class CadPrior:
     @property
     def columns(self) -> np.ndarray:
         """Indices in theta of all coordinates with such a prior, ascending."""
-        places = [body.columns for body in self.bodies]
-        return np.sort(np.concatenate([np.zeros(0, dtype=np.intp), *places]))
+        places = np.array([body.columns for body in self.bodies], dtype=np.intp)
+        return np.sort(places.ravel())
 
     def of_bodies(self, is_wanted: np.ndarray) -> CadPrior:
         """The priors on the bodies whose coordinates are wanted.

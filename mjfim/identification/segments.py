@@ -84,10 +84,9 @@ def bristles_of(model: Any) -> tuple[Bristle, ...]:
     scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
     found = []
     for actuator in bristle_actuators(model):
-        if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-            continue
         joint = int(model.actuator_trnid[actuator, 0])
-        if int(model.jnt_type[joint]) in scalar:
+        at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+        if at_joint and int(model.jnt_type[joint]) in scalar:
             found.append(
                 Bristle(
                     actuator=actuator,
@@ -157,7 +156,7 @@ class KnownActivations:
             else self._bent(actuator, qvel)
             for actuator, _ in self.actuators
         ]
-        return np.stack(columns, axis=1) if columns else np.zeros((len(begins), 0))
+        return np.column_stack([np.zeros((len(begins), 0)), *columns])
 
     def _filtered(self, actuator: int, recording: AlignedRecording, begins: np.ndarray) -> Array:
         """(n,) controls after the lag of an actuator, which is at rest at the first row."""
@@ -624,14 +623,14 @@ def batches(segments: Sequence[Segment], max_samples: int) -> Iterator[list[int]
     order = sorted(range(len(segments)), key=lambda i: segments[i].samples)
     batch: list[int] = []
     for i in order:
+        # Shorter segments are simulated as long as the longest one of their batch.
         samples = segments[i].samples
-        if batch:
-            # Shorter segments are simulated as long as the longest one of their batch.
-            too_long = samples > MAX_LENGTH_RATIO * segments[batch[0]].samples
-            too_many = (len(batch) + 1) * samples > max_samples
-            if too_long or too_many:
-                yield batch
-                batch = []
+        if batch and (
+            samples > MAX_LENGTH_RATIO * segments[batch[0]].samples
+            or (len(batch) + 1) * samples > max_samples
+        ):
+            yield batch
+            batch = []
         batch.append(i)
 
     if batch:

@@ -351,11 +351,8 @@ class BarrierExpansion:
         """
         state_and_control = np.concatenate([zeta.z[:-1], zeta.v], axis=1)
         changes = np.einsum("kswi,ki->ksw", self.observations, state_and_control)
-        largest_observed = np.abs(changes).max(initial=0.0)
-
-        control_changes = zeta.v / self.control_scale
-        largest_control = np.abs(control_changes).max(initial=0.0)
-        return float(max(largest_observed, largest_control))
+        all_changes = np.append(changes, zeta.v / self.control_scale)
+        return float(np.abs(all_changes).max(initial=0.0))
 
     @cached_property
     def uniform_weights(self) -> Weights:
@@ -374,12 +371,8 @@ class BarrierExpansion:
 
         Q = np.zeros((N + 1, nx, nx))
         Q[:-1] = H[:, :nx, :nx]
-        control_weights = self.control_scale**-2.0 / N
-        R = H[:, nx:, nx:] + np.diag(control_weights)
-
-        is_limited = self.weights.W > 0.0
-        step_weights = self.control_step_scale**-2.0 / N
-        W = np.where(is_limited, step_weights, 0.0)
+        R = H[:, nx:, nx:] + np.diag(self.control_scale**-2.0 / N)
+        W = np.where(self.weights.W > 0.0, self.control_step_scale**-2.0 / N, 0.0)
         return Weights(Q=Q, S=H[:, nx:, :nx], R=R, W=W)
 
 

@@ -422,8 +422,8 @@ class _Search:
 
     def _iterate(self) -> Solution | None:
         """Take one step and linearise at its end; return the solution where the search ends."""
-        if (reason := self.budget.exhausted) is not None:
-            return self._stopped(reason)
+        if (stopped := self._stopped()) is not None:
+            return stopped
 
         # Marquardt's scaling: column norms never shrink, so that the damping does not forget a
         # column.
@@ -481,8 +481,8 @@ class _Search:
             factor = max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
             self.damping = max(self.damping * factor, MIN_DAMPING)
             self.damping_growth = 2.0
-        if (reason := self.budget.exhausted) is not None:
-            return self._stopped(reason)
+        if (stopped := self._stopped()) is not None:
+            return stopped
         linearised = self.problem.condense(self.unknowns)
         if linearised is None:
             return self._solution("stopped: the simulation diverges next to the estimate")
@@ -533,8 +533,8 @@ class _Search:
             self.damping_growth *= 2.0
             step = self._step(self.damping)
 
-            if (reason := self.budget.exhausted) is not None:
-                return self._stopped(reason)
+            if (stopped := self._stopped()) is not None:
+                return stopped
 
     def _trial(self, step: Step) -> _Trial:
         """Evaluate a step with the current damping.
@@ -691,8 +691,11 @@ class _Search:
             stuck=True,
         )
 
-    def _stopped(self, reason: StopReason) -> Solution:
+    def _stopped(self) -> Solution | None:
         """Best values so far, where the budget is exhausted."""
+        reason = self.budget.exhausted
+        if reason is None:
+            return None
         return self._solution(
             f"{reason.value}; the best estimate so far",
             interrupted=reason is StopReason.REQUESTED,

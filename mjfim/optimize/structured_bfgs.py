@@ -421,7 +421,20 @@ class StructuredBFGS:
         if before is None or proposed is None:
             return
 
-        self._adapt(before, proposed, moved)
+        # The curvature along the step is tried after a step that was much too long, and given up
+        # after one that was too long in spite of it.
+        square = max(float(np.vdot(proposed.v, proposed.v)), SMALLEST_SQUARE)
+        taken_fraction = float(np.vdot(proposed.v, moved.v)) / square
+        if taken_fraction < MUCH_SHORTENED and before.barrier.curvature is not None:
+            self.is_bent = not self.is_bent
+
+        # The damping falls after a step that was taken, and rises after a shortened one.
+        if taken_fraction > MIN_TAKEN_FRACTION:
+            relative_length = before.barrier.largest_relative_move(proposed) / self.reach
+            factor = float(np.clip(DAMPING_GAIN * relative_length, *LOWER_LIMITS))
+            self.damping = self.damping * factor if self.damping > MIN_DAMPING else 0.0
+        elif before.expansion.slope(proposed) < -SIGNIFICANT_DECREASE:
+            self.damping = RAISE_LIMITS[0] * max(self.damping, MIN_DAMPING)
 
         after = self._local_model(expansion, K)
         s = after.coordinates.coordinate(moved)
@@ -430,28 +443,6 @@ class StructuredBFGS:
 
         y = after.cost_gradient - before.cost_gradient - before.predicted_change(s)
         self._pairs = (*self._pairs, (s, y))[-self.memory :]
-
-    def _adapt(self, before: _LocalModel, proposed: TangentCurve, moved: TangentCurve) -> None:
-        """Lower the damping after a step that was taken, raise it after a shortened one.
-
-        Such a step also changes how the curvature of the barrier is taken.
-        """
-        square = max(float(np.vdot(proposed.v, proposed.v)), SMALLEST_SQUARE)
-        taken_fraction = float(np.vdot(proposed.v, moved.v)) / square
-
-        # The curvature along the step is tried after a step that was much too long, and given up
-        # after one that was too long in spite of it.
-        if taken_fraction < MUCH_SHORTENED and before.barrier.curvature is not None:
-            self.is_bent = not self.is_bent
-
-        if taken_fraction > MIN_TAKEN_FRACTION:
-            relative_length = before.barrier.largest_relative_move(proposed) / self.reach
-            factor = float(np.clip(DAMPING_GAIN * relative_length, *LOWER_LIMITS))
-            self.damping = self.damping * factor if self.damping > MIN_DAMPING else 0.0
-            return
-
-        if before.expansion.slope(proposed) < -SIGNIFICANT_DECREASE:
-            self.damping = RAISE_LIMITS[0] * max(self.damping, MIN_DAMPING)
 
     def reset(self) -> bool:
         """Clear the memory.
