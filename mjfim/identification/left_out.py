@@ -174,27 +174,20 @@ def with_initial_states(
     if problem.unknown_count <= len(problem.shared):
         return problem, at
 
-    # Deviations of the initial state that were fitted belong to other recordings.
-    begin = replace(at, private=problem.begin(problem.parameters.guess).private)
-    known = problem.masked(_masks_for_initial_states(problem, masks))
-    found = minimise(known.with_shared_held(), begin, INITIAL_STATES, budget)
-    return problem, at if found is None else found.unknowns
-
-
-def _masks_for_initial_states(
-    problem: FitProblem, predicted: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """(M, ny) for every recording, True for the values from which initial states are estimated."""
-    masks = [np.zeros_like(mask) for mask in problem.masks]
+    known = [np.zeros_like(mask) for mask in masks]
     for segment in problem.segments:
-        i = segment.recording
-        rows = segment.rows
+        i, rows = segment.recording, segment.rows
         counted = problem.masks[i][rows]
 
         # The predicted values are used only where a segment has no others.
-        others = counted & ~predicted[i][rows]
-        masks[i][rows] = others if others.any() else counted
-    return masks
+        others = counted & ~masks[i][rows]
+        known[i][rows] = others if others.any() else counted
+
+    # Deviations of the initial state that were fitted belong to other recordings.
+    begin = replace(at, private=problem.begin(problem.parameters.guess).private)
+    held = problem.masked(known).with_shared_held()
+    found = minimise(held, begin, INITIAL_STATES, budget)
+    return problem, at if found is None else found.unknowns
 
 
 def fit_without(

@@ -536,9 +536,13 @@ def measured_initial_states(
 
         # Quaternions cannot be averaged componentwise; the nearest one is taken.
         for q, _ in space.quaternions:
-            components = range(q, q + 4)
-            if all(a in output_of for a in components):
-                nearest = _nearest_values(recording, [output_of[a] for a in components], t0)
+            columns = [output_of[a] for a in range(q, q + 4) if a in output_of]
+            if len(columns) == 4:
+                # Components of one quaternion are measured together.
+                row_after = int(np.searchsorted(recording.t, t0))
+                rows = recording.measured_rows_near(columns[0], row_after, 1)
+                row = rows[np.argmin(np.abs(recording.t[rows] - t0))]
+                nearest = recording.y[row, columns]
                 states[k, q : q + 4] = nearest / np.linalg.norm(nearest)
 
     _, qvel, act = space.split(states)
@@ -562,15 +566,6 @@ def _local_fit(
     unit = float(np.abs(times).max()) or 1.0
     coefficients = np.polynomial.polynomial.polyfit(times / unit, y, degree)
     return float(coefficients[0]), float(coefficients[1] / unit)
-
-
-def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: float) -> Array:
-    """Measured values of some outputs in the row nearest to time t0 [s]."""
-    # Components of one quaternion are measured together.
-    row_after = int(np.searchsorted(recording.t, t0))
-    candidates = recording.measured_rows_near(columns[0], row_after, 1)
-    nearest = min(candidates, key=lambda row: abs(recording.t[row] - t0))
-    return recording.y[nearest, list(columns)]
 
 
 def _nominal_states(

@@ -185,9 +185,8 @@ class FitUnknowns:
     @property
     def own_columns(self) -> np.ndarray:
         """(K, e) common columns of the unknowns that belong to each recording."""
-        count = len(self.per_recording)
         columns = np.arange(len(self.shared), self.column_count)
-        return columns.reshape(len(self.recordings), count)
+        return columns.reshape(len(self.recordings), len(self.per_recording))
 
     @property
     def estimated(self) -> np.ndarray:
