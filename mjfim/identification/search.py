@@ -112,22 +112,12 @@ class FitTask:
             initial = experiment.initial.model_copy(update={"free": free})
             experiment = experiment.model_copy(update={"initial": initial})
             system = replace(system, experiment=experiment)
-
-        parameters = system.parameters
-        theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
-        if theta.shape != parameters.guess.shape:
-            raise ExperimentError(
-                f"start: {theta.shape} numbers; expected one per parameter: "
-                f"{listed(parameters.names)}"
-            )
-        if method == "least_squares":
-            theta = np.clip(theta, parameters.lower, parameters.upper)
         return cls(
             system=system,
             recordings=tuple(recordings),
             held_out=tuple(held_out),
             method=method,
-            start=theta,
+            start=_start(system, method, start),
             elsewhere=elsewhere,
         )
 
@@ -218,6 +208,19 @@ def _require_holdable(system: System, names: Sequence[str]) -> None:
 
     if len(set(names)) == len(parameters):
         raise ExperimentError(f"{source}: fit.hold: all parameters are held; leave one out")
+
+
+def _start(system: System, method: Method, start: Array | None) -> Array:
+    """(p,) parameters at which the search starts; the guess where none are given."""
+    parameters = system.parameters
+    theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
+    if theta.shape != parameters.guess.shape:
+        names = listed(parameters.names)
+        raise ExperimentError(f"start: {theta.shape} numbers; expected one per parameter: {names}")
+
+    if method == "least_squares":
+        theta = np.clip(theta, parameters.lower, parameters.upper)
+    return theta
 
 
 # Settings of the paper's Newton-Raphson iteration.

@@ -321,8 +321,7 @@ class Regulator:
         if growth > threshold:
             return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
 
-        N, nx, nu = expansion.B.shape
-        return np.zeros((N, nu, nx))
+        return np.zeros_like(expansion.B.swapaxes(1, 2))
 
 
 def optimize(
