@@ -501,8 +501,9 @@ class FitSearch:
         self, problem: FitProblem, begin: UnknownValues
     ) -> UnknownValues:
         """Unknowns with initial states improved on the first part of each segment alone."""
-        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
-        return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
+        return self.with_initial_states(
+            problem.of_first_parts(INITIAL_STATE_SHARE), begin, INITIAL_STATE_ITERATIONS
+        )
 
     def with_initial_states(
         self,

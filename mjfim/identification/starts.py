@@ -498,13 +498,12 @@ def choose_length(
     lengths, problems, fits = zip(*compared, strict=True)
 
     # Losses of each fit over the segments of each fit.
-    sigma = system.noise.sigma
     blocks, budget = blocks_of(parts), search.budget
     losses = [
         [
             joined_losses(
                 [
-                    losses_of(each, theta, part, blocks, sigma, budget)
+                    losses_of(each, theta, part, blocks, system.noise.sigma, budget)
                     for part, theta in zip(parts, fit[1:], strict=True)
                 ]
             )

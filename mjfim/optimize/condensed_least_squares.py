@@ -261,8 +261,7 @@ class Condensed:
         Those of the private unknowns are root mean squares over the segments.
         """
         n = self.private_count
-        J = self.triangles[:, :, :-1]
-        squares = np.sum(J**2, axis=1)
+        squares = np.sum(self.triangles[:, :, :-1] ** 2, axis=1)
         private = squares[:, :n].mean(axis=0)
 
         common_J = self.common_rows[:, :-1]

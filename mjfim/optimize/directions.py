@@ -39,8 +39,8 @@ def convex_pairs(s: Array, y: Array, tolerance: float) -> list[CurvaturePair]:
     changes = y.reshape(len(y), -1)
     curvatures = np.einsum("pi,pi->p", steps, changes)
     norms = np.linalg.norm(steps, axis=1) * np.linalg.norm(changes, axis=1)
-    is_convex = curvatures > tolerance * norms
-    return [(s[i], y[i], float(curvatures[i])) for i in np.flatnonzero(is_convex)]
+    convex = np.flatnonzero(curvatures > tolerance * norms)
+    return [(s[i], y[i], float(curvatures[i])) for i in convex]
 
 
 def inverse_hessian_product(

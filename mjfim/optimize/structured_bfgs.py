@@ -156,8 +156,7 @@ def basis_matrix(basis: Array, response: Array, weights: Weights) -> Array:
     for u in range(nu):
         control[:, :, u, u] += steps.T @ (weights.W[:, u, None] * steps)
 
-    control_matrix = control.swapaxes(1, 2).reshape(M * nu, M * nu)
-    return np.asarray(0.5 * (H + H.T) + control_matrix)
+    return np.asarray(0.5 * (H + H.T) + control.swapaxes(1, 2).reshape(M * nu, M * nu))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
