@@ -59,15 +59,16 @@ def _measured_sums(system: System, law: ControlLaw, t: Array, inputs: Array, y: 
     unknown = np.zeros((N, len(MEASURED_SUMS)))
     unknown[:, -1] = 1.0
     output = outputs_by_state(system.model, system.outputs).get(law.q)
-    measured = np.isfinite(y[:, output]) if output is not None else np.zeros(len(y), dtype=bool)
-    if output is None or not measured.any():
+    position = np.full(len(y), np.nan) if output is None else y[:, output]
+    measured = np.isfinite(position)
+    if not measured.any():
         return unknown
 
     # Errors at all evaluations of the law in the recording.
     substeps, timestep = system.grid.substeps, float(system.model.opt.timestep)
     steps = np.arange(0, N * substeps, law.tick)
     sample = steps // substeps
-    q = np.interp(steps * timestep, t[measured], y[measured, output])
+    q = np.interp(steps * timestep, t[measured], position[measured])
     reference = inputs[sample, law.columns["reference"]]
     if law.interpolated:
         points = np.arange(N) * substeps
@@ -87,15 +88,7 @@ def _measured_sums(system: System, law: ControlLaw, t: Array, inputs: Array, y: 
     count = -(-(np.arange(N) * substeps) // law.tick)
     since = begun[count]
     place = np.minimum(since, len(steps) - 1)
-    first = since == 0
-    return np.column_stack(
-        [
-            total[count] - total[since],
-            reference[place],
-            q[place],
-            np.where(first, 1.0, 0.0),
-        ]
-    )
+    return np.column_stack([total[count] - total[since], reference[place], q[place], since == 0])
 
 
 # Largest distance from the grid [sample periods] at which a time stamp counts as lying on it.
@@ -197,12 +190,12 @@ def on_grid_of(system: System, recordings: Sequence[Recording]) -> System:
         return system
 
     # Engine steps after which there are rows; their common divisors are possible samples.
+    substeps = 1
     if all(_lie_on_grid(t, timestep) for t in times):
         steps = np.concatenate([np.rint(t / timestep).astype(np.int64) for t in times])
         common = int(np.gcd.reduce(steps))
-        divisors = (k for k in range(min(common, stated), 0, -1) if common % k == 0)
-        return system.with_substeps(next(divisors, 1))
-    return system.with_substeps(1)
+        substeps = max(k for k in range(1, stated + 1) if common % k == 0)
+    return system.with_substeps(substeps)
 
 
 def _lie_on_grid(t: Array, dt: float) -> bool:
@@ -229,7 +222,15 @@ def align(system: System, recording: Recording) -> AlignedRecording:
     dt = system.dt
     t = _times(recording)
     rows = _control(system, recording)
-    y = _outputs(system, recording)
+    names = system.outputs.names
+    if not set(names) & set(recording.outputs):
+        raise RecordingError(
+            f"{recording.name}: no measured column; "
+            f"{unknown('column', listed(recording.outputs), names)}"
+        )
+
+    # An array in the order of the outputs is shared.
+    y = recording.y if recording.outputs == tuple(names) else _in_order(system, recording)
 
     # Time stamps that nearly lie on the grid are moved onto it.
     sample = np.rint(t / dt)
@@ -297,29 +298,13 @@ def _control(system: System, recording: Recording) -> Array:
     return np.asarray(ctrl)
 
 
-def _outputs(system: System, recording: Recording) -> Array:
-    """(M, ny) measured values in the order of the outputs.
-
-    Raises RecordingError where the recording has none of them.
-    """
-    names = system.outputs.names
-    if not set(names) & set(recording.outputs):
-        raise RecordingError(
-            f"{recording.name}: no measured column; "
-            f"{unknown('column', listed(recording.outputs), names)}"
-        )
-
-    # An array in the order of the outputs is shared.
-    return recording.y if recording.outputs == tuple(names) else _in_order(system, recording)
-
-
 def _in_order(system: System, recording: Recording) -> Array:
     """(M, ny) measured values in the order of the outputs, NaN for those without a column."""
     names = system.outputs.names
     y = np.full((len(recording.t), len(names)), np.nan)
-    for name in recording.outputs:
+    for name, column in zip(recording.outputs, recording.y.T, strict=True):
         if name in names:
-            y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
+            y[:, names.index(name)] = column
     return y
 
 
@@ -362,12 +347,10 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     edges = np.arange(N + 1) * dt
 
     # Integral of the control at every row; the last control is held beyond the last edge.
-    integral = np.concatenate(
-        [np.zeros((1, ctrl.shape[1])), np.cumsum(ctrl * np.diff(t)[:, None], axis=0)]
-    )
     extended_t = np.append(t, max(edges[-1], t[-1]) + dt)
-    last_interval = extended_t[-1] - t[-1]
-    integral = np.concatenate([integral, integral[-1:] + ctrl[-1:] * last_interval])
+    held = np.concatenate([ctrl, ctrl[-1:]])
+    integral = np.cumsum(held * np.diff(extended_t)[:, None], axis=0)
+    integral = np.concatenate([np.zeros((1, ctrl.shape[1])), integral])
 
     # Means over the samples are differences of the integral at their edges.
     at_edges = np.column_stack([np.interp(edges, extended_t, column) for column in integral.T])
@@ -378,10 +361,8 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     margin = EDGE_TOLERANCE * dt
     first = np.searchsorted(t, edges[:-1] + margin, side="right") - 1
     last = np.searchsorted(t, edges[1:] - margin, side="left") - 1
-    first = np.clip(first, 0, len(ctrl) - 1)
-    last = np.clip(last, 0, len(ctrl) - 1)
-    constant = first == last
-    return np.where(constant[:, None], ctrl[first], mean)
+    first, last = np.clip([first, last], 0, len(ctrl) - 1)
+    return np.where((first == last)[:, None], ctrl[first], mean)
 
 
 def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array:
@@ -418,18 +399,13 @@ def _quaternion_outputs(system: System) -> list[list[int]]:
     model = system.model
     kinds = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
 
-    found = []
-    for q, _ in system.space.quaternions:
-        addresses = range(q, q + 4)
-        found.append([i for i, output in enumerate(outputs) if output.state in addresses])
-
-    for sensor in range(model.nsensor):
-        if int(model.sensor_type[sensor]) not in kinds:
-            continue
-        first = int(model.sensor_adr[sensor])
-        addresses = range(first, first + 4)
-        found.append([i for i, output in enumerate(outputs) if output.sensor in addresses])
-
+    states = [q for q, _ in system.space.quaternions]
+    sensors = model.sensor_adr[np.isin(model.sensor_type, kinds)].tolist()
+    found = [[i for i, each in enumerate(outputs) if each.state in range(q, q + 4)] for q in states]
+    found += [
+        [i for i, each in enumerate(outputs) if each.sensor in range(first, first + 4)]
+        for first in sensors
+    ]
     return [columns for columns in found if len(columns) == 4]
 
 

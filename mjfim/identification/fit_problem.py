@@ -7,10 +7,11 @@ linearised rows are condensed block by block.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise, zip_longest
-from typing import Protocol, TypeVar
+from itertools import pairwise
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align, on_grid_of
 from mjfim.identification.segment_simulation import (
+    DivergedSegmentError,
     SegmentBatch,
     SegmentRows,
     SegmentSimulation,
@@ -38,29 +40,16 @@ from mjfim.plant.outputs import Noise
 from mjfim.plant.plant import SENSITIVITY_STEP
 from mjfim.records.trajectory import Recording
 
+if TYPE_CHECKING:
+    from mjfim.identification.fit_workers import FitWorkers
+
 T = TypeVar("T")
 
-# Work on one batch of a problem, at values of the unknowns.
-BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T | None]
+# Work on one batch of a problem, at values of the unknowns. It raises `DivergedSegmentError`.
+BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T]
 
 # A task on a whole problem, which ends early when the budget is exhausted.
 ProblemWork = Callable[["FitProblem", Budget], T]
-
-
-class ProblemWorkers(Protocol):
-    """Workers that do tasks on a problem."""
-
-    @property
-    def count(self) -> int:
-        """Number of workers."""
-
-    def of_batches(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> Sequence[T]:
-        """Do works that are one pass over the data."""
-
-    def of_whole(
-        self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
-    ) -> Iterator[T]:
-        """Do works that do not depend on each other, each of them in one worker."""
 
 
 # Number of stated samples of the longest recording along which difference steps are calibrated.
@@ -84,7 +73,7 @@ class FitProblem(SegmentSimulation):
     masks: tuple[np.ndarray, ...]
     noise: Noise
     loss: RobustLoss
-    workers: ProblemWorkers | None = None
+    workers: FitWorkers | None = None
 
     @classmethod
     def of(
@@ -158,7 +147,7 @@ class FitProblem(SegmentSimulation):
 
     # ---- variants
 
-    def on_workers(self, workers: ProblemWorkers) -> FitProblem:
+    def on_workers(self, workers: FitWorkers) -> FitProblem:
         """This problem, the batches of which are simulated by workers.
 
         Args:
@@ -222,11 +211,11 @@ class FitProblem(SegmentSimulation):
         Returns:
             The problem, with as many segments.
         """
-        segments = []
-        for segment in self.segments:
-            recording = self.recordings[segment.recording]
-            segments.append(segment.first_part(recording.t, recording.dt, share))
-        return replace(self, segments=tuple(segments))
+        segments = tuple(
+            segment.first_part(self.recordings[segment.recording], share)
+            for segment in self.segments
+        )
+        return replace(self, segments=segments)
 
     def cut(self, length: float | None) -> FitProblem | None:
         """This problem over segments of a length [s] with free initial states.
@@ -251,7 +240,6 @@ class FitProblem(SegmentSimulation):
             segments=segments,
             shared=np.flatnonzero(~parameters.recording_specific & ~is_held),
             free_starts=True,
-            bounded=True,
             start_directions=directions,
             masks=tuple(np.array(recording.measured) for recording in self.recordings),
             pins=self.pins[:0],
@@ -284,12 +272,9 @@ class FitProblem(SegmentSimulation):
     @property
     def segments_with_values(self) -> np.ndarray:
         """Indices of the segments that contain a measured value that counts."""
-        indices = [
-            i
-            for i, segment in enumerate(self.segments)
-            if self.masks[segment.recording][segment.rows].any()
-        ]
-        return np.array(indices, dtype=np.intp)
+        return np.flatnonzero(
+            [self.masks[segment.recording][segment.rows].any() for segment in self.segments]
+        )
 
     @property
     def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:
@@ -314,7 +299,7 @@ class FitProblem(SegmentSimulation):
             if found is None:
                 return None
             for part in found:
-                outputs[self.segments[part.segment].recording][part.rows] = part.y
+                outputs[part.recording][part.rows] = part.y
         return outputs
 
     def errors_at(self, at: UnknownValues) -> list[Array] | None:
@@ -388,33 +373,15 @@ class FitProblem(SegmentSimulation):
             common_rows=self.common_rows(at),
         )
 
-    def outputs_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[SegmentRows] | None:
-        """Predicted outputs of a batch.
+    def outputs_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[SegmentRows]:
+        """Predicted outputs of the rows of a batch."""
+        return list(self.rows_of_batch(at, batch))
 
-        Args:
-            at: The unknowns.
-            batch: The batch.
+    def losses_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[float]:
+        """Losses of the rows of a batch, which the cost adds in this order."""
+        return [self.loss.value(self.residual(rows)) for rows in self.rows_of_batch(at, batch)]
 
-        Returns:
-            The rows of its segments; None where a simulation diverges.
-        """
-        predicted = []
-        for rows in self.rows_of_batch(at, batch):
-            if rows is None:
-                return None
-            predicted.append(rows)
-        return predicted
-
-    def losses_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[float] | None:
-        """Losses of the rows of a batch, which the cost adds in this order; None as above."""
-        losses = []
-        for rows in self.rows_of_batch(at, batch):
-            if rows is None:
-                return None
-            losses.append(self.loss.value(self.residual(rows)))
-        return losses
-
-    def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array] | None:
+    def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array]:
         """Condensed blocks of a batch, all of whose rows are in it.
 
         Args:
@@ -422,21 +389,21 @@ class FitProblem(SegmentSimulation):
             batch: The batch, with derivatives.
 
         Returns:
-            (m, m) triangle of each block by its index; None where a perturbed simulation diverges.
+            (m, m) triangle of each block by its index.
+
+        Raises:
+            DivergedSegmentError: A perturbed simulation diverges.
         """
         m = self.private_count + self.column_count + 1
         empty = np.zeros((m, m))
         blocks: dict[int, Array] = {}
         for rows in self.rows_of_batch(at, batch):
-            if rows is None:
-                return None
-
             # The weights are those of iteratively reweighted least squares.
             place, r, J = self.linearised(rows)
             weighted = np.column_stack([J, r]) * self.loss.weight(r)[:, None]
 
             # Values are added to the triangle of the block of their row.
-            block = self.blocks_of(rows)[place]
+            block = self.blocks_of_rows(rows.segment, rows.rows)[place]
             edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
             for first, last in pairwise(edges):
                 index = int(block[first])
@@ -446,12 +413,12 @@ class FitProblem(SegmentSimulation):
 
     def mask_of(self, rows: SegmentRows) -> np.ndarray:
         """(k, ny) True for the values of k rows that count."""
-        return np.asarray(self.masks[self.segments[rows.segment].recording][rows.rows])
+        return np.asarray(self.masks[rows.recording][rows.rows])
 
     def residual(self, rows: SegmentRows) -> Array:
         """(n,) whitened residuals of the values of some rows that count [standard deviations]."""
         mask = self.mask_of(rows)
-        measured = self.recordings[self.segments[rows.segment].recording].y[rows.rows]
+        measured = self.recordings[rows.recording].y[rows.rows]
 
         # Values that do not count may be NaN.
         return self.noise.whiten_present(np.where(mask, rows.y - measured, 0.0), mask)
@@ -465,25 +432,25 @@ class FitProblem(SegmentSimulation):
         """
         mask = self.mask_of(rows)
         common, private = rows.jacobians
-        columns = self.to_columns(common, self.segments[rows.segment].recording)
+        columns = self.to_columns(common, rows.recording)
         J = self.noise.whiten_present(np.concatenate([private, columns], axis=2), mask)
         return np.nonzero(mask)[0], self.residual(rows), J
 
     def of_batches(
         self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues
     ) -> Iterator[T | None]:
-        """Results of a work on batches, in the order of the batches.
+        """Results of a work on batches, in their order; None where a simulation diverges.
 
         Args:
             work: Function of the problem, the unknowns and a batch, such as `blocks_of_batch`.
             batches: The batches.
             at: The unknowns.
         """
+        works = (partial(_work_on_batch, work=work, at=at, batch=batch) for batch in batches)
         if self.workers is None:
-            yield from (work(self, at, batch) for batch in batches)
-            return
-        works = [partial(_work_on_batch, work=work, at=at, batch=batch) for batch in batches]
-        yield from self.workers.of_batches(self, works)
+            yield from (each(self, Budget()) for each in works)
+        else:
+            yield from self.workers.of_batches(self, list(works))
 
     def of_whole(self, works: Sequence[ProblemWork[T]], budget: Budget) -> Iterator[T]:
         """Results of independent works, in this process or by a worker each.
@@ -509,8 +476,10 @@ def _work_on_batch(
     at: UnknownValues,
     batch: SegmentBatch,
 ) -> T | None:
-    """A work on one batch as a task on the whole problem."""
-    return work(problem, at, batch)
+    """A work on one batch as a task on the whole problem; None where a simulation diverges."""
+    with suppress(DivergedSegmentError):
+        return work(problem, at, batch)
+    return None
 
 
 def have_same_initial_states(problem: FitProblem, other: FitProblem) -> bool:
@@ -556,9 +525,8 @@ def sensitivity_rows(
     if wanted is None:
         wanted = np.ones(len(problem.parameters), dtype=bool)
     work: BatchWork[dict[int, Array]] = partial(_of_batch, with_error=with_error)
-    batches = list(
-        problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)
-    )
+    accurate = replace(problem, central=with_error, difference_step=SENSITIVITY_STEP)
+    batches = list(accurate.batches(derivatives=True, wanted=wanted))
     condensed: dict[int, Array] = {}
     for batch, of_batch in zip(batches, problem.of_batches(work, batches, at), strict=True):
         if of_batch is None:
@@ -573,28 +541,23 @@ def sensitivity_rows(
     found = []
     for segment in sorted(condensed):
         J, change = np.split(condensed[segment], 2, axis=1)
-        by_theta = J[:, n:]
-        change_by_theta = change[:, n:]
 
         # A free initial state explains everything in the span of its derivatives.
         Q = np.linalg.qr(J[:, :n])[0]
-        remaining = by_theta - Q @ (Q.T @ by_theta)
-        remaining_change = change_by_theta - Q @ (Q.T @ change_by_theta)
-        found.append((remaining, remaining_change))
+        by_theta, its_change = (rows[:, n:] - Q @ (Q.T @ rows[:, n:]) for rows in (J, change))
+        found.append((by_theta, its_change))
     return found
 
 
 def _of_batch(
     problem: FitProblem, at: UnknownValues, batch: SegmentBatch, *, with_error: bool
-) -> dict[int, Array] | None:
+) -> dict[int, Array]:
     """Condense the whitened sensitivity of a batch, and its change with a longer step.
 
     Returns:
-        (k, 2 (n+p)) triangle of each segment by its index; None where a perturbed simulation
-        diverges. Changes are zero without an error.
+        (k, 2 (n+p)) triangle of each segment by its index. Changes are zero without an error.
     """
-    fine = problem.rows_of_batch(at, batch)
-    coarse: Iterator[SegmentRows | None] = iter(())
+    coarse: Iterator[SegmentRows] = iter(())
     if with_error:
         coarse = problem.rows_of_batch(at, replace(batch, step=COARSER_STEP_FACTOR * batch.step))
 
@@ -606,15 +569,12 @@ def _of_batch(
         return problem.noise.whiten_present(G, problem.mask_of(rows))
 
     condensed: dict[int, Array] = {}
-    for rows, coarse_rows in zip_longest(fine, coarse):
-        if rows is None:
-            return None
-
+    for rows in problem.rows_of_batch(at, batch):
         # Without a simulation with the longer step, the change is unknown.
         J = sensitivity(rows)
         change = np.zeros_like(J)
-        if coarse_rows is not None:
-            change = sensitivity(coarse_rows) - J
+        with suppress(StopIteration, DivergedSegmentError):
+            change = sensitivity(next(coarse)) - J
 
         both = np.concatenate([J, change], axis=1)
         earlier = condensed.get(rows.segment, both[:0])

@@ -11,9 +11,10 @@ import shutil
 import tempfile
 import uuid
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
@@ -82,10 +83,10 @@ def _made(
     require_values([system, *recordings])
     found = []
     for recording, folder in (each.value for each in recordings):
-        arrays: dict[str, Any] = {}
-        for name in () if folder is None else ARRAYS:
-            loaded = np.load(f"{folder}/{name}.npy", mmap_mode=MAP_MODE, allow_pickle=False)
-            arrays[name] = loaded.view(np.ndarray)
+        arrays: dict[str, Any] = {
+            name: np.load(f"{folder}/{name}.npy", MAP_MODE, allow_pickle=False).view(np.ndarray)
+            for name in (ARRAYS if folder else ())
+        }
         found.append(replace(recording, **arrays) if arrays else recording)
     made = _systems.get(system.digest, lambda: system.value.system())
     return _with_parts(problem, made, tuple(found))
@@ -108,14 +109,10 @@ class FitWorkers:
     def __init__(self, executor: ExecutorLike) -> None:
         self._executor = Workers.of(executor)
 
-        # Variants of a problem share systems and recordings, which are sent once.
-        self._problems: weakref.WeakKeyDictionary[
-            FitProblem, dict[int, SharedValue[_SharedProblem]]
-        ]
-        self._problems = weakref.WeakKeyDictionary()
-        self._systems: dict[tuple[System, int], SharedValue[SystemOrder]] = {}
-        self._recordings: dict[AlignedRecording, SharedValue[_SharedRecording]] = {}
-        self._folder: Path | None = None
+        # Values of problems, systems and recordings by the number of threads. Variants of a problem
+        # share systems and recordings.
+        self._known: weakref.WeakKeyDictionary[Any, dict[int, SharedValue[Any]]]
+        self._known = weakref.WeakKeyDictionary()
 
     @property
     def count(self) -> int:
@@ -131,11 +128,12 @@ class FitWorkers:
         if len(works) < 2:
             return [work(problem, Budget()) for work in works]
         orders = self._orders(problem, works)
-        found: dict[int, T] = {}
         budget = Budget(stop=StopToken(also=hurried))
-        for outcome in carry_out(self._executor, _carry_out, orders, budget):
-            if not outcome.is_lost:
-                found[outcome.index] = self._counted(problem, outcome.result)
+        found = {
+            outcome.index: self._counted(problem, outcome.result)
+            for outcome in carry_out(self._executor, _carry_out, orders, budget)
+            if not outcome.is_lost
+        }
         alone = replace(problem, workers=None)
         return [
             found[index] if index in found else work(alone, Budget())
@@ -173,42 +171,46 @@ class FitWorkers:
 
     def _shared(self, problem: FitProblem, threads: int) -> SharedValue[_SharedProblem]:
         """A problem as workers with some number of threads receive it."""
-        known = self._problems.setdefault(problem, {})
-        if threads not in known:
-            key = (problem.system, threads)
-            if key not in self._systems:
-                order = SystemOrder.of(problem.system, threads)
-                self._systems[key] = SharedValue(uuid.uuid4().hex, order)
-            recordings = tuple(self._shared_recording(each) for each in problem.recordings)
-            parts = (_with_parts(problem, None, ()), self._systems[key], recordings)
+
+        def parts() -> tuple[_SharedProblem, int]:
+            """The problem in parts, and the size of what only this variant has."""
+            made = problem.system
+            system = self._once(made, threads, lambda: (SystemOrder.of(made, threads), 0))
+            recordings = tuple(
+                self._once(each, 0, partial(self._sent, each)) for each in problem.recordings
+            )
             size = sum(mask.nbytes for mask in problem.masks)
-            known[threads] = SharedValue(uuid.uuid4().hex, parts, size)
+            return (_with_parts(problem, None, ()), system, recordings), size
+
+        return self._once(problem, threads, parts)
+
+    def _once(self, key: Any, threads: int, make: Callable[[], tuple[T, int]]) -> SharedValue[T]:
+        """The value of an object for workers with some number of threads, which is sent once.
+
+        Args:
+            key: The object.
+            threads: The number of threads.
+            make: Returns the value and its size [bytes].
+        """
+        known = self._known.setdefault(key, {})
+        if threads not in known:
+            known[threads] = SharedValue(uuid.uuid4().hex, *make())
         return known[threads]
 
-    def _shared_recording(self, recording: AlignedRecording) -> SharedValue[_SharedRecording]:
-        """A recording, which workers of this computer find as files where it is large.
+    def _sent(self, recording: AlignedRecording) -> tuple[_SharedRecording, int]:
+        """What is sent of a recording, and its size; a large one is a file on this computer.
 
         The files are removed with this object.
         """
-        if recording not in self._recordings:
-            is_file = self._executor.is_local and not self._executor.shares_memory
-            folder = None
-            if is_file and recording.size > MIN_FILE_BYTES:
-                # Without room on the disk, the recording is sent.
-                with suppress(OSError):
-                    if self._folder is None:
-                        self._folder = Path(tempfile.mkdtemp(prefix="mjfim-recordings-"))
-                        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
-                    written = self._folder / str(len(self._recordings))
-                    written.mkdir()
-                    for name in ARRAYS:
-                        array = getattr(recording, name)
-                        np.save(written / f"{name}.npy", array, allow_pickle=False)
-                    folder = written
-            rest, size = recording, recording.size
-            if folder is not None:
+        is_file = self._executor.is_local and not self._executor.shares_memory
+        if is_file and recording.size > MIN_FILE_BYTES:
+            # Without room on the disk, the recording is sent.
+            with suppress(OSError):
+                folder = Path(tempfile.mkdtemp(prefix="mjfim-recordings-"))
+                weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+                for name in ARRAYS:
+                    array = getattr(recording, name)
+                    np.save(folder / f"{name}.npy", array, allow_pickle=False)
                 nothing = np.zeros(0)
-                rest = replace(recording, t=nothing, y=nothing, ctrl=nothing)
-                size = 0
-            self._recordings[recording] = SharedValue(uuid.uuid4().hex, (rest, folder), size)
-        return self._recordings[recording]
+                return (replace(recording, t=nothing, y=nothing, ctrl=nothing), folder), 0
+        return (recording, None), recording.size

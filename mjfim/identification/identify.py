@@ -485,8 +485,7 @@ def least_squares(
     Raises:
         SimulationDivergedError: The simulation diverges at the start.
     """
-    settings = SearchSettings() if settings is None else settings
-    found = minimise(problem, problem.begin(start), settings, budget)
+    found = minimise(problem, problem.begin(start), settings or SearchSettings(), budget)
     if found is None:
         raise SimulationDivergedError("the simulation diverges at the start of the fit")
     return found

@@ -21,6 +21,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import jackknife_std
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
+from mjfim.identification.search import of_subset
 from mjfim.optimize.levenberg_marquardt import (
     WEAK_DAMPING,
     SearchSettings,
@@ -152,10 +153,9 @@ def affordable_part(problem: FitProblem, solution: Solution) -> tuple[FitProblem
 
     wanted = max(MAX_SAMPLES * count // problem.sample_count, 2)
     subset = evenly_spread_indices(count, wanted)
-    unknowns = solution.unknowns
     part = replace(
         solution,
-        unknowns=replace(unknowns, private=unknowns.private[subset]),
+        unknowns=of_subset(solution.unknowns, subset),
         condensed=solution.condensed.of_segments(subset),
     )
     return problem.of_segments(subset), part
@@ -174,32 +174,20 @@ def with_initial_states(
     if problem.unknown_count <= len(problem.shared):
         return problem, at
 
-    # Deviations of the initial state that were fitted belong to other recordings.
-    private = np.zeros_like(at.private)
-    if not problem.free_starts:
-        guess = problem.parameters.guess[problem.private]
-        private = np.tile(guess, (len(problem.segments), 1))
-
-    known = problem.masked(_masks_for_initial_states(problem, masks))
-    begin = replace(at, private=private)
-    found = minimise(known.with_shared_held(), begin, INITIAL_STATES, budget)
-    return problem, at if found is None else found.unknowns
-
-
-def _masks_for_initial_states(
-    problem: FitProblem, predicted: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """(M, ny) for every recording, True for the values from which initial states are estimated."""
-    masks = [np.zeros_like(mask) for mask in problem.masks]
+    known = [np.zeros_like(mask) for mask in masks]
     for segment in problem.segments:
-        i = segment.recording
-        rows = segment.rows
+        i, rows = segment.recording, segment.rows
         counted = problem.masks[i][rows]
 
         # The predicted values are used only where a segment has no others.
-        others = counted & ~predicted[i][rows]
-        masks[i][rows] = others if others.any() else counted
-    return masks
+        others = counted & ~masks[i][rows]
+        known[i][rows] = others if others.any() else counted
+
+    # Deviations of the initial state that were fitted belong to other recordings.
+    begin = replace(at, private=problem.begin(problem.parameters.guess).private)
+    held = problem.masked(known).with_shared_held()
+    found = minimise(held, begin, INITIAL_STATES, budget)
+    return problem, at if found is None else found.unknowns
 
 
 def fit_without(
@@ -224,14 +212,11 @@ def fit_without(
         return None
     others = others.of_segments(segments)
 
-    def own(at: UnknownValues) -> UnknownValues:
-        """The unknowns of the segments with other data."""
-        return replace(at, private=at.private[segments])
-
     # A step is the fit if it lowers the cost nearly as far as the linearisation predicts.
     at, condensed = solution.unknowns, solution.condensed
-    cost = others.cost(own(at))
-    starts = [(cost, own(at))]
+    begin = of_subset(at, segments)
+    cost = others.cost(begin)
+    starts = [(cost, begin)]
     remaining = condensed.without_blocks(problem.blocks_containing(masks))
     values = problem.common_values(at)
     lower, upper = problem.lower - values, problem.upper - values
@@ -242,11 +227,12 @@ def fit_without(
         if step.predicted_decrease < ENOUGH_SHARE * first:
             break
         moved = problem.moved(at, step, 1.0)
-        cost_at_end = others.cost(own(moved))
+        end = of_subset(moved, segments)
+        cost_at_end = others.cost(end)
         missed = cost_at_end - (cost - step.predicted_decrease)
         if missed <= max(ALLOWED_SHARE * step.predicted_decrease, SEARCH.rough_share * cost):
             return None if budget.exhausted is not None else moved
-        starts.append((cost_at_end, own(moved)))
+        starts.append((cost_at_end, end))
 
     # The data that are left out may have led the estimate to a minimum that the others lack.
     guess = others.begin(problem.parameters.guess)
@@ -309,9 +295,9 @@ class HeldOutLosses:
         # Blocks of one recording are alike where something differs from recording to recording, so
         # that the scatter between the parts counts as well.
         difference = self.losses - other.losses
-        n_parts = int(self.parts.max()) + 1
-        by_part = np.bincount(self.parts, difference, n_parts).astype(float)
-        counts_by_part = np.bincount(self.parts, self.counts, n_parts).astype(float)
+        by_part, counts_by_part = (
+            np.bincount(self.parts, each).astype(float) for each in (difference, self.counts)
+        )
         standard_error = max(
             _standard_error(difference, self.counts), _standard_error(by_part, counts_by_part)
         )
@@ -399,13 +385,11 @@ def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
     # Stretches begin with a segment where there are enough of them, because a segment whose initial
     # state is free is then predicted as a whole. Otherwise they have equal numbers of rows.
     recording = problem.recordings[0]
-    rows = np.array([segment.rows.start for segment in problem.segments])
+    rows, least = np.array([each.rows.start for each in problem.segments]), MIN_SEGMENTS_PER_PART
     if len(rows) < MIN_SEGMENTS_PER_PART * MIN_STRETCHES:
-        rows = np.flatnonzero(problem.masks[0].any(axis=1))
-        groups = min(MAX_FOLDS, len(rows))
-    else:
-        groups = min(MAX_FOLDS, len(rows) // MIN_SEGMENTS_PER_PART)
-    times = [float(recording.t[group[0]]) for group in np.array_split(rows, groups)]
+        rows, least = np.flatnonzero(problem.masks[0].any(axis=1)), 1
+    groups = np.array_split(rows, min(MAX_FOLDS, len(rows) // least))
+    times = [float(recording.t[group[0]]) for group in groups]
     return stretches_of(recording.name, 0, times)
 
 
@@ -559,18 +543,11 @@ def _predict_held_out(held_out: FitProblem, theta: Array, budget: Budget) -> Ite
         if budget.exhausted is not None:
             return
         begin_stage("predicting held-out recordings", i, len(held_out.recordings))
-        name = held_out.recordings[i].name
-        masks = masks_of(held_out.masks, [i])
-        errors, outputs = _predicted(held_out, theta, masks, name, budget)
-        guess = held_out.system.parameters.guess
-        nominal_errors, nominal_outputs = _predicted(held_out, guess, masks, name, budget)
-        yield Prediction(
-            name=name,
-            identified=errors,
-            nominal=nominal_errors,
-            held_out=True,
-            identified_outputs=outputs[i],
-            nominal_outputs=nominal_outputs[i],
+        name, masks = held_out.recordings[i].name, masks_of(held_out.masks, [i])
+        prediction, outputs = _prediction(held_out, theta, masks, name, budget)
+        identified, nominal = (each[i] for each in outputs)
+        yield replace(
+            prediction, held_out=True, identified_outputs=identified, nominal_outputs=nominal
         )
 
 
@@ -607,13 +584,21 @@ def _prediction_by_others(
     others = fit_without(problem, budget, solution=solution, part=part)
     if others is None:
         return None
-    guess, masks = problem.parameters.guess, part.masks(problem)
-    return Prediction(
-        name=part.name,
-        identified=_predicted(problem, others.theta, masks, part.name, budget)[0],
-        nominal=_predicted(problem, guess, masks, part.name, budget)[0],
-        held_out=False,
-    )
+    return _prediction(problem, others.theta, part.masks(problem), part.name, budget)[0]
+
+
+def _prediction(
+    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget
+) -> tuple[Prediction, tuple[list[Array], list[Array]]]:
+    """The prediction of the values in some masks, and the outputs of both models; see `_predicted`.
+
+    The models are those at theta: (p,) and at the guess.
+    """
+    errors, outputs = _predicted(problem, theta, masks, name, budget)
+    guess = problem.parameters.guess
+    nominal, nominal_outputs = _predicted(problem, guess, masks, name, budget)
+    prediction = Prediction(name=name, identified=errors, nominal=nominal, held_out=False)
+    return prediction, (outputs, nominal_outputs)
 
 
 def _predicted(

@@ -44,7 +44,6 @@ class UnknownBody:
     """A body whose whole inertia is unknown.
 
     Attributes:
-        body: Number of the body.
         columns: (10,) indices in theta of its coordinates, in their order.
         is_logcholesky: True for log-Cholesky, False for barycentric coordinates.
         reference: (10,) log-Cholesky coordinates of the inertia in the model.
@@ -54,7 +53,6 @@ class UnknownBody:
             where the model's inertia is no prior knowledge.
     """
 
-    body: int
     columns: np.ndarray
     is_logcholesky: bool
     reference: Array
@@ -187,7 +185,6 @@ def unknown_bodies(parameters: ParameterSet) -> tuple[UnknownBody, ...]:
         order = np.array([places[i] for i in range(COUNT)], dtype=np.intp)
         found.append(
             UnknownBody(
-                body=body,
                 columns=order,
                 is_logcholesky=kind == "logcholesky",
                 reference=reference,
@@ -314,8 +311,8 @@ class CadPrior:
     @property
     def columns(self) -> np.ndarray:
         """Indices in theta of all coordinates with such a prior, ascending."""
-        places = [body.columns for body in self.bodies]
-        return np.sort(np.concatenate([np.zeros(0, dtype=np.intp), *places]))
+        places = np.array([body.columns for body in self.bodies], dtype=np.intp)
+        return np.sort(places.ravel())
 
     def of_bodies(self, is_wanted: np.ndarray) -> CadPrior:
         """The priors on the bodies whose coordinates are wanted.

@@ -501,8 +501,9 @@ class FitSearch:
         self, problem: FitProblem, begin: UnknownValues
     ) -> UnknownValues:
         """Unknowns with initial states improved on the first part of each segment alone."""
-        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
-        return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
+        return self.with_initial_states(
+            problem.of_first_parts(INITIAL_STATE_SHARE), begin, INITIAL_STATE_ITERATIONS
+        )
 
     def with_initial_states(
         self,
@@ -603,8 +604,9 @@ class FitSearch:
         searched = []
         for number, solution in enumerate(problem.of_whole(works, self.budget), start=1):
             begin_stage("searching from random starts", number, len(works))
-            searched.append(solution)
-        return [solution for solution in searched if solution is not None]
+            if solution is not None:
+                searched.append(solution)
+        return searched
 
     def _residual_sigma(self, problem: FitProblem, at: UnknownValues) -> Array:
         """(ny,) standard deviations of the residuals [y-unit]; a robust loss ignores outliers.

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.errors import SimulationDivergedError
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.segments import batches
 from mjfim.identification.unknowns import FitUnknowns
@@ -41,19 +42,25 @@ MIN_BLOCK_ROWS = 8
 MAX_BLOCKS = 1024
 
 
+class DivergedSegmentError(SimulationDivergedError):
+    """A simulation of segments diverges, so that a batch has no result."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentRows:
     """Predictions of k rows of one segment.
 
     Attributes:
         segment: Index of the segment.
-        rows: (k,) rows of its recording.
+        recording: Index of its recording.
+        rows: (k,) rows of the recording.
         y: (k, ny) predicted outputs [y-unit].
         jacobians: (k, ny, p) derivatives by theta [y-unit / theta-unit], and (k, ny, n) derivatives
             by the private unknowns; none if not requested.
     """
 
     segment: int
+    recording: int
     rows: np.ndarray
     y: Array
     jacobians: tuple[Array, ...]
@@ -148,10 +155,7 @@ class SegmentSimulation(FitUnknowns):
 
         # Samples without a segment get the first known state.
         gap = np.isnan(states[:, 0])
-        if gap.all():
-            states[:] = plant.nominal_initial_state
-        elif gap.any():
-            states[gap] = states[np.flatnonzero(~gap)[0]]
+        states[gap] = plant.nominal_initial_state if gap.all() else states[np.argmin(gap)]
         return replace(plant.trajectory(states, ctrl[:, :0]), ctrl=ctrl)
 
     def clipped_shares(self, at: UnknownValues) -> dict[str, float]:
@@ -180,16 +184,13 @@ class SegmentSimulation(FitUnknowns):
         plant, segment = self.system.plant, self.segments[index]
         theta = self.theta_of_recording(at, segment.recording)
         start = self._initial_state(at, index)[None]
-        if plant.laws is None:
-            return plant.simulator.rollout(
-                [plant.model(theta)], start, self._control(index, samples, 0)[None]
-            )
-
         lead = plant.lead(theta)
         inputs = self._control(index, samples, lead)[None]
-        first = np.array([segment.begin - lead])
-        place = slice(lead, lead + samples)
-        context = InputContext.of_interval(inputs, first, place, lead, None)
+        context = None
+        if plant.laws is not None:
+            first = np.array([segment.begin - lead])
+            place = slice(lead, lead + samples)
+            context = InputContext.of_interval(inputs, first, place, lead, None)
         return plant.simulator.rollout(
             [plant.model(theta)], start, inputs[:, lead:], context=context
         )
@@ -198,17 +199,12 @@ class SegmentSimulation(FitUnknowns):
         self,
         *,
         derivatives: bool,
-        central: bool | None = None,
-        step: float | None = None,
         wanted: np.ndarray | None = None,
     ) -> Iterator[SegmentBatch]:
         """Divide all segments into batches that fit into memory; every segment is in one of them.
 
         Args:
             derivatives: Whether to compute derivatives.
-            central: True for two-sided differences; default: as this simulation states, and
-                two-sided unless there is much data where it does not.
-            step: Relative step of two-sided differences; default: the stated one.
             wanted: (p,) True for the parameters by which to differentiate; default: those that have
                 common columns.
 
@@ -220,32 +216,35 @@ class SegmentSimulation(FitUnknowns):
 
         # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
-        central = self.central if central is None else central
+        central, step = self.central, self.difference_step
         if central is None:
             central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
-        step = self.difference_step if step is None else step
         if not central:
             step = ONE_SIDED_STEP_FACTOR * step
 
-        simulations = 1
-        if derivatives:
-            simulations += directions * (2 if central else 1)
+        simulations = 1 + derivatives * directions * (1 + central)
 
         # The states of a batch have to fit into memory.
         numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
         most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
         max_samples = max(most // (simulations * self.system.grid.substeps), 1)
-        for recording, segments in self._batches(max_samples):
-            yield SegmentBatch(
-                recording=recording,
-                segments=tuple(segments),
-                derivatives=derivatives,
-                central=central,
-                step=step,
-                wanted=wanted,
-            )
 
-    def rows_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> Iterator[SegmentRows | None]:
+        # Without parameters of single recordings, a batch may contain segments of all recordings.
+        groups = [list(range(len(self.segments)))]
+        if len(self.per_recording):
+            groups = [self.segments_of(recording) for recording in range(len(self.recordings))]
+        for recording, indices in enumerate(groups):
+            for places in batches([self.segments[i] for i in indices], max_samples):
+                yield SegmentBatch(
+                    recording=recording,
+                    segments=tuple(indices[k] for k in places),
+                    derivatives=derivatives,
+                    central=central,
+                    step=step,
+                    wanted=wanted,
+                )
+
+    def rows_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> Iterator[SegmentRows]:
         """Simulate a batch over one interval of time after the other.
 
         Args:
@@ -253,8 +252,10 @@ class SegmentSimulation(FitUnknowns):
             batch: The batch.
 
         Yields:
-            Predictions of some rows of one segment. Where a simulation diverges, None is the last
-            item.
+            Predictions of some rows of one segment.
+
+        Raises:
+            DivergedSegmentError: A simulation diverges.
         """
         theta = self.theta_of_recording(at, batch.recording)
         longest = max(self.segments[i].samples for i in batch.segments)
@@ -273,33 +274,9 @@ class SegmentSimulation(FitUnknowns):
         )
         for response in responses:
             if response is None:
-                yield None
-                return
+                raise DivergedSegmentError
             for place, i in enumerate(batch.segments):
-                found = self._rows_of_segment(theta, i, place, response)
-                if found is not None:
-                    yield found
-
-    def _batches(self, max_samples: int) -> Iterator[tuple[int, list[int]]]:
-        """Segments that are simulated together.
-
-        Args:
-            max_samples: Largest number of samples of a batch.
-
-        Yields:
-            Index of a recording whose parameters the segments have, and indices of the segments.
-        """
-        # Without parameters of single recordings, a batch may contain segments of all recordings.
-        if not len(self.per_recording):
-            for batch in batches(self.segments, max_samples):
-                yield 0, batch
-            return
-
-        for recording in range(len(self.recordings)):
-            indices = self.segments_of(recording)
-            segments = [self.segments[i] for i in indices]
-            for batch in batches(segments, max_samples):
-                yield recording, [indices[k] for k in batch]
+                yield from self._rows_of_segment(theta, i, place, response)
 
     def _initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""
@@ -320,17 +297,13 @@ class SegmentSimulation(FitUnknowns):
         """
         segment = self.segments[index]
         recorded = self.recordings[segment.recording].ctrl
-        first, end = segment.begin - lead, segment.begin + samples
-        ctrl = recorded[max(first, 0) : end]
-
-        before = np.repeat(ctrl[:1], max(-first, 0), axis=0)
-        after = np.repeat(ctrl[-1:], lead + samples - len(before) - len(ctrl), axis=0)
-        return np.concatenate([before, ctrl, after])
+        places = np.arange(segment.begin - lead, segment.begin + samples)
+        return recorded[np.clip(places, 0, len(recorded) - 1)]
 
     def _rows_of_segment(
         self, theta: Array, index: int, place: int, response: Response
-    ) -> SegmentRows | None:
-        """Predictions of the rows of a segment inside a simulated interval; None without such rows.
+    ) -> Iterator[SegmentRows]:
+        """Predictions of the rows of a segment inside a simulated interval, if there are any.
 
         Args:
             theta: (p,) parameters of the recording.
@@ -352,12 +325,15 @@ class SegmentSimulation(FitUnknowns):
         is_last = response.first + samples >= segment.samples
         inside = clipped >= response.first
         inside &= (clipped < response.first + samples) | is_last
-        if not inside.any():
-            return None
-
-        y, *jacobians = self._at_times(response, place, recording, times[inside])
-        rows = np.flatnonzero(inside) + segment.rows.start
-        return SegmentRows(segment=index, rows=rows, y=y, jacobians=tuple(jacobians))
+        if inside.any():
+            y, *jacobians = self._at_times(response, place, recording, times[inside])
+            yield SegmentRows(
+                segment=index,
+                recording=segment.recording,
+                rows=np.flatnonzero(inside) + segment.rows.start,
+                y=y,
+                jacobians=tuple(jacobians),
+            )
 
     def _at_times(
         self, response: Response, place: int, recording: AlignedRecording, times: Array
@@ -420,18 +396,6 @@ class SegmentSimulation(FitUnknowns):
         counts = np.diff(self._offsets)
         return np.repeat(self._rows_per_segment / counts, counts)
 
-    def blocks_of(self, rows: SegmentRows) -> np.ndarray:
-        """Blocks of some rows of a segment.
-
-        Args:
-            rows: The k rows.
-
-        Returns:
-            (k,) index of the block of every row.
-        """
-        begin = self.segments[rows.segment].rows.start
-        return self._block_of_row(rows.segment, rows.rows - begin)
-
     def blocks_containing(self, masks: Sequence[np.ndarray]) -> np.ndarray:
         """(B,) True for the blocks that contain a marked value.
 
@@ -441,14 +405,15 @@ class SegmentSimulation(FitUnknowns):
         found = np.zeros(self.block_count, dtype=bool)
         for index, segment in enumerate(self.segments):
             rows = np.flatnonzero(masks[segment.recording][segment.rows].any(axis=1))
-            found[self._block_of_row(index, rows)] = True
+            found[self.blocks_of_rows(index, segment.rows.start + rows)] = True
         return found
 
-    def _block_of_row(self, segment: int, rows: np.ndarray) -> np.ndarray:
-        """(k,) index of the block of some rows, which are counted from the begin of a segment."""
+    def blocks_of_rows(self, segment: int, rows: np.ndarray) -> np.ndarray:
+        """(k,) index of the block of some rows: (k,) of the recording of a segment."""
         first = self._offsets[segment]
         count = self._offsets[segment + 1] - first
-        return np.asarray(first + rows * count // self._rows_per_segment[segment])
+        places = rows - self.segments[segment].rows.start
+        return np.asarray(first + places * count // self._rows_per_segment[segment])
 
     @cached_property
     def _rows_per_segment(self) -> np.ndarray:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -83,10 +84,9 @@ def bristles_of(model: Any) -> tuple[Bristle, ...]:
     scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
     found = []
     for actuator in bristle_actuators(model):
-        if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-            continue
         joint = int(model.actuator_trnid[actuator, 0])
-        if int(model.jnt_type[joint]) in scalar:
+        at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+        if at_joint and int(model.jnt_type[joint]) in scalar:
             found.append(
                 Bristle(
                     actuator=actuator,
@@ -125,18 +125,14 @@ class KnownActivations:
             columns = dict(zip(controls.tolist(), inputs.tolist(), strict=True))
 
         # No recording shows the control that a law computes, so that its lag is an unknown.
-        def is_shown(actuator: int) -> bool:
-            """Whether the recording shows what moves the activation of an actuator."""
-            is_lag = int(model.actuator_dyntype[actuator]) in FILTERS
-            return not is_lag or int(model.actuator_ctrladr[actuator]) in columns
-
-        stated = set(layout.act.tolist())
-        found = [
+        is_shown = ~np.isin(model.actuator_dyntype, FILTERS)
+        is_shown |= np.isin(model.actuator_ctrladr, list(columns))
+        is_added = (model.actuator_actnum > 0) & ~np.isin(model.actuator_actadr, layout.act)
+        found = tuple(
             (actuator, int(model.actuator_actadr[actuator]))
-            for actuator in np.flatnonzero(model.actuator_actnum).tolist()
-            if int(model.actuator_actadr[actuator]) not in stated and is_shown(actuator)
-        ]
-        return KnownActivations(model=model, actuators=tuple(found), columns=columns)
+            for actuator in np.flatnonzero(is_added & is_shown).tolist()
+        )
+        return KnownActivations(model=model, actuators=found, columns=columns)
 
     @property
     def addresses(self) -> list[int]:
@@ -160,7 +156,7 @@ class KnownActivations:
             else self._bent(actuator, qvel)
             for actuator, _ in self.actuators
         ]
-        return np.stack(columns, axis=1) if columns else np.zeros((len(begins), 0))
+        return np.column_stack([np.zeros((len(begins), 0)), *columns])
 
     def _filtered(self, actuator: int, recording: AlignedRecording, begins: np.ndarray) -> Array:
         """(n,) controls after the lag of an actuator, which is at rest at the first row."""
@@ -235,17 +231,17 @@ class Segment:
     rows: slice
     start: Array
 
-    def first_part(self, t: Array, dt: float, share: float) -> Segment:
+    def first_part(self, recording: AlignedRecording, share: float) -> Segment:
         """The first rows of this segment, and the samples that they need.
 
         Args:
-            t: (M,) times of the rows of the recording [s].
-            dt: Sample period [s].
+            recording: Its recording.
             share: Share of the rows.
         """
         count = self.rows.stop - self.rows.start
         last = self.rows.start + max(int(np.ceil(share * count)), min(count, MIN_SAMPLES))
-        samples = int(np.ceil(t[last - 1] / dt - EDGE_TOLERANCE)) - self.begin
+        end = recording.t[last - 1] / recording.dt
+        samples = int(np.ceil(end - EDGE_TOLERANCE)) - self.begin
         return replace(
             self,
             samples=min(max(samples, MIN_SAMPLES), self.samples),
@@ -428,7 +424,7 @@ def cut_into_segments(
     Raises:
         RecordingError: The length is too short.
     """
-    segments = []
+    segments: list[Segment] = []
     ticks = system.plant.tick_samples
     for i, recording in enumerate(recordings):
         N = len(recording.ctrl)
@@ -459,19 +455,13 @@ def cut_into_segments(
         row_bounds = np.searchsorted(recording.t, times)
         row_bounds[-1] = len(recording.t)
 
-        for k, begin in enumerate(begins.tolist()):
-            first, last = int(row_bounds[k]), int(row_bounds[k + 1])
-            if last <= first:
-                continue
-            segments.append(
-                Segment(
-                    recording=i,
-                    begin=begin,
-                    samples=int(bounds[k + 1]) - begin,
-                    rows=slice(first, last),
-                    start=starts[k],
-                )
-            )
+        rows = [slice(*each) for each in pairwise(row_bounds.tolist())]
+        places = zip(rows, begins.tolist(), bounds[1:].tolist(), starts, strict=True)
+        segments += [
+            Segment(recording=i, begin=begin, samples=end - begin, rows=own, start=start)
+            for own, begin, end, start in places
+            if own.stop > own.start
+        ]
     return tuple(segments)
 
 
@@ -483,9 +473,6 @@ def _max_delay(parameters: ParameterSet, duration: float) -> float:
         duration: Duration of the shortest recording [s].
     """
     per_parameter = parameters.delay_derivative
-    if not per_parameter.any():
-        return 0.0
-
     growth = MAX_DELAY_GROWTH * np.array([p.prior or p.scale for p in parameters.parameters])
     has_prior = np.array([p.prior is not None for p in parameters.parameters])
     grows = ~has_prior & (per_parameter != 0.0)
@@ -549,9 +536,13 @@ def measured_initial_states(
 
         # Quaternions cannot be averaged componentwise; the nearest one is taken.
         for q, _ in space.quaternions:
-            components = range(q, q + 4)
-            if all(a in output_of for a in components):
-                nearest = _nearest_values(recording, [output_of[a] for a in components], t0)
+            columns = [output_of[a] for a in range(q, q + 4) if a in output_of]
+            if len(columns) == 4:
+                # Components of one quaternion are measured together.
+                row_after = int(np.searchsorted(recording.t, t0))
+                rows = recording.measured_rows_near(columns[0], row_after, 1)
+                row = rows[np.argmin(np.abs(recording.t[rows] - t0))]
+                nearest = recording.y[row, columns]
                 states[k, q : q + 4] = nearest / np.linalg.norm(nearest)
 
     _, qvel, act = space.split(states)
@@ -575,15 +566,6 @@ def _local_fit(
     unit = float(np.abs(times).max()) or 1.0
     coefficients = np.polynomial.polynomial.polyfit(times / unit, y, degree)
     return float(coefficients[0]), float(coefficients[1] / unit)
-
-
-def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: float) -> Array:
-    """Measured values of some outputs in the row nearest to time t0 [s]."""
-    # Components of one quaternion are measured together.
-    row_after = int(np.searchsorted(recording.t, t0))
-    candidates = recording.measured_rows_near(columns[0], row_after, 1)
-    nearest = min(candidates, key=lambda row: abs(recording.t[row] - t0))
-    return recording.y[nearest, list(columns)]
 
 
 def _nominal_states(
@@ -636,14 +618,14 @@ def batches(segments: Sequence[Segment], max_samples: int) -> Iterator[list[int]
     order = sorted(range(len(segments)), key=lambda i: segments[i].samples)
     batch: list[int] = []
     for i in order:
+        # Shorter segments are simulated as long as the longest one of their batch.
         samples = segments[i].samples
-        if batch:
-            # Shorter segments are simulated as long as the longest one of their batch.
-            too_long = samples > MAX_LENGTH_RATIO * segments[batch[0]].samples
-            too_many = (len(batch) + 1) * samples > max_samples
-            if too_long or too_many:
-                yield batch
-                batch = []
+        if batch and (
+            samples > MAX_LENGTH_RATIO * segments[batch[0]].samples
+            or (len(batch) + 1) * samples > max_samples
+        ):
+            yield batch
+            batch = []
         batch.append(i)
 
     if batch:

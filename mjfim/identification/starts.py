@@ -485,29 +485,25 @@ def choose_length(
     if problem.sample_count <= MAX_WHOLE_SAMPLES:
         tried.append((None, problem.of_segments(problem.spread(MAX_SAMPLES, MAX_FOLDS))))
     parts = _parts_to_leave_out(problem)
-    lengths: list[float | None] = []
-    problems: list[FitProblem] = []
-    fits: list[Array] = []
+    compared = []
     for number, (length, part) in enumerate(tried):
         begin_stage("comparing lengths of the segments", number, len(tried))
         found = _estimates_over(search, whole, length, part, parts)
         if search.interrupted:
             return None
         if found is not None:
-            lengths.append(length)
-            problems.append(part)
-            fits.append(found)
-    if len(fits) < 2:
+            compared.append((length, part, found))
+    if len(compared) < 2:
         return None
+    lengths, problems, fits = zip(*compared, strict=True)
 
     # Losses of each fit over the segments of each fit.
-    sigma = system.noise.sigma
     blocks, budget = blocks_of(parts), search.budget
     losses = [
         [
             joined_losses(
                 [
-                    losses_of(each, theta, part, blocks, sigma, budget)
+                    losses_of(each, theta, part, blocks, system.noise.sigma, budget)
                     for part, theta in zip(parts, fit[1:], strict=True)
                 ]
             )
@@ -517,7 +513,7 @@ def choose_length(
     ]
     if search.interrupted:
         return None
-    chosen = _chosen([_over_all_horizons(losses, i) for i in range(len(fits))])
+    chosen = _chosen(losses)
     longest = max(float(recording.t[-1]) for recording in problem.recordings)
     differences = [fit - fits[chosen] for fit in fits]
     study = HorizonStudy(
@@ -580,33 +576,31 @@ def _parts_to_leave_out(problem: FitProblem) -> tuple[LeftOutPart, ...]:
     return tuple(parts)
 
 
-def _over_all_horizons(losses: Sequence[Sequence[HeldOutLosses]], index: int) -> HeldOutLosses:
-    """Losses of one fit over all horizons, relative to the smallest mean loss over each horizon.
+def _chosen(losses: Sequence[Sequence[HeldOutLosses]]) -> int:
+    """Index of the longest segments whose predictions are not clearly worse than the best.
 
     Args:
         losses: Losses of each fit over each horizon.
-        index: Index of the fit.
     """
-    row = losses[index]
+    # Losses over all horizons are relative to the smallest mean loss over each horizon.
     least = [
-        min(each[h].error ** 2 for each in losses if np.isfinite(each[h].error))
-        for h in range(len(row))
+        min(each.error**2 for each in over_horizon if np.isfinite(each.error))
+        for over_horizon in zip(*losses, strict=True)
     ]
     scales = np.maximum(least, np.finfo(float).tiny)
-    return HeldOutLosses(
-        losses=np.concatenate([each.losses / s for each, s in zip(row, scales, strict=True)]),
-        counts=np.concatenate([each.counts for each in row]),
-        parts=np.concatenate([each.parts for each in row]),
-        estimates=row[0].estimates,
-    )
-
-
-def _chosen(losses: Sequence[HeldOutLosses]) -> int:
-    """Index of the longest segments whose predictions are not clearly worse than the best."""
-    best = min(losses, key=lambda each: each.error)
+    joined = [
+        HeldOutLosses(
+            losses=np.concatenate([each.losses / s for each, s in zip(row, scales, strict=True)]),
+            counts=np.concatenate([each.counts for each in row]),
+            parts=np.concatenate([each.parts for each in row]),
+            estimates=row[0].estimates,
+        )
+        for row in losses
+    ]
+    best = min(joined, key=lambda each: each.error)
     relevant = RELEVANT_SHARE * best.error**2
     good = []
-    for i, each in enumerate(losses):
+    for i, each in enumerate(joined):
         reduction = each.reduction(best)
         if not (reduction.is_clear and reduction.mean > relevant):
             good.append(i)

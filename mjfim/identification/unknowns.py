@@ -125,12 +125,12 @@ class FitUnknowns:
     @cached_property
     def lower(self) -> Array:
         """(c,) lower bounds of the common unknowns [theta-unit]."""
-        return self.parameters.lower[self.parameter_of_column] if self.bounded else -self._infinite
+        return np.where(self.bounded, self.parameters.lower[self.parameter_of_column], -np.inf)
 
     @cached_property
     def upper(self) -> Array:
         """(c,) upper bounds of the common unknowns [theta-unit]."""
-        return self.parameters.upper[self.parameter_of_column] if self.bounded else self._infinite
+        return np.where(self.bounded, self.parameters.upper[self.parameter_of_column], np.inf)
 
     @cached_property
     def _of_inertias(self) -> np.ndarray:
@@ -178,11 +178,6 @@ class FitUnknowns:
         return bounds[0], bounds[1]
 
     @property
-    def _infinite(self) -> Array:
-        """(c,) upper bounds where there are none."""
-        return np.full(self.column_count, np.inf)
-
-    @property
     def first_columns(self) -> np.ndarray:
         """(s+e,) common columns of the shared parameters and of those of the first recording."""
         return np.arange(len(self.shared) + len(self.per_recording))
@@ -190,9 +185,8 @@ class FitUnknowns:
     @property
     def own_columns(self) -> np.ndarray:
         """(K, e) common columns of the unknowns that belong to each recording."""
-        count = len(self.per_recording)
         columns = np.arange(len(self.shared), self.column_count)
-        return columns.reshape(len(self.recordings), count)
+        return columns.reshape(len(self.recordings), len(self.per_recording))
 
     @property
     def estimated(self) -> np.ndarray:
@@ -437,8 +431,6 @@ class FitUnknowns:
             rows[:, diagonal, diagonal] = 1.0 / sigma
             rows[:, :, -1] = at.private / sigma
             return rows
-        if not n:
-            return np.zeros((count, 0, m))
 
         # Stated priors on the deviations of the initial state.
         parameters, private = self.parameters, self.private

@@ -169,16 +169,11 @@ class Condensed:
         """
         R = self.triangles
         n = self.private_count
-        if not n:
-            return R.reshape(-1, R.shape[2])
 
         # Where a segment has no full rank, the best private unknowns do not cancel these rows.
-        private = R[:, :n, :n]
-        residual = R[:, :n, -1:]
-        remaining_jacobian = private @ self.private_response + R[:, :n, n:-1]
-        remaining_residual = residual - private @ (self._private_inverse @ residual)
-        remaining = np.concatenate([remaining_jacobian, remaining_residual], axis=2)
-
+        J, residual = self._following(R[:, :n], self.private_response)
+        residual = residual - R[:, :n, :n] @ (self._private_inverse @ residual)
+        remaining = np.concatenate([J, residual], axis=2)
         rows = np.concatenate([remaining, R[:, n:, n:]], axis=1)
         return rows.reshape(-1, rows.shape[2])
 
@@ -191,17 +186,19 @@ class Condensed:
         Returns:
             Rows with equal derivatives, and with the residuals that the linearisation predicts.
         """
-        n = self.private_count
-        everywhere = np.broadcast_to(step.common, (self.segment_count, len(step.common)))
-        moves = np.concatenate([step.private, everywhere], axis=1)[..., None]
-
+        moves = self._moves(step.common, step.private)
         blocks = np.array(self.blocks)
         blocks[..., -1:] += blocks[..., :-1] @ moves[self.segment_of_block]
         private_rows = np.array(self.private_rows)
         private_rows[..., -1:] += private_rows[..., :-1] @ moves
         common_rows = np.array(self.common_rows)
-        common_rows[:, -1] += common_rows[:, :-1] @ moves[0, n:, 0]
+        common_rows[:, -1] += common_rows[:, :-1] @ step.common
         return replace(self, blocks=blocks, private_rows=private_rows, common_rows=common_rows)
+
+    def _moves(self, common: Array, private: Array) -> Array:
+        """(P, n+c, 1) moves of all unknowns of each segment."""
+        everywhere = np.broadcast_to(common, (self.segment_count, len(common)))
+        return np.concatenate([private, everywhere], axis=1)[..., None]
 
     def of_segments(self, indices: np.ndarray) -> Condensed:
         """The linearised residuals of some segments only, and the rows of the common unknowns.
@@ -233,24 +230,14 @@ class Condensed:
     @property
     def rank(self) -> int:
         """Number of unknowns, private and common, that the rows determine."""
-        n = self.private_count
-        private_rank = 0
-        if n:
-            columns = self.triangles[:, :, :n]
-            norms = np.linalg.norm(columns, axis=1, keepdims=True)
-            scaled = columns / np.maximum(norms, SMALLEST_NORM)
-            ranks = np.linalg.matrix_rank(scaled, tol=PRIVATE_RANK_COUNT_TOLERANCE)
-            private_rank = int(ranks.sum())
+        columns = self.triangles[:, :, : self.private_count]
+        norms = np.linalg.norm(columns, axis=1, keepdims=True)
+        private = columns / np.maximum(norms, SMALLEST_NORM)
+        of_segments = np.linalg.matrix_rank(private, tol=PRIVATE_RANK_COUNT_TOLERANCE)
 
-        common_rank = 0
-        H = self.information()
-        if len(H):
-            scaled, _ = scaled_to_unit_diagonal(H)
-            common_rank = int(
-                np.linalg.matrix_rank(scaled, tol=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
-            )
-
-        return private_rank + common_rank
+        common, _ = scaled_to_unit_diagonal(self.information())
+        of_common = np.linalg.matrix_rank(common, tol=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
+        return int(of_segments.sum() + of_common)
 
     def information(self, with_common_rows: bool = True) -> Array:
         """Information about the common unknowns, the private ones marginalised.
@@ -274,8 +261,7 @@ class Condensed:
         Those of the private unknowns are root mean squares over the segments.
         """
         n = self.private_count
-        J = self.triangles[:, :, :-1]
-        squares = np.sum(J**2, axis=1)
+        squares = np.sum(self.triangles[:, :, :-1] ** 2, axis=1)
         private = squares[:, :n].mean(axis=0)
 
         common_J = self.common_rows[:, :-1]
@@ -312,10 +298,8 @@ class Condensed:
         """
         n = self.private_count
         c = self.common_count
-        weight = np.sqrt(damping) * scale
-        R = self._damped_triangles(weight[:n], scale[:n])
-        segment_rows = R[:, n:, n:].reshape(-1, c + 1)
-        damping_rows = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
+        segment_rows = self._damped_triangles(damping, scale)[:, n:, n:].reshape(-1, c + 1)
+        damping_rows = np.diag(np.append(np.sqrt(damping) * scale[n:], 0.0))[:c]
         return np.concatenate([segment_rows, damping_rows])
 
     def step_to(self, common: Array, damping: float, scale: Array) -> Step:
@@ -330,56 +314,22 @@ class Condensed:
             The step with its predicted decrease.
         """
         n = self.private_count
-        weight = np.sqrt(damping) * scale
-        private = np.zeros((self.segment_count, 0))
-        if n:
-            # The steps of the private unknowns follow from that of the common ones.
-            R = self._damped_triangles(weight[:n], scale[:n])
-            rhs = R[:, :n, -1] + R[:, :n, n:-1] @ common
-            private = np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
-        return self._evaluated(common, private)
+        damped = self._damped_triangles(damping, scale)
+        rhs = damped[:, :n, -1] + damped[:, :n, n:-1] @ common
+        private = np.asarray(-np.linalg.solve(damped[:, :n, :n], rhs[..., None])[..., 0])
 
-    def _damped_triangles(self, weight: Array, scale: Array) -> Array:
-        """(P, m, m) triangles of all rows of each segment and of the damping of private unknowns.
-
-        Args:
-            weight: (n,) damping of each private unknown.
-            scale: (n,) scale of each private unknown.
-        """
-        n = self.private_count
-        R = np.array(self.triangles)
-        if not n:
-            return R
-
-        least = MIN_PRIVATE_DAMPING * np.maximum(scale, SMALLEST_NORM)
-        damping_rows = np.zeros((self.segment_count, n, R.shape[2]))
-        damping_rows[:, np.arange(n), np.arange(n)] = np.maximum(weight, least)
-        return triangle(np.concatenate([R, damping_rows], axis=1))
-
-    def _evaluated(self, common: Array, private: Array) -> Step:
-        """A step with its lengths and the decrease that the linearisation predicts.
-
-        The damping does not count.
-        """
+        # Change of all residuals along the step. The damping does not count.
         R = self.triangles
-        n = self.private_count
         residual = R[:, :, -1]
         common_residual = self.common_rows[:, -1]
-
-        # Change of all residuals along the step.
-        everywhere = np.broadcast_to(common, (self.segment_count, len(common)))
-        moves = np.concatenate([private, everywhere], axis=1)
-        change = (R[:, :, :-1] @ moves[..., None])[..., 0]
+        change = (R[:, :, :-1] @ self._moves(common, private))[..., 0]
         common_change = self.common_rows[:, :-1] @ common
 
         decrease = -float(np.sum(change * (residual + 0.5 * change)))
         decrease -= float(common_change @ (common_residual + 0.5 * common_change))
 
         # Lengths in standard deviations.
-        common_length = 0.0
-        if len(common):
-            common_length = float(np.sqrt(common @ self.information() @ common))
-
+        common_length = float(np.sqrt(common @ self.information() @ common))
         private_length = 0.0
         if n:
             private_change = (R[:, :, :n] @ private[..., None])[..., 0]
@@ -393,6 +343,24 @@ class Condensed:
             private_length=private_length,
         )
 
+    def _damped_triangles(self, damping: float, scale: Array) -> Array:
+        """(P, m, m) triangles of all rows of each segment and of the damping of private unknowns.
+
+        Args:
+            damping: Damping factor.
+            scale: (n+c,) scale of every unknown.
+        """
+        n = self.private_count
+        R = self.triangles
+        if not n:
+            return R
+
+        least = MIN_PRIVATE_DAMPING * np.maximum(scale[:n], SMALLEST_NORM)
+        damping_rows = np.zeros((self.segment_count, n, R.shape[2]))
+        weight = np.maximum(np.sqrt(damping) * scale[:n], least)
+        damping_rows[:, np.arange(n), np.arange(n)] = weight
+        return triangle(np.concatenate([R, damping_rows], axis=1))
+
     @cached_property
     def block_scores(self) -> Array:
         """(B, c) gradient of half of each block's squares by the common unknowns.
@@ -400,8 +368,7 @@ class Condensed:
         The private unknowns follow the common ones at their optimum.
         """
         J, r = self._reduced_blocks
-        gradient = np.swapaxes(J, 1, 2) @ r
-        return gradient[..., 0]
+        return (np.swapaxes(J, 1, 2) @ r)[..., 0]
 
     @cached_property
     def block_information(self) -> Array:
@@ -451,23 +418,23 @@ class Condensed:
 
         The private unknowns follow the common ones at their optimum.
         """
-        n = self.private_count
-        rows = self.private_rows
-        through_private = rows[:, :, :n] @ self.private_response
-        J = rows[:, :, n:-1] + through_private
-        return np.concatenate([J, rows[:, :, -1:]], axis=2)
+        J, r = self._following(self.private_rows, self.private_response)
+        return np.concatenate([J, r], axis=2)
 
     @property
     def _reduced_blocks(self) -> tuple[Array, Array]:
-        """(B, m, c) Jacobian of each block by the common unknowns, and its (B, m, 1) residuals.
+        """(B, m, c) Jacobian of each block by the common unknowns, and its (B, m, 1) residuals."""
+        return self._following(self.blocks, self.private_response[self.segment_of_block])
 
-        The private unknowns follow the common ones at their optimum.
+    def _following(self, rows: Array, response: Array) -> tuple[Array, Array]:
+        """Rows of the common unknowns and residuals; private unknowns follow at their optimum.
+
+        Args:
+            rows: (..., k, m) rows of all unknowns.
+            response: (..., n, c) derivatives of the private unknowns by the common ones.
         """
         n = self.private_count
-        response = self.private_response[self.segment_of_block]
-        through_private = self.blocks[:, :, :n] @ response
-        J = self.blocks[:, :, n:-1] + through_private
-        return J, self.blocks[:, :, -1:]
+        return rows[..., n:-1] + rows[..., :n] @ response, rows[..., -1:]
 
 
 def triangle(rows: Array) -> Array:
@@ -533,10 +500,8 @@ def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Arr
     # An unknown that the solver holds at a bound is placed exactly there; the scaling by the norms
     # has round-off.
     inside = np.clip(solved.x / norms, low, high)
-    inside = np.where(solved.active_mask < 0, low, inside)
-    inside = np.where(solved.active_mask > 0, high, inside)
-
-    d[~fixed] = inside
+    held = [solved.active_mask < 0, solved.active_mask > 0]
+    d[~fixed] = np.select(held, [low, high], inside)
     return d
 
 
@@ -564,14 +529,9 @@ class RobustLoss:
     @property
     def inlier_mean_square(self) -> float:
         """Mean square of standard normal residuals that are not outliers."""
-        if self.kind == "linear":
-            return 1.0
-
-        # Variance of the normal distribution truncated at both sides.
-        limit = self.outlier_threshold
-        inside = 1.0 - 2.0 * scipy.special.ndtr(-limit)
-        density = np.exp(-0.5 * limit**2) / np.sqrt(2.0 * np.pi)
-        return float(1.0 - 2.0 * limit * density / inside)
+        # Variance of the normal distribution truncated at both sides, by chi-square probabilities.
+        square = self.outlier_threshold**2
+        return float(scipy.special.chdtr(3, square) / scipy.special.chdtr(1, square))
 
     def value(self, r: Array) -> float:
         """Sum of the loss over residuals.
@@ -607,9 +567,5 @@ class RobustLoss:
         z = (r / self.scale) ** 2
         if self.kind == "huber":
             return np.minimum(1.0, np.maximum(z, SMALLEST_SQUARE) ** -0.25)
-        if self.kind == "soft_l1":
-            return (1.0 + z) ** -0.25
-        if self.kind == "cauchy":
-            return (1.0 + z) ** -0.5
-
-        return np.ones_like(r)
+        powers = {"soft_l1": -0.25, "cauchy": -0.5}
+        return (1.0 + z) ** powers.get(self.kind, 0.0)

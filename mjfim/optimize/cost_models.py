@@ -288,7 +288,6 @@ class StepCurvature(Protocol):
             factors of the curvature at the beginning of the step, by kind of limit; largest ratio
             of a factor to that in the model that led to the step, at least 1.
         """
-        ...
 
     def scaled(self, mu: float) -> StepCurvature:
         """Return the curvature of a multiple of the barrier.
@@ -296,7 +295,6 @@ class StepCurvature(Protocol):
         Args:
             mu: Factor of the barrier.
         """
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -353,11 +351,8 @@ class BarrierExpansion:
         """
         state_and_control = np.concatenate([zeta.z[:-1], zeta.v], axis=1)
         changes = np.einsum("kswi,ki->ksw", self.observations, state_and_control)
-        largest_observed = np.abs(changes).max(initial=0.0)
-
-        control_changes = zeta.v / self.control_scale
-        largest_control = np.abs(control_changes).max(initial=0.0)
-        return float(max(largest_observed, largest_control))
+        all_changes = np.append(changes, zeta.v / self.control_scale)
+        return float(np.abs(all_changes).max(initial=0.0))
 
     @cached_property
     def uniform_weights(self) -> Weights:
@@ -376,12 +371,8 @@ class BarrierExpansion:
 
         Q = np.zeros((N + 1, nx, nx))
         Q[:-1] = H[:, :nx, :nx]
-        control_weights = self.control_scale**-2.0 / N
-        R = H[:, nx:, nx:] + np.diag(control_weights)
-
-        is_limited = self.weights.W > 0.0
-        step_weights = self.control_step_scale**-2.0 / N
-        W = np.where(is_limited, step_weights, 0.0)
+        R = H[:, nx:, nx:] + np.diag(self.control_scale**-2.0 / N)
+        W = np.where(self.weights.W > 0.0, self.control_step_scale**-2.0 / N, 0.0)
         return Weights(Q=Q, S=H[:, nx:, :nx], R=R, W=W)
 
 
@@ -415,15 +406,10 @@ class EigenvalueModel:
         """
         return self._changed(d).gradient
 
-    @cached_property
-    def _logs(self) -> Array:
-        """(r, r) diagonal matrix of the logarithms of the eigenvalues over the smallest one."""
-        return np.diag(np.log(self.eigenvalues / self.eigenvalues[0]))
-
     def _changed(self, d: Array) -> _ChangedLogs:
         """Eigenvalues of the changed logarithm at coordinates d: (m,)."""
-        changed = self._logs + symmetric_matrix(d, len(self.eigenvalues))
-        logs, vectors = np.linalg.eigh(changed)
+        before = np.diag(np.log(self.eigenvalues / self.eigenvalues[0]))
+        logs, vectors = np.linalg.eigh(before + symmetric_matrix(d, len(before)))
         return _ChangedLogs(logs=logs, vectors=vectors, power=self.power, weight=self.weight)
 
     def minimising_gradient(self, d0: Array, spread: Array) -> Array:
@@ -451,40 +437,20 @@ class EigenvalueModel:
 
             H = np.eye(len(y)) + L.T @ here.hessian @ L
             step = -np.linalg.solve(0.5 * (H + H.T), g)
-            y, here = self._line_search(y, here, step, float(g @ step), L, d0)
+
+            # The step is halved until the model plus `1/2 |y|^2` falls sufficiently.
+            before, slope = here.value + 0.5 * float(y @ y), float(g @ step)
+            fraction = 2.0
+            while fraction > 2.0 * MIN_NEWTON_FRACTION:
+                fraction *= 0.5
+                new = y + fraction * step
+                here = self._changed(d0 + L @ new)
+                after = here.value + 0.5 * float(new @ new)
+                if after <= before + SUFFICIENT_DECREASE * fraction * slope:
+                    break
+            y = new
 
         return here.gradient
-
-    def _line_search(
-        self, y: Array, here: _ChangedLogs, step: Array, slope: float, L: Array, d0: Array
-    ) -> tuple[Array, _ChangedLogs]:
-        """Halve a step until the proximal objective falls sufficiently.
-
-        The objective is the model at `d0 + L y` plus `1/2 |y|^2`.
-
-        Args:
-            y: (m,) point at which the step begins.
-            here: The model at this point.
-            step: (m,) Newton step.
-            slope: Directional derivative of the objective along the step, negative.
-            L: (m, m) square root of spread.
-            d0: (m,) centre of the proximal term.
-
-        Returns:
-            The point after the step, and the model there.
-        """
-        before = here.value + 0.5 * float(y @ y)
-        fraction = 1.0
-        while True:
-            new = y + fraction * step
-            there = self._changed(d0 + L @ new)
-            after = there.value + 0.5 * float(new @ new)
-            if after <= before + SUFFICIENT_DECREASE * fraction * slope:
-                return new, there
-
-            fraction *= 0.5
-            if fraction <= MIN_NEWTON_FRACTION:
-                return new, there
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

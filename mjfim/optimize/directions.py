@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.optimize.lq import CurveCoordinates, TangentCurve, descent
-from mjfim.optimize.projection_operator import Expansion
+from mjfim.optimize.lq import RiccatiSolution, TangentCurve, Weights
+from mjfim.optimize.projection_operator import Direction, Expansion
 
 # Smallest curvature of a stored pair, relative to the norms of the step and of the change of the
 # gradient.
@@ -39,8 +39,8 @@ def convex_pairs(s: Array, y: Array, tolerance: float) -> list[CurvaturePair]:
     changes = y.reshape(len(y), -1)
     curvatures = np.einsum("pi,pi->p", steps, changes)
     norms = np.linalg.norm(steps, axis=1) * np.linalg.norm(changes, axis=1)
-    is_convex = curvatures > tolerance * norms
-    return [(s[i], y[i], float(curvatures[i])) for i in np.flatnonzero(is_convex)]
+    convex = np.flatnonzero(curvatures > tolerance * norms)
+    return [(s[i], y[i], float(curvatures[i])) for i in convex]
 
 
 def inverse_hessian_product(
@@ -80,7 +80,7 @@ def inverse_hessian_product(
 
 
 @dataclass
-class MetricDescent:
+class MetricDescent(Direction):
     """The paper's direction, the solution of its problem (8).
 
     It minimises `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space. All weights are already
@@ -110,30 +110,10 @@ class MetricDescent:
                 "the problem must provide extended expansions for a metric with weight on psi"
             )
 
-        zeta = descent(
-            shown.A,
-            shown.B,
-            shown.a,
-            shown.b,
-            Q=self.Q,
-            R=self.R,
-            terminal=self.terminal,
-        )
+        weights = Weights.constant(len(shown.B), self.Q, self.R, self.terminal)
+        zeta = RiccatiSolution.solve(shown.A, shown.B, weights).descent(shown.a, shown.b)
         nx = expansion.A.shape[1]
         return TangentCurve(z=zeta.z[:, :nx], v=zeta.v)
-
-    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Ignore an accepted step; this direction has no memory.
-
-        Args:
-            expansion: Expansion at the new point.
-            K: (N, nu, nx) gain of the projection operator.
-            moved: Difference between the new and the old point.
-        """
-
-    def reset(self) -> bool:
-        """Return False: there is no memory to clear."""
-        return False
 
 
 @dataclass
@@ -186,7 +166,7 @@ class LBFGS:
             return
 
         before = self._last[2]
-        s = CurveCoordinates(A=expansion.A, B=expansion.B, K=K).coordinate(moved)
+        s = expansion.coordinates(K).coordinate(moved)
         y = self._gradient(expansion, K) - before
 
         pairs = convex_pairs(s[None], y[None], MIN_RELATIVE_CURVATURE)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 
@@ -73,12 +73,11 @@ def step_over_curved_rows(
         part = wanted - at
         for _ in range(MAX_HALVINGS):
             found = curved(at + part)
-            found_cost = np.inf
             if found is not None:
                 residual = data[:, :-1] @ (at + part) + data[:, -1]
                 found_cost = _half_squares(residual) + _half_squares(found[:, -1])
-            if found is not None and found_cost < cost:
-                break
+                if found_cost < cost:
+                    break
             part = 0.5 * part
         else:
             break
@@ -86,16 +85,11 @@ def step_over_curved_rows(
         at, rows, decrease, cost = at + part, found, cost - found_cost, found_cost
         if decrease <= LEAST_DECREASE * (first - cost):
             break
-    return _evaluated(condensed, at, rows, damping, scale)
 
-
-def _evaluated(
-    condensed: Condensed, common: Array, rows: Array, damping: float, scale: Array
-) -> Step:
-    """The step of all unknowns, with the decrease of the curved rows: (l, c+1) at its end."""
-    step = condensed.step_to(common, damping, scale)
+    # The decrease of the step counts the curved rows at its end in place of the linear ones.
+    step = condensed.step_to(at, damping, scale)
     linear = condensed.common_rows
-    residual = linear[:, -1] + linear[:, :-1] @ common
+    residual = linear[:, -1] + linear[:, :-1] @ at
     missed = _half_squares(rows[:, -1]) - _half_squares(residual)
     return replace(step, predicted_decrease=step.predicted_decrease - missed)
 
@@ -104,8 +98,6 @@ def _half_squares(residual: Array) -> float:
     """Half of the sum of squares."""
     return 0.5 * float(residual @ residual)
 
-
-T = TypeVar("T")
 
 # Damping of the first step, relative to the squared column norms of the Jacobian.
 INITIAL_DAMPING = 1e-3
@@ -205,38 +197,12 @@ class UnknownValues:
     per_recording: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
-class InterruptedPassError(Exception):
-    """A request to stop ended a pass over the data, so that its result is not known."""
-
-
-def completed(passes: Callable[[], T]) -> T:
-    """Do what the result needs in any case, also after a request to stop.
-
-    Args:
-        passes: Passes over the data; those that begin after the request are completed.
-    """
-    try:
-        return passes()
-    except InterruptedPassError:
-        return passes()
-
-
 class Problem(Protocol):
     """Cost as a function of the unknowns, whose gradient is that of a sum of squares.
 
     The cost is half of the sum of squared residuals and priors. A robust loss may replace the
     square, and minus the logarithm of the likelihood the whole, where the noise is estimated.
-    Where workers do the passes over the data, `cost` and `condense` raise `InterruptedPassError`
-    after a request to stop.
     """
-
-    @property
-    def lower(self) -> Array:
-        """(c,) lower bounds of the common unknowns, -inf without a bound."""
-
-    @property
-    def upper(self) -> Array:
-        """(c,) upper bounds of the common unknowns, inf without a bound."""
 
     def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
         """(c,) lower and (c,) upper bounds of each common unknown where the others stay."""
@@ -326,8 +292,7 @@ class SearchSettings:
         max_iterations: Largest number of iterations.
         tolerance: Length of a step below which the search has converged: the root mean square over
             the common unknowns [standard deviations].
-        damped: True for Levenberg-Marquardt inside the bounds, False for Gauss-Newton without
-            bounds.
+        damped: True for Levenberg-Marquardt, False for Gauss-Newton.
         relinearise_at_end: Whether to linearise once more at the solution. False saves one
             linearisation: the search ends when the next step is expected to be below the tolerance.
         rough_share: Predicted decrease of the cost, as a share of the cost, below which a step is
@@ -389,17 +354,13 @@ def minimise(
 
     Returns:
         The solution, or None where the initial guess or its neighbourhood diverges.
-
-    Raises:
-        InterruptedPassError: A request to stop ended the first pass over the data.
     """
     cost = problem.cost(start)
     condensed = problem.condense(start) if np.isfinite(cost) else None
     if condensed is None:
         return None
 
-    search = _Search(problem, settings, Budget() if budget is None else budget, callback)
-    return search.run(start, cost, condensed)
+    return _Search(problem, settings, budget or Budget(), callback, start, cost, condensed).run()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -421,65 +382,48 @@ class _Trial:
     ratio: float
 
 
+@dataclass
 class _Search:
     """State of one search: the current point, its linearisation and the damping."""
 
+    problem: Problem
+    settings: SearchSettings
+    budget: Budget
+    callback: Callback | None
     unknowns: UnknownValues
     cost: float
     condensed: Condensed
-    scale: Array
+    iteration: int = 0
+    damping: float = 0.0
+    damping_growth: float = 2.0
+    stagnant_iterations: int = 0
+    slow_iterations: int = 0
+    previous_length: float = ASSUMED_LENGTH
+    unit: float = 1.0
+    iterates: list[UnknownValues] = field(default_factory=list)
 
-    def __init__(
-        self,
-        problem: Problem,
-        settings: SearchSettings,
-        budget: Budget,
-        callback: Callback | None,
-    ) -> None:
-        self.problem = problem
-        self.settings = settings
-        self.budget = budget
-        self.callback = callback
-
-        self.iteration = 0
-
+    def __post_init__(self) -> None:
+        settings = self.settings
+        if settings.damped:
+            self.damping = WEAK_DAMPING if settings.begins_near else INITIAL_DAMPING
         # A length of many unknowns is compared with the root mean square of each.
-        self.unknowns_length = float(np.sqrt(max(len(problem.lower), 1)))
-        self.damping = INITIAL_DAMPING if settings.damped else 0.0
-        if settings.damped and settings.begins_near:
-            self.damping = WEAK_DAMPING
-        self.damping_growth = 2.0
-        self.stagnant_iterations = 0
-        self.slow_iterations = 0
-        self.previous_length = ASSUMED_LENGTH
-        self.unit = 1.0
+        self.unknowns_length = float(np.sqrt(max(self.condensed.common_count, 1)))
         self.unit_is_known = not settings.in_true_deviations
-        self.iterates: list[UnknownValues] = []
+        self.scale = self.condensed.column_norms
+        self._keep(self.unknowns)
 
-    def run(self, start: UnknownValues, cost: float, condensed: Condensed) -> Solution:
-        """Iterate from a point with its cost and linearisation until the search ends."""
-        self.unknowns = start
-        self.cost = cost
-        self.condensed = condensed
-        self.scale = condensed.column_norms
-        self._keep(start)
-
+    def run(self) -> Solution:
+        """Iterate until the search ends."""
         while self.iteration < self.settings.max_iterations:
-            try:
-                ended = self._iterate()
-            except InterruptedPassError:
-                return self._stopped(StopReason.REQUESTED)
-            if ended is not None:
+            if (ended := self._iterate()) is not None:
                 return ended
 
-        return self._solution(
-            f"not converged in {self.settings.max_iterations} iterations", success=False
-        )
+        return self._solution(f"not converged in {self.settings.max_iterations} iterations")
 
     def _iterate(self) -> Solution | None:
         """Take one step and linearise at its end; return the solution where the search ends."""
-        if (reason := self.budget.exhausted) is not None:
-            return self._stopped(reason)
+        if (stopped := self._stopped()) is not None:
+            return stopped
 
         # Marquardt's scaling: column norms never shrink, so that the damping does not forget a
         # column.
@@ -522,12 +466,28 @@ class _Search:
             return self._solution("converged: the step vanished", success=True)
         if near or (slow and trial.fraction == 1.0):
             self.condensed = self.condensed.after(trial.step)
-            solution = self._solution("near the minimum", success=True)
-            return replace(solution, rough=True, slow=not near)
+            return self._solution("near the minimum", success=True, rough=True, slow=not near)
         if futile:
-            return self._solution("stopped: another minimum costs less", success=False)
-        self._relax_damping(trial.ratio)
-        return self._linearise()
+            return self._solution("stopped: another minimum costs less")
+        return self._linearise(trial.ratio)
+
+    def _linearise(self, ratio: float) -> Solution | None:
+        """Adapt the damping to the ratio of actual to predicted decrease, and linearise.
+
+        Return the solution where the search ends.
+        """
+        if self.settings.damped:
+            # Source: Nielsen (1999), eq. 2.5.
+            factor = max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+            self.damping = max(self.damping * factor, MIN_DAMPING)
+            self.damping_growth = 2.0
+        if (stopped := self._stopped()) is not None:
+            return stopped
+        linearised = self.problem.condense(self.unknowns)
+        if linearised is None:
+            return self._solution("stopped: the simulation diverges next to the estimate")
+        self.condensed = linearised
+        return None
 
     def _lengthened(self, trial: _Trial) -> _Trial:
         """A longer step along an accepted one, if the cost falls further there; else this step.
@@ -546,10 +506,7 @@ class _Search:
             factor = min(1.0 / (2.0 - trial.ratio), MAX_LENGTHENING)
         fraction = factor * trial.fraction
         further = self.problem.moved(self.unknowns, trial.step, fraction)
-        try:
-            cost = self.problem.cost(further)
-        except InterruptedPassError:
-            return trial
+        cost = self.problem.cost(further)
         if cost >= trial.cost:
             return trial
         return replace(trial, unknowns=further, cost=cost, fraction=fraction)
@@ -576,8 +533,8 @@ class _Search:
             self.damping_growth *= 2.0
             step = self._step(self.damping)
 
-            if (reason := self.budget.exhausted) is not None:
-                return self._stopped(reason)
+            if (stopped := self._stopped()) is not None:
+                return stopped
 
     def _trial(self, step: Step) -> _Trial:
         """Evaluate a step with the current damping.
@@ -605,14 +562,9 @@ class _Search:
         )
 
     def _step(self, damping: float) -> Step:
-        """Minimiser of the damped linearised cost, within the bounds where the search is damped."""
-        if self.settings.damped:
-            values = self.problem.common_values(self.unknowns)
-            lower, upper = (bound - values for bound in self.problem.bounds_at(self.unknowns))
-        else:
-            upper = np.full(self.condensed.common_count, np.inf)
-            lower = -upper
-
+        """Minimiser of the damped linearised cost, within the bounds."""
+        values = self.problem.common_values(self.unknowns)
+        lower, upper = (bound - values for bound in self.problem.bounds_at(self.unknowns))
         curved = self.settings.curved_rows
         if curved is None:
             return self.condensed.step(damping, self.scale, lower, upper)
@@ -662,11 +614,8 @@ class _Search:
             most = MAX_ROUGH_ITERATIONS
         else:
             negligible = min(negligible, PREDICTED_STAGNATION * predicted.predicted_decrease)
-        if self.cost - trial.cost <= negligible:
-            self.stagnant_iterations += 1
-        else:
-            self.stagnant_iterations = 0
-
+        is_stagnant = self.cost - trial.cost <= negligible
+        self.stagnant_iterations = self.stagnant_iterations + 1 if is_stagnant else 0
         return self.stagnant_iterations >= most
 
     def _converged(self, trial: _Trial, predicted: Step) -> bool:
@@ -710,10 +659,8 @@ class _Search:
     def _is_slow(self, trial: _Trial) -> bool:
         """Count consecutive iterations of little use; True after too many of them."""
         share = self.settings.stagnant_share
-        if self.cost - trial.cost <= share * self.cost:
-            self.slow_iterations += 1
-        else:
-            self.slow_iterations = 0
+        is_slow = self.cost - trial.cost <= share * self.cost
+        self.slow_iterations = self.slow_iterations + 1 if is_slow else 0
         return share > 0.0 and self.slow_iterations >= MAX_ROUGH_ITERATIONS
 
     def _is_futile(self, trial: _Trial, predicted: Step) -> bool:
@@ -730,35 +677,6 @@ class _Search:
         """Keep an iterate, with the private unknowns of the first segment only."""
         self.iterates.append(replace(at, private=at.private[:1]))
 
-    def _relax_damping(self, ratio: float) -> None:
-        """Adapt the damping to the ratio of actual to predicted decrease.
-
-        Source: Nielsen (1999), eq. 2.5.
-        """
-        if not self.settings.damped:
-            return
-
-        factor = max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-        self.damping = max(self.damping * factor, MIN_DAMPING)
-        self.damping_growth = 2.0
-
-    def _linearise(self) -> Solution | None:
-        """Linearise at the current point.
-
-        Return a solution where a simulation diverges, or where the budget is exhausted.
-        """
-        if (reason := self.budget.exhausted) is not None:
-            return self._stopped(reason)
-
-        condensed = self.problem.condense(self.unknowns)
-        if condensed is None:
-            return self._solution(
-                "stopped: the simulation diverges next to the estimate", success=False
-            )
-
-        self.condensed = condensed
-        return None
-
     def _without_progress(self, predicted: Step) -> Solution:
         """Solution where no step lowers the cost: converged if the predicted step is short."""
         self._find_unit()
@@ -767,23 +685,24 @@ class _Search:
         if is_short and predicted.private_length < max(short, SHORT_PRIVATE_STEP):
             return self._solution("converged: the residual stopped falling", success=True)
 
-        solution = self._solution(
+        return self._solution(
             "stopped: no step lowers the residual any more, though the linearised model predicts "
             "one",
-            success=False,
+            stuck=True,
         )
-        return replace(solution, stuck=True)
 
-    def _stopped(self, reason: StopReason) -> Solution:
+    def _stopped(self) -> Solution | None:
         """Best values so far, where the budget is exhausted."""
+        reason = self.budget.exhausted
+        if reason is None:
+            return None
         return self._solution(
             f"{reason.value}; the best estimate so far",
-            success=False,
             interrupted=reason is StopReason.REQUESTED,
         )
 
-    def _solution(self, status: str, success: bool, interrupted: bool = False) -> Solution:
-        """The current point as a solution."""
+    def _solution(self, status: str, success: bool = False, **more: bool) -> Solution:
+        """The current point as a solution, with further fields of it."""
         return Solution(
             unknowns=self.unknowns,
             condensed=self.condensed,
@@ -791,6 +710,6 @@ class _Search:
             iterations=self.iteration,
             success=success,
             status=status,
-            interrupted=interrupted,
             iterates=tuple(self.iterates),
+            **more,
         )

@@ -44,7 +44,7 @@ class LinearRecursion:
         """Solve the recursion.
 
         Args:
-            z0: (n,) first state.
+            z0: (n,) first state, or (m, n).
             c: (N, n) inputs, or (m, N, n) for m recursions.
 
         Returns:
@@ -112,26 +112,22 @@ def products_at_samples(matrices: Array, vectors: Array) -> Array:
     return (matrices @ columns).transpose(2, 0, 1)
 
 
-def largest_amplification(A: Array, sizes: Array | None = None) -> float:
+def largest_amplification(A: Array, sizes: Array | float = 1.0) -> float:
     """Largest amplification of a deviation of the state.
 
     It covers deviations from the first sample to any other, and from any sample to the last.
 
     Args:
         A: (N, nx, nx) transition matrices.
-        sizes: (nx,) sizes of the state's components, in which deviations are measured [x-unit];
-            default: 1.
+        sizes: (nx,) sizes of the state's components, in which deviations are measured [x-unit].
 
     Returns:
         The largest spectral norm of the products of transition matrices; at least 1.
     """
-    if sizes is not None:
-        A = A * (sizes / sizes[:, None])
-
-    return _largest_norm(_products(A))
+    return _largest_norm(_products(A, sizes))
 
 
-def amplification_in_best_units(A: Array, sizes: Array | None = None) -> float:
+def amplification_in_best_units(A: Array, sizes: Array | float = 1.0) -> float:
     """Upper bound of the amplification of deviations, in units of the state that make it small.
 
     It is the smaller one of two bounds. The first bound is `largest_amplification` in units of the
@@ -149,15 +145,12 @@ def amplification_in_best_units(A: Array, sizes: Array | None = None) -> float:
 
     Args:
         A: (N, nx, nx) transition matrices.
-        sizes: (nx,) sizes of the state's components [x-unit]; default: 1.
+        sizes: (nx,) sizes of the state's components [x-unit].
 
     Returns:
         The bound, at least 1; infinite where a deviation overflows.
     """
-    if sizes is not None:
-        A = A * (sizes / sizes[:, None])
-
-    products = _products(A)
+    products = _products(A, sizes)
     largest = np.max([np.abs(each).max(axis=0) for each in products], axis=0)
     if not np.isfinite(largest).all():
         return np.inf
@@ -171,20 +164,21 @@ def _largest_norm(products: tuple[Array, Array]) -> float:
     return float(max(np.linalg.norm(each, 2, axis=(1, 2)).max() for each in products))
 
 
-def _products(A: Array) -> tuple[Array, Array]:
-    """Products of transition matrices: (N, nx, nx).
+def _products(A: Array, sizes: Array | float) -> tuple[Array, Array]:
+    """Products of transition matrices: (N, nx, nx), in units of (nx,) sizes of the state.
 
     Returns:
         (N+1, nx, nx) products from the first sample to each one, and from each one to the last.
     """
     N, nx, _ = A.shape
-    recursion = LinearRecursion(A)
-    zero = np.zeros((N, nx))
+    units = np.ones(nx) * sizes
+    recursion = LinearRecursion(A * (units / units[:, None]))
+    zero = np.zeros((nx, N, nx))
     unit = np.eye(nx)
 
-    from_start = np.stack([recursion.forward(e, zero) for e in unit], axis=2)
-    to_end = np.stack([recursion.adjoint(np.concatenate([zero, e[None]])) for e in unit], axis=1)
-    return from_start, to_end
+    from_start = recursion.forward(unit, zero)
+    to_end = recursion.adjoint(np.concatenate([zero, unit[:, None]], axis=1))
+    return from_start.transpose(1, 2, 0), to_end.swapaxes(0, 1)
 
 
 def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
@@ -209,7 +203,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
     if not B.shape[2]:
         return np.zeros((len(A), 0, A.shape[1]))
 
-    return RiccatiSolution.solve(A, B, _constant_weights(len(A), Q, R, terminal)).K
+    return RiccatiSolution.solve(A, B, Weights.constant(len(A), Q, R, terminal)).K
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -249,19 +243,32 @@ class Weights:
     R: Array
     W: Array
 
-    def plus(self, other: Weights, factor: float = 1.0) -> Weights:
+    @staticmethod
+    def constant(N: int, Q: Array, R: Array, terminal: Array) -> Weights:
+        """The form with the same weights at N samples, and a weight of its own of the last state.
+
+        Args:
+            N: Number of samples.
+            Q: (nx, nx) weight of the state.
+            R: (nu, nu) weight of the control.
+            terminal: (nx, nx) weight of the last state.
+        """
+        return Weights(
+            Q=np.stack([*[Q] * N, terminal]),
+            S=np.zeros((N, len(R), len(Q))),
+            R=np.stack([R] * N),
+            W=np.zeros((N + 1, len(R))),
+        )
+
+    def plus(self, other: Weights, factor: float) -> Weights:
         """Sum of this form and a multiple of another one.
 
         Args:
             other: The form to add.
             factor: Number with which the other form is multiplied.
         """
-        return Weights(
-            Q=self.Q + factor * other.Q,
-            S=self.S + factor * other.S,
-            R=self.R + factor * other.R,
-            W=self.W + factor * other.W,
-        )
+        arrays = vars(other)
+        return Weights(**{name: own + factor * arrays[name] for name, own in vars(self).items()})
 
     def scaled(self, factor: float) -> Weights:
         """This form multiplied by a number.
@@ -269,7 +276,7 @@ class Weights:
         Args:
             factor: The number.
         """
-        return Weights(Q=factor * self.Q, S=factor * self.S, R=factor * self.R, W=factor * self.W)
+        return Weights(**{name: factor * array for name, array in vars(self).items()})
 
     def half_gradient(self, zeta: TangentCurve) -> tuple[Array, Array]:
         """Half of the form's gradient (a, b) at a tangent curve zeta.
@@ -282,54 +289,16 @@ class Weights:
         Returns:
             a: (N+1, nx) and b: (N, nu), or (m, N+1, nx) and (m, N, nu).
         """
-        z = zeta.z
-        v = zeta.v
-
+        z, v = zeta.z, zeta.v
         a = products_at_samples(self.Q, z)
         a[..., :-1, :] += products_at_samples(self.S.swapaxes(1, 2), v)
         b = products_at_samples(self.S, z[..., :-1, :])
         b += products_at_samples(self.R, v)
-        if not self.W.any():
-            return a, b
 
         # A change of the control between two samples involves both of them.
         changes = np.diff(v, axis=-2, prepend=0.0, append=0.0)
         weighted = self.W * changes
         return a, b + weighted[..., :-1, :] - weighted[..., 1:, :]
-
-
-def descent(
-    A: Array, B: Array, a: Array, b: Array, *, Q: Array, R: Array, terminal: Array
-) -> TangentCurve:
-    """Steepest descent on the tangent space: the paper's problem (8), by Riccati equations.
-
-    It minimises `sum a'z + b'v + 1/2 z'Qz + 1/2 v'Rv` subject to `z_{k+1} = A_k z_k + B_k v_k` and
-    `z_0 = 0`.
-
-    Args:
-        A: (N, nx, nx) transition matrices.
-        B: (N, nx, nu) input matrices.
-        a: (N+1, nx) derivative of the cost by the state.
-        b: (N, nu) derivative of the cost by the control.
-        Q: (nx, nx) metric on z_k for k < N.
-        R: (nu, nu) metric on v_k.
-        terminal: (nx, nx) metric on z_N.
-
-    Returns:
-        The minimiser.
-    """
-    weights = _constant_weights(len(B), Q, R, terminal)
-    return RiccatiSolution.solve(A, B, weights).descent(a, b)
-
-
-def _constant_weights(N: int, Q: Array, R: Array, terminal: Array) -> Weights:
-    """The form with the same weights at N samples, and a weight of its own for the last state."""
-    return Weights(
-        Q=np.stack([*[Q] * N, terminal]),
-        S=np.zeros((N, len(R), len(Q))),
-        R=np.stack([R] * N),
-        W=np.zeros((N + 1, len(R))),
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -376,7 +345,8 @@ class RiccatiSolution:
         # Each step of the recursion is one quadratic form of (v_k, z_k). It adds the weights of the
         # sample and those of the next state, which the matrix [B A] gives.
         to_next = np.concatenate([B, A], axis=2)
-        forms = _forms_of_samples(weights)
+        coupling = weights.S.swapaxes(1, 2)
+        forms = np.block([[weights.R, weights.S], [coupling, weights.Q[:-1]]])
         factors = np.empty((N, nu, forms.shape[2]))
         P = weights.Q[N]
 
@@ -405,6 +375,9 @@ class RiccatiSolution:
     def descent(self, a: Array, b: Array) -> TangentCurve:
         """Minimiser of the linear cost `sum a'z + b'v` plus half of the quadratic form.
 
+        It is the solution of the paper's problem (8), with `z_{k+1} = A_k z_k + B_k v_k` and
+        `z_0 = 0`.
+
         Args:
             a: (N+1, nx) derivative of the cost by the state, or (m, N+1, nx) for m costs.
             b: (N, nu) derivative of the cost by the control, or (m, N, nu).
@@ -429,17 +402,6 @@ class RiccatiSolution:
         return TangentCurve(z=z[..., : self.nx], v=v)
 
 
-def _forms_of_samples(weights: Weights) -> Array:
-    """(N, nu+nx, nu+nx) matrices of a form without W, one for (v_k, z_k) of each sample."""
-    N, nu, nx = weights.S.shape
-    forms = np.empty((N, nu + nx, nu + nx))
-    forms[:, :nu, :nu] = weights.R
-    forms[:, :nu, nu:] = weights.S
-    forms[:, nu:, :nu] = weights.S.swapaxes(1, 2)
-    forms[:, nu:, nu:] = weights.Q[:-1]
-    return forms
-
-
 def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array, Array, Weights]:
     """The problem with the state extended by the previous control.
 
@@ -454,28 +416,20 @@ def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array,
         Transition and input matrices of the state (x_k, v_{k-1}), and the form without W.
     """
     N, nx, nu = B.shape
-    n = nx + nu
     unit = np.eye(nu)
     change_weights = unit * weights.W[:, None]
 
     # Dynamics of the extended state; its last part becomes the present control.
-    wide_A = np.zeros((N, n, n))
-    wide_A[:, :nx, :nx] = A
-    wide_B = np.zeros((N, n, nu))
-    wide_B[:, :nx] = B
-    wide_B[:, nx:] = unit
+    room = ((0, 0), (0, nu), (0, nu))
+    wide_A = np.pad(A, room)
+    wide_B = np.concatenate([B, np.broadcast_to(unit, (N, nu, nu))], axis=1)
 
     # Terms of W (v_k - v_{k-1})^2 with the previous control, with both, and with the present one.
-    Q = np.zeros((N + 1, n, n))
-    Q[:, :nx, :nx] = weights.Q
+    Q = np.pad(weights.Q, room)
     Q[:, nx:, nx:] = change_weights
-    S = np.zeros((N, nu, n))
-    S[:, :, :nx] = weights.S
-    S[:, :, nx:] = -change_weights[:-1]
+    S = np.concatenate([weights.S, -change_weights[:-1]], axis=2)
     R = weights.R + change_weights[:-1]
-
-    wide = Weights(Q=Q, S=S, R=R, W=np.zeros_like(weights.W))
-    return wide_A, wide_B, wide
+    return wide_A, wide_B, Weights(Q=Q, S=S, R=R, W=np.zeros_like(weights.W))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

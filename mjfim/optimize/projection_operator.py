@@ -74,6 +74,10 @@ class Expansion:
         """
         return float(np.sum(self.a * zeta.z) + np.sum(self.b * zeta.v))
 
+    def coordinates(self, K: Array) -> CurveCoordinates:
+        """Curve coordinates of the trajectory, with a gain K: (N, nu, nx)."""
+        return CurveCoordinates(A=self.A, B=self.B, K=K)
+
     def gradient(self, K: Array) -> Array:
         """Gradient by the curve coordinate `c = u + K x`, that is, through the projection operator.
 
@@ -83,7 +87,7 @@ class Expansion:
         Returns:
             (N, nu) gradient [1 / u-unit].
         """
-        return CurveCoordinates(A=self.A, B=self.B, K=K).gradient(self.a, self.b)
+        return self.coordinates(K).gradient(self.a, self.b)
 
     def lift(self, K: Array, c: Array) -> TangentCurve:
         """Tangent vector of a change of the curve coordinate.
@@ -95,7 +99,7 @@ class Expansion:
         Returns:
             The tangent vector.
         """
-        return CurveCoordinates(A=self.A, B=self.B, K=K).lift(c)
+        return self.coordinates(K).lift(c)
 
 
 class Problem(Protocol[P]):
@@ -113,7 +117,6 @@ class Problem(Protocol[P]):
         Returns:
             The cost; infinite where the simulation of the point diverged.
         """
-        ...
 
     def size(self, point: P) -> float:
         """Scale with which changes of J are compared.
@@ -124,7 +127,6 @@ class Problem(Protocol[P]):
         Returns:
             A positive number; J itself where J is positive.
         """
-        ...
 
     def expand(self, point: P) -> Expansion:
         """First-order expansion at a point.
@@ -135,7 +137,6 @@ class Problem(Protocol[P]):
         Returns:
             The expansion.
         """
-        ...
 
     def project(self, point: P, zeta: TangentCurve, gamma: float, K: Array) -> P:
         """The trajectory P(xi + gamma zeta).
@@ -149,7 +150,6 @@ class Problem(Protocol[P]):
         Returns:
             The projected point.
         """
-        ...
 
     def difference(self, new: P, old: P) -> TangentCurve:
         """Difference of two trajectories in the tangent space.
@@ -161,7 +161,6 @@ class Problem(Protocol[P]):
         Returns:
             The tangent vector (x_new - x_old, u_new - u_old).
         """
-        ...
 
     def refine(self, point: P) -> P | None:
         """Make the derivatives at a point more accurate.
@@ -172,7 +171,6 @@ class Problem(Protocol[P]):
         Returns:
             The point with more accurate derivatives; None where there are no more accurate ones.
         """
-        ...
 
 
 class Direction(Protocol):
@@ -180,7 +178,6 @@ class Direction(Protocol):
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
         """A descent direction at an expansion, under the regulator K: (N, nu, nx)."""
-        ...
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
         """Learn from an accepted step.
@@ -190,11 +187,11 @@ class Direction(Protocol):
             K: (N, nu, nx) gain of the projection operator.
             moved: Difference between the new and the old point.
         """
-        ...
+        return
 
     def reset(self) -> bool:
         """Clear the memory; True if there was something to clear."""
-        ...
+        return False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,7 +294,7 @@ class Regulator:
             units, up to which the projection needs no feedback and K is zero. With 0 there is
             always feedback, with infinity never.
         state_sizes: (nx,) sizes of the state's components [x-unit], units in which deviations are
-            measured besides the best ones; default: 1.
+            measured besides the best ones.
     """
 
     Q: Array
@@ -305,7 +302,7 @@ class Regulator:
     terminal: Array
     period: int = 10
     feedback_threshold: float = 0.0
-    state_sizes: Array | None = None
+    state_sizes: Array | float = 1.0
 
     def gain(self, expansion: Expansion) -> Array:
         """Gain about the trajectory of an expansion.
@@ -318,16 +315,13 @@ class Regulator:
         """
         # The two extreme thresholds need no amplification, whose computation takes time.
         threshold = self.feedback_threshold
-        if threshold == 0.0 or np.isinf(threshold):
-            needs_feedback = threshold == 0.0
-        else:
+        growth = np.inf if threshold == 0.0 else 0.0
+        if 0.0 < threshold < np.inf:
             growth = amplification_in_best_units(expansion.A, self.state_sizes)
-            needs_feedback = growth > threshold
-        if needs_feedback:
+        if growth > threshold:
             return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
 
-        N, nx, nu = expansion.B.shape
-        return np.zeros((N, nu, nx))
+        return np.zeros_like(expansion.B.swapaxes(1, 2))
 
 
 def optimize(
@@ -371,41 +365,32 @@ def optimize(
             gamma=gamma,
         )
 
-        # Converged, unless more accurate derivatives show a further descent.
-        if abs(slope) <= tolerance * size:
-            better = problem.refine(point)
-            if better is None:
-                yield replace(iterate, status=Status.CONVERGED)
+        found, status = None, Status.CONVERGED
+        if abs(slope) > tolerance * size:
+            if index >= max_iterations:
+                yield replace(iterate, status=Status.MAX_ITERATIONS)
                 return
-            point = better
-            expansion = problem.expand(point)
-            continue
 
-        if index >= max_iterations:
-            yield replace(iterate, status=Status.MAX_ITERATIONS)
-            return
+            yield iterate
+            status = Status.STALLED
 
-        yield iterate
+            # The linear model is wrong for a step that predicts a decrease of more than twice J.
+            # The line search begins with a shorter step then.
+            if slope < 0.0:
+                first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)
+                found = armijo.search(problem, point, zeta, slope, K, first)
 
-        # The linear model is wrong for a step that predicts a decrease of more than twice J. The
-        # line search begins with a shorter step then.
-        found = None
-        if slope < 0.0:
-            first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)
-            found = armijo.search(problem, point, zeta, slope, K, first)
-
-        # If no step length lowers J: refine the derivatives; if that is impossible, clear the
-        # memory of the direction; if it is empty, end.
+        # More accurate derivatives may show a further descent. Where there are none and no step
+        # lowers J, the memory of the direction is cleared. If it is empty, the algorithm ends.
         if found is None:
             better = problem.refine(point)
             if better is not None:
                 point = better
                 expansion = problem.expand(point)
-                continue
-            if direction.reset():
-                continue
-            yield replace(iterate, status=Status.STALLED)
-            return
+            elif status is Status.CONVERGED or not direction.reset():
+                yield replace(iterate, status=status)
+                return
+            continue
 
         previous = point
         point, gamma = found

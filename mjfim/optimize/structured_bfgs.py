@@ -78,11 +78,6 @@ class CurveMetric:
     coordinates: CurveCoordinates
     weights: Weights
 
-    @cached_property
-    def _riccati(self) -> RiccatiSolution:
-        """Factored linear-quadratic problem of the form."""
-        return RiccatiSolution.solve(self.coordinates.A, self.coordinates.B, self.weights)
-
     def apply(self, s: Array) -> Array:
         """Product of the metric's matrix with a curve coordinate.
 
@@ -104,11 +99,12 @@ class CurveMetric:
         Returns:
             (N, nu) curve coordinate s with `apply(s) = g`, or (m, N, nu).
         """
-        K = self.coordinates.K
+        A, B, K = self.coordinates.A, self.coordinates.B, self.coordinates.K
         *m, N, _ = g.shape
         a = np.zeros((*m, N + 1, K.shape[2]))
         a[..., :-1, :] = -products_at_samples(K.swapaxes(1, 2), g)
-        return self.coordinates.coordinate(self._riccati.descent(a, -g))
+        curve = RiccatiSolution.solve(A, B, self.weights).descent(a, -g)
+        return self.coordinates.coordinate(curve)
 
 
 def basis_response(expansion: Expansion, basis: Array) -> Array:
@@ -160,8 +156,7 @@ def basis_matrix(basis: Array, response: Array, weights: Weights) -> Array:
     for u in range(nu):
         control[:, :, u, u] += steps.T @ (weights.W[:, u, None] * steps)
 
-    control_matrix = control.swapaxes(1, 2).reshape(M * nu, M * nu)
-    return np.asarray(0.5 * (H + H.T) + control_matrix)
+    return np.asarray(0.5 * (H + H.T) + control.swapaxes(1, 2).reshape(M * nu, M * nu))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,12 +168,6 @@ class BasisMetric:
     """
 
     H: Array
-
-    @cached_property
-    def _factor(self) -> tuple[Array, bool]:
-        """Cholesky factor of H, and whether it is the lower one."""
-        factor, lower = scipy.linalg.cho_factor(self.H, lower=True)
-        return factor, bool(lower)
 
     def apply(self, s: Array) -> Array:
         """Product of the matrix with coefficients.
@@ -201,7 +190,8 @@ class BasisMetric:
             (M, nu) coefficients s with `apply(s) = g`, or (m, M, nu).
         """
         columns = g.reshape(-1, len(self.H)).T
-        return np.asarray(scipy.linalg.cho_solve(self._factor, columns).T.reshape(g.shape))
+        factor = scipy.linalg.cho_factor(self.H, lower=True)
+        return np.asarray(scipy.linalg.cho_solve(factor, columns).T.reshape(g.shape))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -212,6 +202,7 @@ class _LocalModel:
 
     Attributes:
         expansion: Expansion at the point.
+        barrier: Its barrier.
         coordinates: Curve coordinates of its trajectory.
         weights: The barrier's Gauss-Newton Hessian and the ridge, as a form on tangent curves.
         gradient: Gradient of cost and barrier.
@@ -222,6 +213,7 @@ class _LocalModel:
     """
 
     expansion: Expansion
+    barrier: BarrierExpansion
     coordinates: CurveCoordinates
     weights: Weights
     gradient: Array
@@ -241,7 +233,7 @@ class _LocalModel:
         if self.basis is None:
             weights = self.weights
             if damping > 0.0:
-                weights = weights.plus(_barrier(self.expansion).uniform_weights, damping)
+                weights = weights.plus(self.barrier.uniform_weights, damping)
             return CurveMetric(coordinates=self.coordinates, weights=weights)
 
         H, uniform_H = self._matrices
@@ -254,10 +246,9 @@ class _LocalModel:
         """(M nu, M nu) matrices of the weights and of the uniform weights on the coefficients."""
         assert self.basis is not None
         response = basis_response(self.expansion, self.basis)
-        uniform = _barrier(self.expansion).uniform_weights
         return (
             basis_matrix(self.basis, response, self.weights),
-            basis_matrix(self.basis, response, uniform),
+            basis_matrix(self.basis, response, self.barrier.uniform_weights),
         )
 
     def predicted_change(self, s: Array) -> Array:
@@ -361,7 +352,7 @@ class StructuredBFGS:
         Returns:
             The model with the last curvature, its minimum, and the length of that.
         """
-        curvature = _barrier(here.expansion).curvature
+        curvature = here.barrier.curvature
         if curvature is None:
             return here, zeta, relative_length
 
@@ -377,18 +368,14 @@ class StructuredBFGS:
 
     def _with_ridge(self, form: Weights) -> Weights:
         """Weights of the barrier plus those of the ridge."""
-        return Weights(Q=form.Q, S=form.S, R=form.R + np.diag(self.ridge), W=form.W)
+        return replace(form, R=form.R + np.diag(self.ridge))
 
     def _damped_curve(self, here: _LocalModel) -> tuple[TangentCurve, float]:
         """Tangent curve of the model's minimum, and its length over the trusted length."""
         step = self._step(here)
         c = step if self.basis is None else self.basis @ step
         zeta = here.coordinates.lift(c)
-        return zeta, self._relative_length(here.expansion, zeta)
-
-    def _relative_length(self, expansion: Expansion, zeta: TangentCurve) -> float:
-        """Length of a tangent curve over the trusted length."""
-        return _barrier(expansion).largest_relative_move(zeta) / self.reach
+        return zeta, here.barrier.largest_relative_move(zeta) / self.reach
 
     def _step(self, here: _LocalModel) -> Array:
         """Minimum of the model, in its coordinates, with the present damping."""
@@ -433,7 +420,20 @@ class StructuredBFGS:
         if before is None or proposed is None:
             return
 
-        self._adapt(before, proposed, moved)
+        # The curvature along the step is tried after a step that was much too long, and given up
+        # after one that was too long in spite of it.
+        square = max(float(np.vdot(proposed.v, proposed.v)), SMALLEST_SQUARE)
+        taken_fraction = float(np.vdot(proposed.v, moved.v)) / square
+        if taken_fraction < MUCH_SHORTENED and before.barrier.curvature is not None:
+            self.is_bent = not self.is_bent
+
+        # The damping falls after a step that was taken, and rises after a shortened one.
+        if taken_fraction > MIN_TAKEN_FRACTION:
+            relative_length = before.barrier.largest_relative_move(proposed) / self.reach
+            factor = float(np.clip(DAMPING_GAIN * relative_length, *LOWER_LIMITS))
+            self.damping = self.damping * factor if self.damping > MIN_DAMPING else 0.0
+        elif before.expansion.slope(proposed) < -SIGNIFICANT_DECREASE:
+            self.damping = RAISE_LIMITS[0] * max(self.damping, MIN_DAMPING)
 
         after = self._local_model(expansion, K)
         s = after.coordinates.coordinate(moved)
@@ -442,28 +442,6 @@ class StructuredBFGS:
 
         y = after.cost_gradient - before.cost_gradient - before.predicted_change(s)
         self._pairs = (*self._pairs, (s, y))[-self.memory :]
-
-    def _adapt(self, before: _LocalModel, proposed: TangentCurve, moved: TangentCurve) -> None:
-        """Lower the damping after a step that was taken, raise it after a shortened one.
-
-        Such a step also changes how the curvature of the barrier is taken.
-        """
-        square = max(float(np.vdot(proposed.v, proposed.v)), SMALLEST_SQUARE)
-        taken_fraction = float(np.vdot(proposed.v, moved.v)) / square
-
-        # The curvature along the step is tried after a step that was much too long, and given up
-        # after one that was too long in spite of it.
-        if taken_fraction < MUCH_SHORTENED and _barrier(before.expansion).curvature is not None:
-            self.is_bent = not self.is_bent
-
-        if taken_fraction > MIN_TAKEN_FRACTION:
-            relative_length = self._relative_length(before.expansion, proposed)
-            factor = float(np.clip(DAMPING_GAIN * relative_length, *LOWER_LIMITS))
-            self.damping = self.damping * factor if self.damping > MIN_DAMPING else 0.0
-            return
-
-        if before.expansion.slope(proposed) < -SIGNIFICANT_DECREASE:
-            self.damping = RAISE_LIMITS[0] * max(self.damping, MIN_DAMPING)
 
     def reset(self) -> bool:
         """Clear the memory.
@@ -481,9 +459,10 @@ class StructuredBFGS:
         if last is not None and last.expansion is expansion and last.coordinates.K is K:
             return last
 
-        barrier = _barrier(expansion)
-        weights = self._with_ridge(barrier.weights)
-        coordinates = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
+        barrier = expansion.barrier
+        if barrier is None:
+            raise ValueError("a direction under hard limits needs their expansion")
+        coordinates = expansion.coordinates(K)
 
         # Gradients of the sum, of the cost alone, and of the coordinates of the eigenvalue model.
         a = [expansion.a[None], (expansion.a - barrier.a)[None]]
@@ -498,19 +477,12 @@ class StructuredBFGS:
 
         self._last = _LocalModel(
             expansion=expansion,
+            barrier=barrier,
             coordinates=coordinates,
-            weights=weights,
+            weights=self._with_ridge(barrier.weights),
             gradient=gradients[0],
             cost_gradient=gradients[1],
             eigenvalue_slopes=gradients[2:],
             basis=self.basis,
         )
         return self._last
-
-
-def _barrier(expansion: Expansion) -> BarrierExpansion:
-    """Expansion of the barrier. Raises ValueError where there is none."""
-    if expansion.barrier is None:
-        raise ValueError("a direction under hard limits needs their expansion")
-
-    return expansion.barrier

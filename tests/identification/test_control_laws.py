@@ -166,7 +166,6 @@ def test_derivatives_agree_with_differences_of_a_plain_loop(of_a_fit: bool) -> N
         problem = FitProblem.of(system, [exact(system, inputs)])
         batch = next(problem.batches(derivatives=True))
         (rows,) = problem.rows_of_batch(problem.begin(guess), batch)
-        assert rows is not None
         found = rows.jacobians[0]
     size = np.abs(expected).max(axis=(0, 1))
     assert (size * guess > 1e-4).all()

@@ -111,12 +111,12 @@ def test_the_longest_length_is_chosen_unless_it_predicts_clearly_worse() -> None
     rng = np.random.default_rng(0)
     noise = rng.random(20)
     best, same, worse = noise + 1.0, noise + 1.0 + rng.normal(0.0, 0.05, 20), noise + 1.5
-    assert _chosen([losses(each.tolist()) for each in (best, same, best)]) == 2
-    assert _chosen([losses(each.tolist()) for each in (best, same, worse)]) == 1
-    assert _chosen([losses(each.tolist()) for each in (best, worse, worse)]) == 0
+    assert _chosen([[losses(each.tolist())] for each in (best, same, best)]) == 2
+    assert _chosen([[losses(each.tolist())] for each in (best, same, worse)]) == 1
+    assert _chosen([[losses(each.tolist())] for each in (best, worse, worse)]) == 0
 
     # A difference of half a percent is clear here, but not relevant.
-    assert _chosen([losses(each.tolist()) for each in (best, 1.005 * best)]) == 1
+    assert _chosen([[losses(each.tolist())] for each in (best, 1.005 * best)]) == 1
 
 
 def test_a_dependence_on_the_length_is_a_finding_that_the_interval_covers() -> None:

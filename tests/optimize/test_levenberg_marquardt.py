@@ -667,8 +667,8 @@ def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
 )
 def test_one_stagnant_iteration_may_be_chance(unit: float, promised: float, ends: bool) -> None:
     settings = SearchSettings(relinearise_at_end=False)
-    search = _Search(problem(rosenbrock, lower=[-5.0, -5.0]), settings, Budget(), None)
-    search.unit, search.cost = unit, 100.0
+    p, start = problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0)
+    search = _Search(p, settings, Budget(), None, start, 100.0, p.condense(start), unit=unit)
     trial: Any = SimpleNamespace(cost=100.0 - 0.005 * unit)
     predicted: Any = SimpleNamespace(predicted_decrease=promised)
     assert search._stagnates(trial, predicted) == ends

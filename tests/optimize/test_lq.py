@@ -18,7 +18,6 @@ from mjfim.optimize.lq import (
     TangentCurve,
     Weights,
     amplification_in_best_units,
-    descent,
     largest_amplification,
     regulator,
 )
@@ -166,6 +165,21 @@ def test_regulator_gain_minimises_its_cost_over_a_finite_time_varying_horizon() 
         assert cost(best - step) - cost(best) == pytest.approx(
             rise, rel=1e-5
         )  # stationary: no linear term
+
+
+def descent(
+    A: np.ndarray,
+    B: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    *,
+    Q: np.ndarray,
+    R: np.ndarray,
+    terminal: np.ndarray,
+) -> TangentCurve:
+    """The minimiser with constant weights."""
+    weights = Weights.constant(len(B), Q, R, terminal)
+    return RiccatiSolution.solve(A, B, weights).descent(a, b)
 
 
 @pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])

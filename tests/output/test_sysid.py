@@ -139,7 +139,6 @@ def test_sysid_gets_the_same_model_data_and_weights(case: str, tmp_path: Path) -
     assert same_dynamics(built, task.system.model_at(theta))
     fit = FitProblem.of(task.system, [recording])
     wanted = dense_residuals(fit, fit.begin(theta))
-    assert wanted is not None
     mine = np.sort(np.abs(residual(problem, theta)))
     theirs = np.sort(np.abs(wanted.r[: fit.value_count]))  # priors follow the data
     np.testing.assert_allclose(mine, theirs, rtol=1e-6, atol=1e-6)
@@ -157,7 +156,6 @@ def test_times_off_the_grid_are_read_between_the_steps() -> None:
     problem = sysid_problem(task.system, [recording])
     fit = FitProblem.of(task.system, [recording])
     wanted = dense_residuals(fit, fit.begin(task.parameters.true))
-    assert wanted is not None
     mine = residual(problem, task.parameters.true)
     np.testing.assert_allclose(mine, -wanted.r, atol=1e-3)
 

@@ -27,7 +27,7 @@ class Residuals:
     J: Array
 
 
-def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
+def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals:
     """All rows without a loss: recordings first, then priors and pins.
 
     Args:
@@ -35,7 +35,10 @@ def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
         at: The unknowns.
 
     Returns:
-        Residuals with their derivatives; None where a perturbed simulation diverges.
+        Residuals with their derivatives.
+
+    Raises:
+        DivergedSegmentError: A perturbed simulation diverges.
     """
     n = problem.private_count
     residuals = []
@@ -43,8 +46,6 @@ def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
 
     for batch in problem.batches(derivatives=True):
         for rows in problem.rows_of_batch(at, batch):
-            if rows is None:
-                return None
             _, r, J = problem.linearised(rows)
             residuals.append(r)
             jacobians.append(_wide_jacobian(problem, J[:, n:], J[:, :n], rows.segment))
