@@ -25,7 +25,7 @@ from mjfim.output.panels import Picture
 from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
 from mjfim.output.plots import estimate_studies, studies
-from mjfim.output.words import CampaignParameters, complete_labels
+from mjfim.output.words import complete_labels
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -254,10 +254,7 @@ def _(result: Rehearsal) -> Pictures:
 @pictures_of.register
 def _(campaign: Campaign) -> Pictures:
     """The picture of a campaign; none before its first round."""
-    if not campaign.rounds:
-        return {}
-    parameters = CampaignParameters.recorded(campaign)
-    return {"campaign": partial(studies.campaign, campaign, parameters)}
+    return {"campaign": partial(studies.campaign, campaign)} if campaign.rounds else {}
 
 
 # Messages for developers, which a user does not see.

@@ -41,7 +41,6 @@ from mjfim.output.panels import (
 from mjfim.output.plots.estimate_studies import pairs
 from mjfim.output.words import (
     BEST_CASE,
-    CampaignParameters,
     as_sentence,
     format_number,
     format_percent,
@@ -678,19 +677,24 @@ def _row(values: Array, row: int, role: str, label: str) -> list[Mark]:
 # ---- campaigns
 
 
-def campaign(result: Campaign, parameters: CampaignParameters) -> Picture:
-    """Show standard deviation and estimate of each parameter over the rounds."""
+def campaign(result: Campaign, true: Array | None = None) -> Picture:
+    """Show standard deviation and estimate of each parameter over the rounds.
+
+    Args:
+        result: The campaign.
+        true: (p,) true values of its parameters [theta-unit], where they are known.
+    """
     has_target = np.isfinite(result.wanted)
-    shown = sorted(parameters.interest, key=lambda j: not has_target[j])[:MAX_ROUNDS]
+    shown = sorted(result.interest, key=lambda j: not has_target[j])[:MAX_ROUNDS]
     numbers = np.array([float(r.number) for r in result.rounds])
     limits = (0.5, float(numbers[-1]) + 0.5)
     panels = []
     for row, j in enumerate(shown):
-        name, unit = shorten(parameters.names[j], 18), parameters.units[j]
+        name = shorten(result.parameters[j], 18)
+        unit = result.rounds[0].estimate.units[j]
         label = "round" if row == len(shown) - 1 else ""
         axis = Axis(label=label, limits=limits, most=min(len(numbers), 8), whole=True)
         guess = format_number(float(result.rounds[0].theta[j]), 4)
-        true = None if parameters.true is None else float(parameters.true[j])
         panels += [
             _accuracy_over_rounds(
                 result, numbers, j, title=with_unit(f"σ of {name}", unit), axis=axis, row=row
@@ -748,7 +752,7 @@ def _estimate_over_rounds(
     result: Campaign,
     numbers: Array,
     j: int,
-    true: float | None,
+    true: Array | None,
     *,
     title: str,
     axis: Axis,
@@ -767,5 +771,5 @@ def _estimate_over_rounds(
         if np.isfinite(std[-1]):
             marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED.word, opacity=0.07))
     if true is not None:
-        marks.append(hline(true, label="true value"))
+        marks.append(hline(float(true[j]), label="true value"))
     return Panel(title=title, marks=marks, x=axis, y=Axis(most=4), place=(row, 1))
