@@ -31,6 +31,7 @@ from mjfim.output.rerun.camera import (
     camera_axes,
     extents,
     fit_in_view,
+    followed_body,
     moving_points,
     seen_points,
     view_direction,
@@ -57,10 +58,8 @@ SLOW_SPEEDS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 # is largest. They are even, as the encoder of mp4 needs.
 VIEW_SIZES = ((640, 360), (560, 420), (480, 480))
 
-# Distance that a free body travels, as a multiple of the size of the robot, above which the camera
-# follows it; time over which the motion of this camera is averaged [s of the film]; and points of
-# the line along the path of the body.
-FOLLOWED_TRAVEL = 1.5
+# Time over which the motion of a camera that follows a free body is averaged [s of the film], and
+# points of the line along the path of the body.
 CAMERA_SECONDS = 0.5
 TRAIL_POINTS = 100
 
@@ -239,7 +238,8 @@ def film_of_motions(
     ]
     poses = [[body_poses(model, t, track.qpos) for track in view] for view in tracks]
     nothing, points = np.zeros((0, 3)), evenly_spread_indices(frames, TRAIL_POINTS)
-    paths = _followed_paths(model, poses)
+    followed = followed_body(model, [view[0] for view in poses])
+    paths = [] if followed is None else [view[0].positions[:, followed] for view in poses]
     shifts = [_smooth(path - path[0]) for path in paths] or [np.zeros((frames, 3))] * len(poses)
     camera = _camera(model, poses, shifts)
     views = []
@@ -325,27 +325,6 @@ def _camera(
         spacing=FLOOR_SPACING * max(distance, height),
         size=size,
     )
-
-
-def _followed_paths(model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]]) -> list[Array]:
-    """The (F, 3) path in each view of the free body that the camera follows [m].
-
-    There are none where no free body travels far.
-    """
-    free = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
-    if not len(free):
-        return []
-
-    # The free body that carries most of the mass, and its size with everything on it.
-    bodies = model.jnt_bodyid[free]
-    body = int(bodies[np.argmax(model.body_subtreemass[bodies])])
-    members = np.flatnonzero(model.body_rootid == model.body_rootid[body])
-    reach = model.geom_rbound[np.isin(model.geom_bodyid, members)].max(initial=0.0)
-    size = 2.0 * float(reach) or float(model.stat.extent)
-
-    paths = [view[0].positions[:, body] for view in poses]
-    travel = max(float(np.ptp(path, axis=0).max()) for path in paths)
-    return paths if travel >= FOLLOWED_TRAVEL * size else []
 
 
 def _smooth(path: Array) -> Array:

@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 import mujoco
@@ -67,8 +68,8 @@ from mjfim.output.rerun.scene import (
     log_pose,
     log_robot,
     pale_shapes,
-    strip_of_path,
 )
+from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Labels, Trajectory
@@ -90,9 +91,7 @@ ROBOTS_TO_TEXT, LEFT_TO_RIGHT = [5, 4], [2, 3]
 START_SECONDS = 3.0
 
 
-def log_design(
-    path: Path, model: mujoco.MjModel, design: Design, labels: Labels, *, addition: str = ""
-) -> None:
+def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels) -> None:
     """Write design.rrd: both robots, their signals, sensitivities, the search and a summary.
 
     Args:
@@ -100,7 +99,6 @@ def log_design(
         model: Model with the parameters of the design.
         design: The design.
         labels: Labels of its columns.
-        addition: Markdown below the summary.
     """
     both = {
         INITIAL.word: design.initial.trajectory,
@@ -111,14 +109,10 @@ def log_design(
         "limits": limit_panels(design, labels, rows=False),
         "information": [information_panel(design)],
     }
-    named = replace(
-        labels,
-        parameters=design.parameters,
-        parameter_units=labels.parameter_units or ("",) * len(design.parameters),
-    )
+    phases = sensitivity_phase(design, complete_labels(design))
     planes = {
-        "sensitivities ψ": planes_of("sensitivities ψ", sensitivity_phase(design, named).panels),
-        "optimiser": planes_of("optimiser", convergence(design).panels),
+        name: planes_of(name, picture.panels)
+        for name, picture in (("sensitivities ψ", phases), ("optimiser", convergence(design)))
     }
     iterates = _iterate_plots(design, labels)
     grids = []
@@ -128,17 +122,13 @@ def log_design(
 
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in both.items()}
     robots = _robots(model, poses, ASPECT_WITH_TEXT)
-    with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids]) as rec:
-        _log_text(rec, design_text(design, addition))
+    text = as_markdown(page_of(design), DESIGN_COLOURS)
+    with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids], text) as rec:
         log_series(rec, tabs)
         for found in planes.values():
             for plane, panel in found:
                 plane.log(rec, panel.marks)
-        for name, each in poses.items():
-            log_robot(rec, model, ("robots", name), each, style_of(name))
-        initial = poses[INITIAL.word]
-        root = ("robots", INITIAL.word)
-        log_end_path(rec, model, root, initial, style_of(root[1]))
+        _log_robots(rec, model, poses, {name: name for name in poses}, [INITIAL.word])
         _log_iterates(rec, model, design, iterates)
 
 
@@ -149,8 +139,6 @@ def log_estimate(
     measured: Trajectory | None,
     identified: Trajectory,
     labels: Labels,
-    *,
-    addition: str = "",
 ) -> None:
     """Write estimate.rrd: identified and measured robot and outputs, residuals and a summary.
 
@@ -161,7 +149,6 @@ def log_estimate(
         measured: Motion of the first recording, where its positions were measured.
         identified: Motion of the identified model.
         labels: Labels of their columns.
-        addition: Markdown below the summary.
     """
     shown = {IDENTIFIED.word: _thinned(identified)}
     title = f"{IDENTIFIED.word} robot ({IDENTIFIED.colour_name})"
@@ -190,12 +177,10 @@ def log_estimate(
     root = ("robots", IDENTIFIED.word)
     view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
     tabs += series_tabs(states)
-    with open_recording(path, model, "estimate", view, tabs) as rec:
-        _log_text(rec, estimate_text(estimate, addition))
+    text = as_markdown(page_of(estimate), ESTIMATE_COLOURS)
+    with open_recording(path, model, "estimate", view, tabs, text) as rec:
         log_series(rec, recordings | states)
-        for name, each in poses.items():
-            log_robot(rec, model, ("robots", name), each, style_of(name))
-        log_end_path(rec, model, root, poses[IDENTIFIED.word], style_of(root[1]))
+        _log_robots(rec, model, poses, {name: name for name in poses}, [IDENTIFIED.word])
 
 
 def _pairs(panels: Sequence[Panel]) -> list[Panel]:
@@ -221,7 +206,9 @@ def log_trajectories(
     """
     named = {shown_word(name): each for name, each in trajectories.items()}
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in named.items()}
-    roles = dict(zip(named, _roles(list(named)), strict=True))
+    further = cycle(FURTHER_ROLES)
+    known = (INITIAL.word, DESIGNED.word)
+    roles = {name: name if name in known else next(further) for name in named}
     states: Tabs = {
         group: [
             replace(
@@ -237,19 +224,9 @@ def log_trajectories(
         ).items()
     }
     robots = _robots(model, poses, ASPECT_WITHOUT_TEXT, roles)
-    with open_recording(path, model, "replay", robots, series_tabs(states), text=False) as rec:
+    with open_recording(path, model, "replay", robots, series_tabs(states)) as rec:
         log_series(rec, states)
-        for name, each in poses.items():
-            style = style_of(roles[name])
-            log_robot(rec, model, ("robots", name), each, style)
-            log_end_path(rec, model, ("robots", name), each, style)
-
-
-def _roles(names: Sequence[str]) -> list[str]:
-    """Return a role for every name; names that are no words take the further ones in turn."""
-    known = (INITIAL.word, DESIGNED.word)
-    further = iter(FURTHER_ROLES * (1 + len(names) // len(FURTHER_ROLES)))
-    return [name if name in known else next(further) for name in names]
+        _log_robots(rec, model, poses, roles, list(poses))
 
 
 def style_of(role: str) -> RobotStyle:
@@ -260,13 +237,8 @@ def style_of(role: str) -> RobotStyle:
 def _thinned(trajectory: Trajectory) -> Trajectory:
     """Return at most `MAX_SAMPLES` evenly spread samples of a trajectory."""
     rows = evenly_spread_indices(len(trajectory.t), MAX_SAMPLES)
-    return Trajectory(
-        t=trajectory.t[rows],
-        qpos=trajectory.qpos[rows],
-        qvel=trajectory.qvel[rows],
-        act=trajectory.act[rows],
-        ctrl=trajectory.ctrl[rows[:-1]],
-    )
+    states = {key: getattr(trajectory, key)[rows] for key in ("t", "qpos", "qvel", "act")}
+    return Trajectory(**states, ctrl=trajectory.ctrl[rows[:-1]])
 
 
 # ---- iterates of the search
@@ -295,7 +267,7 @@ def _iterate_plots(design: Design, labels: Labels) -> list[IteratePlot]:
                 for t, each in zip(motions.t, values, strict=True)
             ]
             every = [line(*pair, "text") for pair in (start, *curves)]
-            plane = Plane.around(("iterates", title), f"{title} over time [s]", every, log=False)
+            plane = Plane.around(("iterates", title), f"{title} over time [s]", every)
             plots.append((plane, start, curves))
     return plots
 
@@ -313,11 +285,9 @@ def _log_iterates(
     still_poses = body_poses(model, np.zeros(1), middle[None])
     designed = body_poses(model, design.trajectory.t, design.trajectory.qpos)
     end = end_point(model, designed)
-    if end is not None:
-        rec.set_time("sim_time", duration=0.0)
-        path = strip_of_path(designed.world_paths(*end)[:, 0], style)
-        rec.log(entity_path((*root, "path")), path, strict=True)
-        rec.reset_time()
+    rec.set_time("sim_time", duration=0.0)
+    log_end_path(rec, root, designed, end, style)
+    rec.reset_time()
     motions = design.motions
     if motions is None:
         return
@@ -327,9 +297,7 @@ def _log_iterates(
         poses = body_poses(model, motions.t[i], qpos)
         log_pose(rec, model, root, poses, len(qpos) // 2)
         log_pose(rec, model, ("robots", INITIAL.word), still_poses, 0)
-        if end is not None:
-            path = strip_of_path(poses.world_paths(*end)[:, 0], style)
-            rec.log(entity_path((*root, "path")), path, strict=True)
+        log_end_path(rec, root, poses, end, style)
         for plane, _, curves in plots:
             curve = plane.curve(*curves[i], DESIGNED.word)
             rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
@@ -346,8 +314,7 @@ def open_recording(
     kind: str,
     robots: rrb.Container | rrb.View,
     tabs: Sequence[rrb.Container],
-    *,
-    text: bool = True,
+    text: str = "",
 ) -> Iterator[rr.RecordingStream]:
     """Open a stream into a temporary file, which replaces `path` once it is complete.
 
@@ -357,15 +324,15 @@ def open_recording(
         kind: Kind of the recording.
         robots: Views of the robots, on the left.
         tabs: Tabs with signals, on the right.
-        text: Whether there is a summary below the robots.
+        text: Summary below the robots, as Markdown; empty for none.
 
     Yields:
         The stream.
     """
-    left = robots
+    left, summary = robots, entity_path(("summary",))
     if text:
-        document = rrb.TextDocumentView(origin=entity_path(("summary",)), name="summary")
-        left = rrb.Vertical(robots, document, row_shares=ROBOTS_TO_TEXT)
+        below = rrb.TextDocumentView(origin=summary, name="summary")
+        left = rrb.Vertical(robots, below, row_shares=ROBOTS_TO_TEXT)
     layout = rrb.Horizontal(left)
     if tabs:
         right = rrb.Tabs(*tabs, active_tab=0)
@@ -381,6 +348,9 @@ def open_recording(
     ):
         rec.set_log_time_enabled(False)
         rec.save(partial, default_blueprint=blueprint_of(layout, time_panel))
+        if text:
+            document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+            rec.log(summary, document, static=True, strict=True)
         yield rec
 
 
@@ -421,10 +391,15 @@ def robot_views(
         view = rrb.Spatial3DView(
             origin=entity_path(root),
             name=title,
-            eye_controls=camera.controls(tracked),
+            eye_controls=rrb.EyeControls3D(
+                position=camera.position,
+                look_target=camera.target,
+                eye_up=(0.0, 0.0, 1.0),
+                tracking_entity=tracked,
+            ),
             line_grid=rrb.LineGrid3D(visible=grid_helps),
             background=BACKGROUND,
-            overrides=dict((overrides or {}).items()),
+            overrides={**(overrides or {})},
         )
         views.append(view)
     return views
@@ -455,10 +430,19 @@ def _robots(
     return rrb.Tabs(separate, overlay, active_tab=0)
 
 
-def _log_text(rec: rr.RecordingStream, markdown: str) -> None:
-    """Log the text of the summary panel."""
-    document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
-    rec.log(entity_path(("summary",)), document, static=True, strict=True)
+def _log_robots(
+    rec: rr.RecordingStream,
+    model: mujoco.MjModel,
+    poses: Mapping[str, BodyPoses],
+    roles: Mapping[str, str],
+    with_path: Sequence[str],
+) -> None:
+    """Log robots by their names, some of them with the path of the end."""
+    for name, each in poses.items():
+        root, style = ("robots", name), style_of(roles[name])
+        log_robot(rec, model, root, each, style)
+        if name in with_path:
+            log_end_path(rec, root, each, end_point(model, each), style, static=True)
 
 
 # ---- the viewer
@@ -556,23 +540,3 @@ ESTIMATE_COLOURS = (
     )
     + " Grey lines: twice the standard deviation of the noise."
 )
-
-
-def design_text(design: Design, addition: str = "") -> str:
-    """Render a design as Markdown.
-
-    Args:
-        design: The design.
-        addition: A paragraph below it; may be empty.
-    """
-    return as_markdown(page_of(design), DESIGN_COLOURS, addition)
-
-
-def estimate_text(estimate: Estimate, addition: str = "") -> str:
-    """Render an estimate as Markdown.
-
-    Args:
-        estimate: The estimate.
-        addition: A paragraph below it; may be empty.
-    """
-    return as_markdown(page_of(estimate), ESTIMATE_COLOURS, addition)

@@ -32,9 +32,9 @@ from mjfim.output.rerun.scene import (
     body_poses,
     end_point,
     entity_path,
+    log_end_path,
     log_pose,
     log_robot,
-    strip_of_path,
 )
 from mjfim.records.design import HistoryRow, IterateMotion
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
@@ -230,10 +230,7 @@ class LiveShow:
         share = self._updates % UPDATES_PER_MOTION / UPDATES_PER_MOTION
         self._updates += 1
         log_pose(self._rec, self._model, ROBOT, poses, round(share * (len(rows) - 1)))
-        end = end_point(self._model, poses)
-        if end is not None:
-            path = strip_of_path(poses.world_paths(*end)[:, 0], STYLE)
-            self._rec.log(entity_path((*ROBOT, "path")), path, strict=True)
+        log_end_path(self._rec, ROBOT, poses, end_point(self._model, poses), STYLE)
         for group, values in self._signals(motion).items():
             for k, (plane, y) in enumerate(zip(self._planes[group], values.T, strict=True)):
                 self._planes[group][k] = self._log_curve(plane, motion, y)
@@ -249,7 +246,7 @@ class LiveShow:
         titles = {"positions": labels.positions, "controls": labels.controls}
         self._planes = {
             group: [
-                Plane.around((group, title), f"{title} over time [s]", [], log=False)
+                Plane.around((group, title), f"{title} over time [s]", [])
                 for title in titles[group][: values.shape[1]]
             ]
             for group, values in self._signals(motion).items()
@@ -268,7 +265,7 @@ class LiveShow:
         seen = [line(t, y, "text")]
         if self._updates > 1:
             seen.append(line([t[0], t[0]], plane.y, "text"))
-        grown = Plane.around(plane.parts, plane.title, seen, log=False)
+        grown = Plane.around(plane.parts, plane.title, seen)
         grown.log(self._rec, static=False)
         curve = grown.curve(t, y, DESIGNED.word)
         self._rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)

@@ -151,7 +151,9 @@ class Plane:
     is_log: bool = False
 
     @classmethod
-    def around(cls, parts: EntityParts, title: str, marks: Sequence[Mark], log: bool) -> Plane:
+    def around(
+        cls, parts: EntityParts, title: str, marks: Sequence[Mark], *, log: bool = False
+    ) -> Plane:
         """Return axes that hold all lines and dots."""
         shown = [mark for mark in marks if mark.kind in ("line", "dots")]
         x = np.concatenate([np.zeros(0), *(mark.x for mark in shown)])
@@ -240,7 +242,7 @@ def planes_of(name: str, panels: Sequence[Panel]) -> list[tuple[Plane, Panel]]:
         across = " ".join(panel.x.label.split())
         title = f"{label} over {across}" if across else panel.title
         if any(len(mark.x) for mark in panel.marks):
-            planes.append((Plane.around((name, title), title, panel.marks, panel.y.log), panel))
+            planes.append((Plane.around((name, title), title, panel.marks, log=panel.y.log), panel))
     return planes
 
 
