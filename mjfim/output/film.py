@@ -309,21 +309,19 @@ def _camera(
     fits = [(size, fit_in_view(points, slope, size[0] / size[1])) for size in VIEW_SIZES]
     size, (middle, distance) = max(fits, key=lambda each: each[0][1] / each[1][1])
     target = middle @ axes
+    offset = distance * direction
+    camera = FilmCamera(target=target, offset=offset, floor=None, spacing=0.0, size=size)
     if has_floor(model) or direction[2] < EDGE_ON:
-        return FilmCamera(
-            target=target, offset=distance * direction, floor=None, spacing=0.0, size=size
-        )
+        return camera
 
     # The floor is below the whole motion.
     heights = np.concatenate([shift[:, 2] for shift in shifts])
     lowest = float((points @ axes)[:, 2].min())
-    height = float(target[2] + distance * direction[2] + np.ptp(heights)) - lowest
-    return FilmCamera(
-        target=target,
-        offset=distance * direction,
+    height = float(target[2] + offset[2] + np.ptp(heights)) - lowest
+    return replace(
+        camera,
         floor=lowest + float(heights.min()),
         spacing=FLOOR_SPACING * max(distance, height),
-        size=size,
     )
 
 

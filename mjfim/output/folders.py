@@ -27,9 +27,8 @@ from mjfim.output.plots.pictures import (
     ESTIMATE_PICTURES,
     Pictures,
     begin_pictures,
-    fit_names,
-    held_out_names,
     histogram_name,
+    numbered,
     pictures_of,
 )
 from mjfim.output.report import Media, kinds_in, write_report
@@ -124,9 +123,7 @@ def _clear_models(place: Path) -> None:
     """Remove the models of drawn robots, and their folder where nothing else is in it."""
     if not place.is_dir():
         return
-    for stale in list(place.iterdir()):
-        if re.fullmatch(SAMPLE_FILES, stale.name):
-            remove_earlier_result(stale)
+    clear(place, SAMPLE_FILES)
     if {file.name for file in place.iterdir()} <= {MANIFEST}:
         (place / MANIFEST).unlink(missing_ok=True)
         place.rmdir()
@@ -188,7 +185,7 @@ def estimate_files(
     """
     unwanted = {"selection": not select, "samples": not samples, "recordings": recordings < 2}
     names = [name for name in ESTIMATE_PICTURES if not unwanted.get(name)]
-    names += [*fit_names(recordings), *held_out_names(held_out)]
+    names += [*numbered("fit", recordings), *numbered("held_out", held_out)]
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
     return (*data, *map(PictureFormat.PNG.file_of, names))
 

@@ -2,7 +2,7 @@
 
 A page has a verdict, sentences and tables. The terminal, the report, notebooks and the Rerun viewer
 are written from it. There is one word and one colour for each thing. The keys of
-JSON files and arrays are part of the file formats and stay as they are; `SHOWN_WORDS` translates
+JSON files and arrays are part of the file formats and stay as they are; `shown_word` translates
 them.
 
 | word       | meaning                                                           |
@@ -97,17 +97,14 @@ TERMS = (INITIAL, DESIGNED, NOMINAL, MEASURED, IDENTIFIED)
 # The terms of the two trajectories of a design or study, by their key in the records and files.
 TRAJECTORY_TERMS: dict[str, Term] = {"initial": INITIAL, "final": DESIGNED}
 
-# Words that are shown for keys of records and files; other keys are shown as they are.
-SHOWN_WORDS: dict[str, str] = {key: term.word for key, term in TRAJECTORY_TERMS.items()}
-
 
 def shown_word(key: str) -> str:
-    """Return the word that is shown for a key.
+    """Return the word that is shown for a key; other keys are shown as they are.
 
     Args:
         key: Key of a record or file, such as `final`.
     """
-    return SHOWN_WORDS.get(key, key)
+    return TRAJECTORY_TERMS[key].word if key in TRAJECTORY_TERMS else key
 
 
 class Emphasis(StrEnum):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
+from typing import Any
 
 import numpy as np
 import scipy
@@ -137,13 +138,17 @@ def shorten(text: str, width: int = 28) -> str:
     return f"{text[:kept]}…{text[-kept:]}"
 
 
-def as_sentence(text: str) -> str:
-    """Return a text with a capital first letter and a full stop.
+def share_note(shown: Sized, every: Sized, which: str) -> str:
+    """Say that only some things are shown, and which; empty where all are.
 
     Args:
-        text: The text, without a full stop.
+        shown: What is shown.
+        every: All of them.
+        which: Their name, and by what they were chosen.
     """
-    return f"{text[:1].upper()}{text[1:]}."
+    if len(shown) >= len(every):
+        return ""
+    return f" Shown: {len(shown)} of {len(every)} {which}."
 
 
 def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
@@ -179,38 +184,31 @@ def complete_labels(record: Design | Estimate | MonteCarloStudy) -> Labels:
 
     Args:
         record: The record.
+
+    Raises:
+        MjfimError: The labels do not fit the record.
     """
+    words = {
+        "qpos": "qpos",
+        "positions": "position",
+        "velocities": "velocity",
+        "controls": "control",
+    }
+    sizes: dict[str, int] = {}
+    if isinstance(record, Design):
+        motion = record.trajectory
+        arrays = (motion.qpos, motion.qvel, motion.qvel, motion.ctrl)
+        sizes = {name: array.shape[1] for name, array in zip(words, arrays, strict=True)}
     if record.labels is not None:
+        record.labels.check(**sizes, parameters=len(record.parameters))
         return record.labels
 
-    units = ("",) * len(record.parameters)
-    if isinstance(record, Estimate):
-        units = record.units
-    if not isinstance(record, Design):
-        return Labels(
-            qpos=(),
-            positions=(),
-            velocities=(),
-            controls=(),
-            parameters=record.parameters,
-            parameter_units=units,
-        )
-
-    trajectory = record.trajectory
-    velocities = trajectory.qvel.shape[1]
-    return Labels(
-        qpos=_numbered("qpos", trajectory.qpos.shape[1]),
-        positions=_numbered("position", velocities),
-        velocities=_numbered("velocity", velocities),
-        controls=_numbered("control", trajectory.ctrl.shape[1]),
-        parameters=record.parameters,
-        parameter_units=units,
-    )
-
-
-def _numbered(quantity: str, count: int) -> tuple[str, ...]:
-    """Return labels with a number in place of a name."""
-    return tuple(f"{quantity} {i} [model unit]" for i in range(count))
+    numbered: dict[str, Any] = {
+        name: tuple(f"{word} {i} [model unit]" for i in range(sizes.get(name, 0)))
+        for name, word in words.items()
+    }
+    units = record.units if isinstance(record, Estimate) else ("",) * len(record.parameters)
+    return Labels(**numbered, parameters=record.parameters, parameter_units=units)
 
 
 # Remark on predicted standard deviations.

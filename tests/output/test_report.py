@@ -182,7 +182,7 @@ MARKS = [
     line([0, 1], [2, 3], "measured", label="curve", dash="--"),
     Mark(kind="steps", x=np.arange(3.0), y=np.array([5.0, 6.0])),
     dots([1], [2], "nominal", symbol="|", texts=["<odd>"]),
-    bars([3.0], [0.0], "initial", left=[1.0], label="bars", hollow=True),
+    bars([3.0], [0.0], "initial", left=1.0, label="bars", hollow=True),
     vline(2.0, "muted"),
     hspan(-1.0, 1.0, label="strip"),
 ]

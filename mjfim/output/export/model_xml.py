@@ -324,19 +324,19 @@ def add_element(
     if comment:
         add_comment(parent, comment, first=first)
     added = etree.Element(tag, dict(attributes))
-    _insert(parent, added, 0 if first else len(parent))
+    _insert(parent, added, first=first)
     return added
 
 
 def add_comment(parent: Any, comment: str, *, first: bool = False) -> None:
     """Add a comment as the last or the first child; two hyphens in a row are separated."""
     added = etree.Comment(f" {comment.replace('--', '- -')} ")
-    _insert(parent, added, 0 if first else len(parent))
+    _insert(parent, added, first=first)
 
 
-def _insert(parent: Any, added: Any, place: int) -> None:
+def _insert(parent: Any, added: Any, *, first: bool) -> None:
     """Add a node as the first or the last child, on a line of its own where others are."""
-    tail = parent.text
+    tail, place = parent.text, 0 if first else len(parent)
     if place > 0:
         tail, parent[-1].tail = parent[-1].tail, parent.text
     parent.insert(place, added)

@@ -68,10 +68,13 @@ def design_page(design: Design) -> Page:
         Section("Optimisation", search),
     ]
     if design.limits:
-        sections.insert(2, Section("Limits", [Plot("limits"), _limit_table(design)]))
+        margins = numbers(design.limits.values())
+        columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
+        table = tabulated("Limits", columns, detail=True)
+        sections.insert(2, Section("Limits", [Plot("limits"), table]))
     if design.rehearsal is not None:
         sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
-    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    before, after = _least_eigenvalues(design)
     reserve = listed([f"{100 * share:.2g} % of {kind}" for kind, share in design.reserve.items()])
     return Page(
         kind="Design of an experiment",
@@ -92,6 +95,11 @@ def design_page(design: Design) -> Page:
 def _seconds(design: Design) -> float:
     """Duration of the motion [s]."""
     return float(design.trajectory.t[-1] - design.trajectory.t[0])
+
+
+def _least_eigenvalues(design: Design) -> list[float]:
+    """The smallest eigenvalue of the information before and after the search."""
+    return [float(each.eigenvalues[0]) for each in (design.initial, design.final)]
 
 
 # ---- verdict
@@ -200,7 +208,7 @@ def _reservation(design: Design) -> str:
     """
     found = _undetermined(design)
     if not found and _tells_less(design):
-        before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+        before, after = _least_eigenvalues(design)
         return (
             f"it tells less than its start (λ_min {before:.3g} → {after:.3g}), because the cost "
             "weighs the control or the tracking more than the information"
@@ -226,7 +234,7 @@ def _reservation(design: Design) -> str:
 
 def _tells_less(design: Design) -> bool:
     """Whether a start inside the limits has more information."""
-    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    before, after = _least_eigenvalues(design)
     return not design.initial_violations and RELEVANT_RATIO * after < before
 
 
@@ -396,7 +404,7 @@ def _accuracy_parts(design: Design) -> Iterator[Part]:
         )
     if design.scaled_start is not None:
         yield Text(_scaled_sentence(design, design.scaled_start))
-    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    before, after = _least_eigenvalues(design)
     yield Text(
         f"λ_min {before:.4g} → {after:.4g} ({after / max(before, TINY):.1f} ×), cost J "
         f"{design.initial.cost:.5g} → {design.final.cost:.5g}, found from the {design.found_by}"
@@ -478,13 +486,6 @@ def _eigenvalue_table(design: Design) -> Table:
         },
         detail=True,
     )
-
-
-def _limit_table(design: Design) -> Table:
-    """Tabulate the worst margin of each kind of limit."""
-    margins = numbers(design.limits.values())
-    columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
-    return tabulated("Limits", columns, detail=True)
 
 
 def _start_table(design: Design) -> Table:

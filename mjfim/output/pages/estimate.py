@@ -36,7 +36,7 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.pages.studies import equation_parts
-from mjfim.output.words import NOT_ALONE, predicted_data, relative
+from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
 from mjfim.records.terms import Decision, Selection, SelectionStep
@@ -64,7 +64,8 @@ ABOUT_STD = (
 
 def estimate_page(estimate: Estimate) -> Page:
     """Describe estimates with intervals, the fit of every output, and predictions."""
-    equation = estimate.inverse_dynamics
+    equation, rms = estimate.inverse_dynamics, estimate.residual_rms
+    residuals = {"output": [*rms], "residual rms": numbers(rms.values())}
     parts: dict[str, Sequence[Part]] = {
         "Parameters": [*_parameter_parts(estimate), *_correlation_tables(estimate)],
         "Added terms": [] if estimate.selection is None else selection_parts(estimate.selection),
@@ -74,7 +75,7 @@ def estimate_page(estimate: Estimate) -> Page:
         "Drawn robots": list(sample_parts(estimate)),
         "Predictions": _prediction_parts(estimate.predictions),
         "Signals": [Plot("fit")] if estimate.recordings else [],
-        "Residuals": [_residual_table(estimate), Plot("spectra")],
+        "Residuals": [tabulated("Fit of every output", residuals, detail=True), Plot("spectra")],
         "Search": [Plot("trace")] if len(estimate.trace) > 1 else [],
     }
     causes, details = estimate.causes, estimate.details
@@ -263,13 +264,6 @@ def _correlation_tables(estimate: Estimate) -> Iterator[Table]:
     yield tabulated("Correlation of the estimates", columns, detail=True)
 
 
-def _residual_table(estimate: Estimate) -> Table:
-    """Tabulate the residuals of every output."""
-    rms = estimate.residual_rms
-    columns = {"output": [*rms], "residual rms": numbers(rms.values())}
-    return tabulated("Fit of every output", columns, detail=True)
-
-
 # ---- predictions
 
 
@@ -341,7 +335,13 @@ WORDS = {
 
 def selection_parts(selection: Selection) -> Sequence[Part]:
     """Which terms were added, the steps that led to them, and what they depend on."""
-    parts: list[Part] = [Text(str(selection)), _table(selection)]
+    steps = Table(
+        title="Terms that were tried: error of data that were left out of the fit",
+        columns=("term", "decision", "terms", "error [σ]", "reduction [σ²]", "± standard error"),
+        rows=tuple(_row(step) for step in selection.steps),
+        spare=("terms",),
+    )
+    parts: list[Part] = [Text(str(selection)), steps]
     kept = {term.path for term in selection.terms}
     parts += [
         Text(_about_alternatives(step), Emphasis.WARNING)
@@ -378,16 +378,6 @@ def _about_alternatives(step: SelectionStep) -> str:
         values = listed([f"{name} = {value:.4g}" for name, value in alternative.values.items()])
         text += f" With {alternative.description}, {values}."
     return text
-
-
-def _table(selection: Selection) -> Table:
-    """Tabulate the steps."""
-    return Table(
-        title="Terms that were tried: error of data that were left out of the fit",
-        columns=("term", "decision", "terms", "error [σ]", "reduction [σ²]", "± standard error"),
-        rows=tuple(_row(step) for step in selection.steps),
-        spare=("terms",),
-    )
 
 
 def _row(step: SelectionStep) -> Row:
@@ -535,9 +525,7 @@ def _value_table(comparison: RecordingComparison) -> Table:
     odd = {recording.index for recording in comparison.odd}
     pairs = [(j, k) for j in shown for k in range(count)]
     note = "Each value is one Gauss-Newton step away from the estimate of all recordings."
-    if len(shown) < len(comparison.parameters):
-        of_all = f"{len(shown)} of {len(comparison.parameters)} parameters"
-        note += f" Shown: {of_all}, those that differ most."
+    note += share_note(shown, comparison.parameters, "parameters, those that differ most")
     return tabulated(
         "What each recording suggests alone",
         {

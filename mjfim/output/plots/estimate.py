@@ -20,6 +20,7 @@ from mjfim.output.panels import (
     area,
     around,
     dots,
+    grid,
     hline,
     hspan,
     in_grid,
@@ -35,6 +36,7 @@ from mjfim.output.words import (
     format_number,
     format_with_uncertainty,
     predicted_data,
+    share_note,
     shorten,
     without_zeros,
 )
@@ -106,7 +108,6 @@ GAP = 2.5
 def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     """Show estimates and 95 % intervals relative to the guess; hollow where at a bound."""
     count = len(estimate.theta)
-    labels.check(parameters=count)
     guess = estimate.initial_theta
     percent = np.where(estimate.guess_sizes > 0.0, estimate.guess_sizes, np.nan) / 100.0
     centre = (estimate.theta - guess) / percent
@@ -193,7 +194,6 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
 
 def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
     """Show the parameters over the iterations of the search over all data."""
-    labels.check(parameters=len(estimate.theta))
     with np.errstate(invalid="ignore", divide="ignore"):
         change = np.ptp(estimate.trace, axis=0) / np.ptp(estimate.interval, axis=1)
     order = np.argsort(-np.nan_to_num(change, posinf=0.0), kind="stable")
@@ -223,22 +223,17 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
                 y=Axis(most=4),
             )
         )
-    columns = min(4, len(panels))
     note = (
         "0: begin of the search over all data, after short searches for a start. The last point is "
         "the identified value."
     )
-    if len(panels) < len(estimate.theta):
-        note += (
-            f" Shown: {len(panels)} of {len(estimate.theta)} parameters, those that changed most "
-            "over the width of their interval."
-        )
-    return Picture(
-        title="Parameters over the iterations of the fit",
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[1.5] * -(-len(panels) // columns),
-        widths=[1.0] * columns,
+    which = "parameters, those that changed most over the width of their interval"
+    return grid(
+        "Parameters over the iterations of the fit",
+        panels,
+        [1.5] * len(panels),
+        min(4, len(panels)),
+        note + share_note(panels, estimate.theta, which),
     )
 
 
@@ -329,7 +324,7 @@ def _over_time(
             look = {"width": 0.6, "dash": "--", "opacity": 0.6, "label": "begin of a segment"}
             marks += [vline(float(begin), "muted", **look) for begin in boundaries]
         shown = Axis(most=4, limits=_visible_range(np.concatenate([y, model]), guess))
-        panels.append(Panel(title=label, marks=marks, x=time, y=shown, place=(place, 0)))
+        panels.append(Panel(title=label, marks=marks, x=time, y=shown))
 
         errors, remark = _errors(
             t, y, model, guess, float(sigma[j]), is_prediction=is_prediction, size=size
@@ -344,7 +339,6 @@ def _over_time(
                 x=time,
                 y=unit,
                 message=message,
-                place=(place, 1),
             )
         )
     if len(columns) < len(recording.outputs):
@@ -354,6 +348,7 @@ def _over_time(
         )
     heights = [1.2] * len(columns)
     heights[-1] += 0.2
+    panels = in_grid(panels, 2)
     return Picture(title=title, panels=panels, note=note, heights=heights, widths=[1.4, 1.0])
 
 
@@ -428,13 +423,7 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Picture:
         "Smoothed by Welch's method; samples count as evenly spaced. A band above the line at low "
         "frequencies: the model lacks a slow effect. p(white): p-value of a test for white noise."
     )
-    return Picture(
-        title="Spectra of the residuals",
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[1.9] * -(-len(panels) // columns),
-        widths=[1.0] * columns,
-    )
+    return grid("Spectra of the residuals", panels, [1.9] * len(panels), columns, note)
 
 
 def _spectrum_panel(estimate: Estimate, column: int, name: str) -> Panel:

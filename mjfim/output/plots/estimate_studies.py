@@ -14,9 +14,10 @@ from mjfim.output.panels import (
     Panel,
     Picture,
     area,
+    blank_rows,
     dots,
+    grid,
     hline,
-    in_grid,
     intervals,
     line,
     mark,
@@ -25,7 +26,7 @@ from mjfim.output.panels import (
     vline,
     vspan,
 )
-from mjfim.output.words import as_sentence, format_number, normal_density, shorten
+from mjfim.output.words import format_number, normal_density, share_note, shorten
 from mjfim.records.estimate import Estimate, HorizonStudy
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Decision, SelectionStep
@@ -162,7 +163,7 @@ def horizons(estimate: Estimate) -> Picture:
     )
     heights = [2.6, *[0.9] * len(panels)]
     heights[-1] += 0.3
-    return Picture(title=title, panels=in_grid([errors, *panels], 1), note=note, heights=heights)
+    return grid(title, [errors, *panels], heights, 1, note)
 
 
 def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
@@ -215,24 +216,11 @@ def recordings(estimate: Estimate) -> Picture:
     if np.isfinite(comparison.prediction).any():
         note += " Another recording: 95 % interval of what it would suggest."
     if estimate.misfit:
-        note += " " + as_sentence(
-            "the model does not explain the recordings, and its error can make them differ"
-        )
-    if len(shown) < len(comparison.parameters):
-        note += (
-            f" Shown: {len(shown)} of {len(comparison.parameters)} parameters, those that differ "
-            "most."
-        )
-    if len(rows) < count:
-        note += f" Shown: {len(rows)} of {count} recordings."
+        note += " The model does not explain the recordings, and its error can make them differ."
+    note += share_note(shown, comparison.parameters, "parameters, those that differ most")
+    note += share_note(rows, comparison.recordings, "recordings")
     height = 0.95 + 0.2 * (len(rows) + 1)
-    return Picture(
-        title=title,
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[height] * -(-len(panels) // columns),
-        widths=[1.0] * columns,
-    )
+    return grid(title, panels, [height] * len(panels), columns, note)
 
 
 def _recordings_panel(
@@ -265,7 +253,7 @@ def _recordings_panel(
     roles = [DESIGNED.word if k in odd else "text" for k in rows]
     shown = row_axis([shorten(name, 16) for name in names], roles)
     if not is_left:
-        shown = Axis(ticks=[], limits=shown.limits)
+        shown = blank_rows(len(names))
     label = with_unit(comparison.parameters[j], comparison.units[j])
     return Panel(marks=marks, x=Axis(label=label, limits=limits, most=3), y=shown)
 
@@ -342,8 +330,6 @@ def pairs(
         texts = _distinct(ticks)
         return Axis(ticks=[-TICK, TICK], names=texts, limits=(-RANGE, RANGE))
 
-    if len(shown) < len(names):
-        note += _share_note(len(shown), len(names))
     keys = [
         line([], [], role, width=7.0, opacity=opacity + 0.1, label=f"{size:g} σ")
         for size, opacity in reversed(ELLIPSES)
@@ -411,8 +397,6 @@ def samples(estimate: Estimate) -> Picture:
     )
     if estimate.misfit:
         note += " It does not cover the error of a model that does not explain the recordings."
-    if len(shown) < len(draws.parameters):
-        note += _share_note(len(shown), len(draws.parameters))
     if len(shown) > 1 and len(draws) > MAX_DOTS:
         note += f" The panels of pairs show {MAX_DOTS} robots."
     title = f"{len(draws)} drawn {'robot' if len(draws) == 1 else 'robots'}"
@@ -434,6 +418,7 @@ def _corner(
     keys: Sequence[Mark] = (),
 ) -> Picture:
     """Show a panel for each parameter, and below the diagonal one for each pair."""
+    which = "parameters, those with the largest correlations"
     panels = []
     for row, i in enumerate(shown):
         for column, j in enumerate(shown[: row + 1]):
@@ -453,7 +438,7 @@ def _corner(
     return Picture(
         title=title,
         panels=panels,
-        note=note,
+        note=note + share_note(shown, names, which),
         heights=heights,
         widths=[1.0] * len(shown),
         keys=keys,
@@ -486,8 +471,3 @@ def _distinct(numbers: Array) -> list[str]:
     largest = float(np.abs(numbers).max()) or 1.0
     digits = int(np.clip(np.ceil(np.log10(largest / spread)) + 2, 2, 9))
     return [format_number(float(number), digits) for number in numbers]
-
-
-def _share_note(shown: int, count: int) -> str:
-    """Say that only some parameters are shown."""
-    return f" Shown: {shown} of {count} parameters, those with the largest correlations."

@@ -69,24 +69,14 @@ ESTIMATE_PICTURES = (
 Pictures = dict[str, Callable[[], Picture]]
 
 
-def fit_names(count: int) -> tuple[str, ...]:
-    """Return the names of the pictures of the fits of `count` recordings."""
-    return _numbered("fit", count)
-
-
-def held_out_names(count: int) -> tuple[str, ...]:
-    """Return the names of the pictures of the predictions of `count` held-out recordings."""
-    return _numbered("held_out", count)
-
-
 def histogram_name(parameter: str) -> str:
     """Return the name of the histogram of a parameter."""
     safe_name = re.sub(r"[^\w.-]", "_", parameter)
     return f"histogram_{safe_name}"
 
 
-def _numbered(name: str, count: int) -> tuple[str, ...]:
-    """Return names with numbers; a single one has none."""
+def numbered(name: str, count: int) -> tuple[str, ...]:
+    """Return the names of pictures, one for each recording; a single one has no number."""
     return (name,) if count == 1 else tuple(f"{name}_{i + 1}" for i in range(count))
 
 
@@ -159,11 +149,11 @@ def _(estimate: Estimate) -> Pictures:
     held = sum(prediction.recording is not None for prediction in estimate.predictions)
     fits = {
         name: partial(of_estimate.fit, estimate, i, labels)
-        for i, name in enumerate(fit_names(len(estimate.recordings)))
+        for i, name in enumerate(numbered("fit", len(estimate.recordings)))
     }
     held_out = {
         name: partial(of_estimate.held_out, estimate, i, labels)
-        for i, name in enumerate(held_out_names(held))
+        for i, name in enumerate(numbered("held_out", held))
     }
     forces = estimate.inverse_dynamics
     optional: dict[str, tuple[bool, Callable[[], Picture]]] = {

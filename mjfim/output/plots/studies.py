@@ -17,6 +17,8 @@ from mjfim.output.page import (
     MEASURED,
     OTHER,
     TRAJECTORY_TERMS,
+    as_sentence,
+    shown_word,
 )
 from mjfim.output.pages.studies import budget_in_words
 from mjfim.output.panels import (
@@ -27,9 +29,12 @@ from mjfim.output.panels import (
     Picture,
     around,
     bars,
+    blank_rows,
     dots,
+    grid,
     hline,
     hspan,
+    in_grid,
     intervals,
     line,
     mark,
@@ -41,12 +46,12 @@ from mjfim.output.panels import (
 from mjfim.output.plots.estimate_studies import pairs
 from mjfim.output.words import (
     BEST_CASE,
-    as_sentence,
     format_number,
     format_percent,
     format_with_uncertainty,
     normal_density,
     quotient_unit,
+    share_note,
     shorten,
     squared_unit,
     without_zeros,
@@ -125,16 +130,15 @@ def check(result: Check) -> Picture:
         (known & is_single, {"label": label}),
         (known & ~is_single, {"opacity": 0.45, "label": "identifiable combination"}),
     ]
-    begin = np.full(len(places), low)
     marks = [
-        bars(percent[chosen], places[chosen], role, left=begin[chosen], **look)
+        bars(percent[chosen], places[chosen], role, left=low, **look)
         for chosen, look in kinds
         if chosen.any()
     ]
     if not is_alone.all():
-        end = np.full(len(places), high)[~is_alone]
+        rest = places[~is_alone]
         look = {"hollow": True, "label": "not identifiable alone"}
-        marks.append(bars(end, places[~is_alone], "muted", left=begin[~is_alone], **look))
+        marks.append(bars(np.full(len(rest), high), rest, "muted", left=low, **look))
 
     # A light mark below the dark one can be seen on a bar.
     at = {"symbol": "|", "size": 10.0}
@@ -214,7 +218,7 @@ def _correlations(result: Check, rows: int) -> Panel:
         cells=cells,
         marks=marks,
         x=Axis(ticks=range(count), names=result.wanted),
-        y=Axis(ticks=[], limits=(rows - 0.5, -0.5)),
+        y=blank_rows(rows),
         remark=remark,
         place=(0, 1),
     )
@@ -329,7 +333,7 @@ def _worst_combinations(
     title = "σ of the worst combination"
     worst = np.array([row.worst_relative_std for row in rows])
     known = np.isfinite(worst)
-    places = Axis(ticks=[], limits=(len(rows) - 0.5, -0.5))
+    places = blank_rows(len(rows))
     if not known.any():
         return Panel(
             title=title, message="no method found a usable control", y=places, place=(0, 1)
@@ -360,7 +364,7 @@ def _worst_combinations(
             text = f"{format_percent(margin)} {kind.replace('_', ' ')}"
         end = [row.worst_relative_std]
         marks += [
-            bars(end, [place], role, left=[low], **look),
+            bars(end, [place], role, left=low, **look),
             words(end, [place], [f"{format_number(end[0])}   {text}"], "text"),
         ]
     return Panel(title=title, marks=marks, x=axis, y=places, place=(0, 1))
@@ -371,7 +375,6 @@ def _worst_combinations(
 
 def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
     """Show scatter, Cramér-Rao bound and efficiency of every parameter along each trajectory."""
-    labels.check(parameters=len(study.theta))
     smallest = np.min([trials.efficiency for trials in study.sets.values()], axis=0)
     order = np.argsort(np.nan_to_num(smallest, nan=np.inf), kind="stable")
     shown = np.sort(order[:MAX_STUDIED])
@@ -406,18 +409,13 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
         f"Simulated recordings of the model with noise of the stated σ, at {study.measure_rate:g} "
         "Hz. Efficiency with its 95 % interval; 1: the bound is reached."
     )
-    if len(shown) < len(study.theta):
-        note += (
-            f" Shown: {len(shown)} of {len(study.theta)} parameters, those with the smallest "
-            "efficiency."
-        )
-    rows_only = Axis(ticks=[], limits=(len(shown) - 0.5, -0.5))
+    note += share_note(shown, study.theta, "parameters, those with the smallest efficiency")
     panels = [
         Panel(marks=scatter, x=Axis(label=f"{label} [–]", log=True), y=row_axis(names)),
         Panel(
             marks=efficiency,
             x=Axis(label="efficiency: bound / observed variance [–]"),
-            y=rows_only,
+            y=blank_rows(len(shown)),
             place=(0, 1),
         ),
     ]
@@ -432,13 +430,12 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
 
 def _trajectory(key: str) -> tuple[str, str]:
     """Return the word and the role of a trajectory of a study."""
-    term = TRAJECTORY_TERMS.get(key)
-    return (key, OTHER.word) if term is None else (term.word, term.word)
+    word = shown_word(key)
+    return word, word if key in TRAJECTORY_TERMS else OTHER.word
 
 
 def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Picture:
     """Show the estimates of one parameter along each trajectory (the paper's figures 4 to 6)."""
-    labels.check(parameters=len(study.theta))
     unit, label = labels.parameter_units[index], labels.parameter(index)
     theta = float(study.theta[index])
     true = f"true value {format_number(theta)} {unit}".rstrip()
@@ -569,11 +566,7 @@ def robots(comparison: RobotComparison) -> Picture:
         f"Numbers: {first} → {second}, each with half the width of its 95 % interval. A difference "
         "outside the strip would be found with a probability of 80 % or more."
     )
-    if len(order) < len(comparison.parameters):
-        note += (
-            f" Shown: {len(order)} of {len(comparison.parameters)} parameters, the most "
-            "significant ones."
-        )
+    note += share_note(order, comparison.parameters, "parameters, the most significant ones")
     if not comparison.is_reliable:
         note += " One of the estimates is not reliable, or does not fit its recordings."
 
@@ -602,7 +595,7 @@ def robots(comparison: RobotComparison) -> Picture:
 def rehearsal(result: Rehearsal) -> Picture:
     """Show the margin of every limit and the largest speed of every joint, for all robots."""
     panels = [_margins(result)] if result.limits else []
-    panels.append(_speeds(result, len(panels)))
+    panels.append(_speeds(result))
     control = "with the gains K(t)" if result.feedback else "open loop"
     title = (
         f"{result.robots} robots, parameters up to {100 * result.wrong:g} % off, {control}: "
@@ -614,7 +607,7 @@ def rehearsal(result: Rehearsal) -> Picture:
     height = max(2.6, 1.0 + 0.24 * max(len(result.limits), len(result.joints)))
     return Picture(
         title=title,
-        panels=panels,
+        panels=in_grid(panels, 2),
         note=note,
         heights=[height],
         widths=[1.3, 1.0] if result.limits else [1.0],
@@ -642,7 +635,7 @@ def _margins(result: Rehearsal) -> Panel:
     )
 
 
-def _speeds(result: Rehearsal, column: int) -> Panel:
+def _speeds(result: Rehearsal) -> Panel:
     """Return a row per joint: largest speed of the model, and of every robot."""
     speeds = np.where(np.isfinite(result.speed), result.speed, np.nan)
     most = np.nanmax(speeds, axis=0)
@@ -659,7 +652,6 @@ def _speeds(result: Rehearsal, column: int) -> Panel:
         x=Axis(label="share of the largest one [%]", limits=(0.0, 105.0)),
         y=row_axis(list(result.joints)),
         beside=[("", "text", texts)],
-        place=(0, column),
     )
 
 
@@ -689,15 +681,15 @@ def campaign(result: Campaign, true: Array | None = None) -> Picture:
     numbers = np.array([float(r.number) for r in result.rounds])
     limits = (0.5, float(numbers[-1]) + 0.5)
     panels = []
-    for row, j in enumerate(shown):
+    for j in shown:
         name = shorten(result.parameters[j], 18)
         unit = result.rounds[0].estimate.units[j]
-        label = "round" if row == len(shown) - 1 else ""
+        label = "round" if j == shown[-1] else ""
         axis = Axis(label=label, limits=limits, most=min(len(numbers), 8), whole=True)
         guess = format_number(float(result.rounds[0].theta[j]), 4)
         panels += [
             _accuracy_over_rounds(
-                result, numbers, j, title=with_unit(f"σ of {name}", unit), axis=axis, row=row
+                result, numbers, j, title=with_unit(f"σ of {name}", unit), axis=axis
             ),
             _estimate_over_rounds(
                 result,
@@ -706,7 +698,6 @@ def campaign(result: Campaign, true: Array | None = None) -> Picture:
                 true,
                 title=f"{with_unit(name, unit)}, first design at {guess}",
                 axis=axis,
-                row=row,
             ),
         ]
     count = len(numbers)
@@ -714,18 +705,12 @@ def campaign(result: Campaign, true: Array | None = None) -> Picture:
         f"{as_sentence(result.status.value)} Bars, and the band of the last round: ± 1 and ± 2 "
         "formal σ, which are the true accuracy only if the model and the noise are right."
     )
-    heights = [1.75] * len(shown)
-    return Picture(
-        title=f"{count} {'round' if count == 1 else 'rounds'} of design, recording and estimate",
-        panels=panels,
-        note=note,
-        heights=heights,
-        widths=[1.0, 1.0],
-    )
+    title = f"{count} {'round' if count == 1 else 'rounds'} of design, recording and estimate"
+    return grid(title, panels, [1.75] * len(panels), 2, note)
 
 
 def _accuracy_over_rounds(
-    result: Campaign, numbers: Array, j: int, *, title: str, axis: Axis, row: int
+    result: Campaign, numbers: Array, j: int, *, title: str, axis: Axis
 ) -> Panel:
     """Return predicted and formal standard deviations of parameter j."""
     predicted = np.array([r.predicted[j] for r in result.rounds])
@@ -743,9 +728,7 @@ def _accuracy_over_rounds(
             hline(wanted, dash="--", label="wanted"),
             hspan(low, wanted, "text", opacity=0.06),
         ]
-    return Panel(
-        title=title, marks=marks, x=axis, y=Axis(log=True, limits=(low, high)), place=(row, 0)
-    )
+    return Panel(title=title, marks=marks, x=axis, y=Axis(log=True, limits=(low, high)))
 
 
 def _estimate_over_rounds(
@@ -756,7 +739,6 @@ def _estimate_over_rounds(
     *,
     title: str,
     axis: Axis,
-    row: int,
 ) -> Panel:
     """Return the estimates of parameter j, with the true value if it is known."""
     theta = np.array([r.estimate.theta[j] for r in result.rounds])
@@ -772,4 +754,4 @@ def _estimate_over_rounds(
             marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED.word, opacity=0.07))
     if true is not None:
         marks.append(hline(float(true[j]), label="true value"))
-    return Panel(title=title, marks=marks, x=axis, y=Axis(most=4), place=(row, 1))
+    return Panel(title=title, marks=marks, x=axis, y=Axis(most=4))

@@ -399,7 +399,7 @@ def robot_views(
             ),
             line_grid=rrb.LineGrid3D(visible=grid_helps),
             background=BACKGROUND,
-            overrides={**(overrides or {})},
+            overrides=dict((overrides or {}).items()),
         )
         views.append(view)
     return views
