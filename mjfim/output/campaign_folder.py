@@ -318,5 +318,4 @@ def _leaves(values: object, *place: str) -> Iterator[tuple[tuple[str, ...], Any]
 
 
 def _shown(value: object) -> str:
-    """Return a value for a message."""
     return "not stated" if value is None else shortened(json.dumps(value))

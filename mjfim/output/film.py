@@ -29,7 +29,6 @@ from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, OTHER, Te
 from mjfim.output.rerun.camera import (
     EDGE_ON,
     camera_axes,
-    extents,
     fit_in_view,
     followed_body,
     moving_points,
@@ -222,7 +221,7 @@ def film_of_motions(
     if not all(np.isfinite(each.qpos).all() for each in every):
         raise NoVideoError("the motion has positions that are not finite")
 
-    longest = max(every, key=lambda each: float(each.t[-1]))
+    longest = max(every, key=lambda each: each.t[-1])
     begin, end = float(longest.t[0]), float(longest.t[-1])
     speed = film_speed(end - begin)
     shown = min(end - begin, LONGEST_FILM * speed)
@@ -300,7 +299,7 @@ def _camera(
         for each in view
     ]
     clouds = moving_points(model, seen)
-    direction = view_direction(extents(clouds))
+    direction = view_direction(clouds)
     axes = camera_axes(direction)
     points = seen_points(model, clouds) @ axes.T
 
@@ -464,7 +463,6 @@ class Painter:
     # ---- the scene
 
     def _picture(self, view: FilmView, k: int) -> NDArray[np.uint8]:
-        """Draw a view of a frame."""
         model, data, scene = self._film.model, self._data, self._renderer.scene
         self._camera.lookat[:] = view.target[k]
         for track in view.tracks:
@@ -518,7 +516,7 @@ class Painter:
         scene, model = self._renderer.scene, self._film.model
         eye = scene.camera[0]
         position, forward, up = (np.array(each) for each in (eye.pos, eye.forward, eye.up))
-        distance = BACKGROUND_DISTANCE * float(model.vis.map.zfar) * float(model.stat.extent)
+        distance = BACKGROUND_DISTANCE * model.vis.map.zfar * model.stat.extent
         turn = np.stack([np.cross(forward, up), up, -forward], axis=1)
         size = distance * np.array([2.0, 2.0, 1e-3])
         _add_box(scene, size, position + distance * forward, turn, BACKGROUND)

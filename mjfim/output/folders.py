@@ -454,7 +454,6 @@ def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureForm
     """
 
     def write(make: Callable[[], Picture], file: Path) -> None:
-        """Draw a picture and write it."""
         from mjfim.output.plots.draw import save  # imports matplotlib, which is slow
 
         save(make(), file)

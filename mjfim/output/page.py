@@ -55,7 +55,7 @@ class PictureFormat(StrEnum):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Term:
     """A thing that is shown, and how.
 
@@ -81,16 +81,14 @@ class Term:
         return red, green, blue
 
 
-INITIAL = Term(word="initial", colour="#0077bb", colour_on_dark="#4fb0f0", colour_name="blue")
-DESIGNED = Term(word="designed", colour="#cc3311", colour_on_dark="#ff7f66", colour_name="red")
-NOMINAL = Term(word="nominal", colour="#ee7733", colour_on_dark="#f7a55c", colour_name="orange")
-MEASURED = Term(word="measured", colour="#009988", colour_on_dark="#2fc9b5", colour_name="teal")
-IDENTIFIED = Term(
-    word="identified", colour="#aa3377", colour_on_dark="#e884bd", colour_name="purple"
-)
+INITIAL = Term("initial", "#0077bb", "#4fb0f0", "blue")
+DESIGNED = Term("designed", "#cc3311", "#ff7f66", "red")
+NOMINAL = Term("nominal", "#ee7733", "#f7a55c", "orange")
+MEASURED = Term("measured", "#009988", "#2fc9b5", "teal")
+IDENTIFIED = Term("identified", "#aa3377", "#e884bd", "purple")
 
 # What is beside the five, such as a baseline.
-OTHER = Term(word="other", colour="#8a6d3b", colour_on_dark="#cdb07a", colour_name="brown")
+OTHER = Term("other", "#8a6d3b", "#cdb07a", "brown")
 
 TERMS = (INITIAL, DESIGNED, NOMINAL, MEASURED, IDENTIFIED)
 

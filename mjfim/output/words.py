@@ -7,7 +7,6 @@ from collections.abc import Sequence, Sized
 from typing import Any
 
 import numpy as np
-import scipy
 
 from mjfim.arrays import Array
 from mjfim.output.page import number
@@ -164,17 +163,6 @@ def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
     """
     deviations = (x - mean) / std
     return np.asarray(np.exp(-0.5 * deviations**2) / (np.sqrt(2.0 * np.pi) * std))
-
-
-def chi_squared_quantiles(shares: tuple[float, float], freedom: float) -> tuple[float, float]:
-    """Return two quantiles of a chi-squared distribution.
-
-    Args:
-        shares: Probabilities that a value lies below each (0..1).
-        freedom: Degrees of freedom, positive.
-    """
-    low, high = 2.0 * scipy.special.gammaincinv(0.5 * freedom, np.array(shares))
-    return float(low), float(high)
 
 
 def complete_labels(record: Design | Estimate | MonteCarloStudy) -> Labels:

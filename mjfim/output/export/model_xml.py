@@ -403,7 +403,6 @@ def same_inertia(a: BodyInertia, b: BodyInertia, tolerance: float = ROUNDING) ->
 
 
 def _source_file(path: Path, read: Callable[[Path], bytes]) -> SourceFile:
-    """Read a file."""
     content = read(path)
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:

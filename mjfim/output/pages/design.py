@@ -61,7 +61,7 @@ def design_page(design: Design) -> Page:
     """Describe predicted standard deviations before and after a design, and how it ended."""
     search: list[Part] = [Plot("convergence"), _eigenvalue_table(design)]
     if len(design.starts) > 1:
-        search += [_start_table(design)]
+        search.append(_start_table(design))
     sections = [
         Section("Accuracy", list(_accuracy_parts(design))),
         Section("Motion", [Plot("trajectories"), Plot("sensitivity_phase")]),
@@ -138,7 +138,6 @@ def _danger(rehearsal: Rehearsal) -> Verdict:
 
 
 def _robots(rehearsal: Rehearsal) -> str:
-    """The robots of a rehearsal in words."""
     return f"{rehearsal.robots} robots whose parameters are up to {100 * rehearsal.wrong:g} % off"
 
 
@@ -162,7 +161,6 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
 
 
 def _kind(limit: RehearsedLimit) -> str:
-    """The kind of a limit in words."""
     return limit.kind.replace("_", " ")
 
 
@@ -181,7 +179,7 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
     free = [i for i in free if peaks[i] > 0.0]
     if free:
         fastest: dict[str, int] = {}
-        for i in sorted(free, key=lambda i: -float(peaks[i])):
+        for i in sorted(free, key=lambda i: -peaks[i]):
             fastest.setdefault(rehearsal.units[i], i)
         shown = [f"{peaks[i]:.2g} {unit} ({rehearsal.joints[i]})" for unit, i in fastest.items()]
         which = "1 speed has" if len(free) == 1 else f"{len(free)} speeds have"
@@ -227,7 +225,7 @@ def _reservation(design: Design) -> str:
     text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
     if not np.isfinite(std[worst]):
         return text
-    share = relative(float(std[worst]), float(sizes[worst]))
+    share = relative(std[worst], sizes[worst])
     of_one = f": σ is {share} of its size"
     return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
 
@@ -245,10 +243,10 @@ def _accuracy(design: Design) -> str:
     sentence = f"one experiment of {_seconds(design):.3g} s determines every parameter"
     if not wanted:
         return sentence
-    worst = max(wanted, key=lambda j: float(shares[j]))
+    worst = max(wanted, key=lambda j: shares[j])
     name = design.parameters[worst]
     before, after = float(design.initial.std[worst]), float(design.stated_std[worst])
-    sentence += f" with a σ of {relative(after, float(design.sizes[worst]))} or less"
+    sentence += f" with a σ of {relative(after, design.sizes[worst])} or less"
     if not np.isfinite(before):
         return f"{sentence}; the initial motion does not determine {name}"
     if before > RELEVANT_RATIO * after:
@@ -586,7 +584,6 @@ def _check_parts(check: Check) -> Iterator[Part]:
 
 
 def _row(row: ParameterCheck) -> Row:
-    """The row of one parameter."""
     name, value = named(row.name, row.unit), number(row.value, 4)
     if row.nuisance:
         return Row((name, value, "nuisance", "", "", "", ""), Emphasis.WEAK)
@@ -627,7 +624,6 @@ def _about_eigenvalues(check: Check) -> str:
 
 
 def _about_self_test(check: Check) -> str:
-    """The result of the derivative self-test."""
     test = check.self_test
     if not test.finished:
         return "derivative self-test not finished, because the check was interrupted"

@@ -157,7 +157,7 @@ def _worst_estimate(estimate: Estimate) -> str:
     if not known.any():
         return ""
     worst = int(np.argmax(np.where(known, shares, -np.inf)))
-    share = relative(float(half_widths[worst]), float(sizes[worst]))
+    share = relative(half_widths[worst], sizes[worst])
     others = f" except {first_ones(uncertain)} (not determined)" if uncertain else ""
     return (
         f", and every parameter{others} is known to ± {share} or better (95 % interval, widest for "
@@ -212,7 +212,6 @@ def _parameter_parts(estimate: Estimate) -> Iterator[Part]:
 
 
 def _estimate_table(estimate: Estimate) -> Table:
-    """Tabulate estimates, standard deviations and intervals."""
     names, std = estimate.parameters, estimate.std
     low, high = estimate.interval.T
     is_held = [name in estimate.held for name in names]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -139,10 +140,7 @@ def experiment_page(stated: StatedExperiment) -> Page:
             ],
         ),
     )
-    page = _page(stated.source, _serves(stated), tables)
-    return Page(
-        kind=page.kind, verdict=page.verdict, warnings=stated.warnings, sections=page.sections
-    )
+    return replace(_page(stated.source, _serves(stated), tables), warnings=stated.warnings)
 
 
 def _serves(stated: StatedExperiment) -> str:
@@ -210,7 +208,6 @@ def _jitter(log: LogSummary) -> str:
 
 
 def _range_cells(found: Sequence[ColumnSummary]) -> tuple[str, ...]:
-    """The cells of one column over all logs."""
     resolutions = [column.resolution for column in found if column.resolution > 0.0]
     empty = float(np.mean([column.empty_share for column in found]))
     return (

@@ -301,7 +301,6 @@ def _method_row(comparison: Comparison, row: MethodResult) -> Row:
 
 
 def _std_table(comparison: Comparison) -> Table:
-    """Tabulate the standard deviation of every parameter with every method."""
     wanted = list(comparison.wanted)
     names = [named(comparison.parameters[j], comparison.units[j]) for j in wanted]
     std = {row.title: numbers(row.std[wanted]) for row in comparison.rows}

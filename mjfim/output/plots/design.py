@@ -234,7 +234,7 @@ def information_panel(design: Design) -> Panel:
     ):
         t = evaluation.trajectory.t
         root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-        last = format_number(float(root[-1]))
+        last = format_number(root[-1])
         marks += [
             _curve(t, root, term.word, width),
             words([t[-1]], [root[-1]], [last], term.word),
@@ -326,7 +326,7 @@ def convergence(design: Design) -> Picture:
         found = _history_marks(iterations, each, begin)
         stage = [vline(iterations[c], "band", width=1.5, front=0.0) for c in changes]
         usable = each[np.isfinite(each)]
-        ends = [format_number(float(value)) for value in (*usable[:1], *usable[-1:])]
+        ends = [format_number(value) for value in (*usable[:1], *usable[-1:])]
         panels.append(
             Panel(
                 marks=[*stage, *found],
@@ -384,7 +384,7 @@ def standard_deviations(design: Design, labels: Labels) -> Picture:
         ends, places = std[known], at[known]
         marks.append(bars(ends, places, term.word, left=low, size=0.36, label=term.word))
         if len(names) <= MAX_HIGH_ROWS:
-            texts = [format_number(float(value)) for value in ends]
+            texts = [format_number(value) for value in ends]
             marks.append(words(ends, places, texts, term.word))
         if not known.all():
             beyond = np.full(len(at[~known]), high)
@@ -542,7 +542,6 @@ def _row_marks(usage: LimitUsage, place: int, role: str) -> list[Mark]:
 
 
 def _words(kind: str) -> str:
-    """Return the name of a kind of limit in words."""
     return kind.replace("_", " ")
 
 

@@ -207,7 +207,7 @@ def _draw_panel(axes: Axes, panel: Panel, width: float, height: float) -> None:
             # Few ticks, with plain numbers.
             low, high = axis.get_view_interval()
             axis.set_major_locator(FixedLocator(log_ticks(float(low), float(high))))
-            axis.set_major_formatter(lambda value, _: plain_number(float(value)))
+            axis.set_major_formatter(lambda value, _: plain_number(value))
             axis.set_minor_locator(NullLocator())
 
     remark = wrap(panel.remark, 0.7 * width, NOTE_FONT) if panel.remark else []
@@ -308,7 +308,6 @@ def _name_ticks(axis: DrawnAxis, stated: Axis, room: float) -> None:
 
 
 def _draw_mark(axes: Axes, mark: Mark) -> None:
-    """Draw a mark."""
     colour = ROLES[mark.role]
     stroke: dict[str, Any] = {
         "color": colour,

@@ -32,7 +32,6 @@ from mjfim.output.panels import (
     vline,
 )
 from mjfim.output.words import (
-    chi_squared_quantiles,
     format_number,
     format_with_uncertainty,
     predicted_data,
@@ -186,8 +185,8 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
     half_width = np.inf
     if np.isfinite(estimate.std[j]):
         half_width = 0.5 * float(np.ptp(estimate.interval[j]))
-    guess = without_zeros(format_number(float(estimate.initial_theta[j]), 4))
-    value = format_with_uncertainty(float(estimate.theta[j]), half_width)
+    guess = without_zeros(format_number(estimate.initial_theta[j], 4))
+    value = format_with_uncertainty(estimate.theta[j], half_width)
     text = f"{guess} → {value} {unit}".rstrip()
     return f"{text}   (at its bound)" if estimate.parameters[j] in estimate.at_bound else text
 
@@ -201,7 +200,7 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
     for j in np.sort(order[:MAX_PARAMETERS]).tolist():
         values = np.append(estimate.trace[1:, j], estimate.theta[j])
         marks = [
-            hline(float(estimate.trace[0, j]), NOMINAL.word, label=NOMINAL.word),
+            hline(estimate.trace[0, j], NOMINAL.word, label=NOMINAL.word),
             line(
                 np.arange(len(values)),
                 values,
@@ -255,11 +254,11 @@ def fit(estimate: Estimate, index: int, labels: Labels) -> Picture:
         recording,
         estimate.predicted[index],
         estimate.nominal[index] if estimate.nominal else None,
-        np.array([estimate.sigma[name] for name in recording.outputs]),
+        estimate,
         labels,
         title=f"Fit to {_file_name(recording.name)}",
         note=note,
-        boundaries=estimate.segments[index][1:] if estimate.segments else np.zeros(0),
+        boundaries=estimate.segments[index][1:] if estimate.segments else (),
     )
 
 
@@ -277,17 +276,15 @@ def held_out(estimate: Estimate, index: int, labels: Labels) -> Picture:
         recording,
         prediction.identified_outputs,
         prediction.nominal_outputs,
-        np.array([estimate.sigma.get(name, np.nan) for name in recording.outputs]),
+        estimate,
         labels,
         title=f"Prediction of {_file_name(recording.name)}, held out",
         note=note,
-        boundaries=np.zeros(0),
         is_prediction=True,
     )
 
 
 def _file_name(name: str, width: int = NAME_WIDTH) -> str:
-    """Return the short name of a recording."""
     return shorten(Path(name).name, width)
 
 
@@ -295,15 +292,16 @@ def _over_time(
     recording: Recording,
     identified: Array,
     nominal: Array | None,
-    sigma: Array,
+    estimate: Estimate,
     labels: Labels,
     *,
     title: str,
     note: str,
-    boundaries: Array,
+    boundaries: Sequence[float] | Array = (),
     is_prediction: bool = False,
 ) -> Picture:
     """Show a row per output: the curves over time, and their errors."""
+    sigma = np.array([estimate.sigma.get(name, np.nan) for name in recording.outputs])
     columns = shown_outputs([recording.y], [identified], sigma, MAX_OUTPUTS)
     rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
     size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
@@ -322,7 +320,7 @@ def _over_time(
             marks.append(line(t, guess, NOMINAL.word, width=0.8, front=1.5, label="nominal model"))
         if 0 < len(boundaries) <= MAX_BOUNDARIES:
             look = {"width": 0.6, "dash": "--", "opacity": 0.6, "label": "begin of a segment"}
-            marks += [vline(float(begin), "muted", **look) for begin in boundaries]
+            marks += [vline(begin, "muted", **look) for begin in boundaries]
         shown = Axis(most=4, limits=_visible_range(np.concatenate([y, model]), guess))
         panels.append(Panel(title=label, marks=marks, x=time, y=shown))
 
@@ -437,7 +435,9 @@ def _spectrum_panel(estimate: Estimate, column: int, name: str) -> Panel:
     f, density, freedom = _smoothed_density(estimate, column, sigma)
     if not freedom or not (density > 0.0).any():
         return Panel(title=name, remark=remark, message="not measured")
-    low, high = (freedom / value for value in chi_squared_quantiles((0.975, 0.025), freedom))
+    # Quantiles of a chi-squared distribution; scipy.stats takes long to import.
+    quantiles = 2.0 * scipy.special.gammaincinv(0.5 * freedom, np.array([0.975, 0.025]))
+    low, high = freedom / quantiles
     label = "its 95 % confidence band"
     return Panel(
         title=name,

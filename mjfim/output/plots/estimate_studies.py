@@ -115,7 +115,6 @@ def selection(estimate: Estimate) -> Picture:
 
 
 def _step_name(step: SelectionStep | None) -> str:
-    """Return the name of a step of the selection."""
     if step is None:
         return "no further term"
     if step.decision is Decision.BEGUN:
@@ -179,7 +178,7 @@ def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
 
 def _estimates_by_length(study: HorizonStudy, j: int, axis: Axis) -> Panel:
     """Return the estimates of one parameter with their intervals."""
-    marks = [hline(float(study.theta[study.chosen, j]), IDENTIFIED.word, width=0.6)]
+    marks = [hline(study.theta[study.chosen, j], IDENTIFIED.word, width=0.6)]
     for i, length in enumerate(study.lengths.tolist()):
         role = IDENTIFIED.word if i == study.chosen else "muted"
         value, half = float(study.theta[i, j]), float(np.nan_to_num(study.half_widths[i, j]))
@@ -376,7 +375,7 @@ def samples(estimate: Estimate) -> Picture:
                 opacity=0.6,
                 label="drawn robots",
             ),
-            vline(float(draws.centre[j]), IDENTIFIED.word, width=1.4, label=IDENTIFIED.word),
+            vline(draws.centre[j], IDENTIFIED.word, width=1.4, label=IDENTIFIED.word),
         ]
 
     def scatter(j: int, i: int) -> list[Mark]:
@@ -470,4 +469,4 @@ def _distinct(numbers: Array) -> list[str]:
     spread = float(np.ptp(numbers)) or 1.0
     largest = float(np.abs(numbers).max()) or 1.0
     digits = int(np.clip(np.ceil(np.log10(largest / spread)) + 2, 2, 9))
-    return [format_number(float(number), digits) for number in numbers]
+    return [format_number(number, digits) for number in numbers]

@@ -127,7 +127,6 @@ def pictures_of(record: ShownRecord) -> Pictures:
 
 @pictures_of.register
 def _(design: Design) -> Pictures:
-    """The pictures of a design."""
     labels = complete_labels(design)
     pictures: Pictures = {
         "trajectories": partial(of_design.trajectories, design, labels),
@@ -144,7 +143,6 @@ def _(design: Design) -> Pictures:
 
 @pictures_of.register
 def _(estimate: Estimate) -> Pictures:
-    """The pictures of an estimate; those of studies only where it has them."""
     labels = complete_labels(estimate)
     held = sum(prediction.recording is not None for prediction in estimate.predictions)
     fits = {
@@ -195,13 +193,11 @@ def _(estimate: Estimate) -> Pictures:
 
 @pictures_of.register
 def _(result: InverseDynamicsFit) -> Pictures:
-    """The picture of a fit to the equation of motion."""
     return {"inverse_dynamics": partial(of_estimate.inverse_dynamics, result)}
 
 
 @pictures_of.register
 def _(study: MonteCarloStudy) -> Pictures:
-    """The pictures of a Monte Carlo study."""
     labels = complete_labels(study)
     return {
         "overview": partial(studies.overview, study, labels),
@@ -214,7 +210,6 @@ def _(study: MonteCarloStudy) -> Pictures:
 
 @pictures_of.register
 def _(check: Check) -> Pictures:
-    """The pictures of a check."""
     pictures: Pictures = {"check": partial(studies.check, check)}
     if check.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, check.rehearsal)
@@ -225,7 +220,6 @@ def _(check: Check) -> Pictures:
 
 @pictures_of.register
 def _(comparison: Comparison) -> Pictures:
-    """The picture of a comparison."""
     return {"compare": partial(studies.compare, comparison)}
 
 
@@ -237,7 +231,6 @@ def _(comparison: RobotComparison) -> Pictures:
 
 @pictures_of.register
 def _(result: Rehearsal) -> Pictures:
-    """The picture of a rehearsal."""
     return {"rehearsal": partial(studies.rehearsal, result)}
 
 
@@ -304,7 +297,6 @@ def begin_pictures(
             future = pool.submit(_contents, record, picture_format)
 
     def contents() -> dict[str, bytes]:
-        """Wait for the pictures."""
         if future is None:
             return {}
         fault = future.exception()
@@ -325,7 +317,6 @@ def _import_what_draws() -> None:
 
 
 def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
-    """Draw all pictures of a record."""
     from mjfim.output.plots.draw import content
 
     return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}

@@ -215,7 +215,6 @@ def _points(mark: Mark, colour: str, limit: int) -> Plotly:
 
 
 def _heatmap(cells: Cells) -> Plotly:
-    """Coloured cells with their words."""
     values = cells.values - cells.middle
     trace: Plotly = {
         "type": "heatmap",
@@ -268,7 +267,6 @@ def _layout(panel: Panel, label: str) -> Plotly:
 
 
 def _axis(axis: Axis, label: str) -> Plotly:
-    """An axis of a plot."""
     shown: Plotly = {"title": {"text": escape(label)}} if label else {}
     if axis.limits is not None:
         ends = np.log10(axis.limits) if axis.log else np.asarray(axis.limits)

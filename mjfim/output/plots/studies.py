@@ -69,21 +69,6 @@ from mjfim.records.studies import (
 )
 from mjfim.records.trajectory import Labels, with_unit
 
-# What a picture says of it.
-SCALE_IN_WORDS = "strength of the colour: root of its size"
-
-
-def colour_strength(correlation: Array) -> Array:
-    """Return how strong the colour of each correlation is: the root of its size, with its sign.
-
-    Most correlations of a good experiment are small, and would be as pale as 0 otherwise.
-
-    Args:
-        correlation: Correlations of any shape, -1 to 1; NaN stays.
-    """
-    return np.asarray(np.sign(correlation) * np.sqrt(np.abs(correlation)))
-
-
 # Largest numbers of parameters of a Monte Carlo study, of two robots and of a campaign; of more,
 # those that say most are drawn.
 MAX_STUDIED, MAX_DIFFERENCES, MAX_ROUNDS = 30, 40, 8
@@ -208,12 +193,14 @@ def _correlations(result: Check, rows: int) -> Panel:
         marks = [dots(across, up, "white", size=3.0)]
     sign = "bold" if texts else "dot"
     remark = (
-        f"correlation (red: positive, blue: negative); {SCALE_IN_WORDS}; {sign}: beyond "
-        f"±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
+        "correlation (red: positive, blue: negative); strength of the colour: root of its size; "
+        f"{sign}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
     )
     if np.isnan(correlation).any():
         remark += "; grey: not identifiable alone"
-    cells = Cells(values=colour_strength(correlation), texts=texts, is_bold=confounded)
+    # Most correlations of a good experiment are small, and would be as pale as 0 without the root.
+    strength = np.sign(correlation) * np.sqrt(np.abs(correlation))
+    cells = Cells(values=strength, texts=texts, is_bold=confounded)
     return Panel(
         cells=cells,
         marks=marks,
@@ -282,7 +269,6 @@ def compare(comparison: Comparison) -> Picture:
 
 
 def _method_role(comparison: Comparison, row: MethodResult) -> str:
-    """Return the role of a method."""
     if row.method == DESIGN:
         return DESIGNED.word
     return OTHER.word if row in comparison.beating else INITIAL.word
@@ -311,8 +297,7 @@ def _ratios(
         reach = max(2.0 * float(np.nanstd(logarithms)), 0.1)
     look: dict[str, Any] = {
         "texts": [
-            [format_number(float(ratio)) if np.isfinite(ratio) else "–" for ratio in row]
-            for row in ratios
+            [format_number(ratio) if np.isfinite(ratio) else "–" for ratio in row] for row in ratios
         ]
     }
     if len(names) > MAX_RATIOS:
@@ -519,13 +504,13 @@ def _central_range(values: Array, theta: float, std: float) -> tuple[float, floa
 def _statistics(trials: TrialStatistics, index: int, unit: str, hidden: int) -> str:
     """Return variance, bound, efficiency and counts of one histogram in words."""
     variance, bound = (
-        f"{format_number(float(matrix[index, index]))} {squared_unit(unit)}".rstrip()
+        f"{format_number(matrix[index, index])} {squared_unit(unit)}".rstrip()
         for matrix in (trials.covariance, trials.crlb)
     )
-    low, high = (format_number(float(end)) for end in trials.efficiency_interval[index])
+    low, high = (format_number(end) for end in trials.efficiency_interval[index])
     text = (
         f"variance {variance}, bound {bound}; efficiency "
-        f"{format_number(float(trials.efficiency[index]))}, 95 % interval [{low}, {high}]; "
+        f"{format_number(trials.efficiency[index])}, 95 % interval [{low}, {high}]; "
         f"{trials.trials} trials, {trials.failed} failed"
     )
     return f"{text}, {hidden} outside this range" if hidden else text
@@ -557,7 +542,7 @@ def robots(comparison: RobotComparison) -> Picture:
     first, second = (shorten(name, 24) for name in comparison.names)
     texts = [
         " → ".join(
-            format_with_uncertainty(float(value), NORMAL_95 * float(std))
+            format_with_uncertainty(value, NORMAL_95 * std)
             for value, std in zip(comparison.values[:, j], comparison.std[:, j], strict=True)
         )
         for j in order
@@ -686,7 +671,7 @@ def campaign(result: Campaign, true: Array | None = None) -> Picture:
         unit = result.rounds[0].estimate.units[j]
         label = "round" if j == shown[-1] else ""
         axis = Axis(label=label, limits=limits, most=min(len(numbers), 8), whole=True)
-        guess = format_number(float(result.rounds[0].theta[j]), 4)
+        guess = format_number(result.rounds[0].theta[j], 4)
         panels += [
             _accuracy_over_rounds(
                 result, numbers, j, title=with_unit(f"σ of {name}", unit), axis=axis
@@ -753,5 +738,5 @@ def _estimate_over_rounds(
         if np.isfinite(std[-1]):
             marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED.word, opacity=0.07))
     if true is not None:
-        marks.append(hline(float(true[j]), label="true value"))
+        marks.append(hline(true[j], label="true value"))
     return Panel(title=title, marks=marks, x=axis, y=Axis(most=4))

@@ -80,7 +80,7 @@ def place_camera(
         follow: False for a camera that never follows a body.
     """
     clouds = moving_points(model, motions)
-    towards_camera = view_direction(extents(clouds))
+    towards_camera = view_direction(clouds)
     axes = camera_axes(towards_camera)
     followed = followed_body(model, motions) if follow else None
     if followed is not None:
@@ -130,7 +130,7 @@ def followed_body(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> int | 
     body = int(bodies[np.argmax(model.body_subtreemass[bodies])])
     members = np.flatnonzero(model.body_rootid == model.body_rootid[body])
     reach = model.geom_rbound[np.isin(model.geom_bodyid, members)].max(initial=0.0)
-    size = 2.0 * float(reach) or float(model.stat.extent)
+    size = 2.0 * float(reach) or model.stat.extent
     travel = max(float(np.ptp(poses.positions[:, body], axis=0).max()) for poses in motions)
     return body if travel >= FOLLOWED_TRAVEL * size else None
 
@@ -160,31 +160,22 @@ def moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[A
     ]
 
 
-def extents(clouds: Sequence[Array]) -> Array:
-    """Return the (3,) largest distance that any point travels along each world axis [m].
-
-    Args:
-        clouds: (samples, n, 3) world paths of each motion [m].
-    """
-    travelled = [np.ptp(cloud, axis=0).max(axis=0, initial=0.0) for cloud in clouds]
-    return np.asarray(np.max(travelled, axis=0))
-
-
-def view_direction(extents: Array) -> Array:
+def view_direction(clouds: Sequence[Array]) -> Array:
     """Return the (3,) unit vector towards the camera.
 
     It is along the normal of a planar motion, else from the front right.
 
     Args:
-        extents: (3,) largest distance that any point travels along each world axis [m].
+        clouds: (samples, n, 3) world paths of each motion [m].
     """
-    x, y = extents[0], extents[1]
+    # The largest distance that any point travels along each world axis.
+    travelled = [np.ptp(cloud, axis=0).max(axis=0, initial=0.0) for cloud in clouds]
+    x, y, _ = np.max(travelled, axis=0)
+    direction = TOWARDS_CAMERA_SPATIAL
     if y < PLANAR_RATIO * x:
-        direction = np.array(TOWARDS_CAMERA_XZ)
+        direction = TOWARDS_CAMERA_XZ
     elif x < PLANAR_RATIO * y:
-        direction = np.array(TOWARDS_CAMERA_YZ)
-    else:
-        direction = np.array(TOWARDS_CAMERA_SPATIAL)
+        direction = TOWARDS_CAMERA_YZ
     return np.asarray(direction / np.linalg.norm(direction))
 
 
@@ -210,7 +201,7 @@ def seen_points(model: mujoco.MjModel, clouds: Sequence[Array]) -> Array:
     if len(points) and np.any(np.ptp(points, axis=0) > 0.0):
         return points
 
-    return np.asarray(model.stat.center + 0.5 * float(model.stat.extent) * CORNERS)
+    return np.asarray(model.stat.center + 0.5 * model.stat.extent * CORNERS)
 
 
 def fit_in_view(points: Array, slope: float, aspect: float) -> tuple[Array, float]:

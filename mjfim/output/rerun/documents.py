@@ -499,7 +499,6 @@ def _list(sentences: Iterable[str]) -> str:
 
 
 def _rendered(part: Table | Text | Listing) -> str:
-    """One part of a page."""
     if isinstance(part, Text):
         text = escape(part.text)
         return f"**{text}**" if part.emphasis is Emphasis.STRONG else text
@@ -518,7 +517,6 @@ def _rendered(part: Table | Text | Listing) -> str:
 
 
 def _colours(*meanings: tuple[Term, str]) -> str:
-    """Return a sentence for each colour."""
     return " ".join(f"{term.colour_name.capitalize()}: {meaning}." for term, meaning in meanings)
 
 

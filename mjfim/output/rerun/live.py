@@ -36,7 +36,7 @@ from mjfim.output.rerun.scene import (
     log_pose,
     log_robot,
 )
-from mjfim.records.design import HistoryRow, IterateMotion
+from mjfim.records.design import HistoryRow
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 
 # Shortest time between two motions that are shown [s], samples of a motion, and motions in which
@@ -141,7 +141,6 @@ class LiveShow:
             self._show_best()
 
     def _take(self, event: Event) -> None:
-        """Show the numbers of an event."""
         self._events += 1
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
         if type(event) not in self._kinds:
@@ -202,7 +201,6 @@ class LiveShow:
         self._rec.log(entity_path((plot, name)), look, static=True, strict=True)
 
     def _show_text(self, text: str) -> None:
-        """Show what is done."""
         # A text without a time would be static and hide those that follow.
         self._rec.set_time(TIMELINE, sequence=max(self._events - 1, 0))
         self._rec.log(entity_path(("progress",)), rr.TextDocument(text), strict=True)
@@ -218,24 +216,27 @@ class LiveShow:
         self._is_shown = True
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
         motion = best.row.motion
-        rows = evenly_spread_indices(len(motion.t), MOTION_SAMPLES)
-        qpos = np.asarray(motion.qpos, dtype=np.float64)[rows]
-        if not np.isfinite(qpos).all():
+        t, qpos, ctrl = (
+            np.asarray(each, dtype=np.float64) for each in (motion.t, motion.qpos, motion.ctrl)
+        )
+        rows = evenly_spread_indices(len(t), MOTION_SAMPLES)
+        if not np.isfinite(qpos[rows]).all():
             return
-        poses = body_poses(self._model, np.asarray(motion.t, dtype=np.float64)[rows], qpos)
+        poses = body_poses(self._model, t[rows], qpos[rows])
         if self._camera is None:
-            self._begin(poses, motion)
+            self._begin(poses)
 
         # With every transmission, the robot moves on.
         share = self._updates % UPDATES_PER_MOTION / UPDATES_PER_MOTION
         self._updates += 1
         log_pose(self._rec, self._model, ROBOT, poses, round(share * (len(rows) - 1)))
         log_end_path(self._rec, ROBOT, poses, end_point(self._model, poses), STYLE)
-        for group, values in self._signals(motion).items():
+        _, (positions,) = shown_positions(labels_of_model(self._model), qpos)
+        for group, values in (("positions", positions), ("controls", ctrl)):
             for k, (plane, y) in enumerate(zip(self._planes[group], values.T, strict=True)):
-                self._planes[group][k] = self._log_curve(plane, motion, y)
+                self._planes[group][k] = self._log_curve(plane, t[: len(y)], y)
 
-    def _begin(self, poses: BodyPoses, motion: IterateMotion) -> None:
+    def _begin(self, poses: BodyPoses) -> None:
         """Log the shapes and the first axes, and place the camera around the first motion."""
         first = BodyPoses(
             t=poses.t[:1], positions=poses.positions[:1], quaternions=poses.quaternions[:1]
@@ -243,25 +244,14 @@ class LiveShow:
         log_robot(self._rec, self._model, ROBOT, first, STYLE)
         self._camera = place_camera(self._model, [poses], 1, ASPECT_WITH_TEXT, follow=False)
         labels = labels_of_model(self._model)
-        titles = {"positions": labels.positions, "controls": labels.controls}
         self._planes = {
-            group: [
-                Plane.around((group, title), f"{title} over time [s]", [])
-                for title in titles[group][: values.shape[1]]
-            ]
-            for group, values in self._signals(motion).items()
+            group: [Plane.around((group, title), f"{title} over time [s]", []) for title in titles]
+            for group, titles in (("positions", labels.positions), ("controls", labels.controls))
         }
         self._arrange()
 
-    def _signals(self, motion: IterateMotion) -> dict[str, Array]:
-        """Return (n, nv) positions and (n, nu) controls of a motion."""
-        qpos = np.asarray(motion.qpos, dtype=np.float64)
-        _, (positions,) = shown_positions(labels_of_model(self._model), qpos)
-        return {"positions": positions, "controls": np.asarray(motion.ctrl, dtype=np.float64)}
-
-    def _log_curve(self, plane: Plane, motion: IterateMotion, y: Array) -> Plane:
+    def _log_curve(self, plane: Plane, t: Array, y: Array) -> Plane:
         """Log a curve with axes that hold all curves before it; return the axes."""
-        t = np.asarray(motion.t, dtype=np.float64)[: len(y)]
         seen = [line(t, y, "text")]
         if self._updates > 1:
             seen.append(line([t[0], t[0]], plane.y, "text"))

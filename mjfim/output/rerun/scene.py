@@ -84,7 +84,7 @@ class RobotStyle:
             alpha *= OUTLINE_OPACITY
         else:
             colour = TINT * accent + (1.0 - TINT) * 255.0 * model_rgba[:3]
-        return [round(float(channel)) for channel in (*colour, alpha)]
+        return [round(channel) for channel in (*colour, alpha)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,22 +123,6 @@ def translucent(shape: DrawnShape) -> rrb.Visualizer:
 # ---- geoms of a body
 
 
-def drawn_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the geoms that MuJoCo's viewer shows.
-
-    If a body has geoms of hidden groups only, these are returned.
-
-    Args:
-        model: The model.
-        body: Number of the body.
-    """
-    first = int(model.body_geomadr[body])
-    geoms = range(first, first + int(model.body_geomnum[body]))
-    visible = [geom for geom in geoms if geom_rgba(model, geom)[3] > 0.0]
-    shown = [geom for geom in visible if model.geom_group[geom] <= LAST_SHOWN_GROUP]
-    return shown or visible
-
-
 def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
     """Return the colour (0..1) of a geom, as MuJoCo's renderer chooses it.
 
@@ -148,15 +132,17 @@ def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
         model: The model.
         geom: Number of the geom.
     """
-    rgba = tuple(float(channel) for channel in model.geom_rgba[geom])
+    rgba = tuple(model.geom_rgba[geom].tolist())
     material = int(model.geom_matid[geom])
     if material >= 0 and np.allclose(rgba, DEFAULT_RGBA):
-        return tuple(float(channel) for channel in model.mat_rgba[material])
+        return tuple(model.mat_rgba[material].tolist())
     return rgba
 
 
 def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterator[DrawnShape]:
     """Find the shapes that show a body; a moving body without geoms is a stick figure.
+
+    Its geoms are those that MuJoCo's viewer shows, or all where these are none.
 
     Args:
         model: The model.
@@ -168,7 +154,10 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
     """
     moving = bool(model.body_weldid[body])
     fill = OUTLINE if style.outline and moving else SOLID
-    geoms = drawn_geoms(model, body)
+    first = int(model.body_geomadr[body])
+    every = range(first, first + int(model.body_geomnum[body]))
+    visible = [geom for geom in every if geom_rgba(model, geom)[3] > 0.0]
+    geoms = [geom for geom in visible if model.geom_group[geom] <= LAST_SHOWN_GROUP] or visible
     for geom in geoms:
         rgba = style.geom_colour(geom_rgba(model, geom), moving)
         archetype = geom_shape(model, geom, rgba, fill)
@@ -221,7 +210,7 @@ def geom_shape(
     """
     kind = GeomType(int(model.geom_type[geom]))
     # Half sizes [m]; a radius and a half length for round types.
-    a, b, c = (float(size) for size in model.geom_size[geom])
+    a, b, c = model.geom_size[geom].tolist()
     look: Any = {"colors": [rgba if fill is SOLID else [*rgba[:3], 255]], "fill_mode": fill}
     match kind:
         case GeomType.mjGEOM_SPHERE:
@@ -257,7 +246,7 @@ def stick_figure(
     Yields:
         The shapes.
     """
-    radius = STICK_RADIUS * float(model.stat.extent)
+    radius = STICK_RADIUS * model.stat.extent
     upright = np.array([1.0, 0.0, 0.0, 0.0])
     ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=fill)
     yield DrawnShape(
@@ -294,7 +283,7 @@ def _ground_plane(
 
     Its squares in two tones show depth.
     """
-    extent = float(model.stat.extent)
+    extent = model.stat.extent
     reach = INFINITE_REACH * extent
     half_sizes = np.maximum((half_x, half_y), reach)
 
