@@ -156,7 +156,7 @@ class Film:
         pictures = []
         for view in self.views:
             robots = [
-                f"the {track.term.word} motion{' (transparent)' if track.is_ghost else ''}"
+                f"the {track.term} motion{' (transparent)' if track.is_ghost else ''}"
                 for track in view.tracks
             ]
             pictures.append(" and ".join(robots))
@@ -185,7 +185,7 @@ def film_of(system: System, result: Filmed) -> Film:
         ]
         return film_of_motions(system.model_at(system.theta), motions)
     if isinstance(result, Trajectory):
-        simulated = replace(OTHER, word="simulated")
+        simulated = Term("simulated", OTHER.colour, OTHER.colour_on_dark, OTHER.colour_name)
         return film_of_motions(system.model_at(system.theta), [[(simulated, result)]])
 
     if result.motion is None:
@@ -450,7 +450,7 @@ class Painter:
             x = float(k * (self._film.camera.size[0] + GAP) + MARGIN)
             for j, track in enumerate(view.tracks):
                 words = [(" and " if j else "", FAINT_INK, plain)]
-                words.append((track.term.word, track.term.rgb, bold))
+                words.append((track.term, track.term.rgb, bold))
                 words.append((" (transparent)" if track.is_ghost else "", FAINT_INK, plain))
                 for word, colour, font in words:
                     text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")

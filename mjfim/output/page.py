@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import zip_longest
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 # Name of the report in a folder of results.
 REPORT = "report.html"
@@ -55,24 +55,28 @@ class PictureFormat(StrEnum):
         )
 
 
-@dataclass(frozen=True)
-class Term:
-    """A thing that is shown, and how.
+class Term(str):
+    """The word for a thing that is shown, with its colours.
 
     The colours differ also for readers who cannot tell red from green, and can be read on white and
     on dark grey.
 
     Attributes:
-        word: The word for it.
         colour: Its colour, as `#rrggbb`.
         colour_on_dark: A brighter shade of it, for thin lines and text on a dark page.
         colour_name: The word for its colour.
     """
 
-    word: str
+    __slots__ = ("colour", "colour_name", "colour_on_dark")
     colour: str
     colour_on_dark: str
     colour_name: str
+
+    def __new__(cls, word: str, colour: str, colour_on_dark: str, colour_name: str) -> Self:
+        """Return a word with its colours."""
+        term = super().__new__(cls, word)
+        term.colour, term.colour_on_dark, term.colour_name = colour, colour_on_dark, colour_name
+        return term
 
     @property
     def rgb(self) -> tuple[int, int, int]:
@@ -102,7 +106,7 @@ def shown_word(key: str) -> str:
     Args:
         key: Key of a record or file, such as `final`.
     """
-    return TRAJECTORY_TERMS[key].word if key in TRAJECTORY_TERMS else key
+    return TRAJECTORY_TERMS.get(key, key)
 
 
 class Emphasis(StrEnum):

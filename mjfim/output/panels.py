@@ -15,7 +15,7 @@ from mjfim.output.page import OTHER, TERMS
 # Colours of roles that are no words of the vocabulary: text and reference lines, notes and curves
 # that stay in the background, bands.
 ROLES = {"text": "#222222", "muted": "#6b7076", "band": "#d9dcdf", "white": "#ffffff"} | {
-    term.word: term.colour for term in (*TERMS, OTHER)
+    term: term.colour for term in (*TERMS, OTHER)
 }
 
 # Colours of curves that have no role; they differ also for readers who cannot tell red from green.

@@ -94,7 +94,7 @@ def palettes() -> dict[str, dict[str, Any]]:
     }
     dark: dict[str, Any] = {
         **{role: _lighter(colour) for role, colour in ROLES.items()},
-        **{term.word: term.colour_on_dark for term in (*TERMS, OTHER)},
+        **{term: term.colour_on_dark for term in (*TERMS, OTHER)},
         **DARK,
         "diverging": list(zip(places, CELLS_DARK, strict=True)),
     }

@@ -231,16 +231,6 @@ def relative(std: float, size: float, value: float | None = None) -> str:
     return number(percent, max(places, 2), " %" if is_of_value else f" % of {number(size, 2)}")
 
 
-def size_sentence(values: Sequence[float] | Array, sizes: Sequence[float] | Array) -> str:
-    """Say of what a relative standard deviation is a share; empty where it is of the value."""
-    if np.array_equal(np.abs(values), sizes):
-        return ""
-    return (
-        "A relative σ is a share of the value; for an entry of a vector or tensor, and for a value "
-        "of zero, it is a share of the magnitude of the whole."
-    )
-
-
 def improvement(before: float, after: float) -> str:
     """Write how a standard deviation changed: divided by a number, or times a number."""
     if not (np.isfinite(before) and np.isfinite(after) and after > 0 and before > 0):

@@ -223,8 +223,8 @@ def _estimate_table(estimate: Estimate) -> Table:
     at_bound = [name in estimate.at_bound for name in names]
     columns = {
         "parameter": list(map(named, names, estimate.units)),
-        NOMINAL.word: numbers(estimate.initial_theta, 4),
-        IDENTIFIED.word: list(map(_as_accurate, estimate.theta, std)),
+        NOMINAL: numbers(estimate.initial_theta, 4),
+        IDENTIFIED: list(map(_as_accurate, estimate.theta, std)),
         "formal σ": formal,
         "honest σ": numbers(np.where(known, 0.25 * (high - low), np.nan), 2),
         "95 % low": list(map(_as_accurate, np.where(known, low, np.nan), std)),
@@ -236,7 +236,7 @@ def _estimate_table(estimate: Estimate) -> Table:
         "Estimates with their 95 % intervals",
         columns,
         warned(at_bound),
-        spare=(NOMINAL.word, "honest σ", "at bound", "formal σ"),
+        spare=(NOMINAL, "honest σ", "at bound", "formal σ"),
     )
 
 
@@ -297,8 +297,8 @@ def _prediction_parts(predictions: Sequence[Prediction]) -> Sequence[Part]:
         {
             "recording": [name for name, _, _ in shown],
             "output": [prediction.identified.outputs[j] for _, prediction, j in shown],
-            IDENTIFIED.word: numbers(identified),
-            NOMINAL.word: numbers(nominal),
+            IDENTIFIED: numbers(identified),
+            NOMINAL: numbers(nominal),
             "ratio": numbers(ratio),
         },
         note=note,

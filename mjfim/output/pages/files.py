@@ -106,7 +106,7 @@ def experiment_page(stated: StatedExperiment) -> Page:
     tables = (
         _table(
             "Unknown parameters",
-            f"parameter, {NOMINAL.word}, lower bound, upper bound, nuisance",
+            f"parameter, {NOMINAL}, lower bound, upper bound, nuisance",
             [
                 (
                     named(each.name, each.unit),

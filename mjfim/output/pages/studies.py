@@ -103,8 +103,8 @@ def _campaign_table(campaign: Campaign, true: Array | None) -> Table:
     values, std, wanted = estimate.theta[chosen], estimate.std[chosen], campaign.wanted[chosen]
     columns = {
         "parameter": [named(estimate.parameters[j], estimate.units[j]) for j in chosen],
-        NOMINAL.word: numbers(campaign.rounds[0].theta[chosen], 5),
-        IDENTIFIED.word: numbers(values, 5),
+        NOMINAL: numbers(campaign.rounds[0].theta[chosen], 5),
+        IDENTIFIED: numbers(values, 5),
         "formal σ": numbers(std, 2),
         "wanted σ": numbers(wanted, 2, infinite="-"),
     }

@@ -41,7 +41,6 @@ from mjfim.output.words import (
     relative,
     share_note,
     shorten,
-    size_sentence,
 )
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.trajectory import Labels, Trajectory
@@ -132,7 +131,10 @@ MAX_ENVELOPES, MAX_ROWS, FULL_ROW = 2, 12, 0.86
 
 def trajectories(design: Design, labels: Labels) -> Picture:
     """Show states, controls and the information gathered up to each time (the paper's figure 2)."""
-    both = {INITIAL.word: design.initial.trajectory, DESIGNED.word: design.final.trajectory}
+    both: dict[str, Trajectory] = {
+        INITIAL: design.initial.trajectory,
+        DESIGNED: design.final.trajectory,
+    }
     groups = motion_panels(labels, both, design.usage)
     columns = min(PANEL_COLUMNS, max(map(len, groups.values())))
     panels: list[Panel] = []
@@ -236,8 +238,8 @@ def information_panel(design: Design) -> Panel:
         root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
         last = format_number(root[-1])
         marks += [
-            _curve(t, root, term.word, width),
-            words([t[-1]], [root[-1]], [last], term.word),
+            _curve(t, root, term, width),
+            words([t[-1]], [root[-1]], [last], term),
         ]
     return Panel(
         title="√λ_min up to each time [√s / unit of θ]",
@@ -285,7 +287,7 @@ def _phase_plot(design: Design, labels: Labels, dof: int, j: int) -> Panel:
     marks = []
     for evaluation, term, front in ((design.initial, INITIAL, 3.0), (design.final, DESIGNED, 2.0)):
         position, velocity = evaluation.sensitivity[:, [dof, nv + dof], j].T
-        marks.append(line(position, velocity, term.word, label=term.word, width=1.6, front=front))
+        marks.append(line(position, velocity, term, label=term, width=1.6, front=front))
     name, unit = split_unit(labels.positions[dof])
     divisor, parameter = labels.parameter_units[j], shorten(labels.parameters[j], 14)
     axes = [
@@ -318,7 +320,7 @@ def convergence(design: Design) -> Picture:
     stages = [(row.rate, row.mu) for row in history]
     changes = [k for k in range(1, len(stages)) if stages[k] != stages[k - 1]]
 
-    begin = INITIAL.word
+    begin: str = INITIAL
     if history and not np.isclose(history[0].cost, design.initial.cost, rtol=1e-9, atol=0.0):
         begin = f"start: {design.found_by}"
     panels = []
@@ -352,9 +354,9 @@ def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
         return []
     x, y = iterations[usable], values[usable]
     curve = line(x, y, "muted", symbol=".", size=3.0)
-    ends = [dots(x[-1:], y[-1:], DESIGNED.word, size=6.0, label=DESIGNED.word)]
+    ends = [dots(x[-1:], y[-1:], DESIGNED, size=6.0, label=DESIGNED)]
     if usable[0]:
-        ends.insert(0, dots(x[:1], y[:1], INITIAL.word, size=6.0, label=begin))
+        ends.insert(0, dots(x[:1], y[:1], INITIAL, size=6.0, label=begin))
     return [curve, *ends]
 
 
@@ -382,22 +384,25 @@ def standard_deviations(design: Design, labels: Labels) -> Picture:
     for std, term, offset in zip(stds, (INITIAL, DESIGNED), (-0.19, 0.19), strict=True):
         known, at = np.isfinite(std), rows + offset
         ends, places = std[known], at[known]
-        marks.append(bars(ends, places, term.word, left=low, size=0.36, label=term.word))
+        marks.append(bars(ends, places, term, left=low, size=0.36, label=term))
         if len(names) <= MAX_HIGH_ROWS:
             texts = [format_number(value) for value in ends]
-            marks.append(words(ends, places, texts, term.word))
+            marks.append(words(ends, places, texts, term))
         if not known.all():
             beyond = np.full(len(at[~known]), high)
-            marks.append(bars(beyond, at[~known], term.word, left=low, size=0.36, hollow=True))
+            marks.append(bars(beyond, at[~known], term, left=low, size=0.36, hollow=True))
         shares = [str(relative(*pair)) for pair in zip(std.tolist(), sizes, strict=True)]
-        beside.append(("relative σ", term.word, shares))
+        beside.append(("relative σ", term, shares))
     changes = [improvement(*pair) for pair in stds.T.tolist()]
 
     note = BEST_CASE
     if not all_known:
         note += " Hatched: the parameter is not identifiable alone from this trajectory."
-    if of_size := size_sentence(design.theta, design.sizes):
-        note += f" {of_size}"
+    if not np.array_equal(np.abs(design.theta), design.sizes):
+        note += (
+            " A relative σ is a share of the value; for an entry of a vector or tensor, and for a "
+            "value of zero, it is a share of the magnitude of the whole."
+        )
     panel = Panel(
         marks=marks,
         x=Axis(label="predicted σ [unit of the parameter]", log=True, limits=(low, high)),
@@ -505,7 +510,7 @@ def _limit_panel(
         x=Axis(label="time [s]"),
         y=axis,
         title=margin,
-        role=DESIGNED.word if largest_share(closest[0]) > 1.0 else "text",
+        role=DESIGNED if largest_share(closest[0]) > 1.0 else "text",
         remark=f"largest: {', '.join(shares)}",
     )
 

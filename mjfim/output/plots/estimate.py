@@ -119,22 +119,22 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     is_at_bound = np.array([name in estimate.at_bound for name in estimate.parameters])
     look = {"size": 6.5, "front": 3.0}
     marks = [
-        vline(0.0, NOMINAL.word, width=1.6, label=NOMINAL.word),
+        vline(0.0, NOMINAL, width=1.6, label=NOMINAL),
         intervals(
             centre - half,
             centre + half,
             rows,
-            IDENTIFIED.word,
+            IDENTIFIED,
             width=5.0,
             opacity=0.3,
             label="formal 95 %",
         ),
-        intervals(low, high, rows, IDENTIFIED.word, width=1.4),
+        intervals(low, high, rows, IDENTIFIED, width=1.4),
         dots(
             centre[~is_at_bound],
             rows[~is_at_bound],
-            IDENTIFIED.word,
-            label=f"{IDENTIFIED.word}, 95 % interval",
+            IDENTIFIED,
+            label=f"{IDENTIFIED}, 95 % interval",
             **look,
         ),
     ]
@@ -142,7 +142,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
         at = dots(
             centre[is_at_bound],
             rows[is_at_bound],
-            IDENTIFIED.word,
+            IDENTIFIED,
             symbol="s",
             hollow=True,
             label="at its bound",
@@ -166,7 +166,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     panel = Panel(
         marks=marks,
         x=Axis(
-            label=f"difference from the {NOMINAL.word} value [%]",
+            label=f"difference from the {NOMINAL} value [%]",
             limits=(min(left, -margin), max(right, margin)),
         ),
         y=row_axis([labels.parameter(j) for j in range(count)]),
@@ -200,11 +200,11 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
     for j in np.sort(order[:MAX_PARAMETERS]).tolist():
         values = np.append(estimate.trace[1:, j], estimate.theta[j])
         marks = [
-            hline(estimate.trace[0, j], NOMINAL.word, label=NOMINAL.word),
+            hline(estimate.trace[0, j], NOMINAL, label=NOMINAL),
             line(
                 np.arange(len(values)),
                 values,
-                IDENTIFIED.word,
+                IDENTIFIED,
                 symbol="o",
                 size=3.0,
                 label="estimate so far",
@@ -213,7 +213,7 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
         low, high = estimate.interval[j]
         if np.isfinite(low) and np.isfinite(high):
             label = "95 % interval of the result"
-            marks.append(hspan(low, high, IDENTIFIED.word, opacity=0.15, label=label))
+            marks.append(hspan(low, high, IDENTIFIED, opacity=0.15, label=label))
         panels.append(
             Panel(
                 title=labels.parameter(j),
@@ -313,11 +313,11 @@ def _over_time(
         label = labels.output(recording.outputs[j])
         time = Axis(label="time [s]" if place == len(columns) - 1 else "")
         marks = [
-            dots(t, y, MEASURED.word, symbol=".", size=size, label="measured"),
-            line(t, model, IDENTIFIED.word, width=1.2, label="identified model"),
+            dots(t, y, MEASURED, symbol=".", size=size, label="measured"),
+            line(t, model, IDENTIFIED, width=1.2, label="identified model"),
         ]
         if guess is not None:
-            marks.append(line(t, guess, NOMINAL.word, width=0.8, front=1.5, label="nominal model"))
+            marks.append(line(t, guess, NOMINAL, width=0.8, front=1.5, label="nominal model"))
         if 0 < len(boundaries) <= MAX_BOUNDARIES:
             look = {"width": 0.6, "dash": "--", "opacity": 0.6, "label": "begin of a segment"}
             marks += [vline(begin, "muted", **look) for begin in boundaries]
@@ -381,10 +381,10 @@ def _errors(
     if np.isfinite(sigma):
         marks.append(hspan(-2.0 * sigma, 2.0 * sigma, opacity=0.8, label="±2σ of the noise"))
     residual = y - identified
-    role = IDENTIFIED.word if is_prediction else MEASURED.word
+    role = IDENTIFIED if is_prediction else MEASURED
     marks.append(dots(t, residual, role, symbol=".", size=size, front=2.5))
     if is_prediction and nominal is not None:
-        marks.append(dots(t, y - nominal, NOMINAL.word, symbol=".", size=0.7 * size))
+        marks.append(dots(t, y - nominal, NOMINAL, symbol=".", size=0.7 * size))
     known = residual[np.isfinite(residual)]
     if not known.size:
         return marks, ""
@@ -443,8 +443,8 @@ def _spectrum_panel(estimate: Estimate, column: int, name: str) -> Panel:
         title=name,
         remark=remark,
         marks=[
-            line(f, density, MEASURED.word, label="residual"),
-            area(f, low * density, high * density, MEASURED.word, label=label),
+            line(f, density, MEASURED, label="residual"),
+            area(f, low * density, high * density, MEASURED, label=label),
             hline(1.0, width=0.8, label="white noise of the assumed σ"),
         ],
         x=Axis(label="frequency [Hz]", log=True),
@@ -529,9 +529,9 @@ def predictions(estimate: Estimate, labels: Labels) -> Picture:
                 other=identified[is_row],
                 width=3.0,
             ),
-            dots(nominal, rows, NOMINAL.word, size=6.0, label="nominal model"),
-            dots(identified, rows, IDENTIFIED.word, size=6.0, label="identified model"),
-            vline(1.0, MEASURED.word, width=1.2, dash="--", label="σ of the noise"),
+            dots(nominal, rows, NOMINAL, size=6.0, label="nominal model"),
+            dots(identified, rows, IDENTIFIED, size=6.0, label="identified model"),
+            vline(1.0, MEASURED, width=1.2, dash="--", label="σ of the noise"),
         ],
         x=Axis(
             label="rms prediction error / σ of the noise [–]",
@@ -577,8 +577,8 @@ def inverse_dynamics(fit: InverseDynamicsFit) -> Picture:
         t, measured, explained = _with_gaps(each)
         share = f"{100.0 * each.share:.2g} %" if np.isfinite(each.share) else "no force"
         marks = [
-            line(t, measured, MEASURED.word, width=1.8, label="measured, or by the model"),
-            line(t, explained, IDENTIFIED.word, width=0.9, label="needed by the measured motion"),
+            line(t, measured, MEASURED, width=1.8, label="measured, or by the model"),
+            line(t, explained, IDENTIFIED, width=0.9, label="needed by the measured motion"),
         ]
         panels.append(
             Panel(

@@ -74,7 +74,7 @@ def selection(estimate: Estimate) -> Picture:
         line(
             [step.error for step in phase],
             [row_of[id(step)] for step in phase],
-            IDENTIFIED.word,
+            IDENTIFIED,
             symbol="o",
             size=6.0,
             label="model of this step",
@@ -170,7 +170,7 @@ def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
     name, errors = study.name_of(i), study.errors[i]
     if i == study.chosen:
         look = {"width": 2.2, "symbol": "o", "size": 5.0, "front": 3.0}
-        return line(study.lengths, errors, IDENTIFIED.word, label=f"{name}, chosen", **look)
+        return line(study.lengths, errors, IDENTIFIED, label=f"{name}, chosen", **look)
     k = i % len(DASHES)
     look = {"width": 1.1, "dash": DASHES[k], "symbol": SYMBOLS[k], "size": 4.5}
     return line(study.lengths, errors, "muted", label=name, **look)
@@ -178,9 +178,9 @@ def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
 
 def _estimates_by_length(study: HorizonStudy, j: int, axis: Axis) -> Panel:
     """Return the estimates of one parameter with their intervals."""
-    marks = [hline(study.theta[study.chosen, j], IDENTIFIED.word, width=0.6)]
+    marks = [hline(study.theta[study.chosen, j], IDENTIFIED, width=0.6)]
     for i, length in enumerate(study.lengths.tolist()):
-        role = IDENTIFIED.word if i == study.chosen else "muted"
+        role = IDENTIFIED if i == study.chosen else "muted"
         value, half = float(study.theta[i, j]), float(np.nan_to_num(study.half_widths[i, j]))
         marks += [
             line([length] * 2, [value - half, value + half], role, symbol="_", size=6.0),
@@ -233,11 +233,11 @@ def _recordings_panel(
         low, high = comparison.interval[j]
         label = "95 % interval of the mean"
         marks = [
-            vspan(low, high, IDENTIFIED.word, opacity=0.2, label=label),
-            vline(mean, IDENTIFIED.word, width=1.2, label="mean"),
+            vspan(low, high, IDENTIFIED, opacity=0.2, label=label),
+            vline(mean, IDENTIFIED, width=1.2, label="mean"),
         ]
     for row, k in enumerate(rows):
-        role = DESIGNED.word if k in odd else MEASURED.word
+        role = DESIGNED if k in odd else MEASURED
         label = "odd recording" if k in odd else "one recording, 95 % interval"
         marks += [
             intervals(value[[k]] - half[[k]], value[[k]] + half[[k]], [row], role),
@@ -249,7 +249,7 @@ def _recordings_panel(
         names.append("another one")
         marks.append(intervals([begin], [end], [len(rows)], "muted", width=3.0))
     limits = range_of_intervals(value, value - half, value + half)
-    roles = [DESIGNED.word if k in odd else "text" for k in rows]
+    roles = [DESIGNED if k in odd else "text" for k in rows]
     shown = row_axis([shorten(name, 16) for name in names], roles)
     if not is_left:
         shown = blank_rows(len(names))
@@ -301,7 +301,7 @@ def pairs(
         """Mark the nominal values of a panel, if they lie in it."""
         if max(abs(across), abs(up)) > RANGE:
             return []
-        return [dots([across], [up], NOMINAL.word, symbol="x", size=5.0, label=NOMINAL.word)]
+        return [dots([across], [up], NOMINAL, symbol="x", size=5.0, label=NOMINAL)]
 
     def density(j: int) -> list[Mark]:
         """Draw the normal density of one parameter."""
@@ -343,7 +343,7 @@ def estimate_pairs(estimate: Estimate) -> Picture:
         estimate.units,
         estimate.theta,
         estimate.covariance,
-        IDENTIFIED.word,
+        IDENTIFIED,
         guess=estimate.initial_theta,
         title="Joint uncertainty of the identified parameters",
         note="Formal uncertainty: it is right only if the model and the noise are right.",
@@ -371,18 +371,18 @@ def samples(estimate: Estimate) -> Picture:
                 "columns",
                 edges,
                 counts / counts.max(),
-                MEASURED.word,
+                MEASURED,
                 opacity=0.6,
                 label="drawn robots",
             ),
-            vline(draws.centre[j], IDENTIFIED.word, width=1.4, label=IDENTIFIED.word),
+            vline(draws.centre[j], IDENTIFIED, width=1.4, label=IDENTIFIED),
         ]
 
     def scatter(j: int, i: int) -> list[Mark]:
         """Draw parameter j across and i up."""
         return [
-            dots(robots[:, j], robots[:, i], MEASURED.word, symbol=".", size=2.5, opacity=0.6),
-            dots(draws.centre[[j]], draws.centre[[i]], IDENTIFIED.word),
+            dots(robots[:, j], robots[:, i], MEASURED, symbol=".", size=2.5, opacity=0.6),
+            dots(draws.centre[[j]], draws.centre[[i]], IDENTIFIED),
         ]
 
     def axis(j: int) -> Axis:

@@ -163,8 +163,8 @@ def check(result: Check) -> Picture:
 def source_role(result: Check) -> str:
     """Return the role of the motion that was checked."""
     if "recording" in result.source:
-        return MEASURED.word
-    return DESIGNED.word if "design" in result.source else INITIAL.word
+        return MEASURED
+    return DESIGNED if "design" in result.source else INITIAL
 
 
 def duration(result: Check) -> str:
@@ -270,8 +270,8 @@ def compare(comparison: Comparison) -> Picture:
 
 def _method_role(comparison: Comparison, row: MethodResult) -> str:
     if row.method == DESIGN:
-        return DESIGNED.word
-    return OTHER.word if row in comparison.beating else INITIAL.word
+        return DESIGNED
+    return OTHER if row in comparison.beating else INITIAL
 
 
 def _ratios(
@@ -330,10 +330,10 @@ def _worst_combinations(
         room = (high / low) ** (0.75 if has_margins else 0.45)
         axis = Axis(label=axis.label, limits=(low, high * room), log=True)
 
-    labels = {
-        DESIGNED.word: "design",
-        INITIAL.word: "baseline",
-        OTHER.word: "baseline that beats the design",
+    labels: dict[str, str] = {
+        DESIGNED: "design",
+        INITIAL: "baseline",
+        OTHER: "baseline that beats the design",
     }
     marks: list[Mark] = []
     for place, (row, role) in enumerate(zip(rows, roles, strict=True)):
@@ -416,7 +416,7 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
 def _trajectory(key: str) -> tuple[str, str]:
     """Return the word and the role of a trajectory of a study."""
     word = shown_word(key)
-    return word, word if key in TRAJECTORY_TERMS else OTHER.word
+    return word, word if key in TRAJECTORY_TERMS else OTHER
 
 
 def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Picture:
@@ -531,8 +531,8 @@ def robots(comparison: RobotComparison) -> Picture:
     is_changed = np.array([j in comparison.changed for j in order], dtype=bool)
     marks = [vspan(-1.0, 1.0, opacity=0.6, label="would hardly be found"), vline(0.0)]
     for chosen, role, label in (
-        (is_changed, DESIGNED.word, "differs"),
-        (~is_changed, IDENTIFIED.word, "no difference proven"),
+        (is_changed, DESIGNED, "differs"),
+        (~is_changed, IDENTIFIED, "no difference proven"),
     ):
         inside = chosen & (np.abs(centre) <= reach)
         marks += [
@@ -567,7 +567,7 @@ def robots(comparison: RobotComparison) -> Picture:
     panel = Panel(
         marks=marks,
         x=Axis(label="difference / difference that would be found [–]", limits=(-reach, reach)),
-        y=row_axis(labels, [DESIGNED.word if changed else "text" for changed in is_changed]),
+        y=row_axis(labels, [DESIGNED if changed else "text" for changed in is_changed]),
         beside=[("", "text", texts)],
     )
     row = 0.36 if len(order) <= MAX_HIGH_ROWS else 0.25
@@ -605,11 +605,11 @@ def _margins(result: Rehearsal) -> Panel:
     percent = 100.0 * np.maximum(margins, LEAST_MARGIN)
     low = min(-5.0, float(percent.min(initial=0.0)) - 5.0)
     high = max(100.0, float(percent[0].max(initial=0.0)) + 5.0)
-    marks = [vspan(low, 0.0, DESIGNED.word, opacity=0.1)]
+    marks = [vspan(low, 0.0, DESIGNED, opacity=0.1)]
     for i in range(len(result.limits)):
-        role, label = MEASURED.word, "robots, all keep the limit"
+        role, label = MEASURED, "robots, all keep the limit"
         if not result.kept[:, i].all():
-            role, label = DESIGNED.word, "robots, some exceed the limit"
+            role, label = DESIGNED, "robots, some exceed the limit"
         marks += _row(percent[:, i], i, role, label)
     names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in result.limits]
     return Panel(
@@ -627,7 +627,7 @@ def _speeds(result: Rehearsal) -> Panel:
     share = 100.0 * speeds / np.where(most > 0.0, most, 1.0)
     marks = []
     for i, name in enumerate(result.joints):
-        role = DESIGNED.word if name in result.unlimited else MEASURED.word
+        role = DESIGNED if name in result.unlimited else MEASURED
         label = "robots, nothing limits the speed" if name in result.unlimited else "robots"
         marks += _row(share[:, i], i, role, label)
     texts = [f"{peak:.2g} {unit}" for peak, unit in zip(most, result.units, strict=True)]
@@ -704,8 +704,8 @@ def _accuracy_over_rounds(
     low, high = around(np.concatenate([predicted, attained, [wanted]]), factor=1.5)
     before, after = "predicted before the round", "estimated after the round, from all recordings"
     marks = [
-        dots(numbers, predicted, DESIGNED.word, size=8.0, hollow=True, label=before),
-        line(numbers, attained, IDENTIFIED.word, symbol="o", front=3.0, label=after),
+        dots(numbers, predicted, DESIGNED, size=8.0, hollow=True, label=before),
+        line(numbers, attained, IDENTIFIED, symbol="o", front=3.0, label=after),
     ]
     if np.isfinite(wanted):
         title += f", wanted {format_number(wanted, 2)}"
@@ -729,14 +729,14 @@ def _estimate_over_rounds(
     theta = np.array([r.estimate.theta[j] for r in result.rounds])
     std = np.array([r.attained[j] for r in result.rounds])
     bar = np.where(np.isfinite(std), std, 0.0)
-    marks = [dots(numbers, theta, IDENTIFIED.word)]
+    marks = [dots(numbers, theta, IDENTIFIED)]
     for factor, width in ((1.0, 2.4), (2.0, 0.9)):
         ends = np.column_stack(
             [theta - factor * bar, theta + factor * bar, np.full(len(bar), np.nan)]
         )
-        marks.append(line(np.repeat(numbers, 3), ends.ravel(), IDENTIFIED.word, width=width))
+        marks.append(line(np.repeat(numbers, 3), ends.ravel(), IDENTIFIED, width=width))
         if np.isfinite(std[-1]):
-            marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED.word, opacity=0.07))
+            marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED, opacity=0.07))
     if true is not None:
         marks.append(hline(true[j], label="true value"))
     return Panel(title=title, marks=marks, x=axis, y=Axis(most=4))

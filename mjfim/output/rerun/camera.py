@@ -36,9 +36,9 @@ CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
 
 # Vectors from the scene towards the camera: for a motion in the x-z plane, in the y-z plane, and in
 # space.
-TOWARDS_CAMERA_XZ = (0.0, -1.0, 0.15)
-TOWARDS_CAMERA_YZ = (1.0, 0.0, 0.15)
-TOWARDS_CAMERA_SPATIAL = (1.0, -1.0, 0.6)
+TOWARDS_CAMERA_XZ = np.array([0.0, -1.0, 0.15])
+TOWARDS_CAMERA_YZ = np.array([1.0, 0.0, 0.15])
+TOWARDS_CAMERA_SPATIAL = np.array([1.0, -1.0, 0.6])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -75,7 +75,7 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Labels, Trajectory
 
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
-FURTHER_ROLES = ("series2", "series5", IDENTIFIED.word, "series4")
+FURTHER_ROLES = ("series2", "series5", IDENTIFIED, "series4")
 
 # Largest number of samples of a motion in a file, and of recordings that have a tab each.
 MAX_SAMPLES, MAX_TABS = 20_000, 3
@@ -100,9 +100,9 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
         design: The design.
         labels: Labels of its columns.
     """
-    both = {
-        INITIAL.word: design.initial.trajectory,
-        DESIGNED.word: design.final.trajectory,
+    both: dict[str, Trajectory] = {
+        INITIAL: design.initial.trajectory,
+        DESIGNED: design.final.trajectory,
     }
     tabs: Tabs = motion_panels(labels, both, design.usage)
     tabs |= {
@@ -128,7 +128,7 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
         for found in planes.values():
             for plane, panel in found:
                 plane.log(rec, panel.marks)
-        _log_robots(rec, model, poses, {name: name for name in poses}, [INITIAL.word])
+        _log_robots(rec, model, poses, {}, [INITIAL])
         _log_iterates(rec, model, design, iterates)
 
 
@@ -150,12 +150,12 @@ def log_estimate(
         identified: Motion of the identified model.
         labels: Labels of their columns.
     """
-    shown = {IDENTIFIED.word: _thinned(identified)}
-    title = f"{IDENTIFIED.word} robot ({IDENTIFIED.colour_name})"
+    shown: dict[str, Trajectory] = {IDENTIFIED: _thinned(identified)}
+    title = f"{IDENTIFIED} robot ({IDENTIFIED.colour_name})"
     if measured is not None:
         term = MEASURED
-        shown[term.word] = _thinned(measured)
-        title += f", {term.word} robot ({term.colour_name} outline)"
+        shown[term] = _thinned(measured)
+        title += f", {term} robot ({term.colour_name} outline)"
     kept = sum(prediction.recording is not None for prediction in estimate.predictions)
     fits = [fit(estimate, i, labels) for i in range(len(estimate.recordings))]
     held = [held_out(estimate, i, labels) for i in range(kept)]
@@ -174,13 +174,13 @@ def log_estimate(
 
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in shown.items()}
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
-    root = ("robots", IDENTIFIED.word)
+    root = ("robots", IDENTIFIED)
     view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
     tabs += series_tabs(states)
     text = as_markdown(page_of(estimate), ESTIMATE_COLOURS)
     with open_recording(path, model, "estimate", view, tabs, text) as rec:
         log_series(rec, recordings | states)
-        _log_robots(rec, model, poses, {name: name for name in poses}, [IDENTIFIED.word])
+        _log_robots(rec, model, poses, {}, [IDENTIFIED])
 
 
 def _pairs(panels: Sequence[Panel]) -> list[Panel]:
@@ -207,7 +207,7 @@ def log_trajectories(
     named = {shown_word(name): each for name, each in trajectories.items()}
     poses = {name: body_poses(model, each.t, each.qpos) for name, each in named.items()}
     further = cycle(FURTHER_ROLES)
-    known = (INITIAL.word, DESIGNED.word)
+    known = (INITIAL, DESIGNED)
     roles = {name: name if name in known else next(further) for name in named}
     states: Tabs = {
         group: [
@@ -231,7 +231,7 @@ def log_trajectories(
 
 def style_of(role: str) -> RobotStyle:
     """Return the style of the robot of a role; a measured one is an outline."""
-    return RobotStyle(accent=rgb(role), outline=role == MEASURED.word)
+    return RobotStyle(accent=rgb(role), outline=role == MEASURED)
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
@@ -278,9 +278,9 @@ def _log_iterates(
     """Log on the timeline `iteration` the curves, and the robot in the middle of its motion."""
     for plane, start, _ in plots:
         plane.log(rec)
-        still = plane.curve(*start, INITIAL.word, 0.6)
+        still = plane.curve(*start, INITIAL, 0.6)
         rec.log(entity_path((*plane.parts, "initial")), still, static=True, strict=True)
-    root, style = ("robots", DESIGNED.word), style_of(DESIGNED.word)
+    root, style = ("robots", DESIGNED), style_of(DESIGNED)
     middle = design.initial.trajectory.qpos[len(design.initial.trajectory.t) // 2]
     still_poses = body_poses(model, np.zeros(1), middle[None])
     designed = body_poses(model, design.trajectory.t, design.trajectory.qpos)
@@ -296,10 +296,10 @@ def _log_iterates(
         qpos = np.asarray(motions.qpos[i], dtype=np.float64)
         poses = body_poses(model, motions.t[i], qpos)
         log_pose(rec, model, root, poses, len(qpos) // 2)
-        log_pose(rec, model, ("robots", INITIAL.word), still_poses, 0)
+        log_pose(rec, model, ("robots", INITIAL), still_poses, 0)
         log_end_path(rec, root, poses, end, style)
         for plane, _, curves in plots:
-            curve = plane.curve(*curves[i], DESIGNED.word)
+            curve = plane.curve(*curves[i], DESIGNED)
             rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
     rec.reset_time()
 
@@ -414,7 +414,7 @@ def _robots(
     """Return the views of several robots: separate, and in another tab overlaid."""
     motions, names = list(poses.values()), list(poses)
     camera = place_camera(model, motions, views=len(motions), aspect=aspect)
-    words = {term.word: f"{term.word} ({term.colour_name})" for term in TERMS}
+    words: dict[str, str] = {term: f"{term} ({term.colour_name})" for term in TERMS}
     titles = {words.get(name, name): ("robots", name) for name in names}
     arranged = rrb.Vertical if camera.stacked else rrb.Horizontal
     separate = arranged(*robot_views(model, camera, titles), name="separate")
@@ -439,7 +439,7 @@ def _log_robots(
 ) -> None:
     """Log robots by their names, some of them with the path of the end."""
     for name, each in poses.items():
-        root, style = ("robots", name), style_of(roles[name])
+        root, style = ("robots", name), style_of(roles.get(name, name))
         log_robot(rec, model, root, each, style)
         if name in with_path:
             log_end_path(rec, root, each, end_point(model, each), style, static=True)

@@ -50,10 +50,10 @@ FLUSH_SECONDS = 3.0
 TIMELINE, ROBOT = "event", ("robot",)
 
 # Style of the robot, and roles of curves that share a plot.
-STYLE = style_of(DESIGNED.word)
+STYLE = style_of(DESIGNED)
 ROLES_IN_TURN = (
-    *(term.word for term in (DESIGNED, INITIAL, MEASURED)),
-    *(term.word for term in (NOMINAL, IDENTIFIED, OTHER)),
+    *(term for term in (DESIGNED, INITIAL, MEASURED)),
+    *(term for term in (NOMINAL, IDENTIFIED, OTHER)),
 )
 
 # Name, colour and width of the curves of other starts than the one of the best iterate.
@@ -257,7 +257,7 @@ class LiveShow:
             seen.append(line([t[0], t[0]], plane.y, "text"))
         grown = Plane.around(plane.parts, plane.title, seen)
         grown.log(self._rec, static=False)
-        curve = grown.curve(t, y, DESIGNED.word)
+        curve = grown.curve(t, y, DESIGNED)
         self._rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
         return grown
 
