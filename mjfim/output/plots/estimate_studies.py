@@ -41,7 +41,7 @@ MAX_PAIRED, MAX_COMPARED, MAX_RECORDINGS = 6, 9, 24
 LARGEST_DRAWN_RATIO, MAX_NAMED = 1.5, 20
 
 # Dashes and symbols of the curves of the lengths that were not chosen.
-DASHES, SYMBOLS = (":", "--", "-.", (0, (8, 2)), (0, (1, 4))), ("s", "^", "D", "v", "P")
+DASHES, SYMBOLS = (":", "--", "-."), ("s", "^", "D", "v")
 
 # Half the range of an axis of pairs, places of its ticks, and standard deviations of the ellipses
 # with their opacities [standard deviations].
@@ -171,8 +171,8 @@ def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
     if i == study.chosen:
         look = {"width": 2.2, "symbol": "o", "size": 5.0, "front": 3.0}
         return line(study.lengths, errors, IDENTIFIED, label=f"{name}, chosen", **look)
-    k = i % len(DASHES)
-    look = {"width": 1.1, "dash": DASHES[k], "symbol": SYMBOLS[k], "size": 4.5}
+    dash, symbol = DASHES[i % len(DASHES)], SYMBOLS[i % len(SYMBOLS)]
+    look = {"width": 1.1, "dash": dash, "symbol": symbol, "size": 4.5}
     return line(study.lengths, errors, "muted", label=name, **look)
 
 
