@@ -239,7 +239,12 @@ def film_of_motions(
     nothing, points = np.zeros((0, 3)), evenly_spread_indices(frames, TRAIL_POINTS)
     followed = followed_body(model, [view[0] for view in poses])
     paths = [] if followed is None else [view[0].positions[:, followed] for view in poses]
-    shifts = [_smooth(path - path[0]) for path in paths] or [np.zeros((frames, 3))] * len(poses)
+    # A moving average, at whose ends the path continues.
+    window = round(CAMERA_SECONDS * FRAME_RATE)
+    shifts = [
+        scipy.ndimage.uniform_filter1d(path - path[0], window, axis=0, mode="nearest")
+        for path in paths
+    ] or [np.zeros((frames, 3))] * len(poses)
     camera = _camera(model, poses, shifts)
     views = []
     for k, view in enumerate(tracks):
@@ -322,12 +327,6 @@ def _camera(
         floor=lowest + float(heights.min()),
         spacing=FLOOR_SPACING * max(distance, height),
     )
-
-
-def _smooth(path: Array) -> Array:
-    """Moving average of a path (F, 3) over `CAMERA_SECONDS`; the ends continue."""
-    window = round(CAMERA_SECONDS * FRAME_RATE)
-    return np.asarray(scipy.ndimage.uniform_filter1d(path, window, axis=0, mode="nearest"))
 
 
 # Kinds of OpenGL contexts by system, in the order in which they are tried: without a display first.
@@ -490,7 +489,12 @@ class Painter:
         for geom in self._renderer.scene.geoms[first : self._renderer.scene.ngeom]:
             is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
             if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
-                _tint(geom, track)
+                # Parts with a colour nearly keep it.
+                own = np.array(geom.rgba[:3], dtype=np.float64)
+                purity = float(np.ptp(own)) / max(float(own.max()), 1e-3)
+                share = GHOST_TINT if track.is_ghost else TINT * (1.0 - KEPT_COLOUR * purity)
+                geom.rgba[:3] = (1.0 - share) * own + share * np.array(track.term.rgb) / 255.0
+                geom.rgba[3] *= GHOST_OPACITY if track.is_ghost else 1.0
                 if track.is_ghost:
                     geom.pos[:] += GHOST_SHIFT * self._film.camera.offset
 
@@ -546,15 +550,6 @@ def _add_line(scene: Any, begin: Array, end: Array, width: float, colour: Colour
         mujoco.mju_quat2Mat(turn, quaternion)
         size = np.array([width, width, length]) / 2.0
         _add_box(scene, size, (begin + end) / 2.0, turn, colour)
-
-
-def _tint(geom: Any, track: Track) -> None:
-    """Give a moving part a share of the colour of its robot; parts with a colour nearly keep it."""
-    own = np.array(geom.rgba[:3], dtype=np.float64)
-    purity = float(np.ptp(own)) / max(float(own.max()), 1e-3)
-    share = GHOST_TINT if track.is_ghost else TINT * (1.0 - KEPT_COLOUR * purity)
-    geom.rgba[:3] = (1.0 - share) * own + share * np.array(track.term.rgb) / 255.0
-    geom.rgba[3] *= GHOST_OPACITY if track.is_ghost else 1.0
 
 
 def _free_camera(offset: Array) -> Any:

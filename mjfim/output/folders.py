@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -139,9 +138,6 @@ STALE: dict[type[ShownRecord], str] = {
     Estimate: rf"((fit|held_out)(_\d+)?|{'|'.join(ESTIMATE_PICTURES)})\.({ENDINGS})"
     r"|identified(_.*)?\.(xml|urdf)",
 }
-
-# Further entries of a JSON file: none.
-NOTHING: Mapping[str, object] = MappingProxyType({})
 
 # Files that a design consists of, without figures.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
@@ -301,7 +297,7 @@ def write_result(
     record: ShownRecord,
     system: System | None = None,
     picture_format: PictureFormat = PictureFormat.PNG,
-    further: Mapping[str, object] = NOTHING,
+    further: Mapping[str, object] | None = None,
 ) -> list[str]:
     """Write all files of a result: its data, and then what a result is complete without.
 
@@ -321,7 +317,7 @@ def write_result(
     drawn = begin_pictures(record, picture_format)
     if type(record) in STALE:
         clear(folder, STALE[type(record)])
-    remarks = _write_data(folder, record, system, further)
+    remarks = _write_data(folder, record, system, further or {})
 
     # A video of the robot belongs to the motion of an earlier design or estimate.
     media = Media() if isinstance(record, Design | Estimate) else None

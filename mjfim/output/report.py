@@ -341,8 +341,8 @@ def _limit_of(pictures: Sequence[Sequence[Picture]], library: int, media: Media)
     taken = library + TEXT_SIZE
     if media.video is not None:
         taken += 4 * len(media.video.data) // 3
-    panels = [panel for some in pictures for picture in some for panel in picture.panels]
-    curves = sum(len(panel.marks) for panel in panels)
+    shown = [picture for some in pictures for picture in some]
+    curves = sum(len(panel.marks) for picture in shown for panel in picture.panels)
     share = max(MAX_SIZE - taken, 0) // POINT_SIZE // max(curves, 1)
     return min(max(share, FEWEST_POINTS), MOST_POINTS)
 

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -53,9 +52,6 @@ ROUNDING = 1e-12
 
 # What some editors of Windows put before a text in UTF-8.
 BYTE_ORDER_MARK = "\ufeff".encode()
-
-# Attributes of an element that has none.
-NO_ATTRIBUTES: Mapping[str, str] = MappingProxyType({})
 
 # An element, an attribute of it that names a file or a folder, and the name as the user wrote it.
 Reference = tuple[Any, str, str]
@@ -307,7 +303,7 @@ def child(parent: Any, tag: str) -> Any:
 def add_element(
     parent: Any,
     tag: str,
-    attributes: Mapping[str, str] = NO_ATTRIBUTES,
+    attributes: Mapping[str, str] | None = None,
     *,
     first: bool = False,
     comment: str = "",
@@ -323,7 +319,7 @@ def add_element(
     """
     if comment:
         add_comment(parent, comment, first=first)
-    added = etree.Element(tag, dict(attributes))
+    added = etree.Element(tag, dict(attributes or {}))
     _insert(parent, added, first=first)
     return added
 

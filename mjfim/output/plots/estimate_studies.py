@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -137,10 +138,8 @@ def horizons(estimate: Estimate) -> Picture:
 
     lengths = study.lengths
     axis = Axis(log=True, limits=(lengths[0] / 1.6, lengths[-1] * 1.6))
-    last = Axis(
-        label="time over which is predicted, and length of the fitted segments [s]",
-        log=True,
-        limits=axis.limits,
+    last = replace(
+        axis, label="time over which is predicted, and length of the fitted segments [s]"
     )
     errors = Panel(
         marks=[_curve_of_length(study, i) for i in range(len(lengths))],
@@ -447,13 +446,7 @@ def _corner(
 def _outer(axis: Axis, name: str, unit: str, is_outer: bool) -> Axis:
     """Return an axis that has words only at the edge of the picture."""
     label = f"{shorten(name, 14)}\n[{unit}]" if unit else shorten(name, 14)
-    return Axis(
-        label=label if is_outer else "",
-        ticks=axis.ticks,
-        names=axis.names if is_outer else None,
-        limits=axis.limits,
-        hidden=not is_outer,
-    )
+    return replace(axis, label=label) if is_outer else replace(axis, names=None, hidden=True)
 
 
 def _most_correlated(correlation: Array) -> list[int]:

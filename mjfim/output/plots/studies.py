@@ -415,8 +415,7 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
 
 def _trajectory(key: str) -> tuple[str, str]:
     """Return the word and the role of a trajectory of a study."""
-    word = shown_word(key)
-    return word, word if key in TRAJECTORY_TERMS else OTHER
+    return shown_word(key), TRAJECTORY_TERMS.get(key, OTHER)
 
 
 def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Picture:
@@ -524,8 +523,9 @@ def robots(comparison: RobotComparison) -> Picture:
     order = comparison.order[:MAX_DIFFERENCES].tolist()
     size = np.where(comparison.detectable > 0.0, comparison.detectable, np.nan)[order]
     ends = np.column_stack([comparison.difference, comparison.interval])[order]
-    centre, low, high = np.nan_to_num(ends / size[:, None]).T
-    largest = max(np.abs(each).max(initial=1.3) for each in (centre, low, high))
+    drawn = np.nan_to_num(ends / size[:, None])
+    centre, low, high = drawn.T
+    largest = np.abs(drawn).max(initial=1.3)
     reach = 1.08 * min(float(largest), LARGEST_DIFFERENCE)
     rows = np.arange(float(len(order)))
     is_changed = np.array([j in comparison.changed for j in order], dtype=bool)

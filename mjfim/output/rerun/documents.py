@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import cycle
+from itertools import cycle, islice
 from pathlib import Path
 
 import mujoco
@@ -59,10 +59,11 @@ from mjfim.output.rerun.scene import (
     BodyPoses,
     EntityParts,
     RobotStyle,
+    body_parts,
     body_poses,
+    drawn_shapes,
     end_point,
     entity_path,
-    first_shape_parts,
     has_floor,
     log_end_path,
     log_pose,
@@ -156,14 +157,14 @@ def log_estimate(
         term = MEASURED
         shown[term] = _thinned(measured)
         title += f", {term} robot ({term.colour_name} outline)"
-    kept = sum(prediction.recording is not None for prediction in estimate.predictions)
+    kept = [each.name for each in estimate.predictions if each.recording is not None]
     fits = [fit(estimate, i, labels) for i in range(len(estimate.recordings))]
-    held = [held_out(estimate, i, labels) for i in range(kept)]
+    held = [held_out(estimate, i, labels) for i in range(len(kept))]
     recordings: Tabs = {
         f"{kind}{k}: {Path(name).name}": _pairs(picture.panels)
         for kind, pictures, names in (
             ("", fits, [each.name for each in estimate.recordings]),
-            ("held out ", held, [e.name for e in estimate.predictions if e.recording is not None]),
+            ("held out ", held, kept),
         )
         for k, (picture, name) in enumerate(zip(pictures, names, strict=True), start=1)
     }
@@ -387,7 +388,10 @@ def robot_views(
     for title, root in roots.items():
         tracked = None
         if camera.followed is not None:
-            tracked = entity_path(first_shape_parts(model, followed or root, camera.followed))
+            # A camera can follow a shape, but no body, whose entity has no shape of its own.
+            parts = body_parts(model, followed or root, camera.followed)
+            shapes = drawn_shapes(model, camera.followed, RobotStyle(accent=(0, 0, 0)))
+            tracked = entity_path((*parts, *(shape.name for shape in islice(shapes, 1))))
         view = rrb.Spatial3DView(
             origin=entity_path(root),
             name=title,

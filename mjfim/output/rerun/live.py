@@ -51,10 +51,7 @@ TIMELINE, ROBOT = "event", ("robot",)
 
 # Style of the robot, and roles of curves that share a plot.
 STYLE = style_of(DESIGNED)
-ROLES_IN_TURN = (
-    *(term for term in (DESIGNED, INITIAL, MEASURED)),
-    *(term for term in (NOMINAL, IDENTIFIED, OTHER)),
-)
+ROLES_IN_TURN = (DESIGNED, INITIAL, MEASURED, NOMINAL, IDENTIFIED, OTHER)
 
 # Name, colour and width of the curves of other starts than the one of the best iterate.
 OTHER_STARTS, OTHER_COLOUR, OTHER_WIDTH, BEST_WIDTH = "other starts", (130, 130, 130), 1.0, 2.0

@@ -482,21 +482,6 @@ def body_parts(model: mujoco.MjModel, root: EntityParts, body: int) -> EntityPar
     return (*root, "bodies", name)
 
 
-def first_shape_parts(model: mujoco.MjModel, root: EntityParts, body: int) -> EntityParts:
-    """Return the parts of the path of the first shape of a body.
-
-    A camera can follow a shape; it cannot follow a body, whose entity has no shape of its own.
-
-    Args:
-        model: The model.
-        root: Entity of the robot.
-        body: Number of the body.
-    """
-    parts = body_parts(model, root, body)
-    shape = next(drawn_shapes(model, body, RobotStyle(accent=(0, 0, 0))), None)
-    return parts if shape is None else (*parts, shape.name)
-
-
 # ---- robots
 
 
