@@ -146,14 +146,14 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
         yield f"{rehearsal.diverged} diverge in the simulation"
     if rehearsal.passes_floor.any():
         floor = "the floor" if rehearsal.has_floor else "the plane under the robot"
-        deepest = -float(np.nanmin(rehearsal.lowest))
+        deepest = -np.nanmin(rehearsal.lowest)
         yield f"{rehearsal.below_floor} pass through {floor}, by up to {deepest:.3g} m"
     worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
     order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
     for i in broken[order].tolist():
         limit, count = rehearsal.limits[i], int((~rehearsal.kept[1:, i]).sum())
-        excess = -float(np.nanmin(worst[:, i])) * limit.scale
+        excess = -np.nanmin(worst[:, i]) * limit.scale
         manner = f"by up to {excess:.3g} {limit.unit}".rstrip() if excess > 0.0 else "to its clamp"
         yield f"{count} leave the limit on {_kind(limit)} of {limit.name}, {manner}"
     for name, count in rehearsal.unbraked.items():

@@ -115,7 +115,7 @@ def _verdict(estimate: Estimate) -> Verdict:
 
 
 def _verdict_on_fit(estimate: Estimate) -> Verdict:
-    ratio = float(np.sqrt(estimate.chi2 / max(estimate.dof, 1)))
+    ratio = np.sqrt(estimate.chi2 / max(estimate.dof, 1))
     if not estimate.success:
         why = estimate.status.removesuffix(".")
         if estimate.combinations:

@@ -209,12 +209,12 @@ def _jitter(log: LogSummary) -> str:
 
 def _range_cells(found: Sequence[ColumnSummary]) -> tuple[str, ...]:
     resolutions = [column.resolution for column in found if column.resolution > 0.0]
-    empty = float(np.mean([column.empty_share for column in found]))
+    empty = np.mean([column.empty_share for column in found])
     return (
         found[0].name,
         found[0].source,
-        number(float(np.nanmin([column.minimum for column in found])), 4),
-        number(float(np.nanmax([column.maximum for column in found])), 4),
+        number(np.nanmin([column.minimum for column in found]), 4),
+        number(np.nanmax([column.maximum for column in found]), 4),
         number(min(resolutions, default=0.0), 2),
         f"{100 * empty:.0f} %" if empty else "-",
     )

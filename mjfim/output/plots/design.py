@@ -379,7 +379,7 @@ def standard_deviations(design: Design, labels: Labels) -> Picture:
     all_known = bool(np.isfinite(stds).all())
     high *= 1.0 if all_known else 10.0
 
-    rows = np.arange(float(len(names)))
+    rows = np.arange(len(names))
     marks, beside = [], []
     for std, term, offset in zip(stds, (INITIAL, DESIGNED), (-0.19, 0.19), strict=True):
         known, at = np.isfinite(std), rows + offset

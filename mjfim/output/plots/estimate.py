@@ -115,7 +115,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
 
     left, right = range_of_intervals(centre, low, high)
     margin = 0.06 * (max(right, 0.0) - min(left, 0.0))
-    rows = np.arange(float(count))
+    rows = np.arange(count)
     is_at_bound = np.array([name in estimate.at_bound for name in estimate.parameters])
     look = {"size": 6.5, "front": 3.0}
     marks = [
@@ -304,7 +304,7 @@ def _over_time(
     sigma = np.array([estimate.sigma.get(name, np.nan) for name in recording.outputs])
     columns = shown_outputs([recording.y], [identified], sigma, MAX_OUTPUTS)
     rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
-    size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
+    size = np.clip(900.0 / len(rows), 1.5, 4.0)
     t = recording.t[rows]
     panels = []
     for place, j in enumerate(columns):
@@ -390,8 +390,8 @@ def _errors(
         return marks, ""
     words = "error" if is_prediction else "residual"
     if np.isfinite(sigma):
-        relative_rms = float(np.sqrt(np.mean(known**2))) / sigma
-        outside = 100.0 * float(np.mean(np.abs(known) > 2.0 * sigma))
+        relative_rms = np.sqrt(np.mean(known**2)) / sigma
+        outside = 100.0 * np.mean(np.abs(known) > 2.0 * sigma)
         words += f": rms / σ = {relative_rms:.2f},  {outside:.1f} % outside"
     return marks, words
 
@@ -474,7 +474,7 @@ def _smoothed_density(estimate: Estimate, column: int, sigma: float) -> tuple[Ar
     wanted = 2 * sum(map(len, parts)) // (SEGMENTS + 1)
     length = min(int(np.clip(wanted, SHORTEST_SEGMENT, LONGEST_SEGMENT)), *map(len, parts))
     weights = [max(2 * len(part) // length - 1, 1) for part in parts]
-    densities = [power_density(part, float(np.mean(rates)), length) for part in parts]
+    densities = [power_density(part, np.mean(rates), length) for part in parts]
     frequencies = densities[0][0]
     mean = np.average([density for _, density in densities], axis=0, weights=weights)
     count = sum(weights)
@@ -517,7 +517,7 @@ def predictions(estimate: Estimate, labels: Labels) -> Picture:
             ratio = error / nominal if nominal > 0.0 else np.nan
             texts.append(f"{size}  (× {format_number(ratio, 2)})")
     nominal, identified = np.array(errors).T
-    rows = np.arange(float(len(names)))
+    rows = np.arange(len(names))
     is_row = np.isfinite(nominal)
     panel = Panel(
         marks=[
@@ -607,7 +607,7 @@ def inverse_dynamics(fit: InverseDynamicsFit) -> Picture:
 def _with_gaps(each: EquationFit) -> tuple[Array, Array, Array]:
     """Return times and forces, with NaN where averages are missing."""
     steps = np.diff(each.t)
-    usual = float(np.median(steps)) if len(steps) else 0.0
+    usual = np.median(steps) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > GAP * usual) + 1
     return (
         np.insert(each.t, gaps, each.t[gaps]),

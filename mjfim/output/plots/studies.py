@@ -103,7 +103,7 @@ def check(result: Check) -> Picture:
     shares = [c.std_final / abs(c.value) if c.value else np.nan for c in combined]
     percent = 100.0 * np.array([*(row.relative for row in rows), *shares])
     wanted = 100.0 * np.array([row.wanted / row.size for row in rows])
-    places = np.arange(float(len(percent)))
+    places = np.arange(len(percent))
     known = np.isfinite(percent) & (percent > 0.0)
     is_alone = np.array([np.isfinite(row.std) for row in rows] + [True] * len(combined))
     is_single = places < len(rows)
@@ -263,8 +263,8 @@ def compare(comparison: Comparison) -> Picture:
             _worst_combinations(comparison, rows, roles, has_margins=has_margins),
         ],
         note=note.strip(),
-        heights=[float(np.clip(1.2 + 0.36 * len(rows), 2.2, 11.0))],
-        widths=[float(np.clip(0.55 * len(names), 2.2, 9.0)), 3.6],
+        heights=[np.clip(1.2 + 0.36 * len(rows), 2.2, 11.0)],
+        widths=[np.clip(0.55 * len(names), 2.2, 9.0), 3.6],
     )
 
 
@@ -291,10 +291,10 @@ def _ratios(
         return Panel(message="no parameter is identifiable alone", y=methods)
 
     # White is the design's standard deviation; without one, it is the mean of what is shown.
-    middle, reach = 0.0, float(np.log(LARGEST_RATIO))
+    middle, reach = 0.0, np.log(LARGEST_RATIO)
     if not against_design:
         middle = float(np.nanmean(logarithms))
-        reach = max(2.0 * float(np.nanstd(logarithms)), 0.1)
+        reach = max(2.0 * np.nanstd(logarithms), 0.1)
     look: dict[str, Any] = {
         "texts": [
             [format_number(ratio) if np.isfinite(ratio) else "–" for ratio in row] for row in ratios
@@ -432,7 +432,7 @@ def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Picture:
         if not len(values):
             panels.append(Panel(title=word, message="no successful trials", place=(0, place)))
             continue
-        std = float(np.sqrt(trials.crlb[index, index]))
+        std = np.sqrt(trials.crlb[index, index])
         low, high = _central_range(values, theta, std)
         bins = int(np.clip(2.0 * np.sqrt(len(values)), 8, 60))
         counts, edges = np.histogram(values, bins=bins, range=(low, high))
@@ -527,7 +527,7 @@ def robots(comparison: RobotComparison) -> Picture:
     centre, low, high = drawn.T
     largest = np.abs(drawn).max(initial=1.3)
     reach = 1.08 * min(float(largest), LARGEST_DIFFERENCE)
-    rows = np.arange(float(len(order)))
+    rows = np.arange(len(order))
     is_changed = np.array([j in comparison.changed for j in order], dtype=bool)
     marks = [vspan(-1.0, 1.0, opacity=0.6, label="would hardly be found"), vline(0.0)]
     for chosen, role, label in (
@@ -647,7 +647,7 @@ def _row(values: Array, row: int, role: str, label: str) -> list[Mark]:
     look = {"symbol": "|", "size": 14.0, "width": 1.6, "label": "model"}
     return [
         dots(values[1:], rows, role, size=3.5, opacity=0.5, label=label),
-        dots(values[:1], np.array([float(row)]), "text", **look),
+        dots(values[:1], [row], "text", **look),
     ]
 
 

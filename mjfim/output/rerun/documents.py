@@ -121,7 +121,7 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
         grids += grid_tabs(name, [plane.view() for plane, _ in found])
     grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
 
-    poses = {name: body_poses(model, each.t, each.qpos) for name, each in both.items()}
+    poses = _poses_of(model, both)
     robots = _robots(model, poses, ASPECT_WITH_TEXT)
     text = as_markdown(page_of(design), DESIGN_COLOURS)
     with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids], text) as rec:
@@ -173,7 +173,7 @@ def log_estimate(
     if len(tabs) > MAX_TABS:
         tabs = [rrb.Tabs(*tabs, name="recordings", active_tab=0)]
 
-    poses = {name: body_poses(model, each.t, each.qpos) for name, each in shown.items()}
+    poses = _poses_of(model, shown)
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
     root = ("robots", IDENTIFIED)
     view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
@@ -206,7 +206,7 @@ def log_trajectories(
         labels: Labels of their columns.
     """
     named = {shown_word(name): each for name, each in trajectories.items()}
-    poses = {name: body_poses(model, each.t, each.qpos) for name, each in named.items()}
+    poses = _poses_of(model, named)
     further = cycle(FURTHER_ROLES)
     known = (INITIAL, DESIGNED)
     roles = {name: name if name in known else next(further) for name in named}
@@ -228,6 +228,10 @@ def log_trajectories(
     with open_recording(path, model, "replay", robots, series_tabs(states)) as rec:
         log_series(rec, states)
         _log_robots(rec, model, poses, roles, list(poses))
+
+
+def _poses_of(model: mujoco.MjModel, motions: Mapping[str, Trajectory]) -> dict[str, BodyPoses]:
+    return {name: body_poses(model, each.t, each.qpos) for name, each in motions.items()}
 
 
 def style_of(role: str) -> RobotStyle:
