@@ -530,7 +530,7 @@ def write_page(page: Path, shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> No
         shutil.rmtree(images)
     images.mkdir(parents=True)
 
-    *most, last = [f"{term.colour_name} for {term.word}" for term in TERMS]
+    *most, last = [f"{term.colour_name} for {term}" for term in TERMS]
     colours = f"{', '.join(most)} and {last}"
     parts = [
         "\n".join(textwrap.wrap(line, 100)) for line in HEAD.format(colours=colours).split("\n")

@@ -64,7 +64,6 @@ def campaign(
     from mjfim.experiment.packing import input_files, with_model
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.pages.studies import campaign_page
-    from mjfim.output.words import CampaignParameters
     from mjfim.records.campaign import CampaignStatus
 
     stated = with_target_accuracies(with_model(stated), wanted)
@@ -94,10 +93,10 @@ def campaign(
 
         found = lab.campaign(measure, workers)
 
-    parameters = CampaignParameters.stated(task.parameters, simulated=simulated)
+    true = task.parameters.true if simulated else None
     with writing(run.output):
         remarks = folder.write_campaign(found, simulated=simulated)
-    print_result(False, {}, campaign_page(found, parameters), verbose=run.verbose)
+    print_result(False, {}, campaign_page(found, true), verbose=run.verbose)
     for remark in remarks:
         say(f"warning: {remark}")
     if found.status is CampaignStatus.WAITING:

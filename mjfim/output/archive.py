@@ -289,10 +289,8 @@ def write_control(path: Path, control: Array, system: System) -> None:
         control: (N, nu) control [unit of the actuator].
         system: The experiment, which names the actuators.
     """
-    columns = {"t": np.arange(len(control), dtype=np.float64) * system.dt}
-    for i, name in enumerate(system.controls):
-        columns[name] = control[:, i]
-    write_table(path, columns)
+    t = np.arange(len(control), dtype=np.float64) * system.dt
+    write_table(path, {"t": t, **dict(zip(system.controls, control.T, strict=True))})
 
 
 def write_recording(path: Path, recording: Recording, system: System) -> None:
@@ -310,12 +308,9 @@ def write_recording(path: Path, recording: Recording, system: System) -> None:
     no_control = np.full((1, recording.ctrl.shape[1]), np.nan)
     ctrl = np.concatenate([recording.ctrl, no_control])
 
-    columns = {"t": recording.t}
-    for i, name in enumerate(system.inputs):
-        columns[name] = ctrl[:, i]
-    for i, name in enumerate(recording.outputs):
-        columns[name] = recording.y[:, i]
-    write_table(path, columns)
+    controls = dict(zip(system.inputs, ctrl.T, strict=True))
+    outputs = dict(zip(recording.outputs, recording.y.T, strict=True))
+    write_table(path, {"t": recording.t, **controls, **outputs})
 
 
 def read_design(path: Path) -> dict[str, Trajectory]:

@@ -35,7 +35,7 @@ from mjfim.output.page import REPORT, PictureFormat
 from mjfim.output.plots import studies
 from mjfim.output.plots.pictures import Pictures
 from mjfim.output.report import write_report
-from mjfim.output.words import CampaignParameters, format_with_uncertainty
+from mjfim.output.words import format_with_uncertainty
 from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound
 from mjfim.records.design import Design
@@ -203,22 +203,21 @@ class CampaignFolder:
         Returns:
             Sentences about the identified model.
         """
-        parameters = self.system.parameters
+        true = self.system.parameters.true if simulated else None
         campaign.save_archive(self.path)
         values = {
             **origin_of(self.system, self.path),
             **campaign.summary(),
             "simulated": simulated,
             "units": list(self.system.units),
-            "true": parameters.true if simulated else None,
+            "true": true,
         }
         write_json(self.path / "campaign.json", values)
         write_optional(REPORT, lambda: write_report(self.path))
         if campaign.estimate is None:
             return []
 
-        drawn = CampaignParameters.stated(parameters, simulated=simulated)
-        pictures: Pictures = {"campaign": partial(studies.campaign, campaign, drawn)}
+        pictures: Pictures = {"campaign": partial(studies.campaign, campaign, true)}
         write_pictures(self.path, pictures, self.picture_format)
         try:
             return write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
@@ -319,5 +318,4 @@ def _leaves(values: object, *place: str) -> Iterator[tuple[tuple[str, ...], Any]
 
 
 def _shown(value: object) -> str:
-    """Return a value for a message."""
     return "not stated" if value is None else shortened(json.dumps(value))

@@ -29,8 +29,8 @@ from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, OTHER, Te
 from mjfim.output.rerun.camera import (
     EDGE_ON,
     camera_axes,
-    extents,
     fit_in_view,
+    followed_body,
     moving_points,
     seen_points,
     view_direction,
@@ -57,10 +57,8 @@ SLOW_SPEEDS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 # is largest. They are even, as the encoder of mp4 needs.
 VIEW_SIZES = ((640, 360), (560, 420), (480, 480))
 
-# Distance that a free body travels, as a multiple of the size of the robot, above which the camera
-# follows it; time over which the motion of this camera is averaged [s of the film]; and points of
-# the line along the path of the body.
-FOLLOWED_TRAVEL = 1.5
+# Time over which the motion of a camera that follows a free body is averaged [s of the film], and
+# points of the line along the path of the body.
 CAMERA_SECONDS = 0.5
 TRAIL_POINTS = 100
 
@@ -158,7 +156,7 @@ class Film:
         pictures = []
         for view in self.views:
             robots = [
-                f"the {track.term.word} motion{' (transparent)' if track.is_ghost else ''}"
+                f"the {track.term} motion{' (transparent)' if track.is_ghost else ''}"
                 for track in view.tracks
             ]
             pictures.append(" and ".join(robots))
@@ -187,7 +185,7 @@ def film_of(system: System, result: Filmed) -> Film:
         ]
         return film_of_motions(system.model_at(system.theta), motions)
     if isinstance(result, Trajectory):
-        simulated = replace(OTHER, word="simulated")
+        simulated = Term("simulated", OTHER.colour, OTHER.colour_on_dark, OTHER.colour_name)
         return film_of_motions(system.model_at(system.theta), [[(simulated, result)]])
 
     if result.motion is None:
@@ -223,7 +221,7 @@ def film_of_motions(
     if not all(np.isfinite(each.qpos).all() for each in every):
         raise NoVideoError("the motion has positions that are not finite")
 
-    longest = max(every, key=lambda each: float(each.t[-1]))
+    longest = max(every, key=lambda each: each.t[-1])
     begin, end = float(longest.t[0]), float(longest.t[-1])
     speed = film_speed(end - begin)
     shown = min(end - begin, LONGEST_FILM * speed)
@@ -239,8 +237,14 @@ def film_of_motions(
     ]
     poses = [[body_poses(model, t, track.qpos) for track in view] for view in tracks]
     nothing, points = np.zeros((0, 3)), evenly_spread_indices(frames, TRAIL_POINTS)
-    paths = _followed_paths(model, poses)
-    shifts = [_smooth(path - path[0]) for path in paths] or [np.zeros((frames, 3))] * len(poses)
+    followed = followed_body(model, [view[0] for view in poses])
+    paths = [] if followed is None else [view[0].positions[:, followed] for view in poses]
+    # A moving average, at whose ends the path continues.
+    window = round(CAMERA_SECONDS * FRAME_RATE)
+    shifts = [
+        scipy.ndimage.uniform_filter1d(path - path[0], window, axis=0, mode="nearest")
+        for path in paths
+    ] or [np.zeros((frames, 3))] * len(poses)
     camera = _camera(model, poses, shifts)
     views = []
     for k, view in enumerate(tracks):
@@ -300,7 +304,7 @@ def _camera(
         for each in view
     ]
     clouds = moving_points(model, seen)
-    direction = view_direction(extents(clouds))
+    direction = view_direction(clouds)
     axes = camera_axes(direction)
     points = seen_points(model, clouds) @ axes.T
 
@@ -309,49 +313,20 @@ def _camera(
     fits = [(size, fit_in_view(points, slope, size[0] / size[1])) for size in VIEW_SIZES]
     size, (middle, distance) = max(fits, key=lambda each: each[0][1] / each[1][1])
     target = middle @ axes
+    offset = distance * direction
+    camera = FilmCamera(target=target, offset=offset, floor=None, spacing=0.0, size=size)
     if has_floor(model) or direction[2] < EDGE_ON:
-        return FilmCamera(
-            target=target, offset=distance * direction, floor=None, spacing=0.0, size=size
-        )
+        return camera
 
     # The floor is below the whole motion.
     heights = np.concatenate([shift[:, 2] for shift in shifts])
     lowest = float((points @ axes)[:, 2].min())
-    height = float(target[2] + distance * direction[2] + np.ptp(heights)) - lowest
-    return FilmCamera(
-        target=target,
-        offset=distance * direction,
+    height = float(target[2] + offset[2] + np.ptp(heights)) - lowest
+    return replace(
+        camera,
         floor=lowest + float(heights.min()),
         spacing=FLOOR_SPACING * max(distance, height),
-        size=size,
     )
-
-
-def _followed_paths(model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]]) -> list[Array]:
-    """The (F, 3) path in each view of the free body that the camera follows [m].
-
-    There are none where no free body travels far.
-    """
-    free = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
-    if not len(free):
-        return []
-
-    # The free body that carries most of the mass, and its size with everything on it.
-    bodies = model.jnt_bodyid[free]
-    body = int(bodies[np.argmax(model.body_subtreemass[bodies])])
-    members = np.flatnonzero(model.body_rootid == model.body_rootid[body])
-    reach = model.geom_rbound[np.isin(model.geom_bodyid, members)].max(initial=0.0)
-    size = 2.0 * float(reach) or float(model.stat.extent)
-
-    paths = [view[0].positions[:, body] for view in poses]
-    travel = max(float(np.ptp(path, axis=0).max()) for path in paths)
-    return paths if travel >= FOLLOWED_TRAVEL * size else []
-
-
-def _smooth(path: Array) -> Array:
-    """Moving average of a path (F, 3) over `CAMERA_SECONDS`; the ends continue."""
-    window = round(CAMERA_SECONDS * FRAME_RATE)
-    return np.asarray(scipy.ndimage.uniform_filter1d(path, window, axis=0, mode="nearest"))
 
 
 # Kinds of OpenGL contexts by system, in the order in which they are tried: without a display first.
@@ -474,7 +449,7 @@ class Painter:
             x = float(k * (self._film.camera.size[0] + GAP) + MARGIN)
             for j, track in enumerate(view.tracks):
                 words = [(" and " if j else "", FAINT_INK, plain)]
-                words.append((track.term.word, track.term.rgb, bold))
+                words.append((track.term, track.term.rgb, bold))
                 words.append((" (transparent)" if track.is_ghost else "", FAINT_INK, plain))
                 for word, colour, font in words:
                     text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
@@ -487,7 +462,6 @@ class Painter:
     # ---- the scene
 
     def _picture(self, view: FilmView, k: int) -> NDArray[np.uint8]:
-        """Draw a view of a frame."""
         model, data, scene = self._film.model, self._data, self._renderer.scene
         self._camera.lookat[:] = view.target[k]
         for track in view.tracks:
@@ -515,7 +489,12 @@ class Painter:
         for geom in self._renderer.scene.geoms[first : self._renderer.scene.ngeom]:
             is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
             if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
-                _tint(geom, track)
+                # Parts with a colour nearly keep it.
+                own = np.array(geom.rgba[:3], dtype=np.float64)
+                purity = float(np.ptp(own)) / max(float(own.max()), 1e-3)
+                share = GHOST_TINT if track.is_ghost else TINT * (1.0 - KEPT_COLOUR * purity)
+                geom.rgba[:3] = (1.0 - share) * own + share * np.array(track.term.rgb) / 255.0
+                geom.rgba[3] *= GHOST_OPACITY if track.is_ghost else 1.0
                 if track.is_ghost:
                     geom.pos[:] += GHOST_SHIFT * self._film.camera.offset
 
@@ -541,7 +520,7 @@ class Painter:
         scene, model = self._renderer.scene, self._film.model
         eye = scene.camera[0]
         position, forward, up = (np.array(each) for each in (eye.pos, eye.forward, eye.up))
-        distance = BACKGROUND_DISTANCE * float(model.vis.map.zfar) * float(model.stat.extent)
+        distance = BACKGROUND_DISTANCE * model.vis.map.zfar * model.stat.extent
         turn = np.stack([np.cross(forward, up), up, -forward], axis=1)
         size = distance * np.array([2.0, 2.0, 1e-3])
         _add_box(scene, size, position + distance * forward, turn, BACKGROUND)
@@ -571,15 +550,6 @@ def _add_line(scene: Any, begin: Array, end: Array, width: float, colour: Colour
         mujoco.mju_quat2Mat(turn, quaternion)
         size = np.array([width, width, length]) / 2.0
         _add_box(scene, size, (begin + end) / 2.0, turn, colour)
-
-
-def _tint(geom: Any, track: Track) -> None:
-    """Give a moving part a share of the colour of its robot; parts with a colour nearly keep it."""
-    own = np.array(geom.rgba[:3], dtype=np.float64)
-    purity = float(np.ptp(own)) / max(float(own.max()), 1e-3)
-    share = GHOST_TINT if track.is_ghost else TINT * (1.0 - KEPT_COLOUR * purity)
-    geom.rgba[:3] = (1.0 - share) * own + share * np.array(track.term.rgb) / 255.0
-    geom.rgba[3] *= GHOST_OPACITY if track.is_ghost else 1.0
 
 
 def _free_camera(offset: Array) -> Any:

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -27,9 +26,8 @@ from mjfim.output.plots.pictures import (
     ESTIMATE_PICTURES,
     Pictures,
     begin_pictures,
-    fit_names,
-    held_out_names,
     histogram_name,
+    numbered,
     pictures_of,
 )
 from mjfim.output.report import Media, kinds_in, write_report
@@ -124,9 +122,7 @@ def _clear_models(place: Path) -> None:
     """Remove the models of drawn robots, and their folder where nothing else is in it."""
     if not place.is_dir():
         return
-    for stale in list(place.iterdir()):
-        if re.fullmatch(SAMPLE_FILES, stale.name):
-            remove_earlier_result(stale)
+    clear(place, SAMPLE_FILES)
     if {file.name for file in place.iterdir()} <= {MANIFEST}:
         (place / MANIFEST).unlink(missing_ok=True)
         place.rmdir()
@@ -142,9 +138,6 @@ STALE: dict[type[ShownRecord], str] = {
     Estimate: rf"((fit|held_out)(_\d+)?|{'|'.join(ESTIMATE_PICTURES)})\.({ENDINGS})"
     r"|identified(_.*)?\.(xml|urdf)",
 }
-
-# Further entries of a JSON file: none.
-NOTHING: Mapping[str, object] = MappingProxyType({})
 
 # Files that a design consists of, without figures.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
@@ -188,7 +181,7 @@ def estimate_files(
     """
     unwanted = {"selection": not select, "samples": not samples, "recordings": recordings < 2}
     names = [name for name in ESTIMATE_PICTURES if not unwanted.get(name)]
-    names += [*fit_names(recordings), *held_out_names(held_out)]
+    names += [*numbered("fit", recordings), *numbered("held_out", held_out)]
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
     return (*data, *map(PictureFormat.PNG.file_of, names))
 
@@ -304,7 +297,7 @@ def write_result(
     record: ShownRecord,
     system: System | None = None,
     picture_format: PictureFormat = PictureFormat.PNG,
-    further: Mapping[str, object] = NOTHING,
+    further: Mapping[str, object] | None = None,
 ) -> list[str]:
     """Write all files of a result: its data, and then what a result is complete without.
 
@@ -324,7 +317,7 @@ def write_result(
     drawn = begin_pictures(record, picture_format)
     if type(record) in STALE:
         clear(folder, STALE[type(record)])
-    remarks = _write_data(folder, record, system, further)
+    remarks = _write_data(folder, record, system, further or {})
 
     # A video of the robot belongs to the motion of an earlier design or estimate.
     media = Media() if isinstance(record, Design | Estimate) else None
@@ -457,7 +450,6 @@ def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureForm
     """
 
     def write(make: Callable[[], Picture], file: Path) -> None:
-        """Draw a picture and write it."""
         from mjfim.output.plots.draw import save  # imports matplotlib, which is slow
 
         save(make(), file)

@@ -309,7 +309,6 @@ def write_optional(name: str, write: Callable[[], object]) -> None:
     """
 
     def guarded() -> None:
-        """Write the file."""
         try:
             write()
         except (MjfimError, OSError):

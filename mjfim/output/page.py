@@ -2,7 +2,7 @@
 
 A page has a verdict, sentences and tables. The terminal, the report, notebooks and the Rerun viewer
 are written from it. There is one word and one colour for each thing. The keys of
-JSON files and arrays are part of the file formats and stay as they are; `SHOWN_WORDS` translates
+JSON files and arrays are part of the file formats and stay as they are; `shown_word` translates
 them.
 
 | word       | meaning                                                           |
@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import zip_longest
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 # Name of the report in a folder of results.
 REPORT = "report.html"
@@ -55,24 +55,28 @@ class PictureFormat(StrEnum):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Term:
-    """A thing that is shown, and how.
+class Term(str):
+    """The word for a thing that is shown, with its colours.
 
     The colours differ also for readers who cannot tell red from green, and can be read on white and
     on dark grey.
 
     Attributes:
-        word: The word for it.
         colour: Its colour, as `#rrggbb`.
         colour_on_dark: A brighter shade of it, for thin lines and text on a dark page.
         colour_name: The word for its colour.
     """
 
-    word: str
+    __slots__ = ("colour", "colour_name", "colour_on_dark")
     colour: str
     colour_on_dark: str
     colour_name: str
+
+    def __new__(cls, word: str, colour: str, colour_on_dark: str, colour_name: str) -> Self:
+        """Return a word with its colours."""
+        term = super().__new__(cls, word)
+        term.colour, term.colour_on_dark, term.colour_name = colour, colour_on_dark, colour_name
+        return term
 
     @property
     def rgb(self) -> tuple[int, int, int]:
@@ -81,33 +85,28 @@ class Term:
         return red, green, blue
 
 
-INITIAL = Term(word="initial", colour="#0077bb", colour_on_dark="#4fb0f0", colour_name="blue")
-DESIGNED = Term(word="designed", colour="#cc3311", colour_on_dark="#ff7f66", colour_name="red")
-NOMINAL = Term(word="nominal", colour="#ee7733", colour_on_dark="#f7a55c", colour_name="orange")
-MEASURED = Term(word="measured", colour="#009988", colour_on_dark="#2fc9b5", colour_name="teal")
-IDENTIFIED = Term(
-    word="identified", colour="#aa3377", colour_on_dark="#e884bd", colour_name="purple"
-)
+INITIAL = Term("initial", "#0077bb", "#4fb0f0", "blue")
+DESIGNED = Term("designed", "#cc3311", "#ff7f66", "red")
+NOMINAL = Term("nominal", "#ee7733", "#f7a55c", "orange")
+MEASURED = Term("measured", "#009988", "#2fc9b5", "teal")
+IDENTIFIED = Term("identified", "#aa3377", "#e884bd", "purple")
 
 # What is beside the five, such as a baseline.
-OTHER = Term(word="other", colour="#8a6d3b", colour_on_dark="#cdb07a", colour_name="brown")
+OTHER = Term("other", "#8a6d3b", "#cdb07a", "brown")
 
 TERMS = (INITIAL, DESIGNED, NOMINAL, MEASURED, IDENTIFIED)
 
 # The terms of the two trajectories of a design or study, by their key in the records and files.
 TRAJECTORY_TERMS: dict[str, Term] = {"initial": INITIAL, "final": DESIGNED}
 
-# Words that are shown for keys of records and files; other keys are shown as they are.
-SHOWN_WORDS: dict[str, str] = {key: term.word for key, term in TRAJECTORY_TERMS.items()}
-
 
 def shown_word(key: str) -> str:
-    """Return the word that is shown for a key.
+    """Return the word that is shown for a key; other keys are shown as they are.
 
     Args:
         key: Key of a record or file, such as `final`.
     """
-    return SHOWN_WORDS.get(key, key)
+    return TRAJECTORY_TERMS.get(key, key)
 
 
 class Emphasis(StrEnum):

@@ -15,7 +15,7 @@ from mjfim.output.page import OTHER, TERMS
 # Colours of roles that are no words of the vocabulary: text and reference lines, notes and curves
 # that stay in the background, bands.
 ROLES = {"text": "#222222", "muted": "#6b7076", "band": "#d9dcdf", "white": "#ffffff"} | {
-    term.word: term.colour for term in (*TERMS, OTHER)
+    term: term.colour for term in (*TERMS, OTHER)
 }
 
 # Colours of curves that have no role; they differ also for readers who cannot tell red from green.
@@ -232,11 +232,9 @@ def intervals(low: Numbers, high: Numbers, rows: Numbers, role: str, **look: Any
     return mark("intervals", low, rows, role, other=np.asarray(high), **look)
 
 
-def bars(
-    ends: Numbers, rows: Numbers, role: str, *, left: Numbers | None = None, **look: Any
-) -> Mark:
-    """Return bars across, from zero or from `left`."""
-    begins = np.zeros(len(ends)) if left is None else np.asarray(left)
+def bars(ends: Numbers, rows: Numbers, role: str, *, left: float, **look: Any) -> Mark:
+    """Return bars across that begin at `left`."""
+    begins = np.full(len(ends), left)
     return mark("bars", ends, rows, role, other=begins, **{"size": 0.6, **look})
 
 
@@ -270,9 +268,12 @@ def words(x: Numbers, y: Numbers, texts: Sequence[str], role: str, **look: Any) 
 
 def row_axis(names: Sequence[str], roles: Sequence[str] = ()) -> Axis:
     """Return a vertical axis with a name for each row, the first one at the top."""
-    count = len(names)
-    limits = (count - 0.5, -0.5)
-    return Axis(ticks=range(count), names=names, roles=roles, limits=limits)
+    return replace(blank_rows(len(names)), ticks=range(len(names)), names=names, roles=roles)
+
+
+def blank_rows(count: int) -> Axis:
+    """Return a vertical axis with places for rows that a neighbour names."""
+    return Axis(ticks=[], limits=(count - 0.5, -0.5))
 
 
 def in_grid(panels: Sequence[Panel], columns: int, first_row: int = 0) -> list[Panel]:
@@ -281,6 +282,19 @@ def in_grid(panels: Sequence[Panel], columns: int, first_row: int = 0) -> list[P
         replace(panel, place=(first_row + k // columns, k % columns))
         for k, panel in enumerate(panels)
     ]
+
+
+def grid(
+    title: str, panels: Sequence[Panel], heights: Sequence[float], columns: int, note: str
+) -> Picture:
+    """Return a picture of panels row by row; a row is as high as its highest panel [inch]."""
+    return Picture(
+        title=title,
+        panels=in_grid(panels, columns),
+        note=note,
+        heights=[max(heights[k : k + columns]) for k in range(0, len(panels), columns)],
+        widths=[1.0] * columns,
+    )
 
 
 def around(values: Array, *, factor: float = 1.4) -> tuple[float, float]:

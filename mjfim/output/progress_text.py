@@ -128,7 +128,6 @@ class NotebookProgress:
         return line if line == self._description else f"{self._description}: {line}"
 
     def _seconds(self) -> float:
-        """Return the time since the work began [s]."""
         return time.monotonic() - self._begun
 
 

@@ -10,6 +10,7 @@ import base64
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from html import unescape
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
@@ -93,7 +94,7 @@ def palettes() -> dict[str, dict[str, Any]]:
     }
     dark: dict[str, Any] = {
         **{role: _lighter(colour) for role, colour in ROLES.items()},
-        **{term.word: term.colour_on_dark for term in (*TERMS, OTHER)},
+        **{term: term.colour_on_dark for term in (*TERMS, OTHER)},
         **DARK,
         "diverging": list(zip(places, CELLS_DARK, strict=True)),
     }
@@ -197,7 +198,6 @@ class Result(NamedTuple):
 
     page: Page
     name: str
-    facts: Mapping[str, str]
     groups: Mapping[str, Sequence[Group]]
     said: set[str]
 
@@ -251,15 +251,15 @@ def write_report(folder: Path, made: ShownRecord | None = None, media: Media | N
                 raise
     file = folder / REPORT
     design = folder if (folder / "design.npz").is_file() else None
-    names, facts, pages = [], [], []
+    names, pages = [], []
     for record in records:
         stated = _stated(folder, record)
         names.append(_name(folder, record, stated))
-        facts.append(_origin(record, stated))
         experiment = stated.get("experiment")
         place = None if experiment is None else os.path.normpath(folder / experiment)
-        pages.append(page_of(record, experiment=place, design=design))
-    html = report_of(records, names, facts, media or media_in(file), pages)
+        page = page_of(record, experiment=place, design=design)
+        pages.append(replace(page, facts={**_origin(record, stated), **page.facts}))
+    html = report_of(records, names, media or media_in(file), pages)
     with replacing(file) as temporary:
         temporary.write_text(html, encoding="utf-8", newline="\n")
     return file
@@ -268,7 +268,6 @@ def write_report(folder: Path, made: ShownRecord | None = None, media: Media | N
 def report_of(
     records: Sequence[ShownRecord],
     names: Sequence[str] = (),
-    facts: Sequence[Mapping[str, str]] = (),
     media: Media | None = None,
     pages: Sequence[Page] = (),
 ) -> str:
@@ -277,7 +276,6 @@ def report_of(
     Args:
         records: The results, the main one first.
         names: What each of them is named after.
-        facts: Further facts of each of them.
         media: The video of the report.
         pages: Page of each result; default: one without the paths of files.
     """
@@ -294,7 +292,6 @@ def report_of(
         Result(
             page=page,
             name=names[i] if names else "",
-            facts={**(facts[i] if facts else {}), **page.facts},
             groups={
                 part: [group_of(each, limit) for each in some] for part, some in drawn[i].items()
             },
@@ -344,8 +341,8 @@ def _limit_of(pictures: Sequence[Sequence[Picture]], library: int, media: Media)
     taken = library + TEXT_SIZE
     if media.video is not None:
         taken += 4 * len(media.video.data) // 3
-    panels = [panel for some in pictures for picture in some for panel in picture.panels]
-    curves = sum(len(panel.marks) for panel in panels)
+    shown = [picture for some in pictures for picture in some]
+    curves = sum(len(panel.marks) for picture in shown for panel in picture.panels)
     share = max(MAX_SIZE - taken, 0) // POINT_SIZE // max(curves, 1)
     return min(max(share, FEWEST_POINTS), MOST_POINTS)
 

@@ -121,7 +121,6 @@ def _shortened(parts: Sequence[Shown], width: int, lines: int) -> tuple[list[Sho
 
 
 def _count(part: Shown) -> int:
-    """Number of rows or items of a part."""
     if isinstance(part, Text):
         return 1
     return len(part.rows if isinstance(part, Table) else part.items)
@@ -139,7 +138,6 @@ def _height(part: Shown, width: int) -> int:
 
 
 def _lines(text: str, width: int) -> int:
-    """Number of lines of a text."""
     return sum(-(-max(cell_len(line), 1) // width) for line in text.split("\n"))
 
 
@@ -158,7 +156,6 @@ def _without_last(part: Shown) -> Shown:
 def _rendered(
     part: Shown, width: int, console: Console, *, verbose: bool
 ) -> Iterator[Styled | Padding | Segment]:
-    """A part as what Rich prints."""
     if isinstance(part, Text):
         yield _styled(part.text, STYLES[part.emphasis])
         return
@@ -242,7 +239,6 @@ def _grid(
 
 
 def _folded(text: str, width: int, console: Console) -> list[str]:
-    """The lines of a cell."""
     if cell_len(text) <= width:
         return [text]
     return [line.plain for line in _styled(text, "").wrap(console, width)]

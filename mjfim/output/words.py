@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Sequence, Sized
+from typing import Any
 
 import numpy as np
-import scipy
 
 from mjfim.arrays import Array
 from mjfim.output.page import number
-from mjfim.records.campaign import Campaign
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.studies import MonteCarloStudy
 from mjfim.records.trajectory import Labels
-
-if TYPE_CHECKING:
-    from mjfim.model.parameters import ParameterSet
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -143,13 +137,17 @@ def shorten(text: str, width: int = 28) -> str:
     return f"{text[:kept]}…{text[-kept:]}"
 
 
-def as_sentence(text: str) -> str:
-    """Return a text with a capital first letter and a full stop.
+def share_note(shown: Sized, every: Sized, which: str) -> str:
+    """Say that only some things are shown, and which; empty where all are.
 
     Args:
-        text: The text, without a full stop.
+        shown: What is shown.
+        every: All of them.
+        which: Their name, and by what they were chosen.
     """
-    return f"{text[:1].upper()}{text[1:]}."
+    if len(shown) >= len(every):
+        return ""
+    return f" Shown: {len(shown)} of {len(every)} {which}."
 
 
 def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
@@ -167,17 +165,6 @@ def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
     return np.asarray(np.exp(-0.5 * deviations**2) / (np.sqrt(2.0 * np.pi) * std))
 
 
-def chi_squared_quantiles(shares: tuple[float, float], freedom: float) -> tuple[float, float]:
-    """Return two quantiles of a chi-squared distribution.
-
-    Args:
-        shares: Probabilities that a value lies below each (0..1).
-        freedom: Degrees of freedom, positive.
-    """
-    low, high = 2.0 * scipy.special.gammaincinv(0.5 * freedom, np.array(shares))
-    return float(low), float(high)
-
-
 def complete_labels(record: Design | Estimate | MonteCarloStudy) -> Labels:
     """Return the labels of a record; numbers in place of names where the record has no labels.
 
@@ -185,89 +172,31 @@ def complete_labels(record: Design | Estimate | MonteCarloStudy) -> Labels:
 
     Args:
         record: The record.
+
+    Raises:
+        MjfimError: The labels do not fit the record.
     """
+    words = {
+        "qpos": "qpos",
+        "positions": "position",
+        "velocities": "velocity",
+        "controls": "control",
+    }
+    sizes: dict[str, int] = {}
+    if isinstance(record, Design):
+        motion = record.trajectory
+        arrays = (motion.qpos, motion.qvel, motion.qvel, motion.ctrl)
+        sizes = {name: array.shape[1] for name, array in zip(words, arrays, strict=True)}
     if record.labels is not None:
+        record.labels.check(**sizes, parameters=len(record.parameters))
         return record.labels
 
-    units = ("",) * len(record.parameters)
-    if isinstance(record, Estimate):
-        units = record.units
-    if not isinstance(record, Design):
-        return Labels(
-            qpos=(),
-            positions=(),
-            velocities=(),
-            controls=(),
-            parameters=record.parameters,
-            parameter_units=units,
-        )
-
-    trajectory = record.trajectory
-    velocities = trajectory.qvel.shape[1]
-    return Labels(
-        qpos=_numbered("qpos", trajectory.qpos.shape[1]),
-        positions=_numbered("position", velocities),
-        velocities=_numbered("velocity", velocities),
-        controls=_numbered("control", trajectory.ctrl.shape[1]),
-        parameters=record.parameters,
-        parameter_units=units,
-    )
-
-
-def _numbered(quantity: str, count: int) -> tuple[str, ...]:
-    """Return labels with a number in place of a name."""
-    return tuple(f"{quantity} {i} [model unit]" for i in range(count))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CampaignParameters:
-    """Parameters of a campaign.
-
-    Attributes:
-        names: Names of the p parameters.
-        units: Their units; empty where a parameter has none.
-        guess: (p,) guess before the first round [theta-unit].
-        interest: Indices of the parameters that are not nuisance parameters.
-        true: (p,) true values [theta-unit]; None where they are not known.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    guess: Array
-    interest: tuple[int, ...]
-    true: Array | None = None
-
-    @classmethod
-    def stated(cls, parameters: ParameterSet, *, simulated: bool) -> CampaignParameters:
-        """Take the parameters of the experiment.
-
-        Args:
-            parameters: The parameters.
-            simulated: True if the recordings were simulated at the true values.
-        """
-        return cls(
-            names=parameters.names,
-            units=tuple(parameter.unit for parameter in parameters.parameters),
-            guess=parameters.guess,
-            interest=tuple(parameters.interest.tolist()),
-            true=parameters.true if simulated else None,
-        )
-
-    @classmethod
-    def recorded(cls, campaign: Campaign) -> CampaignParameters:
-        """Take the parameters from the record of a campaign, which does not know true values.
-
-        Args:
-            campaign: The campaign, with at least one round.
-        """
-        first = campaign.rounds[0]
-        nuisance = {name for design in campaign.designs for name in design.nuisance}
-        return cls(
-            names=campaign.parameters,
-            units=first.estimate.units,
-            guess=first.theta,
-            interest=tuple(j for j, name in enumerate(campaign.parameters) if name not in nuisance),
-        )
+    numbered: dict[str, Any] = {
+        name: tuple(f"{word} {i} [model unit]" for i in range(sizes.get(name, 0)))
+        for name, word in words.items()
+    }
+    units = record.units if isinstance(record, Estimate) else ("",) * len(record.parameters)
+    return Labels(**numbered, parameters=record.parameters, parameter_units=units)
 
 
 # Remark on predicted standard deviations.
@@ -300,16 +229,6 @@ def relative(std: float, size: float, value: float | None = None) -> str:
     places = len(f"{percent:.0f}") if percent < 10.0**MAX_DIGITS else MAX_DIGITS
     is_of_value = value is None or math.isclose(abs(value), size, rel_tol=SAME_SIZE)
     return number(percent, max(places, 2), " %" if is_of_value else f" % of {number(size, 2)}")
-
-
-def size_sentence(values: Sequence[float] | Array, sizes: Sequence[float] | Array) -> str:
-    """Say of what a relative standard deviation is a share; empty where it is of the value."""
-    if np.array_equal(np.abs(values), sizes):
-        return ""
-    return (
-        "A relative σ is a share of the value; for an entry of a vector or tensor, and for a value "
-        "of zero, it is a share of the magnitude of the whole."
-    )
 
 
 def improvement(before: float, after: float) -> str:

@@ -151,6 +151,12 @@ class Campaign(ShownRecord):
         return tuple(r.estimate for r in self.rounds)
 
     @property
+    def interest(self) -> list[int]:
+        """Indices of the parameters that are no nuisance; a campaign with rounds knows them."""
+        nuisance = self.rounds[-1].estimate.nuisance
+        return [j for j, name in enumerate(self.parameters) if name not in nuisance]
+
+    @property
     def designs(self) -> tuple[Design, ...]:
         """The designs of the rounds, where they are known."""
         return tuple(r.design for r in self.rounds if r.design is not None)

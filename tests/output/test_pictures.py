@@ -309,7 +309,7 @@ def test_wrong_names_labels_and_endings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MjfimError, match=r"picture of a Design .*valid: convergence, "):
         draw(design, "portrait")
     with pytest.raises(MjfimError, match=r"labels.qpos has 5 entries, the data has 2"):
-        trajectories(design, make_labels(5, 3))
+        draw(dataclasses.replace(design, labels=make_labels(5, 3)))
     with pytest.raises(MjfimError, match=r"valid: .png, .svg, .pdf"):
         draw(design, "convergence", tmp_path / "x.gif")
     draw(design, "convergence", tmp_path / "x.svg")

@@ -37,6 +37,7 @@ from mjfim.output.report import KINDS, Media, media_in, report_of, write_report
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import LimitUsage
+from mjfim.records.estimate import HorizonStudy
 from tests.support import results
 
 # A name that would change the page, or run, if it were not escaped.
@@ -182,7 +183,7 @@ MARKS = [
     line([0, 1], [2, 3], "measured", label="curve", dash="--"),
     Mark(kind="steps", x=np.arange(3.0), y=np.array([5.0, 6.0])),
     dots([1], [2], "nominal", symbol="|", texts=["<odd>"]),
-    bars([3.0], [0.0], "initial", left=[1.0], label="bars", hollow=True),
+    bars([3.0], [0.0], "initial", left=1.0, label="bars", hollow=True),
     vline(2.0, "muted"),
     hspan(-1.0, 1.0, label="strip"),
 ]
@@ -341,3 +342,19 @@ def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no such folder"):
         write_report(tmp_path / "nowhere")
     assert not (tmp_path / REPORT).exists()
+
+
+def test_a_report_draws_every_length_of_segments_that_was_compared() -> None:
+    count, shape = 7, (7, len(results.PARAMETERS))
+    study = HorizonStudy(
+        lengths=np.geomspace(0.1, 6.4, count),
+        errors=np.ones((count, count)),
+        chosen=0,
+        is_whole=True,
+        parameters=results.PARAMETERS,
+        units=results.UNITS,
+        theta=np.ones(shape),
+        half_widths=np.full(shape, 0.1),
+        is_apart=np.zeros(shape, dtype=bool),
+    )
+    assert "whole recordings" in report_of([results.estimate(horizons=study)])

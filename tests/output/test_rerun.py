@@ -94,9 +94,9 @@ def design(cart: mujoco.MjModel) -> Design:
 
 @pytest.fixture(scope="module")
 def file(cart: mujoco.MjModel, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its recording, with an addition to the summary."""
+    """Its recording."""
     path = tmp_path_factory.mktemp("rerun") / "design.rrd"
-    log_design(path, cart, design, labels_of_model(cart), addition="| a caller's | table |")
+    log_design(path, cart, design, labels_of_model(cart))
     return path
 
 
@@ -180,11 +180,11 @@ def test_in_the_view_of_both_robots_the_initial_one_is_translucent(file: Path) -
     assert not [entity for entity in looks if "designed" in entity]
 
 
-def test_the_summary_holds_outcome_warnings_and_addition(file: Path) -> None:
+def test_the_summary_holds_outcome_warnings_and_colours(file: Path) -> None:
     text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
     assert "it violates limits (position)" in text
     assert "the two parameters are nearly confounded" in text
-    assert text.rstrip().endswith("| a caller's | table |")
+    assert text.rstrip().endswith("change per unit of a parameter.")
 
 
 def test_a_file_is_replaced_only_when_the_new_one_is_complete(

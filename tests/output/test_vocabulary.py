@@ -34,10 +34,10 @@ BETWEEN_PARTS = re.compile(r"""["']\s+f?["']""")
 SHOWN = ("cli", "output", "records", "studies", "identification", "excitation")
 
 
-@pytest.mark.parametrize("term", TERMS, ids=lambda term: term.word)
+@pytest.mark.parametrize("term", TERMS, ids=str)
 def test_the_page_has_the_words_colours_and_meanings(term: Term) -> None:
     rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line[:1] == "|"]
-    (row,) = [row for row in rows if row.startswith(f"| {term.word} |")]
+    (row,) = [row for row in rows if row.startswith(f"| {term} |")]
     assert set(re.findall(r"#[0-9a-f]{6}", row)) == {term.colour}
 
     import mjfim.output.page as shown

@@ -142,7 +142,6 @@ def require_options(to: str, positions: str | None, storage: str, unit: str) -> 
 
 
 def _require(option: str, kind: str, word: str, valid: Iterable[str]) -> None:
-    """Raise ExperimentError unless a word is valid."""
     words = tuple(valid)
     if word not in words:
         raise ExperimentError(f"{option}: {unknown(kind, word, words)}")

@@ -533,7 +533,6 @@ def _add_terms(xml: ModelXml, source: ModelSource) -> None:
 
 
 def _key(element: Any) -> tuple[str, str]:
-    """Kind and name of an element that MuJoCo prints."""
     return element.tag, element.get("name", "")
 
 

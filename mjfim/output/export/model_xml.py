@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -53,9 +52,6 @@ ROUNDING = 1e-12
 
 # What some editors of Windows put before a text in UTF-8.
 BYTE_ORDER_MARK = "\ufeff".encode()
-
-# Attributes of an element that has none.
-NO_ATTRIBUTES: Mapping[str, str] = MappingProxyType({})
 
 # An element, an attribute of it that names a file or a folder, and the name as the user wrote it.
 Reference = tuple[Any, str, str]
@@ -307,7 +303,7 @@ def child(parent: Any, tag: str) -> Any:
 def add_element(
     parent: Any,
     tag: str,
-    attributes: Mapping[str, str] = NO_ATTRIBUTES,
+    attributes: Mapping[str, str] | None = None,
     *,
     first: bool = False,
     comment: str = "",
@@ -323,20 +319,20 @@ def add_element(
     """
     if comment:
         add_comment(parent, comment, first=first)
-    added = etree.Element(tag, dict(attributes))
-    _insert(parent, added, 0 if first else len(parent))
+    added = etree.Element(tag, dict(attributes or {}))
+    _insert(parent, added, first=first)
     return added
 
 
 def add_comment(parent: Any, comment: str, *, first: bool = False) -> None:
     """Add a comment as the last or the first child; two hyphens in a row are separated."""
     added = etree.Comment(f" {comment.replace('--', '- -')} ")
-    _insert(parent, added, 0 if first else len(parent))
+    _insert(parent, added, first=first)
 
 
-def _insert(parent: Any, added: Any, place: int) -> None:
+def _insert(parent: Any, added: Any, *, first: bool) -> None:
     """Add a node as the first or the last child, on a line of its own where others are."""
-    tail = parent.text
+    tail, place = parent.text, 0 if first else len(parent)
     if place > 0:
         tail, parent[-1].tail = parent[-1].tail, parent.text
     parent.insert(place, added)
@@ -403,7 +399,6 @@ def same_inertia(a: BodyInertia, b: BodyInertia, tolerance: float = ROUNDING) ->
 
 
 def _source_file(path: Path, read: Callable[[Path], bytes]) -> SourceFile:
-    """Read a file."""
     content = read(path)
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:

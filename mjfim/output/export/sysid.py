@@ -96,7 +96,6 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
         )
 
     def build_model(parameters: Any, _: Any) -> Any:
-        """The model at values of the parameters."""
         return system.model_at(np.array(parameters.as_vector()))
 
     return SysidProblem(

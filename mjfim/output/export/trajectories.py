@@ -252,7 +252,20 @@ def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: str = "rad") -> N
     task = f"mjfim design {plan.name}"
     tasks = {"task_index": [0], TASK_INDEX: [task]}
     _write_parquet(folder / DATA_FILE, {name: _column(each) for name, each in columns.items()})
-    _write_parquet(folder / EPISODES_FILE, _episode(task, rows, stats))
+    episode: dict[str, Any] = {
+        "episode_index": [0],
+        "tasks": [[task]],
+        "length": [rows],
+        "data/chunk_index": [0],
+        "data/file_index": [0],
+        "dataset_from_index": [0],
+        "dataset_to_index": [rows],
+        "meta/episodes/chunk_index": [0],
+        "meta/episodes/file_index": [0],
+    }
+    for name, numbers in stats.items():
+        episode |= {f"stats/{name}/{key}": [value] for key, value in numbers.items()}
+    _write_parquet(folder / EPISODES_FILE, episode)
     _write_parquet(folder / TASKS_FILE, tasks, {b"pandas": json.dumps(PANDAS).encode()})
     write_json(folder / STATS_FILE, stats)
 
@@ -278,24 +291,6 @@ def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: str = "rad") -> N
         "features": features,
     }
     write_json(folder / INFO_FILE, info)
-
-
-def _episode(task: str, rows: int, stats: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The table of episodes, with one row."""
-    episode: dict[str, Any] = {
-        "episode_index": [0],
-        "tasks": [[task]],
-        "length": [rows],
-        "data/chunk_index": [0],
-        "data/file_index": [0],
-        "dataset_from_index": [0],
-        "dataset_to_index": [rows],
-        "meta/episodes/chunk_index": [0],
-        "meta/episodes/file_index": [0],
-    }
-    for name, numbers in stats.items():
-        episode |= {f"stats/{name}/{key}": [value] for key, value in numbers.items()}
-    return episode
 
 
 def _actions(plan: RobotPlan, factor: float) -> tuple[list[str], Array]:
@@ -346,18 +341,17 @@ def _statistics(values: np.ndarray) -> dict[str, list[float]]:
 def _write_parquet(
     path: Path, columns: Mapping[str, Any], metadata: Mapping[bytes, bytes] | None = None
 ) -> None:
-    """Write a table."""
     table = pa.table(dict(columns)).replace_schema_metadata(metadata)
     with replacing(path) as temporary:
         pyarrow.parquet.write_table(table, temporary)
 
 
 # What the positions of a trajectory are: the planned motion, or the commands of position servos.
-POSITIONS = ("motion", "command")
 CONTENT = {
     "motion": "positions are the planned motion",
     "command": "positions are the commands of the position servos",
 }
+POSITIONS = tuple(CONTENT)
 
 # Ending of the file inside a bag, by its format; and a version of bags that all supported versions
 # of ROS 2 read.

@@ -61,17 +61,20 @@ def design_page(design: Design) -> Page:
     """Describe predicted standard deviations before and after a design, and how it ended."""
     search: list[Part] = [Plot("convergence"), _eigenvalue_table(design)]
     if len(design.starts) > 1:
-        search += [_start_table(design)]
+        search.append(_start_table(design))
     sections = [
         Section("Accuracy", list(_accuracy_parts(design))),
         Section("Motion", [Plot("trajectories"), Plot("sensitivity_phase")]),
         Section("Optimisation", search),
     ]
     if design.limits:
-        sections.insert(2, Section("Limits", [Plot("limits"), _limit_table(design)]))
+        margins = numbers(design.limits.values())
+        columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
+        table = tabulated("Limits", columns, detail=True)
+        sections.insert(2, Section("Limits", [Plot("limits"), table]))
     if design.rehearsal is not None:
         sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
-    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    before, after = _least_eigenvalues(design)
     reserve = listed([f"{100 * share:.2g} % of {kind}" for kind, share in design.reserve.items()])
     return Page(
         kind="Design of an experiment",
@@ -92,6 +95,11 @@ def design_page(design: Design) -> Page:
 def _seconds(design: Design) -> float:
     """Duration of the motion [s]."""
     return float(design.trajectory.t[-1] - design.trajectory.t[0])
+
+
+def _least_eigenvalues(design: Design) -> list[float]:
+    """The smallest eigenvalue of the information before and after the search."""
+    return [float(each.eigenvalues[0]) for each in (design.initial, design.final)]
 
 
 # ---- verdict
@@ -130,7 +138,6 @@ def _danger(rehearsal: Rehearsal) -> Verdict:
 
 
 def _robots(rehearsal: Rehearsal) -> str:
-    """The robots of a rehearsal in words."""
     return f"{rehearsal.robots} robots whose parameters are up to {100 * rehearsal.wrong:g} % off"
 
 
@@ -139,14 +146,14 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
         yield f"{rehearsal.diverged} diverge in the simulation"
     if rehearsal.passes_floor.any():
         floor = "the floor" if rehearsal.has_floor else "the plane under the robot"
-        deepest = -float(np.nanmin(rehearsal.lowest))
+        deepest = -np.nanmin(rehearsal.lowest)
         yield f"{rehearsal.below_floor} pass through {floor}, by up to {deepest:.3g} m"
     worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
     order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
     for i in broken[order].tolist():
         limit, count = rehearsal.limits[i], int((~rehearsal.kept[1:, i]).sum())
-        excess = -float(np.nanmin(worst[:, i])) * limit.scale
+        excess = -np.nanmin(worst[:, i]) * limit.scale
         manner = f"by up to {excess:.3g} {limit.unit}".rstrip() if excess > 0.0 else "to its clamp"
         yield f"{count} leave the limit on {_kind(limit)} of {limit.name}, {manner}"
     for name, count in rehearsal.unbraked.items():
@@ -154,7 +161,6 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
 
 
 def _kind(limit: RehearsedLimit) -> str:
-    """The kind of a limit in words."""
     return limit.kind.replace("_", " ")
 
 
@@ -173,7 +179,7 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
     free = [i for i in free if peaks[i] > 0.0]
     if free:
         fastest: dict[str, int] = {}
-        for i in sorted(free, key=lambda i: -float(peaks[i])):
+        for i in sorted(free, key=lambda i: -peaks[i]):
             fastest.setdefault(rehearsal.units[i], i)
         shown = [f"{peaks[i]:.2g} {unit} ({rehearsal.joints[i]})" for unit, i in fastest.items()]
         which = "1 speed has" if len(free) == 1 else f"{len(free)} speeds have"
@@ -200,7 +206,7 @@ def _reservation(design: Design) -> str:
     """
     found = _undetermined(design)
     if not found and _tells_less(design):
-        before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+        before, after = _least_eigenvalues(design)
         return (
             f"it tells less than its start (λ_min {before:.3g} → {after:.3g}), because the cost "
             "weighs the control or the tracking more than the information"
@@ -219,14 +225,14 @@ def _reservation(design: Design) -> str:
     text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
     if not np.isfinite(std[worst]):
         return text
-    share = relative(float(std[worst]), float(sizes[worst]))
+    share = relative(std[worst], sizes[worst])
     of_one = f": σ is {share} of its size"
     return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
 
 
 def _tells_less(design: Design) -> bool:
     """Whether a start inside the limits has more information."""
-    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    before, after = _least_eigenvalues(design)
     return not design.initial_violations and RELEVANT_RATIO * after < before
 
 
@@ -237,10 +243,10 @@ def _accuracy(design: Design) -> str:
     sentence = f"one experiment of {_seconds(design):.3g} s determines every parameter"
     if not wanted:
         return sentence
-    worst = max(wanted, key=lambda j: float(shares[j]))
+    worst = max(wanted, key=lambda j: shares[j])
     name = design.parameters[worst]
     before, after = float(design.initial.std[worst]), float(design.stated_std[worst])
-    sentence += f" with a σ of {relative(after, float(design.sizes[worst]))} or less"
+    sentence += f" with a σ of {relative(after, design.sizes[worst])} or less"
     if not np.isfinite(before):
         return f"{sentence}; the initial motion does not determine {name}"
     if before > RELEVANT_RATIO * after:
@@ -396,7 +402,7 @@ def _accuracy_parts(design: Design) -> Iterator[Part]:
         )
     if design.scaled_start is not None:
         yield Text(_scaled_sentence(design, design.scaled_start))
-    before, after = (float(each.eigenvalues[0]) for each in (design.initial, design.final))
+    before, after = _least_eigenvalues(design)
     yield Text(
         f"λ_min {before:.4g} → {after:.4g} ({after / max(before, TINY):.1f} ×), cost J "
         f"{design.initial.cost:.5g} → {design.final.cost:.5g}, found from the {design.found_by}"
@@ -478,13 +484,6 @@ def _eigenvalue_table(design: Design) -> Table:
         },
         detail=True,
     )
-
-
-def _limit_table(design: Design) -> Table:
-    """Tabulate the worst margin of each kind of limit."""
-    margins = numbers(design.limits.values())
-    columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
-    return tabulated("Limits", columns, detail=True)
 
 
 def _start_table(design: Design) -> Table:
@@ -585,7 +584,6 @@ def _check_parts(check: Check) -> Iterator[Part]:
 
 
 def _row(row: ParameterCheck) -> Row:
-    """The row of one parameter."""
     name, value = named(row.name, row.unit), number(row.value, 4)
     if row.nuisance:
         return Row((name, value, "nuisance", "", "", "", ""), Emphasis.WEAK)
@@ -626,7 +624,6 @@ def _about_eigenvalues(check: Check) -> str:
 
 
 def _about_self_test(check: Check) -> str:
-    """The result of the derivative self-test."""
     test = check.self_test
     if not test.finished:
         return "derivative self-test not finished, because the check was interrupted"

@@ -36,7 +36,7 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.pages.studies import equation_parts
-from mjfim.output.words import NOT_ALONE, predicted_data, relative
+from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
 from mjfim.records.terms import Decision, Selection, SelectionStep
@@ -64,7 +64,8 @@ ABOUT_STD = (
 
 def estimate_page(estimate: Estimate) -> Page:
     """Describe estimates with intervals, the fit of every output, and predictions."""
-    equation = estimate.inverse_dynamics
+    equation, rms = estimate.inverse_dynamics, estimate.residual_rms
+    residuals = {"output": [*rms], "residual rms": numbers(rms.values())}
     parts: dict[str, Sequence[Part]] = {
         "Parameters": [*_parameter_parts(estimate), *_correlation_tables(estimate)],
         "Added terms": [] if estimate.selection is None else selection_parts(estimate.selection),
@@ -74,7 +75,7 @@ def estimate_page(estimate: Estimate) -> Page:
         "Drawn robots": list(sample_parts(estimate)),
         "Predictions": _prediction_parts(estimate.predictions),
         "Signals": [Plot("fit")] if estimate.recordings else [],
-        "Residuals": [_residual_table(estimate), Plot("spectra")],
+        "Residuals": [tabulated("Fit of every output", residuals, detail=True), Plot("spectra")],
         "Search": [Plot("trace")] if len(estimate.trace) > 1 else [],
     }
     causes, details = estimate.causes, estimate.details
@@ -114,7 +115,7 @@ def _verdict(estimate: Estimate) -> Verdict:
 
 
 def _verdict_on_fit(estimate: Estimate) -> Verdict:
-    ratio = float(np.sqrt(estimate.chi2 / max(estimate.dof, 1)))
+    ratio = np.sqrt(estimate.chi2 / max(estimate.dof, 1))
     if not estimate.success:
         why = estimate.status.removesuffix(".")
         if estimate.combinations:
@@ -156,7 +157,7 @@ def _worst_estimate(estimate: Estimate) -> str:
     if not known.any():
         return ""
     worst = int(np.argmax(np.where(known, shares, -np.inf)))
-    share = relative(float(half_widths[worst]), float(sizes[worst]))
+    share = relative(half_widths[worst], sizes[worst])
     others = f" except {first_ones(uncertain)} (not determined)" if uncertain else ""
     return (
         f", and every parameter{others} is known to ± {share} or better (95 % interval, widest for "
@@ -211,7 +212,6 @@ def _parameter_parts(estimate: Estimate) -> Iterator[Part]:
 
 
 def _estimate_table(estimate: Estimate) -> Table:
-    """Tabulate estimates, standard deviations and intervals."""
     names, std = estimate.parameters, estimate.std
     low, high = estimate.interval.T
     is_held = [name in estimate.held for name in names]
@@ -223,8 +223,8 @@ def _estimate_table(estimate: Estimate) -> Table:
     at_bound = [name in estimate.at_bound for name in names]
     columns = {
         "parameter": list(map(named, names, estimate.units)),
-        NOMINAL.word: numbers(estimate.initial_theta, 4),
-        IDENTIFIED.word: list(map(_as_accurate, estimate.theta, std)),
+        NOMINAL: numbers(estimate.initial_theta, 4),
+        IDENTIFIED: list(map(_as_accurate, estimate.theta, std)),
         "formal σ": formal,
         "honest σ": numbers(np.where(known, 0.25 * (high - low), np.nan), 2),
         "95 % low": list(map(_as_accurate, np.where(known, low, np.nan), std)),
@@ -236,7 +236,7 @@ def _estimate_table(estimate: Estimate) -> Table:
         "Estimates with their 95 % intervals",
         columns,
         warned(at_bound),
-        spare=(NOMINAL.word, "honest σ", "at bound", "formal σ"),
+        spare=(NOMINAL, "honest σ", "at bound", "formal σ"),
     )
 
 
@@ -261,13 +261,6 @@ def _correlation_tables(estimate: Estimate) -> Iterator[Table]:
     ]
     columns = {"parameter": names, **dict(zip(names, cells, strict=True))}
     yield tabulated("Correlation of the estimates", columns, detail=True)
-
-
-def _residual_table(estimate: Estimate) -> Table:
-    """Tabulate the residuals of every output."""
-    rms = estimate.residual_rms
-    columns = {"output": [*rms], "residual rms": numbers(rms.values())}
-    return tabulated("Fit of every output", columns, detail=True)
 
 
 # ---- predictions
@@ -304,8 +297,8 @@ def _prediction_parts(predictions: Sequence[Prediction]) -> Sequence[Part]:
         {
             "recording": [name for name, _, _ in shown],
             "output": [prediction.identified.outputs[j] for _, prediction, j in shown],
-            IDENTIFIED.word: numbers(identified),
-            NOMINAL.word: numbers(nominal),
+            IDENTIFIED: numbers(identified),
+            NOMINAL: numbers(nominal),
             "ratio": numbers(ratio),
         },
         note=note,
@@ -341,7 +334,13 @@ WORDS = {
 
 def selection_parts(selection: Selection) -> Sequence[Part]:
     """Which terms were added, the steps that led to them, and what they depend on."""
-    parts: list[Part] = [Text(str(selection)), _table(selection)]
+    steps = Table(
+        title="Terms that were tried: error of data that were left out of the fit",
+        columns=("term", "decision", "terms", "error [σ]", "reduction [σ²]", "± standard error"),
+        rows=tuple(_row(step) for step in selection.steps),
+        spare=("terms",),
+    )
+    parts: list[Part] = [Text(str(selection)), steps]
     kept = {term.path for term in selection.terms}
     parts += [
         Text(_about_alternatives(step), Emphasis.WARNING)
@@ -378,16 +377,6 @@ def _about_alternatives(step: SelectionStep) -> str:
         values = listed([f"{name} = {value:.4g}" for name, value in alternative.values.items()])
         text += f" With {alternative.description}, {values}."
     return text
-
-
-def _table(selection: Selection) -> Table:
-    """Tabulate the steps."""
-    return Table(
-        title="Terms that were tried: error of data that were left out of the fit",
-        columns=("term", "decision", "terms", "error [σ]", "reduction [σ²]", "± standard error"),
-        rows=tuple(_row(step) for step in selection.steps),
-        spare=("terms",),
-    )
 
 
 def _row(step: SelectionStep) -> Row:
@@ -535,9 +524,7 @@ def _value_table(comparison: RecordingComparison) -> Table:
     odd = {recording.index for recording in comparison.odd}
     pairs = [(j, k) for j in shown for k in range(count)]
     note = "Each value is one Gauss-Newton step away from the estimate of all recordings."
-    if len(shown) < len(comparison.parameters):
-        of_all = f"{len(shown)} of {len(comparison.parameters)} parameters"
-        note += f" Shown: {of_all}, those that differ most."
+    note += share_note(shown, comparison.parameters, "parameters, those that differ most")
     return tabulated(
         "What each recording suggests alone",
         {

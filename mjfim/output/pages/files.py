@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -105,7 +106,7 @@ def experiment_page(stated: StatedExperiment) -> Page:
     tables = (
         _table(
             "Unknown parameters",
-            f"parameter, {NOMINAL.word}, lower bound, upper bound, nuisance",
+            f"parameter, {NOMINAL}, lower bound, upper bound, nuisance",
             [
                 (
                     named(each.name, each.unit),
@@ -139,10 +140,7 @@ def experiment_page(stated: StatedExperiment) -> Page:
             ],
         ),
     )
-    page = _page(stated.source, _serves(stated), tables)
-    return Page(
-        kind=page.kind, verdict=page.verdict, warnings=stated.warnings, sections=page.sections
-    )
+    return replace(_page(stated.source, _serves(stated), tables), warnings=stated.warnings)
 
 
 def _serves(stated: StatedExperiment) -> str:
@@ -210,14 +208,13 @@ def _jitter(log: LogSummary) -> str:
 
 
 def _range_cells(found: Sequence[ColumnSummary]) -> tuple[str, ...]:
-    """The cells of one column over all logs."""
     resolutions = [column.resolution for column in found if column.resolution > 0.0]
-    empty = float(np.mean([column.empty_share for column in found]))
+    empty = np.mean([column.empty_share for column in found])
     return (
         found[0].name,
         found[0].source,
-        number(float(np.nanmin([column.minimum for column in found])), 4),
-        number(float(np.nanmax([column.maximum for column in found])), 4),
+        number(np.nanmin([column.minimum for column in found]), 4),
+        number(np.nanmax([column.maximum for column in found]), 4),
         number(min(resolutions, default=0.0), 2),
         f"{100 * empty:.0f} %" if empty else "-",
     )

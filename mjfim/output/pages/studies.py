@@ -7,6 +7,7 @@ from pathlib import PurePath
 
 import numpy as np
 
+from mjfim.arrays import Array
 from mjfim.errors import first_ones
 from mjfim.output.page import (
     IDENTIFIED,
@@ -31,7 +32,7 @@ from mjfim.output.page import (
     tabulated,
     warned,
 )
-from mjfim.output.words import BEST_CASE, NOT_ALONE, CampaignParameters, complete_labels
+from mjfim.output.words import BEST_CASE, NOT_ALONE, complete_labels
 from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.robots import RobotComparison, p_text
@@ -66,18 +67,17 @@ CAMPAIGN_LEVELS = {
 # ---- campaign
 
 
-def campaign_page(campaign: Campaign, parameters: CampaignParameters | None = None) -> Page:
+def campaign_page(campaign: Campaign, true: Array | None = None) -> Page:
     """Describe the estimate after the last round of a campaign.
 
     Args:
         campaign: The campaign.
-        parameters: Its parameters, where more is known of them than the campaign records.
+        true: (p,) true values of its parameters [theta-unit], where they are known.
     """
     facts, sections = {"rounds": str(len(campaign.rounds))}, []
     if campaign.rounds:
-        known = parameters or CampaignParameters.recorded(campaign)
         sections = [
-            Section("Parameters", [_campaign_table(campaign, known)]),
+            Section("Parameters", [_campaign_table(campaign, true)]),
             Section("Rounds", [Plot("campaign")]),
         ]
         last = campaign.rounds[-1].estimate
@@ -97,19 +97,19 @@ def campaign_page(campaign: Campaign, parameters: CampaignParameters | None = No
     )
 
 
-def _campaign_table(campaign: Campaign, parameters: CampaignParameters) -> Table:
+def _campaign_table(campaign: Campaign, true: Array | None) -> Table:
     """Tabulate the last estimates beside the wanted standard deviations."""
-    estimate, chosen = campaign.rounds[-1].estimate, list(parameters.interest)
+    estimate, chosen = campaign.rounds[-1].estimate, campaign.interest
     values, std, wanted = estimate.theta[chosen], estimate.std[chosen], campaign.wanted[chosen]
     columns = {
         "parameter": [named(estimate.parameters[j], estimate.units[j]) for j in chosen],
-        NOMINAL.word: numbers(parameters.guess[chosen], 5),
-        IDENTIFIED.word: numbers(values, 5),
+        NOMINAL: numbers(campaign.rounds[0].theta[chosen], 5),
+        IDENTIFIED: numbers(values, 5),
         "formal σ": numbers(std, 2),
         "wanted σ": numbers(wanted, 2, infinite="-"),
     }
-    if parameters.true is not None:
-        errors = (values - parameters.true[chosen]) / std
+    if true is not None:
+        errors = (values - true[chosen]) / std
         columns["error"] = [f"{error:+.1f} σ" for error in errors]
     return tabulated("Estimates", columns, warned(~(std <= wanted)))
 
@@ -301,7 +301,6 @@ def _method_row(comparison: Comparison, row: MethodResult) -> Row:
 
 
 def _std_table(comparison: Comparison) -> Table:
-    """Tabulate the standard deviation of every parameter with every method."""
     wanted = list(comparison.wanted)
     names = [named(comparison.parameters[j], comparison.units[j]) for j in wanted]
     std = {row.title: numbers(row.std[wanted]) for row in comparison.rows}

@@ -11,7 +11,7 @@ from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
 from mjfim.output.archive import shown_positions
-from mjfim.output.page import DESIGNED, INITIAL
+from mjfim.output.page import DESIGNED, INITIAL, as_sentence
 from mjfim.output.panels import (
     SERIES,
     Axis,
@@ -23,6 +23,7 @@ from mjfim.output.panels import (
     around,
     bars,
     dots,
+    grid,
     hline,
     hspan,
     in_grid,
@@ -34,13 +35,12 @@ from mjfim.output.panels import (
 )
 from mjfim.output.words import (
     BEST_CASE,
-    as_sentence,
     format_number,
     improvement,
     quotient_unit,
     relative,
+    share_note,
     shorten,
-    size_sentence,
 )
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.trajectory import Labels, Trajectory
@@ -131,7 +131,10 @@ MAX_ENVELOPES, MAX_ROWS, FULL_ROW = 2, 12, 0.86
 
 def trajectories(design: Design, labels: Labels) -> Picture:
     """Show states, controls and the information gathered up to each time (the paper's figure 2)."""
-    both = {INITIAL.word: design.initial.trajectory, DESIGNED.word: design.final.trajectory}
+    both: dict[str, Trajectory] = {
+        INITIAL: design.initial.trajectory,
+        DESIGNED: design.final.trajectory,
+    }
     groups = motion_panels(labels, both, design.usage)
     columns = min(PANEL_COLUMNS, max(map(len, groups.values())))
     panels: list[Panel] = []
@@ -171,11 +174,6 @@ def motion_panels(
         usage: Limits, which are lines where the motion comes near them.
     """
     shown = list(trajectories.values())
-    labels.check(
-        qpos=shown[0].qpos.shape[1],
-        velocities=shown[0].qvel.shape[1],
-        controls=shown[0].ctrl.shape[1],
-    )
     positions, qpos = shown_positions(labels, *(each.qpos for each in shown))
     velocities = [label.replace(" velocity [", " [") for label in labels.velocities]
     controls = [label.replace(" (control)", " [model unit]") for label in labels.controls]
@@ -238,10 +236,10 @@ def information_panel(design: Design) -> Panel:
     ):
         t = evaluation.trajectory.t
         root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-        last = format_number(float(root[-1]))
+        last = format_number(root[-1])
         marks += [
-            _curve(t, root, term.word, width),
-            words([t[-1]], [root[-1]], [last], term.word),
+            _curve(t, root, term, width),
+            words([t[-1]], [root[-1]], [last], term),
         ]
     return Panel(
         title="√λ_min up to each time [√s / unit of θ]",
@@ -257,7 +255,6 @@ def information_panel(design: Design) -> Panel:
 def sensitivity_phase(design: Design, labels: Labels) -> Picture:
     """Show what moves most with each parameter, as phase plots of ψ (the paper's figure 3)."""
     nv = design.trajectory.qvel.shape[1]
-    labels.check(positions=nv, velocities=nv, parameters=len(design.theta))
     psi = design.final.sensitivity
     change = np.abs(psi[:, nv : 2 * nv]).max(axis=0)
     speed = np.abs(design.trajectory.qvel).max(axis=0)
@@ -273,19 +270,14 @@ def sensitivity_phase(design: Design, labels: Labels) -> Picture:
     panels = [_phase_plot(design, labels, int(np.argmax(change[:, j])), j) for j in shown]
     if not panels:
         panels = [Panel(message="the motion depends on no parameter")]
-    columns = min(len(panels), PHASE_COLUMNS)
+    which = "parameters, those with the largest predicted relative standard deviations"
     note = "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative."
-    if len(shown) < len(moving):
-        note += (
-            f" Shown: {len(shown)} of {len(moving)} parameters, those with the largest predicted "
-            "relative standard deviations."
-        )
-    return Picture(
-        title="Sensitivity of the motion to each parameter",
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[2.75] * -(-len(panels) // columns),
-        widths=[1.0] * columns,
+    return grid(
+        "Sensitivity of the motion to each parameter",
+        panels,
+        [2.75] * len(panels),
+        min(len(panels), PHASE_COLUMNS),
+        note + share_note(shown, moving, which),
     )
 
 
@@ -295,7 +287,7 @@ def _phase_plot(design: Design, labels: Labels, dof: int, j: int) -> Panel:
     marks = []
     for evaluation, term, front in ((design.initial, INITIAL, 3.0), (design.final, DESIGNED, 2.0)):
         position, velocity = evaluation.sensitivity[:, [dof, nv + dof], j].T
-        marks.append(line(position, velocity, term.word, label=term.word, width=1.6, front=front))
+        marks.append(line(position, velocity, term, label=term, width=1.6, front=front))
     name, unit = split_unit(labels.positions[dof])
     divisor, parameter = labels.parameter_units[j], shorten(labels.parameters[j], 14)
     axes = [
@@ -328,15 +320,15 @@ def convergence(design: Design) -> Picture:
     stages = [(row.rate, row.mu) for row in history]
     changes = [k for k in range(1, len(stages)) if stages[k] != stages[k - 1]]
 
-    begin = INITIAL.word
+    begin: str = INITIAL
     if history and not np.isclose(history[0].cost, design.initial.cost, rtol=1e-9, atol=0.0):
         begin = f"start: {design.found_by}"
     panels = []
-    for k, (name, each) in enumerate(shown.items()):
+    for name, each in shown.items():
         found = _history_marks(iterations, each, begin)
         stage = [vline(iterations[c], "band", width=1.5, front=0.0) for c in changes]
         usable = each[np.isfinite(each)]
-        ends = [format_number(float(value)) for value in (*usable[:1], *usable[-1:])]
+        ends = [format_number(value) for value in (*usable[:1], *usable[-1:])]
         panels.append(
             Panel(
                 marks=[*stage, *found],
@@ -345,7 +337,6 @@ def convergence(design: Design) -> Picture:
                 title=" → ".join(ends),
                 role="muted",
                 message="" if found else "no iterations recorded",
-                place=(0, k),
             )
         )
     note = as_sentence(design.outcome)
@@ -353,13 +344,7 @@ def convergence(design: Design) -> Picture:
         note += " Thick lines: the time grid becomes finer, or a new stage of the barrier begins."
     if any(row.mu for row in history):
         note += " With limits, the slope is that of log J plus the barrier."
-    return Picture(
-        title="Convergence",
-        panels=panels,
-        note=note,
-        heights=[2.4],
-        widths=[1.0] * len(panels),
-    )
+    return grid("Convergence", panels, [2.4] * len(panels), len(panels), note)
 
 
 def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
@@ -369,9 +354,9 @@ def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
         return []
     x, y = iterations[usable], values[usable]
     curve = line(x, y, "muted", symbol=".", size=3.0)
-    ends = [dots(x[-1:], y[-1:], DESIGNED.word, size=6.0, label=DESIGNED.word)]
+    ends = [dots(x[-1:], y[-1:], DESIGNED, size=6.0, label=DESIGNED)]
     if usable[0]:
-        ends.insert(0, dots(x[:1], y[:1], INITIAL.word, size=6.0, label=begin))
+        ends.insert(0, dots(x[:1], y[:1], INITIAL, size=6.0, label=begin))
     return [curve, *ends]
 
 
@@ -380,7 +365,6 @@ def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
 
 def standard_deviations(design: Design, labels: Labels) -> Picture:
     """Show the predicted standard deviations along both trajectories."""
-    labels.check(parameters=len(design.theta))
     wanted, combined = list(design.wanted), design.combined
     names = [labels.parameter(j) for j in wanted] + [each.expression for each in combined]
     sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
@@ -391,35 +375,34 @@ def standard_deviations(design: Design, labels: Labels) -> Picture:
         ]
     )
     # Infinite bars reach beyond all others.
-    is_known = np.isfinite(stds)
     low, high = around(stds, factor=3.0)
-    high *= 1.0 if is_known.all() else 10.0
+    all_known = bool(np.isfinite(stds).all())
+    high *= 1.0 if all_known else 10.0
 
-    rows = np.arange(float(len(names)))
+    rows = np.arange(len(names))
     marks, beside = [], []
-    for std, known, term, offset in zip(
-        stds, is_known, (INITIAL, DESIGNED), (-0.19, 0.19), strict=True
-    ):
-        at, left = rows + offset, np.full(len(rows), low)
-        texts = [format_number(float(value)) for value in std[known]]
+    for std, term, offset in zip(stds, (INITIAL, DESIGNED), (-0.19, 0.19), strict=True):
+        known, at = np.isfinite(std), rows + offset
         ends, places = std[known], at[known]
-        marks.append(bars(ends, places, term.word, left=left[known], size=0.36, label=term.word))
+        marks.append(bars(ends, places, term, left=low, size=0.36, label=term))
         if len(names) <= MAX_HIGH_ROWS:
-            marks.append(words(ends, places, texts, term.word))
+            texts = [format_number(value) for value in ends]
+            marks.append(words(ends, places, texts, term))
         if not known.all():
-            beyond = np.full(len(at), high)[~known]
-            marks.append(
-                bars(beyond, at[~known], term.word, left=left[~known], size=0.36, hollow=True)
-            )
+            beyond = np.full(len(at[~known]), high)
+            marks.append(bars(beyond, at[~known], term, left=low, size=0.36, hollow=True))
         shares = [str(relative(*pair)) for pair in zip(std.tolist(), sizes, strict=True)]
-        beside.append(("relative σ", term.word, shares))
+        beside.append(("relative σ", term, shares))
     changes = [improvement(*pair) for pair in stds.T.tolist()]
 
     note = BEST_CASE
-    if not is_known.all():
+    if not all_known:
         note += " Hatched: the parameter is not identifiable alone from this trajectory."
-    if of_size := size_sentence(design.theta, design.sizes):
-        note += f" {of_size}"
+    if not np.array_equal(np.abs(design.theta), design.sizes):
+        note += (
+            " A relative σ is a share of the value; for an entry of a vector or tensor, and for a "
+            "value of zero, it is a share of the magnitude of the whole."
+        )
     panel = Panel(
         marks=marks,
         x=Axis(label="predicted σ [unit of the parameter]", log=True, limits=(low, high)),
@@ -463,13 +446,7 @@ def limits(design: Design, labels: Labels) -> Picture:
     ]
     if ends:
         note += f" At the end: {', '.join(ends)}."
-    return Picture(
-        title="How much of each limit the design uses",
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[max(heights[i : i + columns]) for i in range(0, len(heights), columns)],
-        widths=[1.0] * columns,
-    )
+    return grid("How much of each limit the design uses", panels, heights, columns, note)
 
 
 def limit_panels(design: Design, labels: Labels, *, rows: bool = True) -> list[Panel]:
@@ -513,20 +490,16 @@ def _limit_panel(
     solid = [usage for usage in curves if would_be_solid(usage)]
     in_rows = rows and len(solid) > MAX_ENVELOPES
     axis = Axis(label="share of the limit [%]")
+    shown, draw = closest, _curve_marks
     if in_rows:
-        shown = [usage for usage in curves if usage in closest[:MAX_ROWS]]
+        shown, draw = [usage for usage in curves if usage in closest[:MAX_ROWS]], _row_marks
         axis = row_axis([usage.name for usage in shown])
-        marks = [
-            each
-            for row, usage in enumerate(shown)
-            for each in _row_marks(usage, row, roles.get(usage.name, "muted"))
-        ]
-    else:
-        marks = [
-            each
-            for rank, usage in enumerate(closest)
-            for each in _curve_marks(usage, rank, roles.get(usage.name, "muted"))
-        ]
+    marks = [
+        each
+        for place, usage in enumerate(shown)
+        for each in draw(usage, place, roles.get(usage.name, "muted"))
+    ]
+    if not in_rows:
         one_sided = curves[0].kind == "clearance"
         reach = max(112.0, 105.0 * largest_share(closest[0]))
         axis = Axis(label=axis.label, limits=(0.0 if one_sided else -reach, reach))
@@ -537,14 +510,14 @@ def _limit_panel(
         x=Axis(label="time [s]"),
         y=axis,
         title=margin,
-        role=DESIGNED.word if largest_share(closest[0]) > 1.0 else "text",
+        role=DESIGNED if largest_share(closest[0]) > 1.0 else "text",
         remark=f"largest: {', '.join(shares)}",
     )
 
 
-def _curve_marks(usage: LimitUsage, rank: int, role: str) -> list[Mark]:
+def _curve_marks(usage: LimitUsage, place: int, role: str) -> list[Mark]:
     """Return the curve of one limit, or the envelope of one that changes too fast to be seen."""
-    strong, front = rank < NAMED_CURVES, 3.0 - 0.01 * rank
+    strong, front = place < NAMED_CURVES, 3.0 - 0.01 * place
     if not would_be_solid(usage):
         look = {"width": 1.4 if strong else 0.7, "front": front, "label": _name(usage, role)}
         return [line(usage.t, 100.0 * usage.share, role, **look)]
@@ -561,10 +534,10 @@ def _name(usage: LimitUsage, role: str) -> str:
     return "" if role == "muted" else shorten(usage.name, 24)
 
 
-def _row_marks(usage: LimitUsage, row: int, role: str) -> list[Mark]:
+def _row_marks(usage: LimitUsage, place: int, role: str) -> list[Mark]:
     """Return a row that is filled up to the largest share of each interval of time."""
     t, low, high = envelope(usage)
-    base = row + 0.5 * FULL_ROW
+    base = place + 0.5 * FULL_ROW
     top = base - FULL_ROW * np.maximum(np.abs(low), np.abs(high)) / 100.0
     return [
         area(t, np.full(len(t), base), top, role, opacity=0.45),
@@ -574,7 +547,6 @@ def _row_marks(usage: LimitUsage, row: int, role: str) -> list[Mark]:
 
 
 def _words(kind: str) -> str:
-    """Return the name of a kind of limit in words."""
     return kind.replace("_", " ")
 
 

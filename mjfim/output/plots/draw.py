@@ -204,7 +204,11 @@ def _draw_panel(axes: Axes, panel: Panel, width: float, height: float) -> None:
         _draw_mark(axes, mark)
     for axis, stated in ((axes.xaxis, panel.x), (axes.yaxis, panel.y)):
         if stated.log:
-            set_plain_log_ticks(axis)
+            # Few ticks, with plain numbers.
+            low, high = axis.get_view_interval()
+            axis.set_major_locator(FixedLocator(log_ticks(float(low), float(high))))
+            axis.set_major_formatter(lambda value, _: plain_number(value))
+            axis.set_minor_locator(NullLocator())
 
     remark = wrap(panel.remark, 0.7 * width, NOTE_FONT) if panel.remark else []
     axes.set_title(
@@ -304,10 +308,9 @@ def _name_ticks(axis: DrawnAxis, stated: Axis, room: float) -> None:
 
 
 def _draw_mark(axes: Axes, mark: Mark) -> None:
-    """Draw a mark."""
     colour = ROLES[mark.role]
-    other = np.zeros(0) if mark.other is None else mark.other
     stroke: dict[str, Any] = {
+        "color": colour,
         "alpha": mark.opacity,
         "zorder": mark.front,
         "linewidth": mark.width,
@@ -318,7 +321,6 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
             axes.plot(
                 mark.x,
                 mark.y,
-                color=colour,
                 **stroke | ({"linestyle": ""} if mark.kind == "dots" else {}),
                 marker=mark.symbol or None,
                 markersize=mark.size,
@@ -326,50 +328,43 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
                 markeredgewidth=mark.width if mark.symbol in ("|", "_", "x") else 1.0,
             )
         case "steps":
-            axes.stairs(mark.y, mark.x, baseline=None, color=colour, snap=False, **stroke)
-        case "bars":
-            _draw_bars(axes, mark, other, colour)
+            axes.stairs(mark.y, mark.x, baseline=None, snap=False, **stroke)
         case "intervals":
-            _draw_intervals(axes, mark, other, colour)
+            _draw_intervals(axes, mark, colour)
         case "vline":
-            axes.axvline(mark.x[0], color=colour, **stroke)
+            axes.axvline(mark.x[0], **stroke)
         case "hline":
-            axes.axhline(mark.y[0], color=colour, **stroke)
+            axes.axhline(mark.y[0], **stroke)
         case "words":
             for x, y, text in zip(mark.x, mark.y, mark.texts, strict=True):
                 _write(axes, (x, y), text, mark.role, offset=(4.0, 0.0), system="data")
         case _:
-            _draw_strip(axes, mark, other, colour)
+            _draw_filled(axes, mark, {**stroke, "linewidth": 0.0})
 
 
-def _draw_strip(axes: Axes, mark: Mark, other: Any, colour: str) -> None:
-    """Draw a filled mark without an edge."""
-    look: dict[str, Any] = {
-        "color": colour,
-        "alpha": mark.opacity,
-        "zorder": mark.front,
-        "linewidth": 0.0,
-    }
-    if mark.kind == "area":
-        axes.fill_between(mark.x, mark.y, other, **look)
-    elif mark.kind == "columns":
-        axes.stairs(mark.y, mark.x, fill=True, **look)
-    elif mark.kind == "vspan":
-        axes.axvspan(mark.x[0], other[0], **look)
-    else:
-        axes.axhspan(mark.y[0], other[0], **look)
+def _draw_filled(axes: Axes, mark: Mark, look: dict[str, Any]) -> None:
+    """Draw a filled mark; bars that are hollow are hatched."""
+    other: Any = mark.other
+    match mark.kind:
+        case "area":
+            axes.fill_between(mark.x, mark.y, other, **look)
+        case "columns":
+            axes.stairs(mark.y, mark.x, fill=True, **look)
+        case "vspan":
+            axes.axvspan(mark.x[0], other[0], **look)
+        case "hspan":
+            axes.axhspan(mark.y[0], other[0], **look)
+        case "bars":
+            colour = look["color"]
+            bar = {"color": colour, "alpha": mark.opacity}
+            if mark.hollow:
+                bar = {"facecolor": "white", "edgecolor": colour, "hatch": "////", "linewidth": 0.5}
+            axes.barh(mark.y, mark.x - other, left=other, height=mark.size, **bar)
 
 
-def _draw_bars(axes: Axes, mark: Mark, left: Any, colour: str) -> None:
-    """Draw bars across; hollow ones are hatched."""
-    look: dict[str, Any] = {"color": colour, "alpha": mark.opacity}
-    if mark.hollow:
-        look = {"facecolor": "white", "edgecolor": colour, "hatch": "////", "linewidth": 0.5}
-    axes.barh(mark.y, mark.x - left, left=left, height=mark.size, **look)
-
-
-def _draw_intervals(axes: Axes, mark: Mark, ends: Any, colour: str) -> None:
+def _draw_intervals(axes: Axes, mark: Mark, colour: str) -> None:
     """Draw intervals across; arrows mark where the axis cuts them off."""
+    ends: Any = mark.other
     low, high = sorted(axes.get_xlim())
     begin, end = np.clip(mark.x, low, high), np.clip(ends, low, high)
     axes.hlines(
@@ -410,14 +405,6 @@ def _draw_cells(axes: Axes, cells: Cells) -> None:
 
 
 # ---- ticks and words
-
-
-def set_plain_log_ticks(axis: DrawnAxis) -> None:
-    """Let a logarithmic axis have few ticks, with plain numbers."""
-    low, high = axis.get_view_interval()
-    axis.set_major_locator(FixedLocator(log_ticks(float(low), float(high))))
-    axis.set_major_formatter(lambda value, _: plain_number(float(value)))
-    axis.set_minor_locator(NullLocator())
 
 
 def log_ticks(low: float, high: float) -> list[float]:

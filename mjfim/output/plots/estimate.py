@@ -20,6 +20,7 @@ from mjfim.output.panels import (
     area,
     around,
     dots,
+    grid,
     hline,
     hspan,
     in_grid,
@@ -31,10 +32,10 @@ from mjfim.output.panels import (
     vline,
 )
 from mjfim.output.words import (
-    chi_squared_quantiles,
     format_number,
     format_with_uncertainty,
     predicted_data,
+    share_note,
     shorten,
     without_zeros,
 )
@@ -106,7 +107,6 @@ GAP = 2.5
 def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     """Show estimates and 95 % intervals relative to the guess; hollow where at a bound."""
     count = len(estimate.theta)
-    labels.check(parameters=count)
     guess = estimate.initial_theta
     percent = np.where(estimate.guess_sizes > 0.0, estimate.guess_sizes, np.nan) / 100.0
     centre = (estimate.theta - guess) / percent
@@ -115,26 +115,26 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
 
     left, right = range_of_intervals(centre, low, high)
     margin = 0.06 * (max(right, 0.0) - min(left, 0.0))
-    rows = np.arange(float(count))
+    rows = np.arange(count)
     is_at_bound = np.array([name in estimate.at_bound for name in estimate.parameters])
     look = {"size": 6.5, "front": 3.0}
     marks = [
-        vline(0.0, NOMINAL.word, width=1.6, label=NOMINAL.word),
+        vline(0.0, NOMINAL, width=1.6, label=NOMINAL),
         intervals(
             centre - half,
             centre + half,
             rows,
-            IDENTIFIED.word,
+            IDENTIFIED,
             width=5.0,
             opacity=0.3,
             label="formal 95 %",
         ),
-        intervals(low, high, rows, IDENTIFIED.word, width=1.4),
+        intervals(low, high, rows, IDENTIFIED, width=1.4),
         dots(
             centre[~is_at_bound],
             rows[~is_at_bound],
-            IDENTIFIED.word,
-            label=f"{IDENTIFIED.word}, 95 % interval",
+            IDENTIFIED,
+            label=f"{IDENTIFIED}, 95 % interval",
             **look,
         ),
     ]
@@ -142,7 +142,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
         at = dots(
             centre[is_at_bound],
             rows[is_at_bound],
-            IDENTIFIED.word,
+            IDENTIFIED,
             symbol="s",
             hollow=True,
             label="at its bound",
@@ -166,7 +166,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     panel = Panel(
         marks=marks,
         x=Axis(
-            label=f"difference from the {NOMINAL.word} value [%]",
+            label=f"difference from the {NOMINAL} value [%]",
             limits=(min(left, -margin), max(right, margin)),
         ),
         y=row_axis([labels.parameter(j) for j in range(count)]),
@@ -185,15 +185,14 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
     half_width = np.inf
     if np.isfinite(estimate.std[j]):
         half_width = 0.5 * float(np.ptp(estimate.interval[j]))
-    guess = without_zeros(format_number(float(estimate.initial_theta[j]), 4))
-    value = format_with_uncertainty(float(estimate.theta[j]), half_width)
+    guess = without_zeros(format_number(estimate.initial_theta[j], 4))
+    value = format_with_uncertainty(estimate.theta[j], half_width)
     text = f"{guess} → {value} {unit}".rstrip()
     return f"{text}   (at its bound)" if estimate.parameters[j] in estimate.at_bound else text
 
 
 def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
     """Show the parameters over the iterations of the search over all data."""
-    labels.check(parameters=len(estimate.theta))
     with np.errstate(invalid="ignore", divide="ignore"):
         change = np.ptp(estimate.trace, axis=0) / np.ptp(estimate.interval, axis=1)
     order = np.argsort(-np.nan_to_num(change, posinf=0.0), kind="stable")
@@ -201,11 +200,11 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
     for j in np.sort(order[:MAX_PARAMETERS]).tolist():
         values = np.append(estimate.trace[1:, j], estimate.theta[j])
         marks = [
-            hline(float(estimate.trace[0, j]), NOMINAL.word, label=NOMINAL.word),
+            hline(estimate.trace[0, j], NOMINAL, label=NOMINAL),
             line(
                 np.arange(len(values)),
                 values,
-                IDENTIFIED.word,
+                IDENTIFIED,
                 symbol="o",
                 size=3.0,
                 label="estimate so far",
@@ -214,7 +213,7 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
         low, high = estimate.interval[j]
         if np.isfinite(low) and np.isfinite(high):
             label = "95 % interval of the result"
-            marks.append(hspan(low, high, IDENTIFIED.word, opacity=0.15, label=label))
+            marks.append(hspan(low, high, IDENTIFIED, opacity=0.15, label=label))
         panels.append(
             Panel(
                 title=labels.parameter(j),
@@ -223,22 +222,17 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
                 y=Axis(most=4),
             )
         )
-    columns = min(4, len(panels))
     note = (
         "0: begin of the search over all data, after short searches for a start. The last point is "
         "the identified value."
     )
-    if len(panels) < len(estimate.theta):
-        note += (
-            f" Shown: {len(panels)} of {len(estimate.theta)} parameters, those that changed most "
-            "over the width of their interval."
-        )
-    return Picture(
-        title="Parameters over the iterations of the fit",
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[1.5] * -(-len(panels) // columns),
-        widths=[1.0] * columns,
+    which = "parameters, those that changed most over the width of their interval"
+    return grid(
+        "Parameters over the iterations of the fit",
+        panels,
+        [1.5] * len(panels),
+        min(4, len(panels)),
+        note + share_note(panels, estimate.theta, which),
     )
 
 
@@ -260,11 +254,11 @@ def fit(estimate: Estimate, index: int, labels: Labels) -> Picture:
         recording,
         estimate.predicted[index],
         estimate.nominal[index] if estimate.nominal else None,
-        np.array([estimate.sigma[name] for name in recording.outputs]),
+        estimate,
         labels,
         title=f"Fit to {_file_name(recording.name)}",
         note=note,
-        boundaries=estimate.segments[index][1:] if estimate.segments else np.zeros(0),
+        boundaries=estimate.segments[index][1:] if estimate.segments else (),
     )
 
 
@@ -282,17 +276,15 @@ def held_out(estimate: Estimate, index: int, labels: Labels) -> Picture:
         recording,
         prediction.identified_outputs,
         prediction.nominal_outputs,
-        np.array([estimate.sigma.get(name, np.nan) for name in recording.outputs]),
+        estimate,
         labels,
         title=f"Prediction of {_file_name(recording.name)}, held out",
         note=note,
-        boundaries=np.zeros(0),
         is_prediction=True,
     )
 
 
 def _file_name(name: str, width: int = NAME_WIDTH) -> str:
-    """Return the short name of a recording."""
     return shorten(Path(name).name, width)
 
 
@@ -300,18 +292,19 @@ def _over_time(
     recording: Recording,
     identified: Array,
     nominal: Array | None,
-    sigma: Array,
+    estimate: Estimate,
     labels: Labels,
     *,
     title: str,
     note: str,
-    boundaries: Array,
+    boundaries: Sequence[float] | Array = (),
     is_prediction: bool = False,
 ) -> Picture:
     """Show a row per output: the curves over time, and their errors."""
+    sigma = np.array([estimate.sigma.get(name, np.nan) for name in recording.outputs])
     columns = shown_outputs([recording.y], [identified], sigma, MAX_OUTPUTS)
     rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
-    size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
+    size = np.clip(900.0 / len(rows), 1.5, 4.0)
     t = recording.t[rows]
     panels = []
     for place, j in enumerate(columns):
@@ -320,16 +313,16 @@ def _over_time(
         label = labels.output(recording.outputs[j])
         time = Axis(label="time [s]" if place == len(columns) - 1 else "")
         marks = [
-            dots(t, y, MEASURED.word, symbol=".", size=size, label="measured"),
-            line(t, model, IDENTIFIED.word, width=1.2, label="identified model"),
+            dots(t, y, MEASURED, symbol=".", size=size, label="measured"),
+            line(t, model, IDENTIFIED, width=1.2, label="identified model"),
         ]
         if guess is not None:
-            marks.append(line(t, guess, NOMINAL.word, width=0.8, front=1.5, label="nominal model"))
+            marks.append(line(t, guess, NOMINAL, width=0.8, front=1.5, label="nominal model"))
         if 0 < len(boundaries) <= MAX_BOUNDARIES:
             look = {"width": 0.6, "dash": "--", "opacity": 0.6, "label": "begin of a segment"}
-            marks += [vline(float(begin), "muted", **look) for begin in boundaries]
+            marks += [vline(begin, "muted", **look) for begin in boundaries]
         shown = Axis(most=4, limits=_visible_range(np.concatenate([y, model]), guess))
-        panels.append(Panel(title=label, marks=marks, x=time, y=shown, place=(place, 0)))
+        panels.append(Panel(title=label, marks=marks, x=time, y=shown))
 
         errors, remark = _errors(
             t, y, model, guess, float(sigma[j]), is_prediction=is_prediction, size=size
@@ -344,7 +337,6 @@ def _over_time(
                 x=time,
                 y=unit,
                 message=message,
-                place=(place, 1),
             )
         )
     if len(columns) < len(recording.outputs):
@@ -354,6 +346,7 @@ def _over_time(
         )
     heights = [1.2] * len(columns)
     heights[-1] += 0.2
+    panels = in_grid(panels, 2)
     return Picture(title=title, panels=panels, note=note, heights=heights, widths=[1.4, 1.0])
 
 
@@ -388,17 +381,17 @@ def _errors(
     if np.isfinite(sigma):
         marks.append(hspan(-2.0 * sigma, 2.0 * sigma, opacity=0.8, label="±2σ of the noise"))
     residual = y - identified
-    role = IDENTIFIED.word if is_prediction else MEASURED.word
+    role = IDENTIFIED if is_prediction else MEASURED
     marks.append(dots(t, residual, role, symbol=".", size=size, front=2.5))
     if is_prediction and nominal is not None:
-        marks.append(dots(t, y - nominal, NOMINAL.word, symbol=".", size=0.7 * size))
+        marks.append(dots(t, y - nominal, NOMINAL, symbol=".", size=0.7 * size))
     known = residual[np.isfinite(residual)]
     if not known.size:
         return marks, ""
     words = "error" if is_prediction else "residual"
     if np.isfinite(sigma):
-        relative_rms = float(np.sqrt(np.mean(known**2))) / sigma
-        outside = 100.0 * float(np.mean(np.abs(known) > 2.0 * sigma))
+        relative_rms = np.sqrt(np.mean(known**2)) / sigma
+        outside = 100.0 * np.mean(np.abs(known) > 2.0 * sigma)
         words += f": rms / σ = {relative_rms:.2f},  {outside:.1f} % outside"
     return marks, words
 
@@ -428,13 +421,7 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Picture:
         "Smoothed by Welch's method; samples count as evenly spaced. A band above the line at low "
         "frequencies: the model lacks a slow effect. p(white): p-value of a test for white noise."
     )
-    return Picture(
-        title="Spectra of the residuals",
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[1.9] * -(-len(panels) // columns),
-        widths=[1.0] * columns,
-    )
+    return grid("Spectra of the residuals", panels, [1.9] * len(panels), columns, note)
 
 
 def _spectrum_panel(estimate: Estimate, column: int, name: str) -> Panel:
@@ -448,14 +435,16 @@ def _spectrum_panel(estimate: Estimate, column: int, name: str) -> Panel:
     f, density, freedom = _smoothed_density(estimate, column, sigma)
     if not freedom or not (density > 0.0).any():
         return Panel(title=name, remark=remark, message="not measured")
-    low, high = (freedom / value for value in chi_squared_quantiles((0.975, 0.025), freedom))
+    # Quantiles of a chi-squared distribution; scipy.stats takes long to import.
+    quantiles = 2.0 * scipy.special.gammaincinv(0.5 * freedom, np.array([0.975, 0.025]))
+    low, high = freedom / quantiles
     label = "its 95 % confidence band"
     return Panel(
         title=name,
         remark=remark,
         marks=[
-            line(f, density, MEASURED.word, label="residual"),
-            area(f, low * density, high * density, MEASURED.word, label=label),
+            line(f, density, MEASURED, label="residual"),
+            area(f, low * density, high * density, MEASURED, label=label),
             hline(1.0, width=0.8, label="white noise of the assumed σ"),
         ],
         x=Axis(label="frequency [Hz]", log=True),
@@ -485,7 +474,7 @@ def _smoothed_density(estimate: Estimate, column: int, sigma: float) -> tuple[Ar
     wanted = 2 * sum(map(len, parts)) // (SEGMENTS + 1)
     length = min(int(np.clip(wanted, SHORTEST_SEGMENT, LONGEST_SEGMENT)), *map(len, parts))
     weights = [max(2 * len(part) // length - 1, 1) for part in parts]
-    densities = [power_density(part, float(np.mean(rates)), length) for part in parts]
+    densities = [power_density(part, np.mean(rates), length) for part in parts]
     frequencies = densities[0][0]
     mean = np.average([density for _, density in densities], axis=0, weights=weights)
     count = sum(weights)
@@ -528,7 +517,7 @@ def predictions(estimate: Estimate, labels: Labels) -> Picture:
             ratio = error / nominal if nominal > 0.0 else np.nan
             texts.append(f"{size}  (× {format_number(ratio, 2)})")
     nominal, identified = np.array(errors).T
-    rows = np.arange(float(len(names)))
+    rows = np.arange(len(names))
     is_row = np.isfinite(nominal)
     panel = Panel(
         marks=[
@@ -540,9 +529,9 @@ def predictions(estimate: Estimate, labels: Labels) -> Picture:
                 other=identified[is_row],
                 width=3.0,
             ),
-            dots(nominal, rows, NOMINAL.word, size=6.0, label="nominal model"),
-            dots(identified, rows, IDENTIFIED.word, size=6.0, label="identified model"),
-            vline(1.0, MEASURED.word, width=1.2, dash="--", label="σ of the noise"),
+            dots(nominal, rows, NOMINAL, size=6.0, label="nominal model"),
+            dots(identified, rows, IDENTIFIED, size=6.0, label="identified model"),
+            vline(1.0, MEASURED, width=1.2, dash="--", label="σ of the noise"),
         ],
         x=Axis(
             label="rms prediction error / σ of the noise [–]",
@@ -588,8 +577,8 @@ def inverse_dynamics(fit: InverseDynamicsFit) -> Picture:
         t, measured, explained = _with_gaps(each)
         share = f"{100.0 * each.share:.2g} %" if np.isfinite(each.share) else "no force"
         marks = [
-            line(t, measured, MEASURED.word, width=1.8, label="measured, or by the model"),
-            line(t, explained, IDENTIFIED.word, width=0.9, label="needed by the measured motion"),
+            line(t, measured, MEASURED, width=1.8, label="measured, or by the model"),
+            line(t, explained, IDENTIFIED, width=0.9, label="needed by the measured motion"),
         ]
         panels.append(
             Panel(
@@ -618,7 +607,7 @@ def inverse_dynamics(fit: InverseDynamicsFit) -> Picture:
 def _with_gaps(each: EquationFit) -> tuple[Array, Array, Array]:
     """Return times and forces, with NaN where averages are missing."""
     steps = np.diff(each.t)
-    usual = float(np.median(steps)) if len(steps) else 0.0
+    usual = np.median(steps) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > GAP * usual) + 1
     return (
         np.insert(each.t, gaps, each.t[gaps]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from mjfim.output.panels import (
     Panel,
     Picture,
     area,
+    blank_rows,
     dots,
+    grid,
     hline,
-    in_grid,
     intervals,
     line,
     mark,
@@ -25,7 +27,7 @@ from mjfim.output.panels import (
     vline,
     vspan,
 )
-from mjfim.output.words import as_sentence, format_number, normal_density, shorten
+from mjfim.output.words import format_number, normal_density, share_note, shorten
 from mjfim.records.estimate import Estimate, HorizonStudy
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Decision, SelectionStep
@@ -40,7 +42,7 @@ MAX_PAIRED, MAX_COMPARED, MAX_RECORDINGS = 6, 9, 24
 LARGEST_DRAWN_RATIO, MAX_NAMED = 1.5, 20
 
 # Dashes and symbols of the curves of the lengths that were not chosen.
-DASHES, SYMBOLS = (":", "--", "-.", (0, (8, 2)), (0, (1, 4))), ("s", "^", "D", "v", "P")
+DASHES, SYMBOLS = (":", "--", "-."), ("s", "^", "D", "v")
 
 # Half the range of an axis of pairs, places of its ticks, and standard deviations of the ellipses
 # with their opacities [standard deviations].
@@ -73,7 +75,7 @@ def selection(estimate: Estimate) -> Picture:
         line(
             [step.error for step in phase],
             [row_of[id(step)] for step in phase],
-            IDENTIFIED.word,
+            IDENTIFIED,
             symbol="o",
             size=6.0,
             label="model of this step",
@@ -114,7 +116,6 @@ def selection(estimate: Estimate) -> Picture:
 
 
 def _step_name(step: SelectionStep | None) -> str:
-    """Return the name of a step of the selection."""
     if step is None:
         return "no further term"
     if step.decision is Decision.BEGUN:
@@ -137,10 +138,8 @@ def horizons(estimate: Estimate) -> Picture:
 
     lengths = study.lengths
     axis = Axis(log=True, limits=(lengths[0] / 1.6, lengths[-1] * 1.6))
-    last = Axis(
-        label="time over which is predicted, and length of the fitted segments [s]",
-        log=True,
-        limits=axis.limits,
+    last = replace(
+        axis, label="time over which is predicted, and length of the fitted segments [s]"
     )
     errors = Panel(
         marks=[_curve_of_length(study, i) for i in range(len(lengths))],
@@ -162,7 +161,7 @@ def horizons(estimate: Estimate) -> Picture:
     )
     heights = [2.6, *[0.9] * len(panels)]
     heights[-1] += 0.3
-    return Picture(title=title, panels=in_grid([errors, *panels], 1), note=note, heights=heights)
+    return grid(title, [errors, *panels], heights, 1, note)
 
 
 def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
@@ -170,17 +169,17 @@ def _curve_of_length(study: HorizonStudy, i: int) -> Mark:
     name, errors = study.name_of(i), study.errors[i]
     if i == study.chosen:
         look = {"width": 2.2, "symbol": "o", "size": 5.0, "front": 3.0}
-        return line(study.lengths, errors, IDENTIFIED.word, label=f"{name}, chosen", **look)
-    k = i % len(DASHES)
-    look = {"width": 1.1, "dash": DASHES[k], "symbol": SYMBOLS[k], "size": 4.5}
+        return line(study.lengths, errors, IDENTIFIED, label=f"{name}, chosen", **look)
+    dash, symbol = DASHES[i % len(DASHES)], SYMBOLS[i % len(SYMBOLS)]
+    look = {"width": 1.1, "dash": dash, "symbol": symbol, "size": 4.5}
     return line(study.lengths, errors, "muted", label=name, **look)
 
 
 def _estimates_by_length(study: HorizonStudy, j: int, axis: Axis) -> Panel:
     """Return the estimates of one parameter with their intervals."""
-    marks = [hline(float(study.theta[study.chosen, j]), IDENTIFIED.word, width=0.6)]
+    marks = [hline(study.theta[study.chosen, j], IDENTIFIED, width=0.6)]
     for i, length in enumerate(study.lengths.tolist()):
-        role = IDENTIFIED.word if i == study.chosen else "muted"
+        role = IDENTIFIED if i == study.chosen else "muted"
         value, half = float(study.theta[i, j]), float(np.nan_to_num(study.half_widths[i, j]))
         marks += [
             line([length] * 2, [value - half, value + half], role, symbol="_", size=6.0),
@@ -215,24 +214,11 @@ def recordings(estimate: Estimate) -> Picture:
     if np.isfinite(comparison.prediction).any():
         note += " Another recording: 95 % interval of what it would suggest."
     if estimate.misfit:
-        note += " " + as_sentence(
-            "the model does not explain the recordings, and its error can make them differ"
-        )
-    if len(shown) < len(comparison.parameters):
-        note += (
-            f" Shown: {len(shown)} of {len(comparison.parameters)} parameters, those that differ "
-            "most."
-        )
-    if len(rows) < count:
-        note += f" Shown: {len(rows)} of {count} recordings."
+        note += " The model does not explain the recordings, and its error can make them differ."
+    note += share_note(shown, comparison.parameters, "parameters, those that differ most")
+    note += share_note(rows, comparison.recordings, "recordings")
     height = 0.95 + 0.2 * (len(rows) + 1)
-    return Picture(
-        title=title,
-        panels=in_grid(panels, columns),
-        note=note,
-        heights=[height] * -(-len(panels) // columns),
-        widths=[1.0] * columns,
-    )
+    return grid(title, panels, [height] * len(panels), columns, note)
 
 
 def _recordings_panel(
@@ -246,11 +232,11 @@ def _recordings_panel(
         low, high = comparison.interval[j]
         label = "95 % interval of the mean"
         marks = [
-            vspan(low, high, IDENTIFIED.word, opacity=0.2, label=label),
-            vline(mean, IDENTIFIED.word, width=1.2, label="mean"),
+            vspan(low, high, IDENTIFIED, opacity=0.2, label=label),
+            vline(mean, IDENTIFIED, width=1.2, label="mean"),
         ]
     for row, k in enumerate(rows):
-        role = DESIGNED.word if k in odd else MEASURED.word
+        role = DESIGNED if k in odd else MEASURED
         label = "odd recording" if k in odd else "one recording, 95 % interval"
         marks += [
             intervals(value[[k]] - half[[k]], value[[k]] + half[[k]], [row], role),
@@ -262,10 +248,10 @@ def _recordings_panel(
         names.append("another one")
         marks.append(intervals([begin], [end], [len(rows)], "muted", width=3.0))
     limits = range_of_intervals(value, value - half, value + half)
-    roles = [DESIGNED.word if k in odd else "text" for k in rows]
+    roles = [DESIGNED if k in odd else "text" for k in rows]
     shown = row_axis([shorten(name, 16) for name in names], roles)
     if not is_left:
-        shown = Axis(ticks=[], limits=shown.limits)
+        shown = blank_rows(len(names))
     label = with_unit(comparison.parameters[j], comparison.units[j])
     return Panel(marks=marks, x=Axis(label=label, limits=limits, most=3), y=shown)
 
@@ -314,7 +300,7 @@ def pairs(
         """Mark the nominal values of a panel, if they lie in it."""
         if max(abs(across), abs(up)) > RANGE:
             return []
-        return [dots([across], [up], NOMINAL.word, symbol="x", size=5.0, label=NOMINAL.word)]
+        return [dots([across], [up], NOMINAL, symbol="x", size=5.0, label=NOMINAL)]
 
     def density(j: int) -> list[Mark]:
         """Draw the normal density of one parameter."""
@@ -342,8 +328,6 @@ def pairs(
         texts = _distinct(ticks)
         return Axis(ticks=[-TICK, TICK], names=texts, limits=(-RANGE, RANGE))
 
-    if len(shown) < len(names):
-        note += _share_note(len(shown), len(names))
     keys = [
         line([], [], role, width=7.0, opacity=opacity + 0.1, label=f"{size:g} σ")
         for size, opacity in reversed(ELLIPSES)
@@ -358,7 +342,7 @@ def estimate_pairs(estimate: Estimate) -> Picture:
         estimate.units,
         estimate.theta,
         estimate.covariance,
-        IDENTIFIED.word,
+        IDENTIFIED,
         guess=estimate.initial_theta,
         title="Joint uncertainty of the identified parameters",
         note="Formal uncertainty: it is right only if the model and the noise are right.",
@@ -386,18 +370,18 @@ def samples(estimate: Estimate) -> Picture:
                 "columns",
                 edges,
                 counts / counts.max(),
-                MEASURED.word,
+                MEASURED,
                 opacity=0.6,
                 label="drawn robots",
             ),
-            vline(float(draws.centre[j]), IDENTIFIED.word, width=1.4, label=IDENTIFIED.word),
+            vline(draws.centre[j], IDENTIFIED, width=1.4, label=IDENTIFIED),
         ]
 
     def scatter(j: int, i: int) -> list[Mark]:
         """Draw parameter j across and i up."""
         return [
-            dots(robots[:, j], robots[:, i], MEASURED.word, symbol=".", size=2.5, opacity=0.6),
-            dots(draws.centre[[j]], draws.centre[[i]], IDENTIFIED.word),
+            dots(robots[:, j], robots[:, i], MEASURED, symbol=".", size=2.5, opacity=0.6),
+            dots(draws.centre[[j]], draws.centre[[i]], IDENTIFIED),
         ]
 
     def axis(j: int) -> Axis:
@@ -411,8 +395,6 @@ def samples(estimate: Estimate) -> Picture:
     )
     if estimate.misfit:
         note += " It does not cover the error of a model that does not explain the recordings."
-    if len(shown) < len(draws.parameters):
-        note += _share_note(len(shown), len(draws.parameters))
     if len(shown) > 1 and len(draws) > MAX_DOTS:
         note += f" The panels of pairs show {MAX_DOTS} robots."
     title = f"{len(draws)} drawn {'robot' if len(draws) == 1 else 'robots'}"
@@ -434,6 +416,7 @@ def _corner(
     keys: Sequence[Mark] = (),
 ) -> Picture:
     """Show a panel for each parameter, and below the diagonal one for each pair."""
+    which = "parameters, those with the largest correlations"
     panels = []
     for row, i in enumerate(shown):
         for column, j in enumerate(shown[: row + 1]):
@@ -453,7 +436,7 @@ def _corner(
     return Picture(
         title=title,
         panels=panels,
-        note=note,
+        note=note + share_note(shown, names, which),
         heights=heights,
         widths=[1.0] * len(shown),
         keys=keys,
@@ -463,13 +446,7 @@ def _corner(
 def _outer(axis: Axis, name: str, unit: str, is_outer: bool) -> Axis:
     """Return an axis that has words only at the edge of the picture."""
     label = f"{shorten(name, 14)}\n[{unit}]" if unit else shorten(name, 14)
-    return Axis(
-        label=label if is_outer else "",
-        ticks=axis.ticks,
-        names=axis.names if is_outer else None,
-        limits=axis.limits,
-        hidden=not is_outer,
-    )
+    return replace(axis, label=label) if is_outer else replace(axis, names=None, hidden=True)
 
 
 def _most_correlated(correlation: Array) -> list[int]:
@@ -485,9 +462,4 @@ def _distinct(numbers: Array) -> list[str]:
     spread = float(np.ptp(numbers)) or 1.0
     largest = float(np.abs(numbers).max()) or 1.0
     digits = int(np.clip(np.ceil(np.log10(largest / spread)) + 2, 2, 9))
-    return [format_number(float(number), digits) for number in numbers]
-
-
-def _share_note(shown: int, count: int) -> str:
-    """Say that only some parameters are shown."""
-    return f" Shown: {shown} of {count} parameters, those with the largest correlations."
+    return [format_number(number, digits) for number in numbers]

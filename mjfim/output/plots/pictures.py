@@ -25,7 +25,7 @@ from mjfim.output.panels import Picture
 from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
 from mjfim.output.plots import estimate_studies, studies
-from mjfim.output.words import CampaignParameters, complete_labels
+from mjfim.output.words import complete_labels
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -69,24 +69,14 @@ ESTIMATE_PICTURES = (
 Pictures = dict[str, Callable[[], Picture]]
 
 
-def fit_names(count: int) -> tuple[str, ...]:
-    """Return the names of the pictures of the fits of `count` recordings."""
-    return _numbered("fit", count)
-
-
-def held_out_names(count: int) -> tuple[str, ...]:
-    """Return the names of the pictures of the predictions of `count` held-out recordings."""
-    return _numbered("held_out", count)
-
-
 def histogram_name(parameter: str) -> str:
     """Return the name of the histogram of a parameter."""
     safe_name = re.sub(r"[^\w.-]", "_", parameter)
     return f"histogram_{safe_name}"
 
 
-def _numbered(name: str, count: int) -> tuple[str, ...]:
-    """Return names with numbers; a single one has none."""
+def numbered(name: str, count: int) -> tuple[str, ...]:
+    """Return the names of pictures, one for each recording; a single one has no number."""
     return (name,) if count == 1 else tuple(f"{name}_{i + 1}" for i in range(count))
 
 
@@ -137,7 +127,6 @@ def pictures_of(record: ShownRecord) -> Pictures:
 
 @pictures_of.register
 def _(design: Design) -> Pictures:
-    """The pictures of a design."""
     labels = complete_labels(design)
     pictures: Pictures = {
         "trajectories": partial(of_design.trajectories, design, labels),
@@ -154,16 +143,15 @@ def _(design: Design) -> Pictures:
 
 @pictures_of.register
 def _(estimate: Estimate) -> Pictures:
-    """The pictures of an estimate; those of studies only where it has them."""
     labels = complete_labels(estimate)
     held = sum(prediction.recording is not None for prediction in estimate.predictions)
     fits = {
         name: partial(of_estimate.fit, estimate, i, labels)
-        for i, name in enumerate(fit_names(len(estimate.recordings)))
+        for i, name in enumerate(numbered("fit", len(estimate.recordings)))
     }
     held_out = {
         name: partial(of_estimate.held_out, estimate, i, labels)
-        for i, name in enumerate(held_out_names(held))
+        for i, name in enumerate(numbered("held_out", held))
     }
     forces = estimate.inverse_dynamics
     optional: dict[str, tuple[bool, Callable[[], Picture]]] = {
@@ -205,13 +193,11 @@ def _(estimate: Estimate) -> Pictures:
 
 @pictures_of.register
 def _(result: InverseDynamicsFit) -> Pictures:
-    """The picture of a fit to the equation of motion."""
     return {"inverse_dynamics": partial(of_estimate.inverse_dynamics, result)}
 
 
 @pictures_of.register
 def _(study: MonteCarloStudy) -> Pictures:
-    """The pictures of a Monte Carlo study."""
     labels = complete_labels(study)
     return {
         "overview": partial(studies.overview, study, labels),
@@ -224,7 +210,6 @@ def _(study: MonteCarloStudy) -> Pictures:
 
 @pictures_of.register
 def _(check: Check) -> Pictures:
-    """The pictures of a check."""
     pictures: Pictures = {"check": partial(studies.check, check)}
     if check.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, check.rehearsal)
@@ -235,7 +220,6 @@ def _(check: Check) -> Pictures:
 
 @pictures_of.register
 def _(comparison: Comparison) -> Pictures:
-    """The picture of a comparison."""
     return {"compare": partial(studies.compare, comparison)}
 
 
@@ -247,17 +231,13 @@ def _(comparison: RobotComparison) -> Pictures:
 
 @pictures_of.register
 def _(result: Rehearsal) -> Pictures:
-    """The picture of a rehearsal."""
     return {"rehearsal": partial(studies.rehearsal, result)}
 
 
 @pictures_of.register
 def _(campaign: Campaign) -> Pictures:
     """The picture of a campaign; none before its first round."""
-    if not campaign.rounds:
-        return {}
-    parameters = CampaignParameters.recorded(campaign)
-    return {"campaign": partial(studies.campaign, campaign, parameters)}
+    return {"campaign": partial(studies.campaign, campaign)} if campaign.rounds else {}
 
 
 # Messages for developers, which a user does not see.
@@ -317,7 +297,6 @@ def begin_pictures(
             future = pool.submit(_contents, record, picture_format)
 
     def contents() -> dict[str, bytes]:
-        """Wait for the pictures."""
         if future is None:
             return {}
         fault = future.exception()
@@ -338,7 +317,6 @@ def _import_what_draws() -> None:
 
 
 def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
-    """Draw all pictures of a record."""
     from mjfim.output.plots.draw import content
 
     return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}

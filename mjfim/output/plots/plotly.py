@@ -215,7 +215,6 @@ def _points(mark: Mark, colour: str, limit: int) -> Plotly:
 
 
 def _heatmap(cells: Cells) -> Plotly:
-    """Coloured cells with their words."""
     values = cells.values - cells.middle
     trace: Plotly = {
         "type": "heatmap",
@@ -248,27 +247,26 @@ def _layout(panel: Panel, label: str) -> Plotly:
     rows = panel.y
     if panel.cells is not None and not rows.names:
         rows = replace(panel.x, limits=(len(panel.cells.values) - 0.5, -0.5))
+    annotations, right = _words_beside(panel)
     layout: Plotly = {
         "xaxis": _axis(panel.x, label),
         "yaxis": _axis(rows, rows.label if panel.title else ""),
         "shapes": [shape for mark in panel.marks for shape in _shapes(mark)],
-        "annotations": _words_beside(panel),
+        "annotations": annotations,
         "barmode": "overlay",
         "bargap": 0,
     }
     if panel.message:
         place = {"xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5, "showarrow": False}
-        layout["annotations"].append({**place, "text": escape(panel.message)})
+        annotations.append({**place, "text": escape(panel.message)})
     if panel.y.names is not None or panel.cells is not None:
         layout["hovermode"] = "closest"
-    right = sum(LETTER * _letters(heading, texts) for heading, _, texts in panel.beside)
-    if right:
-        layout["margin"] = {"r": int(right) + 14, "t": 24}
+    if panel.beside:
+        layout["margin"] = {"r": int(right) + 6, "t": 24}
     return layout
 
 
 def _axis(axis: Axis, label: str) -> Plotly:
-    """An axis of a plot."""
     shown: Plotly = {"title": {"text": escape(label)}} if label else {}
     if axis.limits is not None:
         ends = np.log10(axis.limits) if axis.log else np.asarray(axis.limits)
@@ -306,8 +304,8 @@ def _shapes(mark: Mark) -> list[Plotly]:
     return [{"type": "line", **place, "line": line}]
 
 
-def _words_beside(panel: Panel) -> list[Plotly]:
-    """The columns of words right of the rows."""
+def _words_beside(panel: Panel) -> tuple[list[Plotly], float]:
+    """The columns of words right of the rows, and where they end [CSS pixels]."""
     found, right = [], 8.0
     place: Plotly = {"xref": "paper", "x": 1.0, "xanchor": "left", "showarrow": False}
     for heading, role, texts in panel.beside:
@@ -315,13 +313,8 @@ def _words_beside(panel: Panel) -> list[Plotly]:
         top = {"yref": "paper", "y": 1.0, "yanchor": "bottom"}
         found.append({**look, **top, "text": escape(heading)})
         found += [{**look, "y": row, "text": escape(text)} for row, text in enumerate(texts)]
-        right += LETTER * _letters(heading, texts)
-    return found
-
-
-def _letters(heading: str, texts: Sequence[str]) -> int:
-    """Number of letters of a column of words, with a gap."""
-    return 2 + max(map(len, (heading, *texts)))
+        right += LETTER * (2 + max(map(len, (heading, *texts))))
+    return found, right
 
 
 # ---- numbers

@@ -17,6 +17,8 @@ from mjfim.output.page import (
     MEASURED,
     OTHER,
     TRAJECTORY_TERMS,
+    as_sentence,
+    shown_word,
 )
 from mjfim.output.pages.studies import budget_in_words
 from mjfim.output.panels import (
@@ -27,9 +29,12 @@ from mjfim.output.panels import (
     Picture,
     around,
     bars,
+    blank_rows,
     dots,
+    grid,
     hline,
     hspan,
+    in_grid,
     intervals,
     line,
     mark,
@@ -41,13 +46,12 @@ from mjfim.output.panels import (
 from mjfim.output.plots.estimate_studies import pairs
 from mjfim.output.words import (
     BEST_CASE,
-    CampaignParameters,
-    as_sentence,
     format_number,
     format_percent,
     format_with_uncertainty,
     normal_density,
     quotient_unit,
+    share_note,
     shorten,
     squared_unit,
     without_zeros,
@@ -64,21 +68,6 @@ from mjfim.records.studies import (
     TrialStatistics,
 )
 from mjfim.records.trajectory import Labels, with_unit
-
-# What a picture says of it.
-SCALE_IN_WORDS = "strength of the colour: root of its size"
-
-
-def colour_strength(correlation: Array) -> Array:
-    """Return how strong the colour of each correlation is: the root of its size, with its sign.
-
-    Most correlations of a good experiment are small, and would be as pale as 0 otherwise.
-
-    Args:
-        correlation: Correlations of any shape, -1 to 1; NaN stays.
-    """
-    return np.asarray(np.sign(correlation) * np.sqrt(np.abs(correlation)))
-
 
 # Largest numbers of parameters of a Monte Carlo study, of two robots and of a campaign; of more,
 # those that say most are drawn.
@@ -114,7 +103,7 @@ def check(result: Check) -> Picture:
     shares = [c.std_final / abs(c.value) if c.value else np.nan for c in combined]
     percent = 100.0 * np.array([*(row.relative for row in rows), *shares])
     wanted = 100.0 * np.array([row.wanted / row.size for row in rows])
-    places = np.arange(float(len(percent)))
+    places = np.arange(len(percent))
     known = np.isfinite(percent) & (percent > 0.0)
     is_alone = np.array([np.isfinite(row.std) for row in rows] + [True] * len(combined))
     is_single = places < len(rows)
@@ -126,16 +115,15 @@ def check(result: Check) -> Picture:
         (known & is_single, {"label": label}),
         (known & ~is_single, {"opacity": 0.45, "label": "identifiable combination"}),
     ]
-    begin = np.full(len(places), low)
     marks = [
-        bars(percent[chosen], places[chosen], role, left=begin[chosen], **look)
+        bars(percent[chosen], places[chosen], role, left=low, **look)
         for chosen, look in kinds
         if chosen.any()
     ]
     if not is_alone.all():
-        end = np.full(len(places), high)[~is_alone]
+        rest = places[~is_alone]
         look = {"hollow": True, "label": "not identifiable alone"}
-        marks.append(bars(end, places[~is_alone], "muted", left=begin[~is_alone], **look))
+        marks.append(bars(np.full(len(rest), high), rest, "muted", left=low, **look))
 
     # A light mark below the dark one can be seen on a bar.
     at = {"symbol": "|", "size": 10.0}
@@ -175,8 +163,8 @@ def check(result: Check) -> Picture:
 def source_role(result: Check) -> str:
     """Return the role of the motion that was checked."""
     if "recording" in result.source:
-        return MEASURED.word
-    return DESIGNED.word if "design" in result.source else INITIAL.word
+        return MEASURED
+    return DESIGNED if "design" in result.source else INITIAL
 
 
 def duration(result: Check) -> str:
@@ -205,17 +193,19 @@ def _correlations(result: Check, rows: int) -> Panel:
         marks = [dots(across, up, "white", size=3.0)]
     sign = "bold" if texts else "dot"
     remark = (
-        f"correlation (red: positive, blue: negative); {SCALE_IN_WORDS}; {sign}: beyond "
-        f"±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
+        "correlation (red: positive, blue: negative); strength of the colour: root of its size; "
+        f"{sign}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
     )
     if np.isnan(correlation).any():
         remark += "; grey: not identifiable alone"
-    cells = Cells(values=colour_strength(correlation), texts=texts, is_bold=confounded)
+    # Most correlations of a good experiment are small, and would be as pale as 0 without the root.
+    strength = np.sign(correlation) * np.sqrt(np.abs(correlation))
+    cells = Cells(values=strength, texts=texts, is_bold=confounded)
     return Panel(
         cells=cells,
         marks=marks,
         x=Axis(ticks=range(count), names=result.wanted),
-        y=Axis(ticks=[], limits=(rows - 0.5, -0.5)),
+        y=blank_rows(rows),
         remark=remark,
         place=(0, 1),
     )
@@ -273,16 +263,15 @@ def compare(comparison: Comparison) -> Picture:
             _worst_combinations(comparison, rows, roles, has_margins=has_margins),
         ],
         note=note.strip(),
-        heights=[float(np.clip(1.2 + 0.36 * len(rows), 2.2, 11.0))],
-        widths=[float(np.clip(0.55 * len(names), 2.2, 9.0)), 3.6],
+        heights=[np.clip(1.2 + 0.36 * len(rows), 2.2, 11.0)],
+        widths=[np.clip(0.55 * len(names), 2.2, 9.0), 3.6],
     )
 
 
 def _method_role(comparison: Comparison, row: MethodResult) -> str:
-    """Return the role of a method."""
     if row.method == DESIGN:
-        return DESIGNED.word
-    return OTHER.word if row in comparison.beating else INITIAL.word
+        return DESIGNED
+    return OTHER if row in comparison.beating else INITIAL
 
 
 def _ratios(
@@ -302,14 +291,13 @@ def _ratios(
         return Panel(message="no parameter is identifiable alone", y=methods)
 
     # White is the design's standard deviation; without one, it is the mean of what is shown.
-    middle, reach = 0.0, float(np.log(LARGEST_RATIO))
+    middle, reach = 0.0, np.log(LARGEST_RATIO)
     if not against_design:
         middle = float(np.nanmean(logarithms))
-        reach = max(2.0 * float(np.nanstd(logarithms)), 0.1)
+        reach = max(2.0 * np.nanstd(logarithms), 0.1)
     look: dict[str, Any] = {
         "texts": [
-            [format_number(float(ratio)) if np.isfinite(ratio) else "–" for ratio in row]
-            for row in ratios
+            [format_number(ratio) if np.isfinite(ratio) else "–" for ratio in row] for row in ratios
         ]
     }
     if len(names) > MAX_RATIOS:
@@ -330,7 +318,7 @@ def _worst_combinations(
     title = "σ of the worst combination"
     worst = np.array([row.worst_relative_std for row in rows])
     known = np.isfinite(worst)
-    places = Axis(ticks=[], limits=(len(rows) - 0.5, -0.5))
+    places = blank_rows(len(rows))
     if not known.any():
         return Panel(
             title=title, message="no method found a usable control", y=places, place=(0, 1)
@@ -342,10 +330,10 @@ def _worst_combinations(
         room = (high / low) ** (0.75 if has_margins else 0.45)
         axis = Axis(label=axis.label, limits=(low, high * room), log=True)
 
-    labels = {
-        DESIGNED.word: "design",
-        INITIAL.word: "baseline",
-        OTHER.word: "baseline that beats the design",
+    labels: dict[str, str] = {
+        DESIGNED: "design",
+        INITIAL: "baseline",
+        OTHER: "baseline that beats the design",
     }
     marks: list[Mark] = []
     for place, (row, role) in enumerate(zip(rows, roles, strict=True)):
@@ -361,7 +349,7 @@ def _worst_combinations(
             text = f"{format_percent(margin)} {kind.replace('_', ' ')}"
         end = [row.worst_relative_std]
         marks += [
-            bars(end, [place], role, left=[low], **look),
+            bars(end, [place], role, left=low, **look),
             words(end, [place], [f"{format_number(end[0])}   {text}"], "text"),
         ]
     return Panel(title=title, marks=marks, x=axis, y=places, place=(0, 1))
@@ -372,7 +360,6 @@ def _worst_combinations(
 
 def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
     """Show scatter, Cramér-Rao bound and efficiency of every parameter along each trajectory."""
-    labels.check(parameters=len(study.theta))
     smallest = np.min([trials.efficiency for trials in study.sets.values()], axis=0)
     order = np.argsort(np.nan_to_num(smallest, nan=np.inf), kind="stable")
     shown = np.sort(order[:MAX_STUDIED])
@@ -407,18 +394,13 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
         f"Simulated recordings of the model with noise of the stated σ, at {study.measure_rate:g} "
         "Hz. Efficiency with its 95 % interval; 1: the bound is reached."
     )
-    if len(shown) < len(study.theta):
-        note += (
-            f" Shown: {len(shown)} of {len(study.theta)} parameters, those with the smallest "
-            "efficiency."
-        )
-    rows_only = Axis(ticks=[], limits=(len(shown) - 0.5, -0.5))
+    note += share_note(shown, study.theta, "parameters, those with the smallest efficiency")
     panels = [
         Panel(marks=scatter, x=Axis(label=f"{label} [–]", log=True), y=row_axis(names)),
         Panel(
             marks=efficiency,
             x=Axis(label="efficiency: bound / observed variance [–]"),
-            y=rows_only,
+            y=blank_rows(len(shown)),
             place=(0, 1),
         ),
     ]
@@ -433,13 +415,11 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
 
 def _trajectory(key: str) -> tuple[str, str]:
     """Return the word and the role of a trajectory of a study."""
-    term = TRAJECTORY_TERMS.get(key)
-    return (key, OTHER.word) if term is None else (term.word, term.word)
+    return shown_word(key), TRAJECTORY_TERMS.get(key, OTHER)
 
 
 def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Picture:
     """Show the estimates of one parameter along each trajectory (the paper's figures 4 to 6)."""
-    labels.check(parameters=len(study.theta))
     unit, label = labels.parameter_units[index], labels.parameter(index)
     theta = float(study.theta[index])
     true = f"true value {format_number(theta)} {unit}".rstrip()
@@ -452,7 +432,7 @@ def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Picture:
         if not len(values):
             panels.append(Panel(title=word, message="no successful trials", place=(0, place)))
             continue
-        std = float(np.sqrt(trials.crlb[index, index]))
+        std = np.sqrt(trials.crlb[index, index])
         low, high = _central_range(values, theta, std)
         bins = int(np.clip(2.0 * np.sqrt(len(values)), 8, 60))
         counts, edges = np.histogram(values, bins=bins, range=(low, high))
@@ -523,13 +503,13 @@ def _central_range(values: Array, theta: float, std: float) -> tuple[float, floa
 def _statistics(trials: TrialStatistics, index: int, unit: str, hidden: int) -> str:
     """Return variance, bound, efficiency and counts of one histogram in words."""
     variance, bound = (
-        f"{format_number(float(matrix[index, index]))} {squared_unit(unit)}".rstrip()
+        f"{format_number(matrix[index, index])} {squared_unit(unit)}".rstrip()
         for matrix in (trials.covariance, trials.crlb)
     )
-    low, high = (format_number(float(end)) for end in trials.efficiency_interval[index])
+    low, high = (format_number(end) for end in trials.efficiency_interval[index])
     text = (
         f"variance {variance}, bound {bound}; efficiency "
-        f"{format_number(float(trials.efficiency[index]))}, 95 % interval [{low}, {high}]; "
+        f"{format_number(trials.efficiency[index])}, 95 % interval [{low}, {high}]; "
         f"{trials.trials} trials, {trials.failed} failed"
     )
     return f"{text}, {hidden} outside this range" if hidden else text
@@ -543,15 +523,16 @@ def robots(comparison: RobotComparison) -> Picture:
     order = comparison.order[:MAX_DIFFERENCES].tolist()
     size = np.where(comparison.detectable > 0.0, comparison.detectable, np.nan)[order]
     ends = np.column_stack([comparison.difference, comparison.interval])[order]
-    centre, low, high = np.nan_to_num(ends / size[:, None]).T
-    largest = max(np.abs(each).max(initial=1.3) for each in (centre, low, high))
+    drawn = np.nan_to_num(ends / size[:, None])
+    centre, low, high = drawn.T
+    largest = np.abs(drawn).max(initial=1.3)
     reach = 1.08 * min(float(largest), LARGEST_DIFFERENCE)
-    rows = np.arange(float(len(order)))
+    rows = np.arange(len(order))
     is_changed = np.array([j in comparison.changed for j in order], dtype=bool)
     marks = [vspan(-1.0, 1.0, opacity=0.6, label="would hardly be found"), vline(0.0)]
     for chosen, role, label in (
-        (is_changed, DESIGNED.word, "differs"),
-        (~is_changed, IDENTIFIED.word, "no difference proven"),
+        (is_changed, DESIGNED, "differs"),
+        (~is_changed, IDENTIFIED, "no difference proven"),
     ):
         inside = chosen & (np.abs(centre) <= reach)
         marks += [
@@ -561,7 +542,7 @@ def robots(comparison: RobotComparison) -> Picture:
     first, second = (shorten(name, 24) for name in comparison.names)
     texts = [
         " → ".join(
-            format_with_uncertainty(float(value), NORMAL_95 * float(std))
+            format_with_uncertainty(value, NORMAL_95 * std)
             for value, std in zip(comparison.values[:, j], comparison.std[:, j], strict=True)
         )
         for j in order
@@ -570,11 +551,7 @@ def robots(comparison: RobotComparison) -> Picture:
         f"Numbers: {first} → {second}, each with half the width of its 95 % interval. A difference "
         "outside the strip would be found with a probability of 80 % or more."
     )
-    if len(order) < len(comparison.parameters):
-        note += (
-            f" Shown: {len(order)} of {len(comparison.parameters)} parameters, the most "
-            "significant ones."
-        )
+    note += share_note(order, comparison.parameters, "parameters, the most significant ones")
     if not comparison.is_reliable:
         note += " One of the estimates is not reliable, or does not fit its recordings."
 
@@ -590,7 +567,7 @@ def robots(comparison: RobotComparison) -> Picture:
     panel = Panel(
         marks=marks,
         x=Axis(label="difference / difference that would be found [–]", limits=(-reach, reach)),
-        y=row_axis(labels, [DESIGNED.word if changed else "text" for changed in is_changed]),
+        y=row_axis(labels, [DESIGNED if changed else "text" for changed in is_changed]),
         beside=[("", "text", texts)],
     )
     row = 0.36 if len(order) <= MAX_HIGH_ROWS else 0.25
@@ -603,7 +580,7 @@ def robots(comparison: RobotComparison) -> Picture:
 def rehearsal(result: Rehearsal) -> Picture:
     """Show the margin of every limit and the largest speed of every joint, for all robots."""
     panels = [_margins(result)] if result.limits else []
-    panels.append(_speeds(result, len(panels)))
+    panels.append(_speeds(result))
     control = "with the gains K(t)" if result.feedback else "open loop"
     title = (
         f"{result.robots} robots, parameters up to {100 * result.wrong:g} % off, {control}: "
@@ -615,7 +592,7 @@ def rehearsal(result: Rehearsal) -> Picture:
     height = max(2.6, 1.0 + 0.24 * max(len(result.limits), len(result.joints)))
     return Picture(
         title=title,
-        panels=panels,
+        panels=in_grid(panels, 2),
         note=note,
         heights=[height],
         widths=[1.3, 1.0] if result.limits else [1.0],
@@ -628,11 +605,11 @@ def _margins(result: Rehearsal) -> Panel:
     percent = 100.0 * np.maximum(margins, LEAST_MARGIN)
     low = min(-5.0, float(percent.min(initial=0.0)) - 5.0)
     high = max(100.0, float(percent[0].max(initial=0.0)) + 5.0)
-    marks = [vspan(low, 0.0, DESIGNED.word, opacity=0.1)]
+    marks = [vspan(low, 0.0, DESIGNED, opacity=0.1)]
     for i in range(len(result.limits)):
-        role, label = MEASURED.word, "robots, all keep the limit"
+        role, label = MEASURED, "robots, all keep the limit"
         if not result.kept[:, i].all():
-            role, label = DESIGNED.word, "robots, some exceed the limit"
+            role, label = DESIGNED, "robots, some exceed the limit"
         marks += _row(percent[:, i], i, role, label)
     names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in result.limits]
     return Panel(
@@ -643,14 +620,14 @@ def _margins(result: Rehearsal) -> Panel:
     )
 
 
-def _speeds(result: Rehearsal, column: int) -> Panel:
+def _speeds(result: Rehearsal) -> Panel:
     """Return a row per joint: largest speed of the model, and of every robot."""
     speeds = np.where(np.isfinite(result.speed), result.speed, np.nan)
     most = np.nanmax(speeds, axis=0)
     share = 100.0 * speeds / np.where(most > 0.0, most, 1.0)
     marks = []
     for i, name in enumerate(result.joints):
-        role = DESIGNED.word if name in result.unlimited else MEASURED.word
+        role = DESIGNED if name in result.unlimited else MEASURED
         label = "robots, nothing limits the speed" if name in result.unlimited else "robots"
         marks += _row(share[:, i], i, role, label)
     texts = [f"{peak:.2g} {unit}" for peak, unit in zip(most, result.units, strict=True)]
@@ -660,7 +637,6 @@ def _speeds(result: Rehearsal, column: int) -> Panel:
         x=Axis(label="share of the largest one [%]", limits=(0.0, 105.0)),
         y=row_axis(list(result.joints)),
         beside=[("", "text", texts)],
-        place=(0, column),
     )
 
 
@@ -671,29 +647,34 @@ def _row(values: Array, row: int, role: str, label: str) -> list[Mark]:
     look = {"symbol": "|", "size": 14.0, "width": 1.6, "label": "model"}
     return [
         dots(values[1:], rows, role, size=3.5, opacity=0.5, label=label),
-        dots(values[:1], np.array([float(row)]), "text", **look),
+        dots(values[:1], [row], "text", **look),
     ]
 
 
 # ---- campaigns
 
 
-def campaign(result: Campaign, parameters: CampaignParameters) -> Picture:
-    """Show standard deviation and estimate of each parameter over the rounds."""
+def campaign(result: Campaign, true: Array | None = None) -> Picture:
+    """Show standard deviation and estimate of each parameter over the rounds.
+
+    Args:
+        result: The campaign.
+        true: (p,) true values of its parameters [theta-unit], where they are known.
+    """
     has_target = np.isfinite(result.wanted)
-    shown = sorted(parameters.interest, key=lambda j: not has_target[j])[:MAX_ROUNDS]
+    shown = sorted(result.interest, key=lambda j: not has_target[j])[:MAX_ROUNDS]
     numbers = np.array([float(r.number) for r in result.rounds])
     limits = (0.5, float(numbers[-1]) + 0.5)
     panels = []
-    for row, j in enumerate(shown):
-        name, unit = shorten(parameters.names[j], 18), parameters.units[j]
-        label = "round" if row == len(shown) - 1 else ""
+    for j in shown:
+        name = shorten(result.parameters[j], 18)
+        unit = result.rounds[0].estimate.units[j]
+        label = "round" if j == shown[-1] else ""
         axis = Axis(label=label, limits=limits, most=min(len(numbers), 8), whole=True)
-        guess = format_number(float(result.rounds[0].theta[j]), 4)
-        true = None if parameters.true is None else float(parameters.true[j])
+        guess = format_number(result.rounds[0].theta[j], 4)
         panels += [
             _accuracy_over_rounds(
-                result, numbers, j, title=with_unit(f"σ of {name}", unit), axis=axis, row=row
+                result, numbers, j, title=with_unit(f"σ of {name}", unit), axis=axis
             ),
             _estimate_over_rounds(
                 result,
@@ -702,7 +683,6 @@ def campaign(result: Campaign, parameters: CampaignParameters) -> Picture:
                 true,
                 title=f"{with_unit(name, unit)}, first design at {guess}",
                 axis=axis,
-                row=row,
             ),
         ]
     count = len(numbers)
@@ -710,18 +690,12 @@ def campaign(result: Campaign, parameters: CampaignParameters) -> Picture:
         f"{as_sentence(result.status.value)} Bars, and the band of the last round: ± 1 and ± 2 "
         "formal σ, which are the true accuracy only if the model and the noise are right."
     )
-    heights = [1.75] * len(shown)
-    return Picture(
-        title=f"{count} {'round' if count == 1 else 'rounds'} of design, recording and estimate",
-        panels=panels,
-        note=note,
-        heights=heights,
-        widths=[1.0, 1.0],
-    )
+    title = f"{count} {'round' if count == 1 else 'rounds'} of design, recording and estimate"
+    return grid(title, panels, [1.75] * len(panels), 2, note)
 
 
 def _accuracy_over_rounds(
-    result: Campaign, numbers: Array, j: int, *, title: str, axis: Axis, row: int
+    result: Campaign, numbers: Array, j: int, *, title: str, axis: Axis
 ) -> Panel:
     """Return predicted and formal standard deviations of parameter j."""
     predicted = np.array([r.predicted[j] for r in result.rounds])
@@ -730,8 +704,8 @@ def _accuracy_over_rounds(
     low, high = around(np.concatenate([predicted, attained, [wanted]]), factor=1.5)
     before, after = "predicted before the round", "estimated after the round, from all recordings"
     marks = [
-        dots(numbers, predicted, DESIGNED.word, size=8.0, hollow=True, label=before),
-        line(numbers, attained, IDENTIFIED.word, symbol="o", front=3.0, label=after),
+        dots(numbers, predicted, DESIGNED, size=8.0, hollow=True, label=before),
+        line(numbers, attained, IDENTIFIED, symbol="o", front=3.0, label=after),
     ]
     if np.isfinite(wanted):
         title += f", wanted {format_number(wanted, 2)}"
@@ -739,33 +713,30 @@ def _accuracy_over_rounds(
             hline(wanted, dash="--", label="wanted"),
             hspan(low, wanted, "text", opacity=0.06),
         ]
-    return Panel(
-        title=title, marks=marks, x=axis, y=Axis(log=True, limits=(low, high)), place=(row, 0)
-    )
+    return Panel(title=title, marks=marks, x=axis, y=Axis(log=True, limits=(low, high)))
 
 
 def _estimate_over_rounds(
     result: Campaign,
     numbers: Array,
     j: int,
-    true: float | None,
+    true: Array | None,
     *,
     title: str,
     axis: Axis,
-    row: int,
 ) -> Panel:
     """Return the estimates of parameter j, with the true value if it is known."""
     theta = np.array([r.estimate.theta[j] for r in result.rounds])
     std = np.array([r.attained[j] for r in result.rounds])
     bar = np.where(np.isfinite(std), std, 0.0)
-    marks = [dots(numbers, theta, IDENTIFIED.word)]
+    marks = [dots(numbers, theta, IDENTIFIED)]
     for factor, width in ((1.0, 2.4), (2.0, 0.9)):
         ends = np.column_stack(
             [theta - factor * bar, theta + factor * bar, np.full(len(bar), np.nan)]
         )
-        marks.append(line(np.repeat(numbers, 3), ends.ravel(), IDENTIFIED.word, width=width))
+        marks.append(line(np.repeat(numbers, 3), ends.ravel(), IDENTIFIED, width=width))
         if np.isfinite(std[-1]):
-            marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED.word, opacity=0.07))
+            marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED, opacity=0.07))
     if true is not None:
-        marks.append(hline(true, label="true value"))
-    return Panel(title=title, marks=marks, x=axis, y=Axis(most=4), place=(row, 1))
+        marks.append(hline(true[j], label="true value"))
+    return Panel(title=title, marks=marks, x=axis, y=Axis(most=4))

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.output.rerun.scene import BodyPoses, moving_geoms
@@ -29,15 +27,18 @@ PLANAR_RATIO = 0.2
 # Height of the unit vector towards the camera below which the ground is seen edge-on.
 EDGE_ON = 0.3
 
-# A free body is followed if it travels farther than this multiple of the size of the robot around
-# it; the followed robot is then seen with free space around it, as a multiple of its size.
-FOLLOW_RATIO, FOLLOW_ROOM = 2.0, 1.5
+# A free body is followed if it travels as far as this multiple of the size of the robot around it;
+# the followed robot is then seen with free space around it, as a multiple of its size.
+FOLLOWED_TRAVEL, FOLLOW_ROOM = 1.5, 1.5
+
+# The (8, 3) corners of a cube from -1 to 1.
+CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
 
 # Vectors from the scene towards the camera: for a motion in the x-z plane, in the y-z plane, and in
 # space.
-TOWARDS_CAMERA_XZ = (0.0, -1.0, 0.15)
-TOWARDS_CAMERA_YZ = (1.0, 0.0, 0.15)
-TOWARDS_CAMERA_SPATIAL = (1.0, -1.0, 0.6)
+TOWARDS_CAMERA_XZ = np.array([0.0, -1.0, 0.15])
+TOWARDS_CAMERA_YZ = np.array([1.0, 0.0, 0.15])
+TOWARDS_CAMERA_SPATIAL = np.array([1.0, -1.0, 0.6])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,19 +58,6 @@ class Camera:
     stacked: bool
     edge_on: bool
     followed: int | None = None
-
-    def controls(self, tracked: str | None = None) -> rrb.EyeControls3D:
-        """Return the camera for the blueprint of a 3D view.
-
-        Args:
-            tracked: Path of the entity that it follows; None where it stands still.
-        """
-        return rrb.EyeControls3D(
-            position=self.position,
-            look_target=self.target,
-            eye_up=(0.0, 0.0, 1.0),
-            tracking_entity=tracked,
-        )
 
 
 def place_camera(
@@ -92,11 +80,17 @@ def place_camera(
         follow: False for a camera that never follows a body.
     """
     clouds = moving_points(model, motions)
-    towards_camera = view_direction(extents(clouds))
+    towards_camera = view_direction(clouds)
     axes = camera_axes(towards_camera)
-    followed = followed_body(model, motions, clouds) if follow else None
+    followed = followed_body(model, motions) if follow else None
     if followed is not None:
-        clouds = _around_begin(clouds, motions, followed)
+        # The body stays where the first motion begins.
+        begin = motions[0].positions[0, followed]
+        around = [
+            replace(each, positions=each.positions - each.positions[:, followed, None] + begin)
+            for each in motions
+        ]
+        clouds = moving_points(model, around)
 
     points = seen_points(model, clouds) @ axes.T
     if followed is not None:
@@ -120,36 +114,25 @@ def place_camera(
     )
 
 
-def followed_body(
-    model: mujoco.MjModel, motions: Sequence[BodyPoses], clouds: Sequence[Array]
-) -> int | None:
-    """Return the first free body if it travels far compared with the size of the robot around it.
+def followed_body(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> int | None:
+    """Return the free body that a camera follows; None where none travels far.
 
     Args:
         model: The model.
         motions: Poses along each trajectory.
-        clouds: (samples, n, 3) world paths of the corners of all moving geoms, by motion [m].
     """
     free = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
     if not len(free):
         return None
 
-    body = int(model.jnt_bodyid[free[0]])
-    travelled = max(float(np.ptp(poses.positions[:, body], axis=0).max()) for poses in motions)
-    around = _around_begin(clouds, motions, body)
-    size = max(float(np.ptp(cloud.reshape(-1, 3), axis=0).max()) for cloud in around)
-    return body if travelled > FOLLOW_RATIO * size else None
-
-
-def _around_begin(clouds: Sequence[Array], motions: Sequence[BodyPoses], body: int) -> list[Array]:
-    """Move every sample of each cloud so that a body stays where the first motion begins."""
-    begin = motions[0].positions[0, body]
-    moved = []
-    for cloud, poses in zip(clouds, motions, strict=True):
-        every = max(1, len(poses.t) // CAMERA_SAMPLES)
-        place = poses.positions[::every, body]
-        moved.append(cloud - place[:, None] + begin)
-    return moved
+    # The free body that carries most of the mass, and its size with everything on it.
+    bodies = model.jnt_bodyid[free]
+    body = int(bodies[np.argmax(model.body_subtreemass[bodies])])
+    members = np.flatnonzero(model.body_rootid == model.body_rootid[body])
+    reach = model.geom_rbound[np.isin(model.geom_bodyid, members)].max(initial=0.0)
+    size = 2.0 * float(reach) or model.stat.extent
+    travel = max(float(np.ptp(poses.positions[:, body], axis=0).max()) for poses in motions)
+    return body if travel >= FOLLOWED_TRAVEL * size else None
 
 
 def moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[Array]:
@@ -161,61 +144,38 @@ def moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[A
         model: The model.
         motions: Poses along each trajectory.
     """
-    bodies, points = _moving_corners(model)
-    clouds = []
-    for poses in motions:
-        every = max(1, len(poses.t) // CAMERA_SAMPLES)
-        clouds.append(poses.world_paths(bodies, points, every=every))
-    return clouds
-
-
-def _moving_corners(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
-    """Return the origins of moving bodies and the corners of the bounding boxes of their geoms.
-
-    Returns:
-        bodies: (n,) body of each point.
-        points: (n, 3) points in the frames of their bodies [m].
-    """
+    # The origins of moving bodies, and the corners of the bounding boxes of their geoms.
     moving = np.flatnonzero(model.body_weldid)
-    bodies = [moving]
-    points = [np.zeros((len(moving), 3))]
-
-    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+    bodies, points = [moving], [np.zeros((len(moving), 3))]
     for geom in moving_geoms(model):
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        centre, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-        corners = centre + signs * half_sizes
+        corners = model.geom_aabb[geom, :3] + CORNERS * model.geom_aabb[geom, 3:]
         points.append(model.geom_pos[geom] + corners @ rotation.reshape(3, 3).T)
-        bodies.append(np.full(len(signs), model.geom_bodyid[geom]))
-    return np.concatenate(bodies).astype(np.intp), np.concatenate(points)
+        bodies.append(np.full(len(CORNERS), model.geom_bodyid[geom]))
+    every_body, every_point = np.concatenate(bodies), np.concatenate(points)
+    return [
+        poses.world_paths(every_body, every_point, max(1, len(poses.t) // CAMERA_SAMPLES))
+        for poses in motions
+    ]
 
 
-def extents(clouds: Sequence[Array]) -> Array:
-    """Return the (3,) largest distance that any point travels along each world axis [m].
-
-    Args:
-        clouds: (samples, n, 3) world paths of each motion [m].
-    """
-    travelled = [np.ptp(cloud, axis=0).max(axis=0, initial=0.0) for cloud in clouds]
-    return np.asarray(np.max(travelled, axis=0))
-
-
-def view_direction(extents: Array) -> Array:
+def view_direction(clouds: Sequence[Array]) -> Array:
     """Return the (3,) unit vector towards the camera.
 
     It is along the normal of a planar motion, else from the front right.
 
     Args:
-        extents: (3,) largest distance that any point travels along each world axis [m].
+        clouds: (samples, n, 3) world paths of each motion [m].
     """
-    x, y = extents[0], extents[1]
+    # The largest distance that any point travels along each world axis.
+    travelled = [np.ptp(cloud, axis=0).max(axis=0, initial=0.0) for cloud in clouds]
+    x, y, _ = np.max(travelled, axis=0)
+    direction = TOWARDS_CAMERA_SPATIAL
     if y < PLANAR_RATIO * x:
-        direction = np.array(TOWARDS_CAMERA_XZ)
+        direction = TOWARDS_CAMERA_XZ
     elif x < PLANAR_RATIO * y:
-        direction = np.array(TOWARDS_CAMERA_YZ)
-    else:
-        direction = np.array(TOWARDS_CAMERA_SPATIAL)
+        direction = TOWARDS_CAMERA_YZ
     return np.asarray(direction / np.linalg.norm(direction))
 
 
@@ -241,8 +201,7 @@ def seen_points(model: mujoco.MjModel, clouds: Sequence[Array]) -> Array:
     if len(points) and np.any(np.ptp(points, axis=0) > 0.0):
         return points
 
-    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
-    return np.asarray(model.stat.center + 0.5 * float(model.stat.extent) * signs)
+    return np.asarray(model.stat.center + 0.5 * model.stat.extent * CORNERS)
 
 
 def fit_in_view(points: Array, slope: float, aspect: float) -> tuple[Array, float]:

@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import cycle, islice
 from pathlib import Path
 
 import mujoco
@@ -58,23 +59,24 @@ from mjfim.output.rerun.scene import (
     BodyPoses,
     EntityParts,
     RobotStyle,
+    body_parts,
     body_poses,
+    drawn_shapes,
     end_point,
     entity_path,
-    first_shape_parts,
     has_floor,
     log_end_path,
     log_pose,
     log_robot,
     pale_shapes,
-    strip_of_path,
 )
+from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Labels, Trajectory
 
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
-FURTHER_ROLES = ("series2", "series5", IDENTIFIED.word, "series4")
+FURTHER_ROLES = ("series2", "series5", IDENTIFIED, "series4")
 
 # Largest number of samples of a motion in a file, and of recordings that have a tab each.
 MAX_SAMPLES, MAX_TABS = 20_000, 3
@@ -90,9 +92,7 @@ ROBOTS_TO_TEXT, LEFT_TO_RIGHT = [5, 4], [2, 3]
 START_SECONDS = 3.0
 
 
-def log_design(
-    path: Path, model: mujoco.MjModel, design: Design, labels: Labels, *, addition: str = ""
-) -> None:
+def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels) -> None:
     """Write design.rrd: both robots, their signals, sensitivities, the search and a summary.
 
     Args:
@@ -100,25 +100,20 @@ def log_design(
         model: Model with the parameters of the design.
         design: The design.
         labels: Labels of its columns.
-        addition: Markdown below the summary.
     """
-    both = {
-        INITIAL.word: design.initial.trajectory,
-        DESIGNED.word: design.final.trajectory,
+    both: dict[str, Trajectory] = {
+        INITIAL: design.initial.trajectory,
+        DESIGNED: design.final.trajectory,
     }
     tabs: Tabs = motion_panels(labels, both, design.usage)
     tabs |= {
         "limits": limit_panels(design, labels, rows=False),
         "information": [information_panel(design)],
     }
-    named = replace(
-        labels,
-        parameters=design.parameters,
-        parameter_units=labels.parameter_units or ("",) * len(design.parameters),
-    )
+    phases = sensitivity_phase(design, complete_labels(design))
     planes = {
-        "sensitivities ψ": planes_of("sensitivities ψ", sensitivity_phase(design, named).panels),
-        "optimiser": planes_of("optimiser", convergence(design).panels),
+        name: planes_of(name, picture.panels)
+        for name, picture in (("sensitivities ψ", phases), ("optimiser", convergence(design)))
     }
     iterates = _iterate_plots(design, labels)
     grids = []
@@ -126,19 +121,15 @@ def log_design(
         grids += grid_tabs(name, [plane.view() for plane, _ in found])
     grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
 
-    poses = {name: body_poses(model, each.t, each.qpos) for name, each in both.items()}
+    poses = _poses_of(model, both)
     robots = _robots(model, poses, ASPECT_WITH_TEXT)
-    with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids]) as rec:
-        _log_text(rec, design_text(design, addition))
+    text = as_markdown(page_of(design), DESIGN_COLOURS)
+    with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids], text) as rec:
         log_series(rec, tabs)
         for found in planes.values():
             for plane, panel in found:
                 plane.log(rec, panel.marks)
-        for name, each in poses.items():
-            log_robot(rec, model, ("robots", name), each, style_of(name))
-        initial = poses[INITIAL.word]
-        root = ("robots", INITIAL.word)
-        log_end_path(rec, model, root, initial, style_of(root[1]))
+        _log_robots(rec, model, poses, {}, [INITIAL])
         _log_iterates(rec, model, design, iterates)
 
 
@@ -149,8 +140,6 @@ def log_estimate(
     measured: Trajectory | None,
     identified: Trajectory,
     labels: Labels,
-    *,
-    addition: str = "",
 ) -> None:
     """Write estimate.rrd: identified and measured robot and outputs, residuals and a summary.
 
@@ -161,22 +150,21 @@ def log_estimate(
         measured: Motion of the first recording, where its positions were measured.
         identified: Motion of the identified model.
         labels: Labels of their columns.
-        addition: Markdown below the summary.
     """
-    shown = {IDENTIFIED.word: _thinned(identified)}
-    title = f"{IDENTIFIED.word} robot ({IDENTIFIED.colour_name})"
+    shown: dict[str, Trajectory] = {IDENTIFIED: _thinned(identified)}
+    title = f"{IDENTIFIED} robot ({IDENTIFIED.colour_name})"
     if measured is not None:
         term = MEASURED
-        shown[term.word] = _thinned(measured)
-        title += f", {term.word} robot ({term.colour_name} outline)"
-    kept = sum(prediction.recording is not None for prediction in estimate.predictions)
+        shown[term] = _thinned(measured)
+        title += f", {term} robot ({term.colour_name} outline)"
+    kept = [each.name for each in estimate.predictions if each.recording is not None]
     fits = [fit(estimate, i, labels) for i in range(len(estimate.recordings))]
-    held = [held_out(estimate, i, labels) for i in range(kept)]
+    held = [held_out(estimate, i, labels) for i in range(len(kept))]
     recordings: Tabs = {
         f"{kind}{k}: {Path(name).name}": _pairs(picture.panels)
         for kind, pictures, names in (
             ("", fits, [each.name for each in estimate.recordings]),
-            ("held out ", held, [e.name for e in estimate.predictions if e.recording is not None]),
+            ("held out ", held, kept),
         )
         for k, (picture, name) in enumerate(zip(pictures, names, strict=True), start=1)
     }
@@ -185,17 +173,15 @@ def log_estimate(
     if len(tabs) > MAX_TABS:
         tabs = [rrb.Tabs(*tabs, name="recordings", active_tab=0)]
 
-    poses = {name: body_poses(model, each.t, each.qpos) for name, each in shown.items()}
+    poses = _poses_of(model, shown)
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
-    root = ("robots", IDENTIFIED.word)
+    root = ("robots", IDENTIFIED)
     view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
     tabs += series_tabs(states)
-    with open_recording(path, model, "estimate", view, tabs) as rec:
-        _log_text(rec, estimate_text(estimate, addition))
+    text = as_markdown(page_of(estimate), ESTIMATE_COLOURS)
+    with open_recording(path, model, "estimate", view, tabs, text) as rec:
         log_series(rec, recordings | states)
-        for name, each in poses.items():
-            log_robot(rec, model, ("robots", name), each, style_of(name))
-        log_end_path(rec, model, root, poses[IDENTIFIED.word], style_of(root[1]))
+        _log_robots(rec, model, poses, {}, [IDENTIFIED])
 
 
 def _pairs(panels: Sequence[Panel]) -> list[Panel]:
@@ -220,8 +206,10 @@ def log_trajectories(
         labels: Labels of their columns.
     """
     named = {shown_word(name): each for name, each in trajectories.items()}
-    poses = {name: body_poses(model, each.t, each.qpos) for name, each in named.items()}
-    roles = dict(zip(named, _roles(list(named)), strict=True))
+    poses = _poses_of(model, named)
+    further = cycle(FURTHER_ROLES)
+    known = (INITIAL, DESIGNED)
+    roles = {name: name if name in known else next(further) for name in named}
     states: Tabs = {
         group: [
             replace(
@@ -237,36 +225,25 @@ def log_trajectories(
         ).items()
     }
     robots = _robots(model, poses, ASPECT_WITHOUT_TEXT, roles)
-    with open_recording(path, model, "replay", robots, series_tabs(states), text=False) as rec:
+    with open_recording(path, model, "replay", robots, series_tabs(states)) as rec:
         log_series(rec, states)
-        for name, each in poses.items():
-            style = style_of(roles[name])
-            log_robot(rec, model, ("robots", name), each, style)
-            log_end_path(rec, model, ("robots", name), each, style)
+        _log_robots(rec, model, poses, roles, list(poses))
 
 
-def _roles(names: Sequence[str]) -> list[str]:
-    """Return a role for every name; names that are no words take the further ones in turn."""
-    known = (INITIAL.word, DESIGNED.word)
-    further = iter(FURTHER_ROLES * (1 + len(names) // len(FURTHER_ROLES)))
-    return [name if name in known else next(further) for name in names]
+def _poses_of(model: mujoco.MjModel, motions: Mapping[str, Trajectory]) -> dict[str, BodyPoses]:
+    return {name: body_poses(model, each.t, each.qpos) for name, each in motions.items()}
 
 
 def style_of(role: str) -> RobotStyle:
     """Return the style of the robot of a role; a measured one is an outline."""
-    return RobotStyle(accent=rgb(role), outline=role == MEASURED.word)
+    return RobotStyle(accent=rgb(role), outline=role == MEASURED)
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
     """Return at most `MAX_SAMPLES` evenly spread samples of a trajectory."""
     rows = evenly_spread_indices(len(trajectory.t), MAX_SAMPLES)
-    return Trajectory(
-        t=trajectory.t[rows],
-        qpos=trajectory.qpos[rows],
-        qvel=trajectory.qvel[rows],
-        act=trajectory.act[rows],
-        ctrl=trajectory.ctrl[rows[:-1]],
-    )
+    states = {key: getattr(trajectory, key)[rows] for key in ("t", "qpos", "qvel", "act")}
+    return Trajectory(**states, ctrl=trajectory.ctrl[rows[:-1]])
 
 
 # ---- iterates of the search
@@ -295,7 +272,7 @@ def _iterate_plots(design: Design, labels: Labels) -> list[IteratePlot]:
                 for t, each in zip(motions.t, values, strict=True)
             ]
             every = [line(*pair, "text") for pair in (start, *curves)]
-            plane = Plane.around(("iterates", title), f"{title} over time [s]", every, log=False)
+            plane = Plane.around(("iterates", title), f"{title} over time [s]", every)
             plots.append((plane, start, curves))
     return plots
 
@@ -306,18 +283,16 @@ def _log_iterates(
     """Log on the timeline `iteration` the curves, and the robot in the middle of its motion."""
     for plane, start, _ in plots:
         plane.log(rec)
-        still = plane.curve(*start, INITIAL.word, 0.6)
+        still = plane.curve(*start, INITIAL, 0.6)
         rec.log(entity_path((*plane.parts, "initial")), still, static=True, strict=True)
-    root, style = ("robots", DESIGNED.word), style_of(DESIGNED.word)
+    root, style = ("robots", DESIGNED), style_of(DESIGNED)
     middle = design.initial.trajectory.qpos[len(design.initial.trajectory.t) // 2]
     still_poses = body_poses(model, np.zeros(1), middle[None])
     designed = body_poses(model, design.trajectory.t, design.trajectory.qpos)
     end = end_point(model, designed)
-    if end is not None:
-        rec.set_time("sim_time", duration=0.0)
-        path = strip_of_path(designed.world_paths(*end)[:, 0], style)
-        rec.log(entity_path((*root, "path")), path, strict=True)
-        rec.reset_time()
+    rec.set_time("sim_time", duration=0.0)
+    log_end_path(rec, root, designed, end, style)
+    rec.reset_time()
     motions = design.motions
     if motions is None:
         return
@@ -326,12 +301,10 @@ def _log_iterates(
         qpos = np.asarray(motions.qpos[i], dtype=np.float64)
         poses = body_poses(model, motions.t[i], qpos)
         log_pose(rec, model, root, poses, len(qpos) // 2)
-        log_pose(rec, model, ("robots", INITIAL.word), still_poses, 0)
-        if end is not None:
-            path = strip_of_path(poses.world_paths(*end)[:, 0], style)
-            rec.log(entity_path((*root, "path")), path, strict=True)
+        log_pose(rec, model, ("robots", INITIAL), still_poses, 0)
+        log_end_path(rec, root, poses, end, style)
         for plane, _, curves in plots:
-            curve = plane.curve(*curves[i], DESIGNED.word)
+            curve = plane.curve(*curves[i], DESIGNED)
             rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
     rec.reset_time()
 
@@ -346,8 +319,7 @@ def open_recording(
     kind: str,
     robots: rrb.Container | rrb.View,
     tabs: Sequence[rrb.Container],
-    *,
-    text: bool = True,
+    text: str = "",
 ) -> Iterator[rr.RecordingStream]:
     """Open a stream into a temporary file, which replaces `path` once it is complete.
 
@@ -357,15 +329,15 @@ def open_recording(
         kind: Kind of the recording.
         robots: Views of the robots, on the left.
         tabs: Tabs with signals, on the right.
-        text: Whether there is a summary below the robots.
+        text: Summary below the robots, as Markdown; empty for none.
 
     Yields:
         The stream.
     """
-    left = robots
+    left, summary = robots, entity_path(("summary",))
     if text:
-        document = rrb.TextDocumentView(origin=entity_path(("summary",)), name="summary")
-        left = rrb.Vertical(robots, document, row_shares=ROBOTS_TO_TEXT)
+        below = rrb.TextDocumentView(origin=summary, name="summary")
+        left = rrb.Vertical(robots, below, row_shares=ROBOTS_TO_TEXT)
     layout = rrb.Horizontal(left)
     if tabs:
         right = rrb.Tabs(*tabs, active_tab=0)
@@ -381,6 +353,9 @@ def open_recording(
     ):
         rec.set_log_time_enabled(False)
         rec.save(partial, default_blueprint=blueprint_of(layout, time_panel))
+        if text:
+            document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+            rec.log(summary, document, static=True, strict=True)
         yield rec
 
 
@@ -417,11 +392,19 @@ def robot_views(
     for title, root in roots.items():
         tracked = None
         if camera.followed is not None:
-            tracked = entity_path(first_shape_parts(model, followed or root, camera.followed))
+            # A camera can follow a shape, but no body, whose entity has no shape of its own.
+            parts = body_parts(model, followed or root, camera.followed)
+            shapes = drawn_shapes(model, camera.followed, RobotStyle(accent=(0, 0, 0)))
+            tracked = entity_path((*parts, *(shape.name for shape in islice(shapes, 1))))
         view = rrb.Spatial3DView(
             origin=entity_path(root),
             name=title,
-            eye_controls=camera.controls(tracked),
+            eye_controls=rrb.EyeControls3D(
+                position=camera.position,
+                look_target=camera.target,
+                eye_up=(0.0, 0.0, 1.0),
+                tracking_entity=tracked,
+            ),
             line_grid=rrb.LineGrid3D(visible=grid_helps),
             background=BACKGROUND,
             overrides=dict((overrides or {}).items()),
@@ -439,7 +422,7 @@ def _robots(
     """Return the views of several robots: separate, and in another tab overlaid."""
     motions, names = list(poses.values()), list(poses)
     camera = place_camera(model, motions, views=len(motions), aspect=aspect)
-    words = {term.word: f"{term.word} ({term.colour_name})" for term in TERMS}
+    words: dict[str, str] = {term: f"{term} ({term.colour_name})" for term in TERMS}
     titles = {words.get(name, name): ("robots", name) for name in names}
     arranged = rrb.Vertical if camera.stacked else rrb.Horizontal
     separate = arranged(*robot_views(model, camera, titles), name="separate")
@@ -455,10 +438,19 @@ def _robots(
     return rrb.Tabs(separate, overlay, active_tab=0)
 
 
-def _log_text(rec: rr.RecordingStream, markdown: str) -> None:
-    """Log the text of the summary panel."""
-    document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
-    rec.log(entity_path(("summary",)), document, static=True, strict=True)
+def _log_robots(
+    rec: rr.RecordingStream,
+    model: mujoco.MjModel,
+    poses: Mapping[str, BodyPoses],
+    roles: Mapping[str, str],
+    with_path: Sequence[str],
+) -> None:
+    """Log robots by their names, some of them with the path of the end."""
+    for name, each in poses.items():
+        root, style = ("robots", name), style_of(roles.get(name, name))
+        log_robot(rec, model, root, each, style)
+        if name in with_path:
+            log_end_path(rec, root, each, end_point(model, each), style, static=True)
 
 
 # ---- the viewer
@@ -515,7 +507,6 @@ def _list(sentences: Iterable[str]) -> str:
 
 
 def _rendered(part: Table | Text | Listing) -> str:
-    """One part of a page."""
     if isinstance(part, Text):
         text = escape(part.text)
         return f"**{text}**" if part.emphasis is Emphasis.STRONG else text
@@ -534,7 +525,6 @@ def _rendered(part: Table | Text | Listing) -> str:
 
 
 def _colours(*meanings: tuple[Term, str]) -> str:
-    """Return a sentence for each colour."""
     return " ".join(f"{term.colour_name.capitalize()}: {meaning}." for term, meaning in meanings)
 
 
@@ -556,23 +546,3 @@ ESTIMATE_COLOURS = (
     )
     + " Grey lines: twice the standard deviation of the noise."
 )
-
-
-def design_text(design: Design, addition: str = "") -> str:
-    """Render a design as Markdown.
-
-    Args:
-        design: The design.
-        addition: A paragraph below it; may be empty.
-    """
-    return as_markdown(page_of(design), DESIGN_COLOURS, addition)
-
-
-def estimate_text(estimate: Estimate, addition: str = "") -> str:
-    """Render an estimate as Markdown.
-
-    Args:
-        estimate: The estimate.
-        addition: A paragraph below it; may be empty.
-    """
-    return as_markdown(page_of(estimate), ESTIMATE_COLOURS, addition)

@@ -32,11 +32,11 @@ from mjfim.output.rerun.scene import (
     body_poses,
     end_point,
     entity_path,
+    log_end_path,
     log_pose,
     log_robot,
-    strip_of_path,
 )
-from mjfim.records.design import HistoryRow, IterateMotion
+from mjfim.records.design import HistoryRow
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 
 # Shortest time between two motions that are shown [s], samples of a motion, and motions in which
@@ -50,11 +50,8 @@ FLUSH_SECONDS = 3.0
 TIMELINE, ROBOT = "event", ("robot",)
 
 # Style of the robot, and roles of curves that share a plot.
-STYLE = style_of(DESIGNED.word)
-ROLES_IN_TURN = (
-    *(term.word for term in (DESIGNED, INITIAL, MEASURED)),
-    *(term.word for term in (NOMINAL, IDENTIFIED, OTHER)),
-)
+STYLE = style_of(DESIGNED)
+ROLES_IN_TURN = (DESIGNED, INITIAL, MEASURED, NOMINAL, IDENTIFIED, OTHER)
 
 # Name, colour and width of the curves of other starts than the one of the best iterate.
 OTHER_STARTS, OTHER_COLOUR, OTHER_WIDTH, BEST_WIDTH = "other starts", (130, 130, 130), 1.0, 2.0
@@ -141,7 +138,6 @@ class LiveShow:
             self._show_best()
 
     def _take(self, event: Event) -> None:
-        """Show the numbers of an event."""
         self._events += 1
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
         if type(event) not in self._kinds:
@@ -202,7 +198,6 @@ class LiveShow:
         self._rec.log(entity_path((plot, name)), look, static=True, strict=True)
 
     def _show_text(self, text: str) -> None:
-        """Show what is done."""
         # A text without a time would be static and hide those that follow.
         self._rec.set_time(TIMELINE, sequence=max(self._events - 1, 0))
         self._rec.log(entity_path(("progress",)), rr.TextDocument(text), strict=True)
@@ -218,27 +213,27 @@ class LiveShow:
         self._is_shown = True
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
         motion = best.row.motion
-        rows = evenly_spread_indices(len(motion.t), MOTION_SAMPLES)
-        qpos = np.asarray(motion.qpos, dtype=np.float64)[rows]
-        if not np.isfinite(qpos).all():
+        t, qpos, ctrl = (
+            np.asarray(each, dtype=np.float64) for each in (motion.t, motion.qpos, motion.ctrl)
+        )
+        rows = evenly_spread_indices(len(t), MOTION_SAMPLES)
+        if not np.isfinite(qpos[rows]).all():
             return
-        poses = body_poses(self._model, np.asarray(motion.t, dtype=np.float64)[rows], qpos)
+        poses = body_poses(self._model, t[rows], qpos[rows])
         if self._camera is None:
-            self._begin(poses, motion)
+            self._begin(poses)
 
         # With every transmission, the robot moves on.
         share = self._updates % UPDATES_PER_MOTION / UPDATES_PER_MOTION
         self._updates += 1
         log_pose(self._rec, self._model, ROBOT, poses, round(share * (len(rows) - 1)))
-        end = end_point(self._model, poses)
-        if end is not None:
-            path = strip_of_path(poses.world_paths(*end)[:, 0], STYLE)
-            self._rec.log(entity_path((*ROBOT, "path")), path, strict=True)
-        for group, values in self._signals(motion).items():
+        log_end_path(self._rec, ROBOT, poses, end_point(self._model, poses), STYLE)
+        _, (positions,) = shown_positions(labels_of_model(self._model), qpos)
+        for group, values in (("positions", positions), ("controls", ctrl)):
             for k, (plane, y) in enumerate(zip(self._planes[group], values.T, strict=True)):
-                self._planes[group][k] = self._log_curve(plane, motion, y)
+                self._planes[group][k] = self._log_curve(plane, t[: len(y)], y)
 
-    def _begin(self, poses: BodyPoses, motion: IterateMotion) -> None:
+    def _begin(self, poses: BodyPoses) -> None:
         """Log the shapes and the first axes, and place the camera around the first motion."""
         first = BodyPoses(
             t=poses.t[:1], positions=poses.positions[:1], quaternions=poses.quaternions[:1]
@@ -246,31 +241,20 @@ class LiveShow:
         log_robot(self._rec, self._model, ROBOT, first, STYLE)
         self._camera = place_camera(self._model, [poses], 1, ASPECT_WITH_TEXT, follow=False)
         labels = labels_of_model(self._model)
-        titles = {"positions": labels.positions, "controls": labels.controls}
         self._planes = {
-            group: [
-                Plane.around((group, title), f"{title} over time [s]", [], log=False)
-                for title in titles[group][: values.shape[1]]
-            ]
-            for group, values in self._signals(motion).items()
+            group: [Plane.around((group, title), f"{title} over time [s]", []) for title in titles]
+            for group, titles in (("positions", labels.positions), ("controls", labels.controls))
         }
         self._arrange()
 
-    def _signals(self, motion: IterateMotion) -> dict[str, Array]:
-        """Return (n, nv) positions and (n, nu) controls of a motion."""
-        qpos = np.asarray(motion.qpos, dtype=np.float64)
-        _, (positions,) = shown_positions(labels_of_model(self._model), qpos)
-        return {"positions": positions, "controls": np.asarray(motion.ctrl, dtype=np.float64)}
-
-    def _log_curve(self, plane: Plane, motion: IterateMotion, y: Array) -> Plane:
+    def _log_curve(self, plane: Plane, t: Array, y: Array) -> Plane:
         """Log a curve with axes that hold all curves before it; return the axes."""
-        t = np.asarray(motion.t, dtype=np.float64)[: len(y)]
         seen = [line(t, y, "text")]
         if self._updates > 1:
             seen.append(line([t[0], t[0]], plane.y, "text"))
-        grown = Plane.around(plane.parts, plane.title, seen, log=False)
+        grown = Plane.around(plane.parts, plane.title, seen)
         grown.log(self._rec, static=False)
-        curve = grown.curve(t, y, DESIGNED.word)
+        curve = grown.curve(t, y, DESIGNED)
         self._rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
         return grown
 

@@ -151,7 +151,9 @@ class Plane:
     is_log: bool = False
 
     @classmethod
-    def around(cls, parts: EntityParts, title: str, marks: Sequence[Mark], log: bool) -> Plane:
+    def around(
+        cls, parts: EntityParts, title: str, marks: Sequence[Mark], *, log: bool = False
+    ) -> Plane:
         """Return axes that hold all lines and dots."""
         shown = [mark for mark in marks if mark.kind in ("line", "dots")]
         x = np.concatenate([np.zeros(0), *(mark.x for mark in shown)])
@@ -185,7 +187,6 @@ class Plane:
         width, height = SIZE
         frame = [[(0.0, 0.0), (0.0, height), (width, height)]]
         lines = rr.LineStrips2D(frame, colors=[AXIS_COLOUR], radii=rr.Radius.ui_points(0.5))
-        rec.log(entity_path((*self.parts, "axes")), lines, static=static, strict=True)
 
         # The viewer writes a number below its point.
         across, up = round_numbers(*self.x), round_numbers(*self.y)
@@ -197,25 +198,26 @@ class Plane:
         )
         texts = [f"{value:.4g}" for value in across]
         texts += [f"{10.0**value if self.is_log else value:.4g}" for value in up]
-        numbers = rr.Points2D(
+        parts: dict[str, rr.AsComponents] = {"axes": lines}
+        parts["numbers"] = rr.Points2D(
             np.concatenate([below, beside]),
             labels=texts,
             colors=[WORD_COLOUR] * len(texts),
             radii=rr.Radius.ui_points(0.0),
             show_labels=True,
         )
-        rec.log(entity_path((*self.parts, "numbers")), numbers, static=static, strict=True)
         for k, mark in enumerate(marks):
             if mark.kind in ("line", "dots"):
                 name = f"{k} {mark.label or mark.kind}"
-                shown: rr.AsComponents = self.curve(mark.x, mark.y, mark.role, 0.6 * mark.width)
+                parts[name] = self.curve(mark.x, mark.y, mark.role, 0.6 * mark.width)
                 if mark.kind == "dots":
-                    shown = rr.Points2D(
+                    parts[name] = rr.Points2D(
                         self.points(mark.x, mark.y),
                         colors=[rgb(mark.role)],
                         radii=rr.Radius.ui_points(2.0),
                     )
-                rec.log(entity_path((*self.parts, name)), shown, static=static, strict=True)
+        for name, part in parts.items():
+            rec.log(entity_path((*self.parts, name)), part, static=static, strict=True)
 
     def view(self) -> rrb.Spatial2DView:
         """Return the view of the plot."""
@@ -240,7 +242,7 @@ def planes_of(name: str, panels: Sequence[Panel]) -> list[tuple[Plane, Panel]]:
         across = " ".join(panel.x.label.split())
         title = f"{label} over {across}" if across else panel.title
         if any(len(mark.x) for mark in panel.marks):
-            planes.append((Plane.around((name, title), title, panel.marks, panel.y.log), panel))
+            planes.append((Plane.around((name, title), title, panel.marks, log=panel.y.log), panel))
     return planes
 
 

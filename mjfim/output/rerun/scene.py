@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,8 +28,8 @@ OUTLINE_OPACITY = 0.3
 # Opacity of a robot beside which another one is drawn in the same view.
 PALE_OPACITY = 0.4
 
-# Share of white in the colour of an outlined robot.
-OUTLINE_WHITE = 0.4
+# Share of white in the colour of an outlined robot, and of the accent colour in that of others.
+OUTLINE_WHITE, TINT = 0.4, 0.35
 
 # Colour (0..1) of a geom that sets none; MuJoCo then takes the colour of its material.
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
@@ -59,12 +60,10 @@ class RobotStyle:
 
     Attributes:
         accent: Accent colour (0..255).
-        tint: Share of the accent colour in the moving geoms; the rest is the model's own colour.
         outline: True to draw the moving geoms as a pale outline in the accent colour.
     """
 
     accent: tuple[int, int, int]
-    tint: float = 0.35
     outline: bool = False
 
     def geom_colour(self, rgba: Iterable[float], moving: bool) -> list[int]:
@@ -84,8 +83,8 @@ class RobotStyle:
             colour = (1.0 - OUTLINE_WHITE) * accent + OUTLINE_WHITE * 255.0
             alpha *= OUTLINE_OPACITY
         else:
-            colour = self.tint * accent + (1.0 - self.tint) * 255.0 * model_rgba[:3]
-        return [round(float(channel)) for channel in (*colour, alpha)]
+            colour = TINT * accent + (1.0 - TINT) * 255.0 * model_rgba[:3]
+        return [round(channel) for channel in (*colour, alpha)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,28 +115,12 @@ def translucent(shape: DrawnShape) -> rrb.Visualizer:
     rgba = [*shape.rgba[:3], round(PALE_OPACITY * shape.rgba[3])]
     if isinstance(shape.archetype, rr.Mesh3D):
         return rr.Mesh3D.from_fields(albedo_factor=rgba).visualizer()
-    kinds = (rr.Boxes3D, rr.Capsules3D, rr.Cylinders3D, rr.Ellipsoids3D)
-    kind = next(kind for kind in kinds if isinstance(shape.archetype, kind))
-    return kind.from_fields(colors=[rgba]).visualizer()
+    kind: Any = type(shape.archetype)
+    found: rrb.Visualizer = kind.from_fields(colors=[rgba]).visualizer()
+    return found
 
 
 # ---- geoms of a body
-
-
-def drawn_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the geoms that MuJoCo's viewer shows.
-
-    If a body has geoms of hidden groups only, these are returned.
-
-    Args:
-        model: The model.
-        body: Number of the body.
-    """
-    first = int(model.body_geomadr[body])
-    geoms = range(first, first + int(model.body_geomnum[body]))
-    visible = [geom for geom in geoms if geom_rgba(model, geom)[3] > 0.0]
-    shown = [geom for geom in visible if model.geom_group[geom] <= LAST_SHOWN_GROUP]
-    return shown or visible
 
 
 def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
@@ -149,15 +132,17 @@ def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
         model: The model.
         geom: Number of the geom.
     """
-    rgba = tuple(float(channel) for channel in model.geom_rgba[geom])
+    rgba = tuple(model.geom_rgba[geom].tolist())
     material = int(model.geom_matid[geom])
     if material >= 0 and np.allclose(rgba, DEFAULT_RGBA):
-        return tuple(float(channel) for channel in model.mat_rgba[material])
+        return tuple(model.mat_rgba[material].tolist())
     return rgba
 
 
 def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterator[DrawnShape]:
     """Find the shapes that show a body; a moving body without geoms is a stick figure.
+
+    Its geoms are those that MuJoCo's viewer shows, or all where these are none.
 
     Args:
         model: The model.
@@ -167,9 +152,12 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
     Yields:
         The shapes.
     """
-    moving = int(model.body_weldid[body]) != 0
+    moving = bool(model.body_weldid[body])
     fill = OUTLINE if style.outline and moving else SOLID
-    geoms = drawn_geoms(model, body)
+    first = int(model.body_geomadr[body])
+    every = range(first, first + int(model.body_geomnum[body]))
+    visible = [geom for geom in every if geom_rgba(model, geom)[3] > 0.0]
+    geoms = [geom for geom in visible if model.geom_group[geom] <= LAST_SHOWN_GROUP] or visible
     for geom in geoms:
         rgba = style.geom_colour(geom_rgba(model, geom), moving)
         archetype = geom_shape(model, geom, rgba, fill)
@@ -207,7 +195,7 @@ def geom_origin(model: mujoco.MjModel, geom: int) -> Array:
 
 
 def geom_shape(
-    model: mujoco.MjModel, geom: int, rgba: list[int], fill: rr.components.FillMode = SOLID
+    model: mujoco.MjModel, geom: int, rgba: list[int], fill: rr.components.FillMode
 ) -> rr.AsComponents | None:
     """Return the archetype of a geom in its own frame, whose origin is `geom_origin`.
 
@@ -222,19 +210,19 @@ def geom_shape(
     """
     kind = GeomType(int(model.geom_type[geom]))
     # Half sizes [m]; a radius and a half length for round types.
-    a, b, c = (float(size) for size in model.geom_size[geom])
-    solid_rgba = rgba if fill is SOLID else [*rgba[:3], 255]
+    a, b, c = model.geom_size[geom].tolist()
+    look: Any = {"colors": [rgba if fill is SOLID else [*rgba[:3], 255]], "fill_mode": fill}
     match kind:
         case GeomType.mjGEOM_SPHERE:
-            return rr.Ellipsoids3D(half_sizes=[[a, a, a]], colors=[solid_rgba], fill_mode=fill)
+            return rr.Ellipsoids3D(half_sizes=[[a, a, a]], **look)
         case GeomType.mjGEOM_ELLIPSOID:
-            return rr.Ellipsoids3D(half_sizes=[[a, b, c]], colors=[solid_rgba], fill_mode=fill)
+            return rr.Ellipsoids3D(half_sizes=[[a, b, c]], **look)
         case GeomType.mjGEOM_BOX:
-            return rr.Boxes3D(half_sizes=[[a, b, c]], colors=[solid_rgba], fill_mode=fill)
+            return rr.Boxes3D(half_sizes=[[a, b, c]], **look)
         case GeomType.mjGEOM_CYLINDER:
-            return rr.Cylinders3D(lengths=[2 * b], radii=[a], colors=[solid_rgba], fill_mode=fill)
+            return rr.Cylinders3D(lengths=[2 * b], radii=[a], **look)
         case GeomType.mjGEOM_CAPSULE:
-            return rr.Capsules3D(lengths=[2 * b], radii=[a], colors=[solid_rgba], fill_mode=fill)
+            return rr.Capsules3D(lengths=[2 * b], radii=[a], **look)
         case GeomType.mjGEOM_PLANE:
             return _ground_plane(model, a, b, rgba)
         case GeomType.mjGEOM_HFIELD:
@@ -245,7 +233,7 @@ def geom_shape(
 
 
 def stick_figure(
-    model: mujoco.MjModel, body: int, rgba: list[int], fill: rr.components.FillMode = SOLID
+    model: mujoco.MjModel, body: int, rgba: list[int], fill: rr.components.FillMode
 ) -> Iterator[DrawnShape]:
     """Return shapes for a body without geoms: a ball, and sticks to its children.
 
@@ -258,7 +246,7 @@ def stick_figure(
     Yields:
         The shapes.
     """
-    radius = STICK_RADIUS * float(model.stat.extent)
+    radius = STICK_RADIUS * model.stat.extent
     upright = np.array([1.0, 0.0, 0.0, 0.0])
     ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=fill)
     yield DrawnShape(
@@ -291,25 +279,18 @@ def stick_figure(
 def _ground_plane(
     model: mujoco.MjModel, half_x: float, half_y: float, rgba: list[int]
 ) -> rr.Mesh3D:
-    """Return a plane, which is infinite for MuJoCo, as a large board.
+    """Return a plane, which is infinite for MuJoCo, as a large board; larger half sizes [m] stay.
 
-    Half sizes [m] larger than that are kept.
+    Its squares in two tones show depth.
     """
-    extent = float(model.stat.extent)
+    extent = model.stat.extent
     reach = INFINITE_REACH * extent
     half_sizes = np.maximum((half_x, half_y), reach)
 
     # The squares of a huge plane are larger.
     side = max(SQUARE_SIZE * extent, 2.0 * float(half_sizes.max()) / MAX_SQUARES)
     counts = np.maximum(np.rint(2.0 * half_sizes / side), 1.0).astype(np.intp)
-    return _checkerboard(half_sizes, counts, rgba)
 
-
-def _checkerboard(half_sizes: Array, counts: NDArray[np.intp], rgba: list[int]) -> rr.Mesh3D:
-    """Return the plane z = 0 as a board of squares in two tones, which shows depth.
-
-    `half_sizes` [m] and `counts` of squares are along x and y.
-    """
     # (squares, 2) column and row of every square.
     squares = np.indices(tuple(counts)).reshape(2, -1).T
 
@@ -324,24 +305,18 @@ def _checkerboard(half_sizes: Array, counts: NDArray[np.intp], rgba: list[int]) 
     is_bright = squares.sum(axis=1) % 2 == 1
     brightness = np.where(is_bright, 1.0, DARK_SQUARE)
     colours = brightness[:, None] * np.array(rgba[:3])
-    first_corners = 4 * np.arange(len(squares))[:, None]
     return rr.Mesh3D(
         vertex_positions=vertices,
-        triangle_indices=_two_triangles(first_corners, (0, 1, 2), (0, 2, 3)),
+        triangle_indices=_two_triangles(4 * np.arange(len(squares)), (0, 1, 2, 3)),
         vertex_normals=np.broadcast_to((0.0, 0.0, 1.0), vertices.shape),
         vertex_colors=np.repeat(colours, 4, axis=0).astype(np.uint8),
     )
 
 
-def _two_triangles(
-    first_corners: NDArray[np.intp], first: tuple[int, ...], second: tuple[int, ...]
-) -> NDArray[np.intp]:
-    """Return (2n, 3) triangles, two for each of n squares.
-
-    The corners of a triangle are the first corners (n, 1) plus the shifts `first` or `second`.
-    """
-    triangles = [first_corners + np.array(shifts) for shifts in (first, second)]
-    return np.concatenate(triangles)
+def _two_triangles(first_corners: NDArray[np.intp], shifts: tuple[int, ...]) -> NDArray[np.intp]:
+    """Return (2n, 3) triangles of n squares by their first corners (n,) and shifts of all four."""
+    corners = first_corners[:, None] + np.array(shifts)
+    return np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
 
 
 def _height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh3D:
@@ -363,12 +338,10 @@ def _height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh
 
     # The first corner of every rectangle between two rows and two columns.
     row_starts = np.arange(rows - 1)[:, None] * columns
-    first_corners = (row_starts + np.arange(columns - 1)).reshape(-1, 1)
+    first_corners = (row_starts + np.arange(columns - 1)).ravel()
     return rr.Mesh3D(
         vertex_positions=vertices.reshape(-1, 3),
-        triangle_indices=_two_triangles(
-            first_corners, (0, 1, columns + 1), (0, columns + 1, columns)
-        ),
+        triangle_indices=_two_triangles(first_corners, (0, 1, columns + 1, columns)),
         vertex_normals=normals,
         albedo_factor=rgba,
     )
@@ -396,6 +369,9 @@ def _mesh(model: mujoco.MjModel, index: int, rgba: list[int]) -> rr.Mesh3D:
 
 # Parts of the path of an entity, not escaped.
 EntityParts = tuple[str, ...]
+
+# Body of the end of a robot, (1,), and the point in the frame of the body, (1, 3) [m].
+EndPoint = tuple[NDArray[np.intp], Array]
 
 # Thickness of the path of a robot's end [points].
 PATH_THICKNESS = 1.0
@@ -454,16 +430,6 @@ def body_poses(model: mujoco.MjModel, t: Array, qpos: Array) -> BodyPoses:
     return BodyPoses(t=np.asarray(t), positions=positions, quaternions=quaternions)
 
 
-def is_moving(model: mujoco.MjModel, body: int) -> bool:
-    """Return True for a body that some joint moves.
-
-    Args:
-        model: The model.
-        body: Number of the body.
-    """
-    return int(model.body_weldid[body]) != 0
-
-
 def has_floor(model: mujoco.MjModel) -> bool:
     """Return True for a model with a ground plane, so that a view needs no grid.
 
@@ -516,22 +482,6 @@ def body_parts(model: mujoco.MjModel, root: EntityParts, body: int) -> EntityPar
     return (*root, "bodies", name)
 
 
-def first_shape_parts(model: mujoco.MjModel, root: EntityParts, body: int) -> EntityParts:
-    """Return the parts of the path of the first shape of a body.
-
-    A camera can follow a shape; it cannot follow a body, whose entity has no shape of its own.
-
-    Args:
-        model: The model.
-        root: Entity of the robot.
-        body: Number of the body.
-    """
-    style = RobotStyle(accent=(0, 0, 0))
-    parts = body_parts(model, root, body)
-    shape = next(drawn_shapes(model, body, style), None)
-    return parts if shape is None else (*parts, shape.name)
-
-
 # ---- robots
 
 
@@ -565,7 +515,7 @@ def log_robot(
             continue
         # No pose of a moving body is static, because static data would override the others.
         xyz, wxyz = poses.positions[:, body], poses.quaternions[:, body]
-        if is_moving(model, body):
+        if model.body_weldid[body]:
             xyzw = np.roll(wxyz, -1, axis=1)
             rows = rr.Transform3D.columns(translation=xyz, quaternion=xyzw)
             rec.send_columns(entity_path(parts), [time_column(poses.t)], rows, strict=True)
@@ -588,45 +538,39 @@ def pale_shapes(
         The appearance of each shape, by the path of its entity.
     """
     pale = {}
-    for body in filter(lambda b: is_moving(model, b), range(1, model.nbody)):
+    for body in np.flatnonzero(model.body_weldid).tolist():
         parts = body_parts(model, root, body)
         for shape in drawn_shapes(model, body, style):
-            found = translucent(shape)
-            pale[entity_path((*parts, shape.name))] = found
+            pale[entity_path((*parts, shape.name))] = translucent(shape)
     return pale
 
 
 def log_end_path(
     rec: rr.RecordingStream,
-    model: mujoco.MjModel,
     root: EntityParts,
     poses: BodyPoses,
+    end: EndPoint | None,
     style: RobotStyle,
+    *,
+    static: bool = False,
 ) -> None:
-    """Log the path of a robot's end as a line, on all timelines.
+    """Log the path of a robot's end as a line, if it has one.
 
     Args:
         rec: The recording.
-        model: The model.
         root: Entity of the robot.
         poses: Poses of its bodies.
+        end: The end of the robot.
         style: Style in which it is drawn.
+        static: True for all timelines, False for the time that is set.
     """
-    point = end_point(model, poses)
-    if point is not None:
-        path = strip_of_path(poses.world_paths(*point)[:, 0], style)
-        rec.log(entity_path((*root, "path")), path, static=True, strict=True)
-
-
-def strip_of_path(path: Array, style: RobotStyle) -> rr.LineStrips3D:
-    """Return a path in the world as a line.
-
-    Args:
-        path: (n, 3) points [m].
-        style: Style with the colour.
-    """
-    radius = rr.Radius.ui_points(PATH_THICKNESS)
-    return rr.LineStrips3D([path], colors=[[*style.accent, 255]], radii=radius)
+    if end is not None:
+        path = rr.LineStrips3D(
+            [poses.world_paths(*end)[:, 0]],
+            colors=[[*style.accent, 255]],
+            radii=rr.Radius.ui_points(PATH_THICKNESS),
+        )
+        rec.log(entity_path((*root, "path")), path, static=static, strict=True)
 
 
 def log_pose(
@@ -637,7 +581,7 @@ def log_pose(
     sample: int,
 ) -> None:
     """Log the pose of a robot at one sample of a motion, at the time that is set."""
-    for body in filter(lambda b: is_moving(model, b), range(1, model.nbody)):
+    for body in np.flatnonzero(model.body_weldid).tolist():
         pose = rr.Transform3D(
             translation=poses.positions[sample, body],
             quaternion=rerun_quaternion(poses.quaternions[sample, body]),
@@ -657,36 +601,22 @@ def moving_geoms(model: mujoco.MjModel) -> NDArray[np.intp]:
     return np.flatnonzero(model.body_weldid[model.geom_bodyid])
 
 
-def _moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
-    """Return the origins of moving bodies and the centres of their geoms.
-
-    Returns:
-        bodies: (n,) body of each point.
-        points: (n, 3) points in the frames of their bodies [m].
-    """
-    moving = np.flatnonzero(model.body_weldid)
-    geoms = moving_geoms(model)
-
-    origins = np.zeros((len(moving), 3))
-    points = np.concatenate([origins, model.geom_pos[geoms]])
-    bodies = np.concatenate([moving, model.geom_bodyid[geoms]])
-    return bodies.astype(np.intp), points
-
-
-def end_point(model: mujoco.MjModel, poses: BodyPoses) -> tuple[NDArray[np.intp], Array] | None:
+def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
     """Return the end of a robot, whose path is drawn.
 
-    Of the points deepest in the tree, it is the one that travels farthest.
+    Of the origins of moving bodies and the centres of their geoms, those deepest in the tree are
+    compared. The end is the one that travels farthest.
 
     Args:
         model: The model.
         poses: Poses of its bodies.
 
     Returns:
-        (1,) number of its body, and (1, 3) the point in the frame of the body [m]; None where
-        nothing moves.
+        The end; None where nothing moves.
     """
-    bodies, points = _moving_centres(model)
+    moving, geoms = np.flatnonzero(model.body_weldid), moving_geoms(model)
+    points = np.concatenate([np.zeros((len(moving), 3)), model.geom_pos[geoms]])
+    bodies = np.concatenate([moving, model.geom_bodyid[geoms]])
     if not len(bodies):
         return None
 
