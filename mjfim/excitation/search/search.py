@@ -498,7 +498,8 @@ class Search:
     def _free_rungs(self) -> tuple[Rung, ...]:
         """The coarse and the stated level without a barrier."""
         stated = Rung(variant=self.stage.task.system.variant)
-        is_fine = self.stage.task.experiment.descent.method != "lbfgs"
+        # A single iteration is for the stated level: one on a coarse level may not lower J there.
+        is_fine = self.stage.task.experiment.descent.method != "lbfgs" or self._max_iterations < 2
         coarse = None if is_fine else easier_level(self.stage, self.first)
         if coarse is None:
             return (stated,)
