@@ -198,9 +198,13 @@ def _pairs_that_may_collide(model: Any) -> list[list[int]]:
     """
     body, weld = model.geom_bodyid, model.body_weldid
     can_move = model.body_treeid[body] >= 0
-    pairs = np.stack(np.triu_indices(model.ngeom, 1))
+    # A scene may have thousands of geoms that cannot move.
+    ends = np.meshgrid(np.flatnonzero(can_move), np.arange(model.ngeom))
+    codes = np.unique(np.minimum(*ends) * model.ngeom + np.maximum(*ends))
+    pairs = np.stack(divmod(codes, model.ngeom))
+    pairs = pairs[:, pairs[0] != pairs[1]]
     pairs = np.where(can_move[pairs[0]], pairs, pairs[::-1])
-    first, second = pairs
+    second = pairs[1]
     # Every geom that moves has a distance to a floor that only an experiment states.
     chosen = second == mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, FLOOR)
     chosen |= np.isin(_codes(pairs), _codes(np.stack([model.pair_geom1, model.pair_geom2])))
@@ -216,7 +220,7 @@ def _pairs_that_may_collide(model: Any) -> list[list[int]]:
     may_collide &= ~np.isin(_codes(body[pairs]), _codes(excluded))
     types, affinities = model.geom_contype[pairs], model.geom_conaffinity[pairs[::-1]]
     chosen |= may_collide & (types & affinities).any(axis=0)
-    found: list[list[int]] = pairs[:, chosen & can_move[first] & (weld_a != weld_b)].T.tolist()
+    found: list[list[int]] = pairs[:, chosen & (weld_a != weld_b)].T.tolist()
     return found
 
 
