@@ -593,7 +593,8 @@ def sample_parameters(
     ]
     if not free:
         raise ExperimentError(
-            "robust: no parameter has a prior or bounds to sample from; state `prior` or `bounds`"
+            "no parameter has a prior or bounds to sample from; state `prior` or `bounds` in "
+            "[parameters]"
         )
 
     samples = np.tile(theta, (count, 1))

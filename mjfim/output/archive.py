@@ -205,7 +205,9 @@ SPACING_TOLERANCE = 1e-3
 PERIOD_TOLERANCE = 1e-6
 
 
-def write_design(folder: Path, design: Design, system: System) -> None:
+def write_design(
+    folder: Path, design: Design, system: System, further: Mapping[str, object] | None = None
+) -> None:
     """Write design.npz, design.csv, reference.csv and design.json, each complete or not at all.
 
     `Design.load` reads the design back. design.json names the experiment file and
@@ -215,6 +217,7 @@ def write_design(folder: Path, design: Design, system: System) -> None:
         folder: Folder for the files; made if it does not exist.
         design: The design.
         system: The experiment for which it was made.
+        further: Further entries of design.json.
     """
     playback = simulate_playback(system, design.trajectory, design.final.gain)
 
@@ -222,7 +225,8 @@ def write_design(folder: Path, design: Design, system: System) -> None:
     write_table(folder / "design.csv", design_columns(playback, system))
     write_table(folder / "reference.csv", reference_columns(playback, system))
 
-    write_json(folder / "design.json", {**origin_of(system, folder), **design.summary()})
+    values = {**origin_of(system, folder), **design.summary(), **(further or {})}
+    write_json(folder / "design.json", values)
 
 
 def summary_with_origin(

@@ -339,7 +339,7 @@ def _write_data(
 ) -> list[str]:
     """Write the data of a result, and the models that it identifies."""
     if system is not None and isinstance(record, Design):
-        archive.write_design(folder, record, system)
+        archive.write_design(folder, record, system, further)
         return []
 
     record.save_archive(folder)
