@@ -1,22 +1,15 @@
-"""Save a picture of a Rerun recording, without a display.
-
-    python scripts/rerun_screenshot.py design.rrd design.png --time 1.5
-    python scripts/rerun_screenshot.py design.rrd search.png --iteration 10 --tab iterates \
-        --size 1280x800
-    python scripts/rerun_screenshot.py design.rrd pictures --every-tab --size 1280x800
+"""Pictures of Rerun recordings for the gallery, without a display.
 
 The viewer needs a Vulkan driver; on Debian, the software driver of `mesa-vulkan-drivers` is enough.
 """
 
 from __future__ import annotations
 
-import argparse
 import re
 import socket
 import subprocess
-import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
@@ -40,30 +33,25 @@ class Shot:
     Attributes:
         rrd: Rerun recording.
         time_s: Simulated time [s].
-        iteration: Iteration of the optimiser that is shown instead of a time.
         size: Width and height of the window [pixels].
     """
 
     rrd: Path
     time_s: float = 0.0
-    iteration: int | None = None
     size: tuple[int, int] = SIZE
 
 
-def screenshot(shot: Shot, png: Path, tabs: Sequence[str] = ()) -> None:
+def screenshot(shot: Shot, png: Path) -> None:
     """Save the picture that the viewer shows.
 
     Args:
         shot: What the picture shows.
         png: File to write.
-        tabs: Names of the tabs that are opened, such as "limits" or "overlay".
 
     Raises:
         ConnectionError: No viewer can start.
     """
     with _viewer(shot) as viewer:
-        if tabs:
-            _open_tabs(viewer, tabs)
         _save(viewer, shot, png)
 
 
@@ -101,11 +89,8 @@ def every_tab(shot: Shot, folder: Path) -> list[Path]:
 
 
 def _save(viewer: ViewerClient, shot: Shot, picture: Path) -> None:
-    """Save what the viewer shows at the time or at the iteration."""
-    if shot.iteration is None:
-        viewer.set_time(timeline="sim_time", duration=shot.time_s, play_state="paused")
-    else:
-        viewer.set_time(timeline="iteration", sequence=shot.iteration, play_state="paused")
+    """Save what the viewer shows at the time."""
+    viewer.set_time(timeline="sim_time", duration=shot.time_s, play_state="paused")
     time.sleep(SETTLE)
     viewer.save_screenshot(str(picture.resolve()))
 
@@ -142,18 +127,6 @@ def _connected(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
     raise ConnectionError("the Rerun viewer does not start; it needs a Vulkan driver")
 
 
-def _open_tabs(viewer: ViewerClient, names: Sequence[str]) -> None:
-    """Open tabs by their names, in every container that has a tab with one of them."""
-    found = viewer.get_blueprint()
-    parts = found.blueprint
-    for path, content in parts.items():
-        container = content.get("ContainerBlueprint", {})
-        for child in container.get("contents", ()):
-            if container.get("container_kind") == "Tabs" and _name(parts, child) in names:
-                parts[path]["ContainerBlueprint"]["active_tab"] = child
-    viewer.set_blueprint(parts, store_id=found.store_id)
-
-
 def _name(parts: Mapping[str, Any], child: str) -> str:
     """Name of a container or a view."""
     shown = parts.get(f"/{child}", {})
@@ -186,42 +159,3 @@ def _free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Width and height that are stated as `1280x800`."""
-    width, height = (int(number) for number in text.split("x"))
-    return width, height
-
-
-def main() -> int:
-    """Run the command line; return exit code 2 where no viewer can start."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("rrd", type=Path)
-    parser.add_argument("png", type=Path, help="file to write; with --every-tab a folder")
-    parser.add_argument("--time", type=float, default=0.0, help="simulated time [s]")
-    parser.add_argument(
-        "--iteration", type=int, help="show the timeline `iteration` at this number instead"
-    )
-    parser.add_argument("--size", type=_size, default=SIZE, help="such as 1280x800 [pixels]")
-    parser.add_argument(
-        "--tab", action="append", default=[], help="tab to open; may be given several times"
-    )
-    parser.add_argument("--every-tab", action="store_true", help="save a picture of every tab")
-    args = parser.parse_args()
-    shot = Shot(rrd=args.rrd, time_s=args.time, iteration=args.iteration, size=args.size)
-    try:
-        if args.every_tab:
-            every_tab(shot, args.png)
-        else:
-            screenshot(shot, args.png, args.tab)
-    except ConnectionError as error:
-        print(f"no viewer: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
