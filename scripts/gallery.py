@@ -35,7 +35,7 @@ import tomlkit
 from PIL import Image
 
 from mjfim.output.page import TERMS
-from scripts.rerun_screenshot import Shot, every_tab, screenshot
+from scripts.rerun_screenshot import Shot, screenshot
 from scripts.verbs import call_verb
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -72,9 +72,6 @@ SCHEMES: tuple[Literal["light", "dark"], ...] = ("light", "dark")
 
 # Moment of the simulated motion that Rerun shows [s].
 SHOWN_TIME = 1.5
-
-# Sizes of the window in which all tabs of Rerun recordings are looked at [pixels].
-VIEWER_SIZES = ((1280, 800), (1920, 1080))
 
 # What the pictures of the page show, by the begin of their names, in the order of the page. Other
 # pictures are for looking at.
@@ -471,21 +468,6 @@ def for_page(picture: Path, target: Path) -> int:
     return image.width
 
 
-def save_every_tab(folder: Path) -> None:
-    """Save pictures of all tabs of the Rerun files of a robot, beside its other screenshots.
-
-    Args:
-        folder: Folder of the robot.
-    """
-    for recording in sorted(folder.glob("*/*.rrd")):
-        for size in VIEWER_SIZES:
-            try:
-                shot = Shot(rrd=recording, time_s=SHOWN_TIME, size=size)
-                every_tab(shot, recording.parent / "screenshots")
-            except ConnectionError as error:
-                print(f"{recording}: no viewer: {error}", file=sys.stderr)
-
-
 # ---- page
 
 
@@ -648,11 +630,6 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/gallery"))
     parser.add_argument("--page", type=Path, help="page in Markdown to write")
     parser.add_argument("--only", nargs="+", metavar="ROBOT", help="names of robots")
-    parser.add_argument(
-        "--every-tab",
-        action="store_true",
-        help="also save every tab of the Rerun files at two sizes, which takes a while",
-    )
     parser.add_argument("--reuse", action="store_true", help="use the files of an earlier run")
     options = parser.parse_args()
 
@@ -664,8 +641,6 @@ def main() -> int:
         calls = kept_calls(folder) if options.reuse else _new_calls(robot, folder, parser)
         if calls:
             found.append((robot, calls))
-            if options.every_tab:
-                save_every_tab(folder)
 
     if options.page is not None:
         write_page(options.page, found)
