@@ -33,6 +33,7 @@ from mjfim.parallel.budget import Budget
 from mjfim.parallel.shared_value import KeptPerThread, SharedValue
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
+from mjfim.records.base import record
 from mjfim.records.design import HistoryRow, StartResult, Status, extended
 from mjfim.records.events import DesignCallback, DesignEvent
 from mjfim.records.trajectory import Trajectory
@@ -68,7 +69,7 @@ WORST = 1e3
 TINY = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Release:
     """One release, evaluated.
 
@@ -209,7 +210,7 @@ class _TimeIsOverError(Exception):
     """Ends a local search, whose method has no other way to end at once."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Plan:
     """What all orders share, for workers."""
 

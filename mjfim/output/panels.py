@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.output.page import OTHER, TERMS
+from mjfim.records.base import record
 
 # Colours of roles that are no words of the vocabulary: text and reference lines, notes and curves
 # that stay in the background, bands.
@@ -57,7 +58,7 @@ Kind = Literal[
 ]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Mark:
     """Something that is drawn in a panel.
 
@@ -121,7 +122,7 @@ class Axis:
     hidden: bool = False
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Cells:
     """Coloured cells, from blue over white to red.
 

@@ -29,6 +29,7 @@ from mjfim.parallel import (
 )
 from mjfim.parallel.budget import Budget, StopReason, StopToken
 from mjfim.parallel.shared_value import KeptPerThread, SharedValue
+from mjfim.records.base import record
 from mjfim.records.design import (
     HistoryRow,
     IterateMotion,
@@ -69,7 +70,7 @@ LARGEST_ERROR = 1.0 / 3.0
 KEPT_GROUNDS = 2
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Rung:
     """A level of the ladder.
 
@@ -84,7 +85,7 @@ class Rung:
     share: float = 1.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Candidate:
     """A control on its way up the ladder. It can be pickled.
 
@@ -218,7 +219,7 @@ class Grounds:
         return sum(plant.engine_steps for plant in plants.values())
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Plan:
     """What all moves of a design share, for workers."""
 

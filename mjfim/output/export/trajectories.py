@@ -41,6 +41,7 @@ from mjfim.model.coordinates import ScalarJoint, state_components
 from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
 from mjfim.output.archive import check_fits, reference_columns, simulate_playback
 from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, rosbags_module
+from mjfim.records.base import record
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Playback
 
@@ -48,7 +49,7 @@ from mjfim.records.trajectory import Playback
 Meaning = Literal["force", "position", "velocity", "other"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Drive:
     """One control, and what it drives.
 

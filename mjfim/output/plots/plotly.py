@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.output.panels import Axis, Cells, Mark, Panel, Picture
 from mjfim.output.words import shorten
+from mjfim.records.base import record
 
 # An object for Plotly, of values that JSON can hold.
 Plotly = dict[str, Any]
@@ -59,7 +60,7 @@ LETTER, NAME_WIDTH = 6.5, 26
 SHORT_LOG_AXIS = 2.5
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Key:
     """An entry of the legend: its name, role and shape."""
 
@@ -68,7 +69,7 @@ class Key:
     shape: str
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Plot:
     """One plot: its words and its size, and the data that the script of the page reads."""
 
@@ -79,7 +80,7 @@ class Plot:
     data: Plotly
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Group:
     """Plots of one picture, under one legend."""
 
