@@ -511,7 +511,7 @@ class _RobotPlayer:
             states: (n+1, ns) states at every engine step.
         """
         constraints = self.constraints
-        margins: list[float] = []
+        margins = []
         if observed is not None:
             bounds = constraints.substeps.bounds
             quantities = constraints.substeps.quantities(observed)

@@ -64,7 +64,7 @@ class ReleaseSpace:
         # Positions and velocities.
         deviations = system.source.coordinates.deviations[: 2 * space.nv]
         components = {component.name: component for component in deviations}
-        chosen: list[TangentComponent] = []
+        chosen = []
         ranges = []
         for name, (low, high) in stated.items():
             if name not in components:

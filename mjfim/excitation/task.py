@@ -583,7 +583,7 @@ class DesignTask:
         # A stop acts inside of a limit that the file states wider than the MJCF.
         model = self.system.model
         own = {(each.kind, each.name): each for each in limits_of_model(model)}
-        named: dict[str, set[str]] = defaultdict(set)
+        named = defaultdict(set)
         for limit in self.limits:
             stop = own.get((limit.kind, limit.name), limit)
             if stop.lower <= limit.lower and limit.upper <= stop.upper:

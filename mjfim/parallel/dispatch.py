@@ -242,7 +242,7 @@ def carry_out(
         ExperimentError: An order cannot be sent, or a cluster had no workers at all.
     """
     dispatch = _Dispatch(Workers.of(executor), function, orders, budget)
-    early: dict[int, Outcome[T]] = {}
+    early = {}
     following = 0
     for outcome in dispatch.arrivals():
         early[outcome.index] = outcome
@@ -322,7 +322,7 @@ def results_on(
         """Do an order in this process."""
         return work(own, order, stop)
 
-    there: Callable[[Order], T] = here
+    there = here
     workers = Workers.of_any(executor)
     if workers is not None:
         made = make(workers.threads_for(len(orders)))

@@ -85,6 +85,10 @@ class Rung:
     share: float = 1.0
 
 
+# Rungs, one after the other.
+Rungs = tuple[Rung, ...]
+
+
 @record
 class Candidate:
     """A control on its way up the ladder. It can be pickled.
@@ -157,6 +161,10 @@ class Candidate:
         if point.cost > self.cost or not np.isfinite(point.cost):
             return self
         return replace(self, best=control, cost=point.cost, point=point)
+
+
+# Iterates as they are found, and at the end the candidates after their moves.
+Moved = Generator[DesignEvent, None, list[Candidate]]
 
 
 class Grounds:
@@ -256,7 +264,7 @@ class Move:
     """
 
     candidate: Candidate
-    rungs: tuple[Rung, ...]
+    rungs: Rungs
     is_last: bool
     iterations: int
     seconds: float
@@ -315,7 +323,11 @@ class Climb:
                 if rung.barrier is None:
                     yield from self._descend_freely(ground, memory)
                 else:
-                    yield from self._descend_inside(ground, self._barrier(rung.barrier))
+                    # What was begun before may have to begin bluntly.
+                    barrier, first = rung.barrier, self.candidate.first_weight
+                    if first is not None:
+                        barrier = replace(barrier, first=max(first, barrier.last))
+                    yield from self._descend_inside(ground, barrier)
                 if self.candidate.has_left or self._is_over:
                     break
         except (SimulationDivergedError, np.linalg.LinAlgError):
@@ -341,11 +353,6 @@ class Climb:
         """Number of iterations that are left."""
         used = self.candidate.iterations - self._begin.iterations
         return self._move.iterations - max(used - 1, 0)
-
-    def _barrier(self, barrier: Barrier) -> Barrier:
-        """The barrier of a rung, which may have to begin bluntly."""
-        first = self.candidate.first_weight
-        return barrier if first is None else replace(barrier, first=max(first, barrier.last))
 
     # ---- moves
 

@@ -357,7 +357,7 @@ class Ground(LimitedLevel):
             max_iterations: Largest number of iterations.
         """
         is_last = problem.mu <= barrier.last
-        merits: list[float] = []
+        merits = []
         iterates = optimize(
             problem,
             problem.reevaluate(point),

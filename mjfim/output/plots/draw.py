@@ -420,7 +420,7 @@ def log_ticks(low: float, high: float) -> list[float]:
         even = np.asarray(MaxNLocator(NARROW_TICKS, steps=[1, 2, 5, 10]).tick_values(low, high))
         return [float(tick) for tick in even if low <= tick <= high]
 
-    ticks: list[float] = []
+    ticks = []
     for digits in TICK_DIGITS:
         candidates = np.sort(np.outer(10.0**decades, digits).ravel())
         ticks = candidates[(candidates >= low) & (candidates <= high)].tolist()

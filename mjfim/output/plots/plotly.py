@@ -139,7 +139,7 @@ def _traces(mark: Mark, limit: int) -> list[Plotly]:
     colour = f"role:{mark.role}"
     named = {"name": escape(mark.label), "legendgroup": mark.label, "opacity": mark.opacity}
     other = np.zeros(0) if mark.other is None else mark.other
-    lines: Plotly = {**named, "type": "scatter", "mode": "lines", "hoverinfo": "skip"}
+    lines = {**named, "type": "scatter", "mode": "lines", "hoverinfo": "skip"}
     match mark.kind:
         case "line" | "steps" | "dots":
             return [{**named, **_points(mark, colour, limit)}]
@@ -181,7 +181,7 @@ def _traces(mark: Mark, limit: int) -> list[Plotly]:
             return [{**lines, "line": line, "x": packed(x), "y": packed(np.repeat(mark.y, 3))}]
         case "words":
             words = [escape(text) for text in mark.texts]
-            look: Plotly = {
+            look = {
                 "textposition": "middle right",
                 "textfont": {"color": colour, "size": 11},
             }
@@ -217,7 +217,7 @@ def _points(mark: Mark, colour: str, limit: int) -> Plotly:
 
 def _heatmap(cells: Cells) -> Plotly:
     values = cells.values - cells.middle
-    trace: Plotly = {
+    trace = {
         "type": "heatmap",
         "z": [[float(v) if np.isfinite(v) else None for v in row] for row in values],
         "colorscale": "role:diverging",
@@ -249,7 +249,7 @@ def _layout(panel: Panel, label: str) -> Plotly:
     if panel.cells is not None and not rows.names:
         rows = replace(panel.x, limits=(len(panel.cells.values) - 0.5, -0.5))
     annotations, right = _words_beside(panel)
-    layout: Plotly = {
+    layout = {
         "xaxis": _axis(panel.x, label),
         "yaxis": _axis(rows, rows.label if panel.title else ""),
         "shapes": [shape for mark in panel.marks for shape in _shapes(mark)],
@@ -308,7 +308,7 @@ def _shapes(mark: Mark) -> list[Plotly]:
 def _words_beside(panel: Panel) -> tuple[list[Plotly], float]:
     """The columns of words right of the rows, and where they end [CSS pixels]."""
     found, right = [], 8.0
-    place: Plotly = {"xref": "paper", "x": 1.0, "xanchor": "left", "showarrow": False}
+    place = {"xref": "paper", "x": 1.0, "xanchor": "left", "showarrow": False}
     for heading, role, texts in panel.beside:
         look = {**place, "xshift": right, "font": {"size": 11, "color": f"role:{role}"}}
         top = {"yref": "paper", "y": 1.0, "yanchor": "bottom"}

@@ -68,7 +68,7 @@ def grid_tabs(name: str, views: Sequence[rrb.View]) -> list[rrb.Container]:
 
 def series_tabs(tabs: Tabs) -> list[rrb.Container]:
     """Return a tab for each group of plots of series; the first plot of a page has a legend."""
-    found: list[rrb.Container] = []
+    found = []
     for name, panels in tabs.items():
         views = [
             rrb.TimeSeriesView(
