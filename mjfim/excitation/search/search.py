@@ -291,7 +291,7 @@ class Search:
         elif is_outside and self._has_time(rung):
             share = OUTSIDE_SHARE
         if share:
-            first, best = yield from self._by_chance(first, best, share, PATIENCE)
+            first, best = yield from self._by_chance(first, best, share)
         return replace(first, control=best.begin) if is_outside else first
 
     def _inside_of(self, candidate: Candidate) -> InsideControl | None:
@@ -409,7 +409,7 @@ class Search:
             if inside is None:
                 break
             share = RANDOM_SHARE if is_useful else CLOSING_SHARE
-            best, inside = yield from self._by_chance(best, inside, share, PATIENCE)
+            best, inside = yield from self._by_chance(best, inside, share)
             done[place] = best
             has_gained = is_progress(before, best.cost)
             if not is_useful and not has_gained:
@@ -434,12 +434,12 @@ class Search:
         return self.budget.seconds_left > FEWEST_EVALUATIONS * seconds
 
     def _by_chance(
-        self, candidate: Candidate, inside: InsideControl, share: float, patience: float
+        self, candidate: Candidate, inside: InsideControl, share: float
     ) -> Generator[DesignEvent, None, tuple[Candidate, InsideControl]]:
         """Improve a candidate by random changes of a control within the limits."""
         budget = self.budget.share(share)
         candidate = candidate.improved(inside.control, inside.point)
-        for found in self.inside.improvements(inside, budget, patience):
+        for found in self.inside.improvements(inside, budget, PATIENCE):
             inside = found
             candidate = candidate.improved(found.control, found.point)
             values = self.grounds.cost.values(found.control)
