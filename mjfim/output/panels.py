@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -95,7 +95,7 @@ class Mark:
     texts: Sequence[str] = ()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Axis:
     """An axis of a panel.
 
@@ -143,7 +143,7 @@ class Cells:
     scale: tuple[Sequence[float], Sequence[str]] | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Panel:
     """A part of a picture with its own axes.
 
@@ -178,7 +178,7 @@ class Panel:
     is_shaded: bool = False
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Picture:
     """Panels under one title and one legend.
 
