@@ -268,6 +268,9 @@ class Run:
                 of the page, where the result is bad.
             remark: What is said behind the name of the folder.
         """
+        from mjfim.output.archive import summary_with_origin
+        from mjfim.output.pages import page_of
+
         remarks: Iterable[str] = ()
         try:
             if self.output:
@@ -277,34 +280,19 @@ class Run:
                     remarks = write_result(self.output, result, system, self.pictures, further)
         finally:
             # It is printed after it is written, also where it cannot be written.
-            self._print(result, system, design, further, sections, verdict)
+            source = None if system is None else system.experiment.source
+            page = page_of(result, experiment=source, design=design, output=self.output)
+            page = replace(page, sections=[*page.sections, *sections])
+            values = {**summary_with_origin(result, system, self.output), **further}
+            print_result(self.as_json, values, page, verbose=self.verbose)
+            if page.verdict.level is Level.BAD:
+                verdict = verdict or page.verdict.text
+            if verdict and (self.as_json or not out.is_terminal):
+                say_from_program(verdict)
         for sentence in remarks:
             say(f"warning: {sentence}")
         if self.output:
             say_written(self.output, remark)
-
-    def _print(
-        self,
-        result: ShownRecord,
-        system: System | None,
-        design: Path | None,
-        further: Mapping[str, object],
-        sections: Iterable[Section],
-        verdict: str,
-    ) -> None:
-        """Print a result on stdout; see `finish`."""
-        from mjfim.output.archive import summary_with_origin
-        from mjfim.output.pages import page_of
-
-        source = None if system is None else system.experiment.source
-        page = page_of(result, experiment=source, design=design, output=self.output)
-        page = replace(page, sections=[*page.sections, *sections])
-        values = {**summary_with_origin(result, system, self.output), **further}
-        print_result(self.as_json, values, page, verbose=self.verbose)
-        if page.verdict.level is Level.BAD:
-            verdict = verdict or page.verdict.text
-        if verdict and (self.as_json or not out.is_terminal):
-            say_from_program(verdict)
 
 
 def print_result(

@@ -22,7 +22,6 @@ from mjfim.cli.progress import progress, say, say_from_program, watched
 from mjfim.errors import MAX_STARTS, first_ones
 
 if TYPE_CHECKING:
-    from mjfim.excitation.shortest_horizon import ShortestExperiment
     from mjfim.excitation.task import DesignTask
     from mjfim.records.design import Design
 
@@ -73,7 +72,7 @@ def design(
     claim_video(video, input_files(stated), force=run.force)
     run.claim((*DESIGN_FILES, *(SHORTEST_FILES if shortest else ())), input_files(stated))
 
-    found: ShortestExperiment | None = None
+    found = None
     with ExitStack() as during:
         workers = during.enter_context(run.workers(_tasks(task, run), _cores(task)))
         most = None if shortest else stated.descent.seconds
@@ -91,7 +90,7 @@ def design(
         else:
             result = mjfim.design(stated, callback=show, threads=run.threads, executor=workers)
 
-    further: dict[str, object] = {}
+    further = {}
     if found is not None:
         # The files describe the shortest horizon, not the stated one.
         system = System.resolve(found.experiment, threads=run.threads)

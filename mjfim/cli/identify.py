@@ -24,7 +24,7 @@ from mjfim.errors import MAX_SAMPLES, ExperimentError
 
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
-    from mjfim.records.estimate import Estimate, ParameterDraws
+    from mjfim.records.estimate import Estimate
 
 
 @verb()
@@ -141,7 +141,7 @@ def _with_draws(result: Estimate, system: System, count: int, seed: int) -> tupl
     from mjfim.parallel.budget import run_optional
 
     # Drawing takes long for many bodies or robots, and Ctrl-C must not lose the fit.
-    found: list[ParameterDraws] = []
+    found = []
     rng = np.random.default_rng(seed)
     try:
         with progress("drawing robots"):

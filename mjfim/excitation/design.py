@@ -361,7 +361,7 @@ def _chosen(
         name="initial control", control=search.stage.task.control, status=Status.INTERRUPTED
     )
     best = min(results, key=lambda result: (result.cost, result.rank), default=nothing)
-    point: DesignPoint | None = best.point
+    point = best.point
     if is_limited:
         shown = best.over_horizon if best.best is None else best.best
         point = point_at_stated_rate(search.stage, shown) if results else None

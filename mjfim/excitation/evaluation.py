@@ -212,17 +212,6 @@ def design_warnings(
     unstable = growth_warning(final.growth)
     if unstable is not None:
         yield unstable
-    yield from _limit_warnings(found)
-    yield from open_boundary_warnings(task)
-    if found.deviation > SAME_STATE_TOLERANCE:
-        yield (
-            f"played on the unmodified model, the design deviates by up to {found.deviation:.2g} "
-            "of the size of its states: a clamp, stop or contact acts"
-        )
-
-
-def _limit_warnings(found: Verification) -> Iterator[str]:
-    """One warning for each kind of limit that is violated."""
     for kind, margin in found.margins.items():
         if not margin < 0.0:
             continue
@@ -236,6 +225,12 @@ def _limit_warnings(found: Verification) -> Iterator[str]:
         if kind in found.by_stated_solver:
             where = " with the solver settings of the MJCF (tolerance, iterations, warm start) only"
         yield f"{kind} limits are exceeded by {-margin:.3g}{where}: {advice}"
+    yield from open_boundary_warnings(task)
+    if found.deviation > SAME_STATE_TOLERANCE:
+        yield (
+            f"played on the unmodified model, the design deviates by up to {found.deviation:.2g} "
+            "of the size of its states: a clamp, stop or contact acts"
+        )
 
 
 def open_boundary_warnings(task: DesignTask) -> Iterator[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -15,6 +14,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import fourier_basis, independent_curves
 from mjfim.experiment.packing import opened
 from mjfim.recordings.control_table import read_control
+from mjfim.records.base import record
 
 # Largest number of harmonics of a Fourier series.
 MAX_SERIES_HARMONICS = 15
@@ -44,7 +44,7 @@ MOST_RANDOM_AMPLITUDE = 6.0
 GIVEN = "given control"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class InitialControl:
     """A control from which an optimisation starts.
 

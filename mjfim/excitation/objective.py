@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,10 +22,11 @@ from mjfim.plant.mixed_derivatives import (
 )
 from mjfim.plant.plant import LumpedParameters, Plant
 from mjfim.plant.state_space import StateSpace
+from mjfim.records.base import record
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RunningCost:
     """Weighted squares of the deviations from a desired trajectory and a desired control.
 
@@ -73,7 +74,7 @@ class RunningCost:
         return a, b
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class DesignPoint:
     """A trajectory with its information and its cost.
 
@@ -120,7 +121,7 @@ DIVERGED = DesignPoint(
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class DesignProblem:
     """The cost J of a design, in the form that Algorithm 1 of the paper needs.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any
 
 import mujoco
@@ -37,6 +37,7 @@ from mjfim.model.units import ANGLE, LENGTH, joint_unit, per_second
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.outputs import outputs_by_state
+from mjfim.records.base import record
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.rehearsal import REST_SHARE, FiniteSteps, Rehearsal, RehearsedLimit
 from mjfim.records.trajectory import Trajectory
@@ -197,7 +198,7 @@ def _drawn(task: DesignTask, rng: np.random.Generator) -> Array:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class _SpeedGroup:
     """A joint whose speed is measured: the norm of the velocities of some degrees of freedom."""
 
@@ -207,7 +208,7 @@ class _SpeedGroup:
     is_limited: bool
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Played:
     """Measurements of one robot; see `Rehearsal`."""
 
@@ -510,7 +511,7 @@ class _RobotPlayer:
             states: (n+1, ns) states at every engine step.
         """
         constraints = self.constraints
-        margins: list[float] = []
+        margins = []
         if observed is not None:
             bounds = constraints.substeps.bounds
             quantities = constraints.substeps.quantities(observed)

@@ -7,7 +7,6 @@ best of them, which lie apart, local searches without derivatives follow.
 from __future__ import annotations
 
 import itertools
-import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -28,11 +27,11 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification
-from mjfim.parallel import ExecutorLike, Workers, one_blas_thread, pool_stop_token, results
-from mjfim.parallel.budget import Budget
-from mjfim.parallel.shared_value import KeptPerThread, SharedValue
+from mjfim.parallel import ExecutorLike, Workers, results_on
+from mjfim.parallel.budget import Budget, StopToken
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
+from mjfim.records.base import record
 from mjfim.records.design import HistoryRow, StartResult, Status, extended
 from mjfim.records.events import DesignCallback, DesignEvent
 from mjfim.records.trajectory import Trajectory
@@ -68,7 +67,7 @@ WORST = 1e3
 TINY = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Release:
     """One release, evaluated.
 
@@ -209,70 +208,51 @@ class _TimeIsOverError(Exception):
     """Ends a local search, whose method has no other way to end at once."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Plan:
-    """What all orders share, for workers."""
-
-    experiment: Experiment
-    added_information: Array | None
-    basis: Array | None
-    space: ReleaseSpace
-    step_factors: Array | None
-    threads: int
-
-    def releases(self) -> Releases:
-        """Make the evaluation in a worker."""
-        task = DesignTask.resolve(
-            self.experiment, threads=self.threads, added_information=self.added_information
-        )
-        plant = task.plant.with_step_factors(self.step_factors)
-        return Releases(stage=DescentLevel(task, self.basis), space=self.space, plant=plant)
+def _made(
+    experiment: Experiment,
+    added: Array | None,
+    basis: Array | None,
+    space: ReleaseSpace,
+    step_factors: Array | None,
+    threads: int,
+) -> Releases:
+    """Make the evaluation in a worker."""
+    task = DesignTask.resolve(experiment, threads=threads, added_information=added)
+    plant = task.plant.with_step_factors(step_factors)
+    return Releases(stage=DescentLevel(task, basis), space=space, plant=plant)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Order:
-    """Order to evaluate some releases, or to follow one; `plan` is for workers only."""
+    """Order to evaluate some releases, or to follow one."""
 
     name: str
     budget: Budget
     grid: tuple[Array, ...] = ()
     start: Release | None = None
-    plan: SharedValue[_Plan] | None = None
 
 
-# Name of an order, what it has tried, how it has ended, and the engine steps of a worker. Without a
-# status its time was over.
+# Name of an order, what it has tried, how it has ended, and the engine steps. Without a status its
+# time was over.
 _Tried = tuple[str, list[Release], Status | None, int]
 
-_kept = KeptPerThread[Releases](2)
 
-
-def _tried(releases: Releases, order: _Order) -> _Tried:
-    """Carry out an order in this process."""
-    stop = pool_stop_token()
+def _tried(releases: Releases, order: _Order, stop: StopToken) -> _Tried:
+    """Carry out an order."""
+    before = releases.plant.engine_steps
 
     def is_over() -> bool:
         """Whether the time is over, or a stop was requested."""
         return stop.requested or order.budget.exhausted is not None
 
+    found, status = list[Release](), None
     if order.start is not None:
-        return order.name, *releases.followed(order.start, is_over), 0
-    found: list[Release] = []
+        found, status = releases.followed(order.start, is_over)
     for shares in order.grid:
         if found and is_over():
             break
         found.append(releases.evaluate(shares))
-    return order.name, found, None, 0
-
-
-@one_blas_thread()
-def _in_worker(order: _Order) -> _Tried:
-    """Carry out an order in a worker."""
-    assert order.plan is not None
-    releases = _kept.get(order.plan.digest, order.plan.value.releases)
-    before = releases.plant.engine_steps
-    name, found, status, _ = _tried(releases, order)
-    return name, found, status, releases.plant.engine_steps - before
+    return order.name, found, status, releases.plant.engine_steps - before
 
 
 class ReleaseSearch:
@@ -363,12 +343,12 @@ class ReleaseSearch:
 
     def _carried_out(self, orders: list[_Order], budget: Budget) -> Iterator[_Tried]:
         """What the orders have tried, in their order, here or on the workers."""
-        if self._workers is not None:
-            plan = self._plan(len(orders))
-            orders = [replace(order, plan=plan) for order in orders]
-        here = partial(_tried, self._releases)
-        for tried in results(_in_worker, orders, self._workers, budget, here):
-            self._releases.plant.simulator.add_steps(tried[-1])
+        own = self._releases.plant
+        before = own.engine_steps
+        for tried in results_on(self._releases, self._plan, _tried, orders, self._workers, budget):
+            # The steps of this process are counted already.
+            own.simulator.add_steps(tried[-1] - (own.engine_steps - before))
+            before = own.engine_steps
             yield tried
 
     def _calibrate(self) -> None:
@@ -410,19 +390,18 @@ class ReleaseSearch:
             )
         return rows
 
-    def _plan(self, tasks: int) -> SharedValue[_Plan]:
-        """What all orders share; the workers do some number of tasks."""
-        assert self._workers is not None
+    def _plan(self, threads: int) -> Callable[[], Releases]:
+        """What makes the evaluation in a worker that has a number of threads."""
         releases, task = self._releases, self._releases.stage.task
-        plan = _Plan(
-            experiment=for_workers(task.experiment, task.system.source),
-            added_information=task.added_information,
-            basis=releases.stage.basis,
-            space=releases.space,
-            step_factors=releases.plant.step_factors,
-            threads=self._workers.threads_for(tasks),
+        return partial(
+            _made,
+            for_workers(task.experiment, task.system.source),
+            task.added_information,
+            releases.stage.basis,
+            releases.space,
+            releases.plant.step_factors,
+            threads,
         )
-        return SharedValue(uuid.uuid4().hex, plan)
 
     def _take(self, release: Release, name: str) -> None:
         """Keep and report a release if it is the best one."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,12 +12,13 @@ from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import TangentComponent, unknown_coordinate
 from mjfim.plant.state_space import StateSpace
+from mjfim.records.base import record
 
 # Distance from an end of a range, relative to its width, up to which a release is at that end.
 EDGE_SHARE = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ReleaseSpace:
     """The d coordinates of the initial state that a design may choose, and their ranges.
 
@@ -64,7 +64,7 @@ class ReleaseSpace:
         # Positions and velocities.
         deviations = system.source.coordinates.deviations[: 2 * space.nv]
         components = {component.name: component for component in deviations}
-        chosen: list[TangentComponent] = []
+        chosen = []
         ranges = []
         for name, (low, high) in stated.items():
             if name not in components:

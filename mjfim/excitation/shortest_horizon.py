@@ -36,7 +36,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
-from mjfim.records.base import SavedRecord
+from mjfim.records.base import SavedRecord, record
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent, shown_progress
@@ -71,7 +71,7 @@ MAX_HORIZON_FACTOR = 4.0
 DEFAULT_TOLERANCE = 0.02
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class SampleGrid:
     """Numbers of samples that an experiment may have.
 
@@ -255,7 +255,7 @@ class OutOfReachError(ExperimentError):
     """Even the longest experiment misses a target standard deviation."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Tried:
     """A duration that was tried.
 
@@ -409,7 +409,7 @@ def shortest_experiment(
         return search.run(_default_longest(task) if longest is None else longest)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _HorizonSearch:
     """Search for the smallest number of samples whose design reaches the targets.
 

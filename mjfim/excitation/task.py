@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -40,6 +40,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import ModelVariant, Relaxation, has_dry_friction, smoothing_speeds_of
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
+from mjfim.records.base import record
 from mjfim.records.trajectory import Trajectory
 
 # Harmonics of a random multisine.
@@ -57,7 +58,7 @@ FADE_SHARE = 0.1
 RANGE_MARGIN = 0.05
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class DesignTask:
     """Everything that the design of an excitation trajectory needs.
 
@@ -582,7 +583,7 @@ class DesignTask:
         # A stop acts inside of a limit that the file states wider than the MJCF.
         model = self.system.model
         own = {(each.kind, each.name): each for each in limits_of_model(model)}
-        named: dict[str, set[str]] = defaultdict(set)
+        named = defaultdict(set)
         for limit in self.limits:
             stop = own.get((limit.kind, limit.name), limit)
             if stop.lower <= limit.lower and limit.upper <= stop.upper:

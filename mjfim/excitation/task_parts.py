@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +27,7 @@ from mjfim.model.parameters import sample_parameters
 from mjfim.model.variants import Relaxation
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.control_table import read_control
+from mjfim.records.base import record
 from mjfim.records.trajectory import Trajectory
 
 
@@ -44,7 +44,7 @@ def named_file(experiment: Experiment) -> Iterator[None]:
 POOLING_EXPONENT = 20.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ParameterSamples:
     """Parameter samples, and how the criterion is pooled over them.
 

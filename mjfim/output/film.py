@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import pairwise
@@ -36,6 +36,7 @@ from mjfim.output.rerun.camera import (
     view_direction,
 )
 from mjfim.output.rerun.scene import BodyPoses, body_poses, has_floor
+from mjfim.records.base import record
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Trajectory
@@ -71,7 +72,7 @@ FILLED = 0.9
 FLOOR_SPACING = 0.12
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class Track:
     """One robot in a view.
 
@@ -86,7 +87,7 @@ class Track:
     is_ghost: bool
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class FilmView:
     """One picture of a frame.
 
@@ -101,7 +102,7 @@ class FilmView:
     trail: Array
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class FilmCamera:
     """Camera of all views.
 
@@ -121,7 +122,7 @@ class FilmCamera:
     size: tuple[int, int]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class Film:
     """A motion in frames.
 

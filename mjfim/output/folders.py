@@ -393,7 +393,7 @@ def _write_figures(
     drawn: Callable[[], dict[str, bytes]],
 ) -> None:
     """Write all pictures of a result, which another process may have drawn."""
-    contents: dict[str, bytes] = {}
+    contents = {}
     write_optional("the pictures", lambda: contents.update(drawn()))
     if contents:
         _clear_other_formats(folder, contents, picture_format)
@@ -403,7 +403,7 @@ def _write_figures(
         return
 
     # Matplotlib takes seconds to import, which nobody waits for who has pressed Ctrl-C twice.
-    pictures: Pictures = {}
+    pictures = {}
     write_optional("the pictures", lambda: pictures.update(pictures_of(record)))
     write_pictures(folder, pictures, picture_format)
 

@@ -86,7 +86,7 @@ def live_system(
 ) -> Iterator[Callback]:
     """Show how a search for a resolved system proceeds. See `live`."""
     tell = say or (lambda sentence: sys.stderr.write(f"mjfim: {sentence}\n"))
-    viewer: LiveShow | None = None
+    viewer = None
     try:
         viewer = _connected(url_of(address or DEFAULT_ADDRESS), system, may_open=address is None)
     except NoViewerError as reason:

@@ -77,9 +77,9 @@ class OutputGuard:
         Raises:
             OutputError: One of them is an input or a folder, or belongs to the user.
         """
-        unknown: list[Path] = []
-        changed: list[Path] = []
-        manifests: dict[Path, Entries] = {}
+        unknown = []
+        changed = []
+        manifests = {}
         for file in files:
             if not os.path.lexists(file):
                 continue

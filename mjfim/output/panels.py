@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.output.page import OTHER, TERMS
+from mjfim.records.base import record
 
 # Colours of roles that are no words of the vocabulary: text and reference lines, notes and curves
 # that stay in the background, bands.
@@ -57,7 +58,7 @@ Kind = Literal[
 ]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Mark:
     """Something that is drawn in a panel.
 
@@ -94,7 +95,7 @@ class Mark:
     texts: Sequence[str] = ()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Axis:
     """An axis of a panel.
 
@@ -121,7 +122,7 @@ class Axis:
     hidden: bool = False
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Cells:
     """Coloured cells, from blue over white to red.
 
@@ -142,7 +143,7 @@ class Cells:
     scale: tuple[Sequence[float], Sequence[str]] | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Panel:
     """A part of a picture with its own axes.
 
@@ -177,7 +178,7 @@ class Panel:
     is_shaded: bool = False
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Picture:
     """Panels under one title and one legend.
 

@@ -103,8 +103,8 @@ def palettes() -> dict[str, dict[str, Any]]:
 
 def _lighter(colour: str) -> str:
     """A colour that can be read on a dark page."""
-    channels = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-    return "#" + "".join(f"{round(c + LIGHTER * (255 - c)):02x}" for c in channels)
+    channels = bytes.fromhex(colour.removeprefix("#"))
+    return f"#{bytes(round(c + LIGHTER * (255 - c)) for c in channels).hex()}"
 
 
 # Folder of the templates, beside this module.

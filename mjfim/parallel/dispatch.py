@@ -242,7 +242,7 @@ def carry_out(
         ExperimentError: An order cannot be sent, or a cluster had no workers at all.
     """
     dispatch = _Dispatch(Workers.of(executor), function, orders, budget)
-    early: dict[int, Outcome[T]] = {}
+    early = {}
     following = 0
     for outcome in dispatch.arrivals():
         early[outcome.index] = outcome
@@ -304,7 +304,7 @@ def results_on(
     work: Callable[[Object, Order, StopToken], T],
     orders: Sequence[Order],
     executor: ExecutorLike | None,
-    stop: StopToken,
+    budget: Budget,
 ) -> Iterator[T]:
     """Do independent work on one object, which a worker makes once; see `results`.
 
@@ -315,19 +315,19 @@ def results_on(
         work: Does an order on the object, with a token that may ask it to stop.
         orders: The orders.
         executor: The workers; None for this process.
-        stop: Ends the work early.
+        budget: As for `results`; its token may ask the work of this process to stop.
     """
 
     def here(order: Order) -> T:
         """Do an order in this process."""
-        return work(own, order, stop)
+        return work(own, order, budget.stop)
 
-    there: Callable[[Order], T] = here
+    there = here
     workers = Workers.of_any(executor)
     if workers is not None:
         made = make(workers.threads_for(len(orders)))
         there = partial(_in_worker, uuid.uuid4().hex, made, work)
-    return results(there, orders, workers, Budget(stop=stop), here)
+    return results(there, orders, workers, budget, here)
 
 
 @one_blas_thread()

@@ -350,7 +350,7 @@ def initialize_worker(stop: ctypes.c_bool, lifeline: connection.Connection, addr
 
 def _hand_over(address: str) -> None:
     """Send what the running task has offered, whenever a stop is requested."""
-    sent: tuple[int, object] | None = None
+    sent = None
     key = multiprocessing.current_process().authkey
     while True:
         time.sleep(OFFER_INTERVAL)

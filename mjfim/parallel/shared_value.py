@@ -53,7 +53,7 @@ class SharedValue(Generic[T]):
 
         Two of them would not be found by the same hash any more after one of them is deleted.
         """
-        own: SharedValue[T] | None = _owned.get(digest)
+        own = _owned.get(digest)
         return cls(digest, value, size) if own is None else own
 
     @property
@@ -154,7 +154,7 @@ def _referenced(digest: str, size: int) -> SharedValue[Any]:
     own = _owned.get(digest)
     if own is not None:
         return own
-    reference: SharedValue[Any] = SharedValue.__new__(SharedValue)
+    reference = SharedValue.__new__(SharedValue)
     reference.digest = digest
     reference.size = size
     reference._value = ()

@@ -242,7 +242,7 @@ class Rehearsal(ShownRecord):
         allowed = MAX_BROKEN * self.robots
         is_model_safe = bool(self.kept[0].all()) and not self.passes_floor[0]
         is_inside = (self.kept | self.is_clamped).all(axis=1) & ~np.isnan(self.end_height)
-        broken = (~is_inside[1:]).sum()
+        broken = int(np.count_nonzero(~is_inside[1:]))
         worst = max(self.unbraked.values(), default=0)
         has_few = max(broken, self.below_floor, worst) < max(allowed, 1.0)
         return is_model_safe and has_few

@@ -51,7 +51,7 @@ from mjfim.information.smoothness import visible_columns
 from mjfim.optimize.directions import LBFGS
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
-from mjfim.parallel.budget import StopToken, stop_on_interrupt
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
@@ -427,7 +427,7 @@ def _identifiability_test(
 
     def differentiated(probes: Iterable[Trajectory]) -> Iterator[RowsAndError | None]:
         """Differentiate motions on the workers."""
-        return results_on(test, make, _rows_along, list(probes), executor, stop)
+        return results_on(test, make, _rows_along, list(probes), executor, Budget(stop=stop))
 
     return replace(test, differentiated=differentiated)
 

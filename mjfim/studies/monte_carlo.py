@@ -22,7 +22,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.information.identifiability import require_visible
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
-from mjfim.parallel.budget import StopToken, stop_on_interrupt
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.base import record
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.studies import MonteCarloStudy, TrialStatistics
@@ -292,7 +292,9 @@ def _estimates(
     def make(threads: int) -> Callable[[], TrialSet]:
         return partial(_made_trials, SystemOrder.of(trial_set.system, threads), trial_set.ctrl)
 
-    for number, found in enumerate(results_on(trial_set, make, _estimated, chunks, executor, stop)):
+    budget = Budget(stop=stop)
+    every = results_on(trial_set, make, _estimated, chunks, executor, budget)
+    for number, found in enumerate(every):
         report((number + 1) / len(chunks))
         if found is not None:
             yield found

@@ -114,7 +114,11 @@ class RobotExperiment:
 
         values["terms"] = {k: v for k, v in values.get("terms", {}).items() if k not in loads}
         parameters = {k: v for k, v in values["parameters"].items() if k not in gone}
-        values["parameters"] = {name: _of_interest(table) for name, table in parameters.items()}
+        # Values that differ from recording to recording remain a nuisance.
+        values["parameters"] = {
+            name: {k: v for k, v in table.items() if k != "nuisance" or table.get("per_recording")}
+            for name, table in parameters.items()
+        }
         hold = tuple(name for name in experiment.fit.hold if name not in gone)
         values["fit"] = {**values.get("fit", {}), "hold": hold}
         bodies = tuple(spec.body or "" for spec in loads.values())
@@ -212,16 +216,6 @@ def parameters_of(name: str, spec: ParameterSpec) -> list[tuple[str, str | None]
     fields = BARYCENTRIC_FIELDS if kind == "barycentric" else LOGCHOLESKY_FIELDS
     pairs = zip(INERTIA_PARAMETRISATIONS[kind].names, fields, strict=True)
     return [(f"{name}.{each}", f"body/{spec.inertial}:{field}") for each, field in pairs]
-
-
-def _of_interest(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A table of a robot's parameter, which is no nuisance where the robot itself is identified.
-
-    Values that differ from recording to recording always are.
-    """
-    if table.get("per_recording"):
-        return dict(table)
-    return {key: value for key, value in table.items() if key != "nuisance"}
 
 
 # Density of the uniform cube whose size is assumed where none is stated [kg/m³]: that of water, and

@@ -20,6 +20,7 @@ from mjfim.optimize.cost_models import BarrierDerivatives, Bounds
 from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.state_space import StateSpace
+from mjfim.records.base import record
 from mjfim.records.trajectory import Trajectory
 
 # Norm over its bound below which the limits of the derivatives at zero hold; the error is the
@@ -27,7 +28,7 @@ from mjfim.records.trajectory import Trajectory
 NEARLY_ZERO = 1e-8
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Magnitude:
     """The norm of some observed numbers, or the angle whose half has this norm as its sine.
 
@@ -104,7 +105,7 @@ END_WEIGHT = 0.1
 NEGLIGIBLE_CLEARANCE = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ConstraintValues:
     """The constrained quantities along a trajectory.
 
@@ -153,7 +154,7 @@ class KindMargins(NamedTuple):
     scale: Array | float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ExpansionSums:
     """Gradient and Gauss-Newton Hessian of the barrier.
 

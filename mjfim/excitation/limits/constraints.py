@@ -134,7 +134,7 @@ class CurvatureOfLimits(StepCurvature):
         self, step: TangentCurve, factors: Sequence[Array] | None
     ) -> tuple[Weights, tuple[Array, ...], float]:
         """See `StepCurvature.along`."""
-        found: list[Array] = []
+        found = []
         growth = 1.0
         for i, member in enumerate(self.members):
             slacks = member.slacks(self.values)
@@ -211,7 +211,7 @@ class ConstraintSet:
     @property
     def members(self) -> tuple[Constraint, ...]:
         """The kinds of constraints that the experiment has."""
-        every: tuple[Constraint | None, ...] = (
+        every = (
             self.substeps,
             self.control,
             self.rate,
@@ -460,7 +460,7 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
     # begins with where the control does not change. Lengths of tendons are like forces that change.
     kinds, substeps = {limit.kind for limit in ordered}, task.system.grid.substeps
     has_forces = not kinds.isdisjoint(FORCE_KINDS)
-    force_rows: tuple[int, ...] = ()
+    force_rows = ()
     if "tendon_length" in kinds or (has_forces and not has_constant_forces(task.system.model)):
         begun = range(substeps) if is_rk4(task.system.model) else ()
         force_rows = (*begun, substeps - 1)

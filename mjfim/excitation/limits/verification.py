@@ -140,7 +140,9 @@ def _verification(
         values: What `_played` returns for the model.
         model: The model.
     """
-    unenforced = _unenforced_kinds(task)
+    unenforced = frozenset[str]()
+    if not task.experiment.limits.enforce:
+        unenforced = frozenset({"clearance", *(limit.kind for limit in task.limits)})
     if values is None:
         margins = dict.fromkeys((*constraints.substeps.kinds, "simulation"), -np.inf)
         return Verification(
@@ -204,13 +206,6 @@ def _worse_of(exact: Verification, stated: Verification) -> Verification:
 def _smaller_of(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
     """The smaller margin of each kind."""
     return {kind: min(margin, second[kind]) for kind, margin in first.items()}
-
-
-def _unenforced_kinds(task: DesignTask) -> frozenset[str]:
-    """Kinds of limits that are checked, but not enforced."""
-    if task.experiment.limits.enforce:
-        return frozenset()
-    return frozenset({"clearance", *(limit.kind for limit in task.limits)})
 
 
 def usage_within_samples(

@@ -29,6 +29,7 @@ from mjfim.parallel import (
 )
 from mjfim.parallel.budget import Budget, StopReason, StopToken
 from mjfim.parallel.shared_value import KeptPerThread, SharedValue
+from mjfim.records.base import record
 from mjfim.records.design import (
     HistoryRow,
     IterateMotion,
@@ -69,7 +70,7 @@ LARGEST_ERROR = 1.0 / 3.0
 KEPT_GROUNDS = 2
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Rung:
     """A level of the ladder.
 
@@ -84,7 +85,11 @@ class Rung:
     share: float = 1.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+# Rungs, one after the other.
+Rungs = tuple[Rung, ...]
+
+
+@record
 class Candidate:
     """A control on its way up the ladder. It can be pickled.
 
@@ -158,6 +163,10 @@ class Candidate:
         return replace(self, best=control, cost=point.cost, point=point)
 
 
+# Iterates as they are found, and at the end the candidates after their moves.
+Moved = Generator[DesignEvent, None, list[Candidate]]
+
+
 class Grounds:
     """The levels of a design in one process, each made when it is used first.
 
@@ -218,7 +227,7 @@ class Grounds:
         return sum(plant.engine_steps for plant in plants.values())
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Plan:
     """What all moves of a design share, for workers."""
 
@@ -255,7 +264,7 @@ class Move:
     """
 
     candidate: Candidate
-    rungs: tuple[Rung, ...]
+    rungs: Rungs
     is_last: bool
     iterations: int
     seconds: float
@@ -314,7 +323,11 @@ class Climb:
                 if rung.barrier is None:
                     yield from self._descend_freely(ground, memory)
                 else:
-                    yield from self._descend_inside(ground, self._barrier(rung.barrier))
+                    # What was begun before may have to begin bluntly.
+                    barrier, first = rung.barrier, self.candidate.first_weight
+                    if first is not None:
+                        barrier = replace(barrier, first=max(first, barrier.last))
+                    yield from self._descend_inside(ground, barrier)
                 if self.candidate.has_left or self._is_over:
                     break
         except (SimulationDivergedError, np.linalg.LinAlgError):
@@ -340,11 +353,6 @@ class Climb:
         """Number of iterations that are left."""
         used = self.candidate.iterations - self._begin.iterations
         return self._move.iterations - max(used - 1, 0)
-
-    def _barrier(self, barrier: Barrier) -> Barrier:
-        """The barrier of a rung, which may have to begin bluntly."""
-        first = self.candidate.first_weight
-        return barrier if first is None else replace(barrier, first=max(first, barrier.last))
 
     # ---- moves
 

@@ -27,6 +27,7 @@ from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
+from mjfim.records.base import record
 from mjfim.records.design import Status
 
 # Smallest tolerance on a coarse level. It is coarse, because the stated level refines the minimum.
@@ -81,7 +82,7 @@ STEERING_TOLERANCE = 1e-6
 RIDGE = 0.03
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Barrier:
     """Weights mu of the barrier, one per stage, and when its descent has converged.
 
@@ -107,7 +108,7 @@ class Barrier:
         return weights
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Step:
     """An iterate of a descent.
 
@@ -356,7 +357,7 @@ class Ground(LimitedLevel):
             max_iterations: Largest number of iterations.
         """
         is_last = problem.mu <= barrier.last
-        merits: list[float] = []
+        merits = []
         iterates = optimize(
             problem,
             problem.reevaluate(point),

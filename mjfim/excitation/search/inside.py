@@ -26,6 +26,7 @@ from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, moved_alike
 from mjfim.excitation.task import FADE_SHARE
 from mjfim.parallel.budget import Budget
+from mjfim.records.base import record
 from mjfim.records.design import ScaledStart
 
 # Shares of a control that are tried first; below the last one, each share is the same factor
@@ -125,7 +126,7 @@ class LimitedCost(LimitedLevel):
         return self.point_along(values) if self.keeps_along(values) else None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class InsideControl:
     """A control that keeps all limits.
 

@@ -15,7 +15,6 @@ from mjfim.arrays import Array
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
-from mjfim.optimize.cost_models import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 
@@ -194,7 +193,7 @@ class InteriorProblem:
             expansion = Expansion(A=A, B=B, a=a, b=b)
 
         scale = self._merit_scale(point)
-        barrier: BarrierExpansion = self.constraints.expand(values, jacobian, self.delta)
+        barrier = self.constraints.expand(values, jacobian, self.delta)
         barrier = barrier.scaled(self.mu)
         if not (self.follows_curvature and self.mu <= SHARP_MU):
             barrier = replace(barrier, curvature=None)

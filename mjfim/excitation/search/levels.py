@@ -155,7 +155,7 @@ def require_coarse_factor(task: DesignTask) -> None:
         )
 
 
-def easier_level(fine: DescentLevel, evaluated: DesignPoint | None = None) -> DescentLevel | None:
+def easier_level(fine: DescentLevel, evaluated: DesignPoint | None) -> DescentLevel | None:
     """Make a coarser or smoother level on which a descent begins.
 
     Args:
@@ -278,9 +278,7 @@ def similar_level(
     return coarse if change <= MAX_COARSE_CHANGE else None
 
 
-def coarser_levels(
-    fine: DescentLevel, evaluated: DesignPoint | None = None
-) -> tuple[DescentLevel, ...]:
+def coarser_levels(fine: DescentLevel, evaluated: DesignPoint | None) -> tuple[DescentLevel, ...]:
     """Make several coarser levels where each sample is one engine step.
 
     With more engine steps in a sample, one level with a longer timestep is enough (`easier_level`).

@@ -24,8 +24,10 @@ from mjfim.excitation.search.climb import (
     Climb,
     Grounds,
     Move,
+    Moved,
     Plan,
     Rung,
+    Rungs,
     move_in_worker,
     row_of,
 )
@@ -188,9 +190,7 @@ class Search:
         """Engine steps since the search began, also those of workers."""
         return self.grounds.steps + self.remote_steps
 
-    def run(
-        self, candidates: Sequence[Candidate], further: Iterable[Candidate] = ()
-    ) -> Generator[DesignEvent, None, list[Candidate]]:
+    def run(self, candidates: Sequence[Candidate], further: Iterable[Candidate] = ()) -> Moved:
         """Yield every iterate; return the candidates that were begun.
 
         Args:
@@ -205,7 +205,7 @@ class Search:
             return (yield from self._run_inside(list(candidates)))
 
         further = iter(further)
-        done: list[Candidate] = []
+        done = []
         waiting = list(candidates)
         begins_as_stated = waiting[0].control is self.stage.task.control
         if self._is_bounded_by_weights and not self._is_determinant:
@@ -240,11 +240,9 @@ class Search:
             done += yield from self._run_inside(waiting, ladder)
         return (yield from self._followed(done, further))
 
-    def _followed(
-        self, done: list[Candidate], further: Iterator[Candidate]
-    ) -> Generator[DesignEvent, None, list[Candidate]]:
+    def _followed(self, done: list[Candidate], further: Iterator[Candidate]) -> Moved:
         """Begin with further controls, until several of them in turn did not help."""
-        size = 1 if self.executor is None else Workers.of(self.executor).count
+        size = self._worker_count
         in_vain = 0
         least = min((each.cost for each in done), default=np.inf)
         while in_vain < FURTHER_STARTS and self._has_time():
@@ -293,7 +291,7 @@ class Search:
         elif is_outside and self._has_time(rung):
             share = OUTSIDE_SHARE
         if share:
-            first, best = yield from self._by_chance(first, best, share, PATIENCE)
+            first, best = yield from self._by_chance(first, best, share)
         return replace(first, control=best.begin) if is_outside else first
 
     def _inside_of(self, candidate: Candidate) -> InsideControl | None:
@@ -307,16 +305,13 @@ class Search:
 
     # ---- descents within the limits
 
-    def _run_inside(
-        self, candidates: list[Candidate], ladder: tuple[Rung, ...] = ()
-    ) -> Generator[DesignEvent, None, list[Candidate]]:
+    def _run_inside(self, candidates: list[Candidate], ladder: Rungs = ()) -> Moved:
         """Let candidates climb within the limits, in batches while there is time."""
         ladder = ladder or self._ladder(candidates)
         done: list[Candidate] = []
         waiting = self._affordable(candidates, ladder[0])
         while waiting and (not done or self.budget.exhausted is None):
-            workers = 1 if self.executor is None else Workers.of(self.executor).count
-            size = max(HALVING_RATE, workers)
+            size = max(HALVING_RATE, self._worker_count)
             done += yield from self._climbed(waiting[:size], ladder)
             waiting = waiting[size:]
         if done and self.grounds.is_limited and all(each.best is None for each in done):
@@ -347,11 +342,9 @@ class Search:
                 candidate = replace(moved, history=extended(candidate.history, rows))
         return candidate
 
-    def _climbed(
-        self, batch: list[Candidate], ladder: tuple[Rung, ...]
-    ) -> Generator[DesignEvent, None, list[Candidate]]:
+    def _climbed(self, batch: list[Candidate], ladder: Rungs) -> Moved:
         """Let a batch climb the ladder; a share of it goes on from each rung."""
-        results: dict[str, Candidate] = {}
+        results = {}
         for number, rung in enumerate(ladder):
             is_last = number == len(ladder) - 1
             if number and not self._has_time_for(batch, rung):
@@ -399,9 +392,7 @@ class Search:
 
     # ---- random changes
 
-    def _helped_by_chance(
-        self, done: list[Candidate], ladder: tuple[Rung, ...]
-    ) -> Generator[DesignEvent, None, list[Candidate]]:
+    def _helped_by_chance(self, done: list[Candidate], ladder: Rungs) -> Moved:
         """Change the best control at random where descents are held up, and descend from there."""
         place = min(range(len(done)), key=lambda i: done[i].cost, default=None)
         if place is None or self.keeps_curves:
@@ -418,7 +409,7 @@ class Search:
             if inside is None:
                 break
             share = RANDOM_SHARE if is_useful else CLOSING_SHARE
-            best, inside = yield from self._by_chance(best, inside, share, PATIENCE)
+            best, inside = yield from self._by_chance(best, inside, share)
             done[place] = best
             has_gained = is_progress(before, best.cost)
             if not is_useful and not has_gained:
@@ -443,12 +434,12 @@ class Search:
         return self.budget.seconds_left > FEWEST_EVALUATIONS * seconds
 
     def _by_chance(
-        self, candidate: Candidate, inside: InsideControl, share: float, patience: float
+        self, candidate: Candidate, inside: InsideControl, share: float
     ) -> Generator[DesignEvent, None, tuple[Candidate, InsideControl]]:
         """Improve a candidate by random changes of a control within the limits."""
         budget = self.budget.share(share)
         candidate = candidate.improved(inside.control, inside.point)
-        for found in self.inside.improvements(inside, budget, patience):
+        for found in self.inside.improvements(inside, budget, PATIENCE):
             inside = found
             candidate = candidate.improved(found.control, found.point)
             values = self.grounds.cost.values(found.control)
@@ -495,7 +486,7 @@ class Search:
         return self.stage.task.experiment.cost.criterion == "D"
 
     @cached_property
-    def _free_rungs(self) -> tuple[Rung, ...]:
+    def _free_rungs(self) -> Rungs:
         """The coarse and the stated level without a barrier."""
         stated = Rung(variant=self.stage.task.system.variant)
         # A single iteration is for the stated level: one on a coarse level may not lower J there.
@@ -506,7 +497,7 @@ class Search:
         self.grounds.keep(coarse)
         return (Rung(variant=coarse.task.system.variant), stated)
 
-    def _ladder(self, candidates: Sequence[Candidate]) -> tuple[Rung, ...]:
+    def _ladder(self, candidates: Sequence[Candidate]) -> Rungs:
         """The rungs within the limits."""
         stated = self.grounds.stated
         variant = stated.task.system.variant
@@ -567,8 +558,7 @@ class Search:
         begun = self.budget.seconds_used
         problem.expand(problem.point(task.initial))
         each = ITERATIONS_OF_A_START * (self.budget.seconds_used - begun)
-        workers = 1 if self.executor is None else Workers.of(self.executor).count
-        return candidates[: max(int(workers * seconds / max(each, 1e-9)), 1)]
+        return candidates[: max(int(self._worker_count * seconds / max(each, 1e-9)), 1)]
 
     @property
     def _max_iterations(self) -> int:
@@ -597,9 +587,12 @@ class Search:
 
     # ---- descents, here or on workers
 
-    def _move(
-        self, candidate: Candidate, rungs: tuple[Rung, ...], seconds: float, is_last: bool
-    ) -> Move:
+    @property
+    def _worker_count(self) -> int:
+        """Number of moves that run side by side."""
+        return 1 if self.executor is None else Workers.of(self.executor).count
+
+    def _move(self, candidate: Candidate, rungs: Rungs, seconds: float, is_last: bool) -> Move:
         """A move for a candidate. seconds: its time [s]."""
         left = max(self._max_iterations - max(candidate.iterations - 1, 0), 1)
         share = rungs[0].share if rungs else 1.0
@@ -613,9 +606,7 @@ class Search:
             keeps_curves=self.keeps_curves,
         )
 
-    def _moved(
-        self, candidates: Sequence[Candidate], rungs: tuple[Rung, ...], *, is_last: bool
-    ) -> Generator[DesignEvent, None, list[Candidate]]:
+    def _moved(self, candidates: Sequence[Candidate], rungs: Rungs, *, is_last: bool) -> Moved:
         """Let candidates climb some rungs; those for which there is no time are left out."""
         share = rungs[0].share if len(rungs) == 1 else 1.0
         if self.executor is not None and (len(candidates) > 1 or self.grounds.is_limited):
@@ -641,10 +632,10 @@ class Search:
     def _moved_on_workers(
         self,
         candidates: Sequence[Candidate],
-        rungs: tuple[Rung, ...],
+        rungs: Rungs,
         share: float,
         is_last: bool,
-    ) -> Generator[DesignEvent, None, list[Candidate]]:
+    ) -> Moved:
         """Let candidates climb some rungs on the workers of the executor."""
         assert self.executor is not None
         workers = Workers.of(self.executor)
@@ -657,8 +648,14 @@ class Search:
             turns = -(-len(waiting) // workers.count)
             seconds = max(end - self.budget.seconds_used, 0.0) / turns
             moves = [
+                # A candidate that has found a control climbs the last rung only.
                 replace(
-                    self._move(each, _rungs_left(each, rungs), min(seconds, longest), is_last),
+                    self._move(
+                        each,
+                        rungs if each.best is None else rungs[-1:],
+                        min(seconds, longest),
+                        is_last,
+                    ),
                     may_continue=seconds > longest and each.iterations <= self._max_iterations,
                     plan=plan,
                 )
@@ -678,7 +675,8 @@ class Search:
                             yield DesignEvent(start=found.name, row=row)
                 results[found.name] = found
                 has_moved = len(found.history) > len(begun.history)
-                if moves[outcome.index].may_continue and has_moved and _is_unfinished(found):
+                is_over = found.is_judged or found.has_left or found.is_held_up or found.status
+                if moves[outcome.index].may_continue and has_moved and not is_over:
                     waiting.append(found)
             if self.budget.exhausted is not None:
                 break
@@ -719,17 +717,6 @@ def candidate_of(start: InitialControl) -> Candidate:
     return Candidate(
         name=start.name, control=start.control, curves=start.basis, repeats=start.repeats
     )
-
-
-def _rungs_left(candidate: Candidate, rungs: tuple[Rung, ...]) -> tuple[Rung, ...]:
-    """The rungs that a candidate still has to climb: the last one if it has found a control."""
-    return rungs if candidate.best is None else rungs[-1:]
-
-
-def _is_unfinished(candidate: Candidate) -> bool:
-    """Whether the time of a move ended before its descent did."""
-    is_over = candidate.is_judged or candidate.has_left or candidate.is_held_up
-    return candidate.status is None and not is_over
 
 
 def _named_stop(candidate: Candidate, budget: Budget) -> Candidate:

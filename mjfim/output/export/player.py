@@ -51,7 +51,7 @@ def play(robot: Any, output: str = "recording.csv", feedback: bool = False) -> s
     if os.path.exists(output):
         raise FileExistsError(f"{output} exists; choose another name for the recording")
     check_start(measured(robot))
-    log: list[tuple[float, np.ndarray, dict[str, float]]] = []
+    log = []
     row, clipped, begin = 0, 0, time.perf_counter()
     control = np.full(len(CONTROLS), nan)
     try:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -41,6 +41,7 @@ from mjfim.model.coordinates import ScalarJoint, state_components
 from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
 from mjfim.output.archive import check_fits, reference_columns, simulate_playback
 from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, rosbags_module
+from mjfim.records.base import record
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Playback
 
@@ -48,7 +49,7 @@ from mjfim.records.trajectory import Playback
 Meaning = Literal["force", "position", "velocity", "other"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Drive:
     """One control, and what it drives.
 
@@ -137,6 +138,8 @@ def _drives(system: System) -> tuple[Drive, ...]:
     for name, i in zip(system.controls, actuators.tolist(), strict=True):
         is_single = int(model.actuator_ctrlnum[i]) == 1
         at_joint = mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT
+        is_affine = mujoco.mjtBias(int(model.actuator_biastype[i])) in AFFINE
+        pulls = is_affine and float(model.actuator_biasprm[i, 1]) < 0.0
         lower, upper = ranges.get(name, (-np.inf, np.inf))
         drives.append(
             Drive(
@@ -146,19 +149,12 @@ def _drives(system: System) -> tuple[Drive, ...]:
                 if is_single and at_joint
                 else None,
                 gear=actuator_gear(model, i),
-                holds_position=_holds_position(model, i),
+                holds_position=pulls and not is_integrated(model, i),
                 lower=float(lower),
                 upper=float(upper),
             )
         )
     return tuple(drives)
-
-
-def _holds_position(model: Any, actuator: int) -> bool:
-    """Whether an actuator pulls its coordinate to a place that its control states."""
-    is_affine = mujoco.mjtBias(int(model.actuator_biastype[actuator])) in AFFINE
-    pulls = is_affine and float(model.actuator_biasprm[actuator, 1]) < 0.0
-    return pulls and not is_integrated(model, actuator)
 
 
 def _meaning(model: Any, actuator: int) -> Meaning:
@@ -604,7 +600,7 @@ def _messages(
     state = types[JOINT_STATE]
     for k, t in enumerate(plan.playback.t.tolist()):
         stamp = START + round(t * NANOSECONDS)
-        rows: Sequence[Array] = [np.ascontiguousarray(values[k]) for values in planned]
+        rows = [np.ascontiguousarray(values[k]) for values in planned]
         yield PLANNED_TOPIC, JOINT_STATE, stamp, state(header(stamp), joints, *rows)
         sent = state(header(stamp), controls, nothing, nothing, plan.held_control[k])
         yield CONTROL_TOPIC, JOINT_STATE, stamp, sent

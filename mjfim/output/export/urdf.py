@@ -102,7 +102,7 @@ def write_identified_urdfs(
         return {}, []
 
     wanted = system.model_at(theta, at_keyframe=False)
-    files: dict[Path, Path] = {}
+    files = {}
     remarks = []
     for name, source in zip(urdf_files(path, system.model_path), sources, strict=True):
         try:
@@ -145,7 +145,7 @@ def _write(path: Path, source: UrdfSource, system: System, wanted: Any) -> None:
     (prefix,) = source.prefixes
     xml, old = ModelXml(source.path, system.source.read), system.model
     stated = _loaded(source.path, "MuJoCo does not load the URDF alone", system.source.files)
-    inertias: dict[str, BodyInertia] = {}
+    inertias = {}
     for link in xml.root.iterchildren("link"):
         name = link.get("name")
         body = identifier(old, "body", prefix + name)
@@ -155,7 +155,7 @@ def _write(path: Path, source: UrdfSource, system: System, wanted: Any) -> None:
             if inertias[name] is not own:
                 _state_inertia(link, own, inertias[name])
 
-    frictions: dict[str, Array] = {}
+    frictions = {}
     for joint in xml.root.iterchildren("joint"):
         friction = _friction(wanted, prefix + joint.get("name"))
         if friction is not None:

@@ -305,7 +305,7 @@ def _cures(rehearsal: Rehearsal) -> Iterator[str]:
 def rehearsal_page(rehearsal: Rehearsal) -> Page:
     """Describe what a design does to robots that differ from the model."""
     verdict = _danger(rehearsal)
-    steps: tuple[str, ...] = (
+    steps = (
         *_cures(rehearsal),
         "Design again: `mjfim design EXPERIMENT -o FOLDER`.",
     )

@@ -212,7 +212,7 @@ def _draw_panel(axes: Axes, panel: Panel, width: float, height: float) -> None:
 
     remark = wrap(panel.remark, 0.7 * width, NOTE_FONT) if panel.remark else []
     axes.set_title(
-        _fitting(panel.title, width, NORMAL_FONT),
+        _fitting(panel.title, width),
         loc="left",
         color=ROLES[panel.role],
         pad=4.0 + 10.5 * len(remark),
@@ -275,9 +275,9 @@ def _set_axis(axes: Axes, axis: DrawnAxis, stated: Axis, room: float, height: fl
     if is_across:
         # A common power of ten stands beside the axis, where no label is.
         axis.get_offset_text().set(x=1.02, ha="left")
-        axes.set_xlabel(_fitting(stated.label, room, NORMAL_FONT))
+        axes.set_xlabel(_fitting(stated.label, room))
     else:
-        axes.set_ylabel(_fitting(stated.label, height, NORMAL_FONT, breaks=True))
+        axes.set_ylabel(_fitting(stated.label, height, breaks=True))
     if stated.log:
         axis._set_axes_scale("log")  # type: ignore[attr-defined]
     if stated.limits is not None:
@@ -420,7 +420,7 @@ def log_ticks(low: float, high: float) -> list[float]:
         even = np.asarray(MaxNLocator(NARROW_TICKS, steps=[1, 2, 5, 10]).tick_values(low, high))
         return [float(tick) for tick in even if low <= tick <= high]
 
-    ticks: list[float] = []
+    ticks = []
     for digits in TICK_DIGITS:
         candidates = np.sort(np.outer(10.0**decades, digits).ravel())
         ticks = candidates[(candidates >= low) & (candidates <= high)].tolist()
@@ -436,17 +436,17 @@ def plain_number(value: float) -> str:
     return format_number(value, 1).removeprefix("1×")
 
 
-def _fitting(label: str, width: float, size: float, *, breaks: bool = False) -> str:
+def _fitting(label: str, width: float, *, breaks: bool = False) -> str:
     """Shorten the name in a label `name [unit]` until it fits; its unit may have its own line."""
-    if "\n" in label or "$" in label or text_width(label, size) <= width:
+    if "\n" in label or "$" in label or text_width(label) <= width:
         return label
     name, unit = split_unit(label)
     suffix = f" [{unit}]" if unit else ""
     if breaks and unit:
         suffix = f"\n[{unit}]"
-    room = width - (0.0 if breaks else text_width(suffix, size))
+    room = width - (0.0 if breaks else text_width(suffix))
     characters = len(name)
-    while characters > 3 and text_width(shorten(name, characters), size) > room:
+    while characters > 3 and text_width(shorten(name, characters)) > room:
         characters -= 1
     return shorten(name, characters) + suffix
 

@@ -62,8 +62,8 @@ def power_density(x: Array, rate: float, length: int) -> tuple[Array, Array]:
     count = max((len(x) - length) // step + 1, 1)
 
     # A part begins where the next segment would begin, so that no segment is left out.
-    total: Array = np.zeros(length // 2 + 1)
-    frequencies: Array = np.zeros(0)
+    total = np.zeros(length // 2 + 1)
+    frequencies = np.zeros(0)
     for first in range(0, count, SEGMENTS_AT_ONCE):
         segments = min(SEGMENTS_AT_ONCE, count - first)
         part = x[first * step : (first + segments - 1) * step + length]
@@ -497,7 +497,7 @@ def predictions(estimate: Estimate, labels: Labels) -> Picture:
         j for j in range(len(outputs)) if any(np.isfinite(p.identified.rms[j]) for p in shown)
     ]
     # With several recordings, the name of an output stands above them.
-    names: list[str] = []
+    names = []
     errors, texts = [], []
     for j in measured[:MAX_SPECTRA]:
         label, unit = split_unit(labels.output(outputs[j]))

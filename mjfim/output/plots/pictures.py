@@ -154,7 +154,7 @@ def _(estimate: Estimate) -> Pictures:
         for i, name in enumerate(numbered("held_out", held))
     }
     forces = estimate.inverse_dynamics
-    optional: dict[str, tuple[bool, Callable[[], Picture]]] = {
+    optional = {
         "selection": (
             estimate.selection is not None,
             partial(estimate_studies.selection, estimate),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.output.panels import Axis, Cells, Mark, Panel, Picture
 from mjfim.output.words import shorten
+from mjfim.records.base import record
 
 # An object for Plotly, of values that JSON can hold.
 Plotly = dict[str, Any]
@@ -59,7 +60,7 @@ LETTER, NAME_WIDTH = 6.5, 26
 SHORT_LOG_AXIS = 2.5
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Key:
     """An entry of the legend: its name, role and shape."""
 
@@ -68,7 +69,7 @@ class Key:
     shape: str
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Plot:
     """One plot: its words and its size, and the data that the script of the page reads."""
 
@@ -79,7 +80,7 @@ class Plot:
     data: Plotly
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Group:
     """Plots of one picture, under one legend."""
 
@@ -138,7 +139,7 @@ def _traces(mark: Mark, limit: int) -> list[Plotly]:
     colour = f"role:{mark.role}"
     named = {"name": escape(mark.label), "legendgroup": mark.label, "opacity": mark.opacity}
     other = np.zeros(0) if mark.other is None else mark.other
-    lines: Plotly = {**named, "type": "scatter", "mode": "lines", "hoverinfo": "skip"}
+    lines = {**named, "type": "scatter", "mode": "lines", "hoverinfo": "skip"}
     match mark.kind:
         case "line" | "steps" | "dots":
             return [{**named, **_points(mark, colour, limit)}]
@@ -180,7 +181,7 @@ def _traces(mark: Mark, limit: int) -> list[Plotly]:
             return [{**lines, "line": line, "x": packed(x), "y": packed(np.repeat(mark.y, 3))}]
         case "words":
             words = [escape(text) for text in mark.texts]
-            look: Plotly = {
+            look = {
                 "textposition": "middle right",
                 "textfont": {"color": colour, "size": 11},
             }
@@ -216,7 +217,7 @@ def _points(mark: Mark, colour: str, limit: int) -> Plotly:
 
 def _heatmap(cells: Cells) -> Plotly:
     values = cells.values - cells.middle
-    trace: Plotly = {
+    trace = {
         "type": "heatmap",
         "z": [[float(v) if np.isfinite(v) else None for v in row] for row in values],
         "colorscale": "role:diverging",
@@ -248,7 +249,7 @@ def _layout(panel: Panel, label: str) -> Plotly:
     if panel.cells is not None and not rows.names:
         rows = replace(panel.x, limits=(len(panel.cells.values) - 0.5, -0.5))
     annotations, right = _words_beside(panel)
-    layout: Plotly = {
+    layout = {
         "xaxis": _axis(panel.x, label),
         "yaxis": _axis(rows, rows.label if panel.title else ""),
         "shapes": [shape for mark in panel.marks for shape in _shapes(mark)],
@@ -307,7 +308,7 @@ def _shapes(mark: Mark) -> list[Plotly]:
 def _words_beside(panel: Panel) -> tuple[list[Plotly], float]:
     """The columns of words right of the rows, and where they end [CSS pixels]."""
     found, right = [], 8.0
-    place: Plotly = {"xref": "paper", "x": 1.0, "xanchor": "left", "showarrow": False}
+    place = {"xref": "paper", "x": 1.0, "xanchor": "left", "showarrow": False}
     for heading, role, texts in panel.beside:
         look = {**place, "xshift": right, "font": {"size": 11, "color": f"role:{role}"}}
         top = {"yref": "paper", "y": 1.0, "yanchor": "bottom"}

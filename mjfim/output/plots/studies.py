@@ -178,7 +178,7 @@ def _correlations(result: Check, rows: int) -> Panel:
     count = len(correlation)
     np.fill_diagonal(correlation, np.where(np.isfinite(np.diagonal(correlation)), 0.0, np.nan))
     confounded = np.abs(correlation) > CONFOUNDED_CORRELATION
-    texts: list[list[str]] = []
+    texts = []
     marks = []
     if count <= MAX_CORRELATIONS:
         texts = [
@@ -369,7 +369,7 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
     least, seen = (np.sqrt(np.diagonal(matrix)[shown]) for matrix in (first.crlb, first.covariance))
     size = np.where(np.isfinite(least), least, seen)
     size = np.where(size > 0.0, size, np.nan)
-    scatter: list[Mark] = []
+    scatter = []
     efficiency = [vline(1.0, dash="--")]
     shifts = 0.3 * (np.arange(len(study.sets)) - 0.5 * (len(study.sets) - 1))
     for shift, (key, trials) in zip(shifts, study.sets.items(), strict=True):

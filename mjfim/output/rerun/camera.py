@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.output.rerun.scene import BodyPoses, moving_geoms
+from mjfim.records.base import record
 
 # Vertical field of view that holds the scene [rad]; a little less than that of the viewer, which
 # leaves a margin.
@@ -41,7 +42,7 @@ TOWARDS_CAMERA_YZ = np.array([1.0, 0.0, 0.15])
 TOWARDS_CAMERA_SPATIAL = np.array([1.0, -1.0, 0.6])
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Camera:
     """Camera that is shared by all robots, so that they can be compared.
 

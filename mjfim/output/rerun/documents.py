@@ -210,7 +210,7 @@ def log_trajectories(
     further = cycle(FURTHER_ROLES)
     known = (INITIAL, DESIGNED)
     roles = {name: name if name in known else next(further) for name in named}
-    states: Tabs = {
+    states = {
         group: [
             replace(
                 panel,
@@ -260,7 +260,7 @@ def _iterate_plots(design: Design, labels: Labels) -> list[IteratePlot]:
         return []
     initial = design.initial.trajectory
     names, positions = shown_positions(labels, initial.qpos, *motions.qpos)
-    plots: list[IteratePlot] = []
+    plots = []
     for titles, first, values in (
         (names, positions[0], positions[1:]),
         (labels.controls, initial.ctrl, list(motions.ctrl)),

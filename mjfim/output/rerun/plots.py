@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import rerun as rr
@@ -12,6 +12,7 @@ import rerun.blueprint as rrb
 from mjfim.arrays import Array
 from mjfim.output.panels import ROLES, Mark, Panel
 from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
+from mjfim.records.base import record
 
 # Colours (0..255) of axes, limits and the edges of bands, and of words, before a dark background.
 AXIS_COLOUR, WORD_COLOUR = (150, 150, 150), (205, 205, 205)
@@ -67,7 +68,7 @@ def grid_tabs(name: str, views: Sequence[rrb.View]) -> list[rrb.Container]:
 
 def series_tabs(tabs: Tabs) -> list[rrb.Container]:
     """Return a tab for each group of plots of series; the first plot of a page has a legend."""
-    found: list[rrb.Container] = []
+    found = []
     for name, panels in tabs.items():
         views = [
             rrb.TimeSeriesView(
@@ -132,7 +133,7 @@ def _send(rec: rr.RecordingStream, parts: EntityParts, t: Array, y: Array, mark:
 # ---- plots of 2D lines
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Plane:
     """Axes of a plot of 2D lines.
 

@@ -6,7 +6,6 @@ All bodies are directly under one entity with their world poses; geoms are their
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -16,6 +15,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
+from mjfim.records.base import record
 
 GeomType = mujoco.mjtGeom
 
@@ -54,7 +54,7 @@ MAX_SQUARES = 64
 DARK_SQUARE = 0.8
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class RobotStyle:
     """Style in which one robot and its curves are drawn.
 
@@ -87,7 +87,7 @@ class RobotStyle:
         return [round(channel) for channel in (*colour, alpha)]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class DrawnShape:
     """A shape that is drawn in the frame of a body.
 
@@ -380,7 +380,7 @@ PATH_THICKNESS = 1.0
 # ---- poses
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@record
 class BodyPoses:
     """World poses of all bodies along a trajectory.
 
