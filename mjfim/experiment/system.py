@@ -249,7 +249,7 @@ class System:
         """
         if not self.experiment.initial.free:
             return self
-        moves = self.parameters.initial_state_derivative(self.space.nx) @ self.theta
+        moves = self.plant.initial_state_derivative @ self.theta
         return self.released(self.space.plus(state, -moves))
 
     def with_substeps(self, substeps: int) -> System:

@@ -147,14 +147,6 @@ class FitProblem(SegmentSimulation):
 
     # ---- variants
 
-    def on_workers(self, workers: FitWorkers) -> FitProblem:
-        """This problem, the batches of which are simulated by workers.
-
-        Args:
-            workers: The workers.
-        """
-        return replace(self, workers=workers)
-
     def with_noise(self, noise: Noise) -> FitProblem:
         """This problem with other noise.
 
@@ -229,7 +221,7 @@ class FitProblem(SegmentSimulation):
             The problem without pins; None where the segments would be too short.
         """
         parameters = self.parameters
-        is_held = parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
+        is_held = self.system.plant.initial_state_derivative.any(axis=0)
         is_held |= np.isin(parameters.names, list(self.system.experiment.fit.hold))
         try:
             segments, directions = free_segments(self.system, self.recordings, length)

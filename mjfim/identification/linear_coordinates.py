@@ -323,11 +323,12 @@ class CadPrior:
         wanted = tuple(body for body in self.bodies if is_wanted[body.columns].all())
         return CadPrior(bodies=wanted, count=self.count)
 
-    def rows(self, theta: Array) -> Array:
+    def rows(self, theta: Array, *, linear: bool = False) -> Array:
         """Rows of the least-squares problem.
 
         Args:
-            theta: (p,) parameters [theta-unit].
+            theta: (p,) parameters [theta-unit], or linear coordinates of them.
+            linear: True for linear coordinates.
 
         Returns:
             (10 b, p+1) rows `[J, r]` of b bodies, with residuals in standard deviations; residuals
@@ -335,7 +336,8 @@ class CadPrior:
         """
         blocks = [np.zeros((0, self.count + 1))]
         for body in self.bodies:
-            found = body.difference(theta[body.columns])
+            difference = body.linear_difference if linear else body.difference
+            found = difference(theta[body.columns])
             rows = np.zeros((len(found.residual), self.count + 1))
             rows[:, body.columns] = found.jacobian
             rows[:, -1] = found.residual

@@ -138,7 +138,7 @@ class FitTask:
             RecordingError: There is no recording, or one cannot be used.
         """
         problem = FitProblem.of(self.system, self.recordings)
-        return problem.unbounded() if self.method == "newton" else problem
+        return replace(problem, bounded=self.method != "newton")
 
 
 def values_of_start(task: FitTask) -> str:

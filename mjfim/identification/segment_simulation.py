@@ -280,15 +280,14 @@ class SegmentSimulation(FitUnknowns):
 
     def _initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""
-        space = self.system.space
-        parameters = self.parameters
+        plant = self.system.plant
         start = self.segments[index].start
         if self.free_starts:
-            return space.plus(start, self.start_directions @ at.private[index])
+            return plant.space.plus(start, self.start_directions @ at.private[index])
 
         theta = np.array(at.theta)
         theta[self.private] = at.private[index]
-        return space.plus(start, parameters.initial_state_derivative(space.nx) @ theta)
+        return plant.space.plus(start, plant.initial_state_derivative @ theta)
 
     def _control(self, index: int, samples: int, lead: int) -> Array:
         """(lead + samples, nu) control of a segment, from `lead` samples before its begin on.

@@ -254,7 +254,7 @@ def has_free_starts(system: System) -> bool:
     settings = system.experiment.fit
     is_measured = settings.start != "stated" or settings.segment_length is not None
     # Recordings may begin at releases that only they show, where nothing else moves the start.
-    moves = system.parameters.initial_state_derivative(system.space.nx).any()
+    moves = system.plant.initial_state_derivative.any()
     return is_measured or (bool(system.experiment.initial.free) and not moves)
 
 
@@ -325,7 +325,7 @@ def stated_segments(
         RecordingError: The segments are too short.
     """
     parameters = system.parameters
-    by_theta = parameters.initial_state_derivative(system.space.nx)
+    by_theta = system.plant.initial_state_derivative
     if not has_free_starts(system):
         return whole_recordings(system, recordings), by_theta[:, parameters.initial_deviations]
 

@@ -476,7 +476,7 @@ def choose_length(
         state, or after a request to stop.
     """
     system = search.task.system
-    if system.parameters.initial_state_derivative(system.space.nx).any():
+    if system.plant.initial_state_derivative.any():
         return None
     tried: list[tuple[float | None, FitProblem]] = [
         (length, part.pinned(search.task.start, whole.null_space))

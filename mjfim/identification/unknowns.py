@@ -70,10 +70,6 @@ class FitUnknowns:
     pins: Array
     pinned_at: Array
 
-    def unbounded(self) -> Self:
-        """This problem without bounds."""
-        return replace(self, bounded=False)
-
     def with_shared_held(self) -> Self:
         """This problem with all shared parameters held: they have no columns, and need no pins."""
         return replace(self, shared=self.shared[:0], pins=self.pins[:0])

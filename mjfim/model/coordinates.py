@@ -15,7 +15,7 @@ Activations are called `act:<actuator>`. Components of sensors have MuJoCo's ind
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -259,46 +259,62 @@ def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
     return ()
 
 
+def _joint_numbers(
+    model: Any, *, with_quaternions: bool
+) -> Iterator[tuple[str, int, str, str, str]]:
+    """The numbers of all joints in a state or a deviation: all of qpos, then all of qvel.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        with_quaternions: True for the orientations of a state, False for those of a deviation.
+
+    Yields:
+        `qpos` or `qvel`, the joint, its name, the part or no text, and the unit.
+    """
+    for field in ("qpos", "qvel"):
+        for j, name in enumerate(joint_names(model)):
+            parts = tangent_parts(model, j)
+            if parts and field == "qpos" and with_quaternions:
+                parts = (*(part for part in parts if part in TRANSLATION), *QUATERNION)
+            for part in parts or ("",):
+                unit = PART_UNITS[part] if part else joint_unit(model, j)
+                yield field, j, name, part, unit if field == "qpos" else per_second(unit)
+
+
 def state_components(model: Any) -> tuple[StateComponent, ...]:
     """The nq + nv numbers of the state without activations: all of qpos, then all of qvel."""
-    found: list[StateComponent] = []
-    for field, firsts in (("qpos", model.jnt_qposadr), ("qvel", model.nq + model.jnt_dofadr)):
-        for j, name in enumerate(joint_names(model)):
-            column, parts = f"{field}:{name}", tangent_parts(model, j)
-            if parts and field == "qpos":
-                parts = (*(part for part in parts if part in TRANSLATION), *QUATERNION)
-            for k, part in enumerate(parts or ("",)):
-                unit = PART_UNITS[part] if part else joint_unit(model, j)
-                group = "pos" if part in TRANSLATION else "rot"
-                component = StateComponent(
-                    name=f"{column}.{part}" if part else column,
-                    groups=(f"{column}.{group}", column) if part else (),
-                    address=int(firsts[j]) + k,
-                    unit=unit if field == "qpos" else per_second(unit),
-                    sigma_factor=QUATERNION_SIGMA_FACTOR if part in QUATERNION else 1.0,
-                )
-                found.append(component)
-    return tuple(found)
+    return tuple(
+        StateComponent(
+            name=f"{field}:{name}.{part}" if part else f"{field}:{name}",
+            groups=(
+                (f"{field}:{name}.{'pos' if part in TRANSLATION else 'rot'}", f"{field}:{name}")
+                if part
+                else ()
+            ),
+            address=address,
+            unit=unit,
+            sigma_factor=QUATERNION_SIGMA_FACTOR if part in QUATERNION else 1.0,
+        )
+        for address, (field, _, name, part, unit) in enumerate(
+            _joint_numbers(model, with_quaternions=True)
+        )
+    )
 
 
 def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
     """The nx = 2 nv + na numbers of a deviation of the state, in the order (dq, dv, da)."""
-    found: list[TangentComponent] = []
-
-    for field in ("qpos", "qvel"):
-        for j, name in enumerate(joint_names(model)):
-            named = element_name(model, "joint", j) != ""
-            for part in tangent_parts(model, j) or ("",):
-                suffix = f".{part}" if part else ""
-                unit = PART_UNITS[part] if part else joint_unit(model, j)
-                component = TangentComponent(
-                    name=f"{field}:{name}{suffix}",
-                    path=f"initial/{name}:{field}{suffix}" if named else "",
-                    address=len(found),
-                    unit=unit if field == "qpos" else per_second(unit),
-                )
-                found.append(component)
-
+    found = []
+    numbers = _joint_numbers(model, with_quaternions=False)
+    for address, (field, j, name, part, unit) in enumerate(numbers):
+        suffix = f".{part}" if part else ""
+        is_named = element_name(model, "joint", j) != ""
+        component = TangentComponent(
+            name=f"{field}:{name}{suffix}",
+            path=f"initial/{name}:{field}{suffix}" if is_named else "",
+            address=address,
+            unit=unit,
+        )
+        found.append(component)
     return (*found, *_activation_components(model))
 
 

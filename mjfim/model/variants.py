@@ -288,12 +288,17 @@ class PlantModel:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         if not self.friction and unconstrained(model):
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-        if forms_one_island(model):
+        # On one kinematic tree there are no islands to find. Where bodies may sleep, MuJoCo needs
+        # the islands for other purposes.
+        if model.ntree == 1 and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
 
-        # A single row is solved exactly by one pass of projected Gauss-Seidel, with which a step of
-        # such a model takes a third less time than with Newton's method.
-        if has_at_most_one_row(model):
+        # The single row of a test bench with one joint, whose dry friction may be a parameter, is
+        # solved exactly by one pass of projected Gauss-Seidel. With it a step of such a model takes
+        # a third less time than with Newton's method. MuJoCo does not solve for it with IPC.
+        has_pass = model.opt.iterations > 0
+        has_pass &= not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_IPC
+        if has_pass and allows_dry_friction_only(model) and model.nv + model.ntendon == 1:
             model.opt.solver = mujoco.mjtSolver.mjSOL_PGS
 
         model.opt.timestep *= self.timestep_factor
@@ -320,26 +325,6 @@ def allows_dry_friction_only(model: Any) -> bool:
     )
     limited = model.jnt_limited.any() or model.tendon_limited.any()
     return bool(no_contact and model.neq == 0 and model.nflex == 0 and not limited)
-
-
-def has_at_most_one_row(model: Any) -> bool:
-    """Whether the constraint solver has at most one row, whatever the parameters are.
-
-    This is so for a test bench with a single joint, whose dry friction may be a parameter. Settings
-    with which MuJoCo does not solve for this row by projected Gauss-Seidel are excluded.
-    """
-    solves = model.opt.iterations > 0
-    solves &= not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_IPC
-    return bool(solves and allows_dry_friction_only(model) and model.nv + model.ntendon == 1)
-
-
-def forms_one_island(model: Any) -> bool:
-    """Whether all constraints act on one kinematic tree, so that there are no islands to find.
-
-    Where bodies may sleep, MuJoCo needs the islands for other purposes.
-    """
-    sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
-    return bool(model.ntree == 1 and not sleeps)
 
 
 # Smoothing speed s of a degree of freedom, divided by its fastest speed.

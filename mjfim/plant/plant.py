@@ -87,7 +87,7 @@ class Derivatives(MixedDerivatives):
             y: (N+1, ny) outputs [y-unit] and G: (N+1, ny, p) [y-unit / theta-unit], or None if a
             simulation diverges.
         """
-        found = self._rollout_differences(theta, self.plant.initial_state(theta), ctrl, step)
+        found = self.rollout_differences(theta, self.plant.initial_state(theta), ctrl, step)
         return None if found is None else (found[0], found[1].G)
 
     def sensitivity(
@@ -124,7 +124,7 @@ class Derivatives(MixedDerivatives):
             or is_still[lumped.lumped].any()
             or lumped.probe[is_still].any()
         )
-        found = self._rollout_differences(
+        found = self.rollout_differences(
             theta,
             trajectory.state[0],
             trajectory.ctrl,
@@ -136,49 +136,7 @@ class Derivatives(MixedDerivatives):
         )
         return None if found is None else found[1]
 
-    def calibrated_step_factors(
-        self, theta: Array, trajectory: Trajectory, wanted: np.ndarray | None = None
-    ) -> Array | None:
-        """Factors of the parameters' difference steps with which their effect exceeds round-off.
-
-        Args:
-            theta: (p,) parameters of the trajectory [theta-unit].
-            trajectory: Trajectory on which the effect of every parameter is measured.
-            wanted: (p,) True for the parameters whose effect is measured; None for all.
-
-        Returns:
-            (p,) factors of at least 1, which are 1 for the other parameters; None if a perturbed
-            rollout diverges.
-        """
-        outputs = self.plant.outputs
-        states = None if outputs.needs_sensors else trajectory.state
-        measured = self._rollout_differences(
-            theta,
-            trajectory.state[0],
-            trajectory.ctrl,
-            SENSITIVITY_STEP,
-            states=states,
-            closed_form=None if outputs.needs_sensors else trajectory,
-            wanted=wanted,
-        )
-        # Nothing asks for the gradient along this trajectory on account of a calibration.
-        self.plant.closed_form_memory.latest = None
-        if measured is None:
-            return None
-
-        # Sensors are relative to their largest values; those that stay zero do not count. The other
-        # outputs are states.
-        y, found = measured
-        is_sensor = np.array([output.sensor is not None for output in outputs.outputs])
-        largest = np.where(is_sensor, np.abs(y).max(axis=0, initial=0.0), 0.0)
-        state_sizes = self.difference_sizes(trajectory)[: self.plant.space.nx]
-        sizes = np.concatenate([state_sizes, np.where(largest > 0.0, largest, np.inf)])
-        moves = np.concatenate([found.psi, found.G], axis=1) * self.plant.parameters.magnitude
-        effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
-        factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effect, TINY), 1.0, MAX_STEP_FACTOR)
-        return factors if wanted is None else np.where(wanted, factors, 1.0)
-
-    def _rollout_differences(
+    def rollout_differences(
         self,
         theta: Array,
         initial_state: Array,
@@ -256,7 +214,7 @@ class Derivatives(MixedDerivatives):
         if lumped is not None:
             sizes = plant.sizes.state
             if not lumped.explains(psi / sizes[:, None], by_probe[0] / sizes):
-                return self._rollout_differences(
+                return self.rollout_differences(
                     theta,
                     initial_state,
                     ctrl,
@@ -540,5 +498,30 @@ class Plant(Dynamics):
             The plant with longer difference steps for parameters that hardly move this trajectory,
             or the plant itself if a perturbed rollout diverges.
         """
-        factors = self.derivatives.calibrated_step_factors(theta, trajectory, wanted)
-        return self if factors is None else self.with_step_factors(factors)
+        derivatives, outputs = self.derivatives, self.outputs
+        has_sensors = outputs.needs_sensors
+        measured = derivatives.rollout_differences(
+            theta,
+            trajectory.state[0],
+            trajectory.ctrl,
+            SENSITIVITY_STEP,
+            states=None if has_sensors else trajectory.state,
+            closed_form=None if has_sensors else trajectory,
+            wanted=wanted,
+        )
+        # Nothing asks for the gradient along this trajectory on account of a calibration.
+        self.closed_form_memory.latest = None
+        if measured is None:
+            return self
+
+        # Sensors are relative to their largest values; those that stay zero do not count. The other
+        # outputs are states.
+        y, found = measured
+        is_sensor = np.array([output.sensor is not None for output in outputs.outputs])
+        largest = np.where(is_sensor, np.abs(y).max(axis=0, initial=0.0), 0.0)
+        state_sizes = derivatives.difference_sizes(trajectory)[: self.space.nx]
+        sizes = np.concatenate([state_sizes, np.where(largest > 0.0, largest, np.inf)])
+        moves = np.concatenate([found.psi, found.G], axis=1) * self.parameters.magnitude
+        effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
+        factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effect, TINY), 1.0, MAX_STEP_FACTOR)
+        return self.with_step_factors(factors if wanted is None else np.where(wanted, factors, 1.0))

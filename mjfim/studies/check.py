@@ -365,7 +365,7 @@ def check_recordings(
     begin_stage("simulating the recordings")
     fit = FitProblem.of(system, recordings, data_only=True)
     if executor is not None:
-        fit = fit.on_workers(FitWorkers(executor))
+        fit = replace(fit, workers=FitWorkers(executor))
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     release, control = recorded_release(system, longest), longest.ctrl[:MAX_TESTED_SAMPLES]
     is_free = system.experiment.initial.free

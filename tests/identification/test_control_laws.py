@@ -232,7 +232,7 @@ def test_a_fit_on_workers_is_the_same_to_the_last_digit(
     cost, condensed = problem.cost(at), problem.condense(at)
 
     with LosingThreads() as threads:
-        divided = problem.on_workers(FitWorkers(threads))
+        divided = replace(problem, workers=FitWorkers(threads))
         divided_cost, found = divided.cost(at), divided.condense(at)
 
     assert threads.submitted > 4

@@ -71,7 +71,7 @@ def test_cost_and_linearisation_are_the_same_although_tasks_are_lost(
     alone = plant.engine_steps
 
     with LosingThreads() as threads:
-        divided = problem.on_workers(FitWorkers(threads))
+        divided = replace(problem, workers=FitWorkers(threads))
         divided_cost, found = divided.cost(at), divided.condense(at)
 
     assert threads.submitted > 4
@@ -92,7 +92,7 @@ def test_a_fit_that_diverges_on_workers_has_no_cost(
     assert problem.cost(at) == np.inf
 
     with LosingThreads() as threads:
-        divided = problem.on_workers(FitWorkers(threads))
+        divided = replace(problem, workers=FitWorkers(threads))
 
         assert divided.cost(at) == np.inf
         assert divided.condense(at) is None
@@ -145,7 +145,7 @@ def test_a_request_to_stop_takes_effect_after_the_pass_that_runs(
     passes = len(list(problem.batches(derivatives=False)))
     passes += len(list(problem.batches(derivatives=True)))
     with StoppingThreads(stop, passes + 1) as threads:
-        divided = problem.on_workers(FitWorkers(threads))
+        divided = replace(problem, workers=FitWorkers(threads))
         found = minimise(divided, begin, SearchSettings(), Budget(stop=stop))
     assert found is not None and found.interrupted
     assert found.cost == problem.cost(found.unknowns)
@@ -173,7 +173,7 @@ def test_a_request_to_stop_ends_waiting_works_and_later_passes_are_done_here(
     at = problem.begin(problem.system.parameters.guess)
     stop = StopToken()
     with StoppingThreads(stop, 1) as threads:
-        divided = problem.on_workers(FitWorkers(threads))
+        divided = replace(problem, workers=FitWorkers(threads))
         works = [partial(cost_at, at=at)] * 4
         assert len(list(divided.of_whole(works, Budget(stop=stop)))) < 4
         assert divided.cost(at) == problem.cost(at)
@@ -202,7 +202,7 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
     alone = left_out.predict_unfitted(problem, solution, None, Budget())
     steps = plant.engine_steps
     with LosingThreads() as threads:
-        divided = problem.on_workers(FitWorkers(threads))
+        divided = replace(problem, workers=FitWorkers(threads))
         found = left_out.predict_unfitted(divided, solution, None, Budget())
 
     assert [part.name for part in found] == [part.name for part in alone]

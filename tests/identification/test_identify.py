@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import signal
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +60,7 @@ WHOLE = {"segments": "whole"}
 
 def newton_raphson(problem: FitProblem, start: np.ndarray) -> Solution:
     """The iteration of the paper, without bounds."""
-    return least_squares(problem.unbounded(), start, NEWTON)
+    return least_squares(replace(problem, bounded=False), start, NEWTON)
 
 
 @pytest.fixture(scope="module")

@@ -127,7 +127,7 @@ def test_variants_of_a_problem_leave_the_problem_unchanged(
     first = problem.of_segments(np.array([0, 2]))
     assert first.value_count < problem.value_count
     assert first.recordings is problem.recordings
-    assert np.isneginf(problem.unbounded().lower).all()
+    assert np.isneginf(dataclasses.replace(problem, bounded=False).lower).all()
     assert len(problem.with_shared_held().lower) == 0
     nothing = problem.masked([np.zeros_like(mask) for mask in problem.masks])
     assert nothing.value_count == 0

@@ -26,7 +26,7 @@ from mjfim.identification.aligned_recording import AlignedRecording, align, on_g
 from mjfim.identification.assessment.residual_tests import whiteness_of
 from mjfim.identification.inverse_dynamics.equations import MotionEquations
 from mjfim.identification.inverse_dynamics.motion import measured_forces
-from mjfim.identification.linear_coordinates import LinearCoordinates
+from mjfim.identification.linear_coordinates import CadPrior, LinearCoordinates
 from mjfim.model.control_laws import LawField
 from mjfim.model.elements import model_length, translations
 from mjfim.model.parameters import ParameterSet
@@ -350,19 +350,14 @@ class EquationSearch:
 
     def _weak_priors(self, x: Array) -> tuple[Array, Array]:
         """Weak priors about the model's inertias and about the start."""
-        held = np.isin(np.arange(len(x)), self.active)
-        residuals, rows = [], []
-        for body in self.coordinates.bodies:
-            held[body.columns] = False
-            found = body.linear_difference(x[body.columns])
-            own = np.zeros((len(found.residual), len(x)))
-            own[:, body.columns] = found.jacobian / body.prior_sigma
-            rows.append(own)
-            residuals.append(found.residual / body.prior_sigma)
+        prior = CadPrior(bodies=self.coordinates.bodies, count=len(x))
+        of_bodies = prior.rows(x, linear=True)
+        held = np.setdiff1d(self.active, prior.columns)
         weight = 1.0 / (HOLD_SIGMA * self.coordinates.sizes[held])
-        residuals.append(weight * (x - self.start)[held])
-        rows.append(np.eye(len(x))[held] * weight[:, None])
-        return np.concatenate(residuals), np.concatenate(rows)
+        return (
+            np.concatenate([of_bodies[:, -1], weight * (x - self.start)[held]]),
+            np.concatenate([of_bodies[:, :-1], np.eye(len(x))[held] * weight[:, None]]),
+        )
 
     # ---- minimum of a linearisation
 
