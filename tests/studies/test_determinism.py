@@ -93,7 +93,7 @@ def robust(folder: Path) -> Experiment:
 
 def floating(folder: Path) -> Experiment:
     """A floating arm with quaternions and an activation state, under many limits."""
-    return floating_task(folder, descent={"max_iterations": 1}).experiment
+    return floating_task(folder, horizon=0.1, descent={"max_iterations": 1}).experiment
 
 
 def free(folder: Path) -> Experiment:
