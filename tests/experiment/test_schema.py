@@ -20,8 +20,8 @@ from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Sign
 from mjfim.experiment.task_tables import LimitKind, Robust
 from mjfim.model.limited_elements import KINDS
 from mjfim.recordings.section import Section
-from tests.support.paths import MODELS
 from tests.support.messages import unsaid
+from tests.support.paths import MODELS
 
 # All keys of the contract.
 CONTRACT = """
@@ -364,8 +364,8 @@ FAULTS: dict[str, tuple[str, str]] = {
     "signal key": (control('{ kind = "sine", amp = 1 }'), "initial.control.amp … amplitude, "),
     "limits key": (
         SHORT + "[limits]\nspeed = 1\n",
-        "limits.speed … acceleration, angular_velocity, bandwidth, clearance, control, control_rate, enforce, "
-        "floor, force, ignored, joint_force, position, reserve, "
+        "limits.speed … acceleration, angular_velocity, bandwidth, clearance, control, "
+        "control_rate, enforce, floor, force, ignored, joint_force, position, reserve, "
         "tendon_force, tendon_length, tilt, velocity",
     ),
     "reserved key": ('source = "x"\n' + SHORT, "source … valid: … model"),

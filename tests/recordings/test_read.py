@@ -175,7 +175,7 @@ def test_unit_of_a_control(read: Read) -> None:
         ("qpos:rail", {"unwrap": True}, r"qpos:rail\.unwrap: only an angle"),
         ("qpos:pinn", {}, r": unknown column 'qpos:pinn' \(did you mean 'qpos:pin'\?\)"),
         ("ctrl:twist", {}, r"unknown column 'ctrl:twist'.*ctrl:turn"),
-        ("qpos:pin", 0.5, "columns.qpos:pin: a number is the value of a constant control"),
+        ("qpos:pin", 0.5, "qpos:pin: a number is the value of a constant control"),
         ("ctrl:pull", 0.5, "unknown column 'ctrl:pull'"),
     ],
 )
@@ -183,8 +183,8 @@ def test_columns_that_do_not_fit_the_model(
     name: str, source: dict[str, Any] | float, said: str, read: Read
 ) -> None:
     """The rules are checked before the file is read; the message names the experiment's key."""
+    stated = {"column": "raw", **source} if isinstance(source, dict) else source
     with pytest.raises(ExperimentError, match=rf"study\.toml: recording\.columns.*{said}"):
-        stated = {"column": "raw", **source} if isinstance(source, dict) else source
         read({"raw": wave()}, columns={name: stated})
 
 
