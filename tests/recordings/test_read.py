@@ -133,6 +133,7 @@ def test_formula(read: Read) -> None:
         ("qvel:pin", "deg/s", np.pi / 180),
         ("qvel:pin", "rpm", 2 * np.pi / 60),
         ("qvel:pin", "rev/s", 2 * np.pi),
+        ("qvel:pin", "rad/s", 1),
         ("qpos:rail", "mm", 1e-3),
         ("qpos:rail", "cm", 1e-2),
         ("qpos:rail", "m", 1),
