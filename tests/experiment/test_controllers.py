@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
 from mjfim.excitation.task_parts import stated_inputs
 from mjfim.experiment.system import System
@@ -17,67 +18,68 @@ from mjfim.recordings.read import read_recording
 from mjfim.recordings.section import LAW_PREFIXES
 from mjfim.studies.inventory import stated_experiment
 from tests.support.closed_loop import arm_experiment
+from tests.support.messages import unsaid
 from tests.support.paths import MODELS
 
 PD = {"kp": 60.0, "kd": 4.0}
 
 # Tables of an experiment, and parts of the message that refuses them.
-FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "actuator": (
         {"controllers": {"shouldr": PD}},
-        ("controllers: unknown actuator 'shouldr'", "did you mean 'shoulder'", "elbow, shoulder"),
+        "controllers: unknown actuator 'shouldr' … did you mean 'shoulder' … elbow, shoulder",
     ),
     "joint": (
         {"controllers": {"shoulder": PD | {"joint": "wrist"}}},
-        ("controllers.shoulder.joint", "'wrist'", "valid: elbow, shoulder"),
+        "controllers.shoulder.joint … 'wrist' … valid: elbow, shoulder",
     ),
     "rate": (
         {"controllers": {"shoulder": PD | {"rate": 300.0}}},
-        ("controllers.shoulder.rate: 300 Hz does not divide", "1000 Hz", "500, 250, 200"),
+        "controllers.shoulder.rate: 300 Hz does not divide … 1000 Hz … 500, 250, 200",
     ),
     "negative gain": (
         {"controllers": {"shoulder": {"kp": -1.0}}},
-        ("controllers.shoulder.kp", "greater than or equal to 0", "-1"),
+        "controllers.shoulder.kp … greater than or equal to 0 … -1",
     ),
     "negative latency": (
         {"controllers": {"shoulder": PD | {"latency": "-2 ms"}}},
-        ("controllers.shoulder.latency", "greater than or equal to 0"),
+        "controllers.shoulder.latency … greater than or equal to 0",
     ),
     "unit of the latency": (
         {"controllers": {"shoulder": PD | {"latency": "2 m"}}},
-        ("controllers.shoulder.latency", "m"),
+        "controllers.shoulder.latency … m",
     ),
     "nothing": (
         {"controllers": {"shoulder": {"rate": 500.0}}},
-        ("controllers.shoulder: the law computes nothing", "kp, kd, ki or feedforward"),
+        "controllers.shoulder: the law computes nothing … kp, kd, ki or feedforward",
     ),
     "range": (
         {"controllers": {"shoulder": PD | {"saturation": (2.0, -2.0)}}},
-        ("controllers.shoulder: saturation [2.0, -2.0] needs lower < upper",),
+        "controllers.shoulder: saturation [2.0, -2.0] needs lower < upper",
     ),
     "key": (
         {"controllers": {"shoulder": PD | {"kv": 1.0}}},
-        ("controllers.shoulder.kv: unknown key 'kv'", "kd"),
+        "controllers.shoulder.kv: unknown key 'kv' … kd",
     ),
     "parameter without a law": (
         {"parameters": {"k": {"target": "controller/elbow:kp"}}},
-        ("parameters.k", "unknown controller 'elbow'", "valid: shoulder"),
+        "parameters.k … unknown controller 'elbow' … valid: shoulder",
     ),
     "field of a parameter": (
         {"parameters": {"k": {"target": "controller/shoulder:kv"}}},
-        ("unknown controller field 'kv'", "velocity_time_constant"),
+        "unknown controller field 'kv' … velocity_time_constant",
     ),
     "index of a parameter": (
         {"parameters": {"k": {"target": "controller/shoulder:saturation[2]"}}},
-        ("index 2 is out of range", "valid: 0 to 1"),
+        "index 2 is out of range … valid: 0 to 1",
     ),
     "limit that is not stated": (
         {"parameters": {"k": {"target": "controller/shoulder:slew"}}},
-        ("the law states no slew", "state `slew` in [controllers.shoulder]"),
+        "the law states no slew … state `slew` in [controllers.shoulder]",
     ),
     "gain without a size": (
         {"parameters": {"k": {"target": "controller/shoulder:ki"}}},
-        ("parameters.k.scale: the guess", "is 0"),
+        "parameters.k.scale: the guess … is 0",
     ),
     "two owners": (
         {
@@ -86,18 +88,18 @@ FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
                 "b": {"target": "controller/shoulder:kp"},
             }
         },
-        ("parameters.b: target 'controller/shoulder:kp' already belongs to parameters.a",),
+        "parameters.b: target 'controller/shoulder:kp' already belongs to parameters.a",
     ),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_faults_are_named(name: str) -> None:
-    tables, fragments = FAULTS[name]
+    tables, parts = FAULTS[name]
     with pytest.raises(ExperimentError) as caught:
         System.resolve(arm_experiment(**{"controllers": {"shoulder": PD}, **tables}))
     message = str(caught.value)
-    assert [part for part in fragments if part not in message] == []
+    assert unsaid(parts, message) == []
     assert "\n" not in message
 
 
@@ -158,12 +160,15 @@ def test_the_names_of_columns_are_those_of_laws() -> None:
 COLUMNS = ("t", "reference:shoulder", "ctrl:elbow", "qpos:shoulder", "qpos:elbow")
 
 
-def log(folder: Path, names: tuple[str, ...] = COLUMNS, scale: float = 1.0) -> Path:
-    """A log with columns of these names."""
-    t = np.arange(60) * 0.002
-    values = [t, *(scale * np.sin(7.0 * t + i) for i in range(1, len(names)))]
+T = np.arange(60) * 0.002
+
+
+def log(folder: Path, names: tuple[str, ...], values: list[Array] | None = None) -> Path:
+    """A log with columns of these names after the time, by default sines of different phases."""
+    columns = values or [np.sin(7.0 * T + i) for i in range(1, len(names))]
     path = folder / "log.csv"
-    np.savetxt(path, np.column_stack(values), delimiter=",", header=",".join(names), comments="")
+    rows = np.column_stack([T, *columns])
+    np.savetxt(path, rows, delimiter=",", header=",".join(names), comments="")
     return path
 
 
@@ -178,64 +183,60 @@ def test_a_log_with_references_is_read(tmp_path: Path) -> None:
     names = ("t", "goal", "ctrl:elbow", "qpos:shoulder")
     found = read_recording(log(tmp_path, names), system.channels)
 
-    t = np.arange(59) * 0.002
-    np.testing.assert_allclose(found.ctrl[:, 0], np.deg2rad(np.sin(7.0 * t + 1)))
-    np.testing.assert_allclose(found.ctrl[:, 1], 1.0)
-    np.testing.assert_allclose(found.ctrl[:, 2], np.sin(7.0 * t + 2))
+    goal, elbow = (np.sin(7.0 * T[:-1] + i) for i in (1, 2))
+    expected = np.column_stack([np.deg2rad(goal), np.ones(59), elbow])
+    np.testing.assert_allclose(found.ctrl, expected)
     assert found.outputs == ("qpos:shoulder",)
 
 
 # Columns of a log or of the table [recording.columns], and parts of the message.
-LOG_FAULTS: dict[str, tuple[tuple[str, ...], dict[str, Any], tuple[str, ...]]] = {
+LOG_FAULTS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "missing": (
         ("t", "ctrl:elbow", "qpos:shoulder"),
         {},
-        ("column 'reference:shoulder' is missing", '[recording.columns] "reference:shoulder"'),
+        "column 'reference:shoulder' is missing … [recording.columns] \"reference:shoulder\"",
     ),
     "both": (
         (*COLUMNS, "ctrl:shoulder"),
         {},
-        ("it holds 'ctrl:shoulder' and 'reference:shoulder'", "[controllers.shoulder]"),
+        "it holds 'ctrl:shoulder' and 'reference:shoulder' … [controllers.shoulder]",
     ),
     "not read": (
         (*COLUMNS, "feedforward:shoulder"),
         {},
-        ("the law of this actuator does not read it", "feedforward = true"),
+        "the law of this actuator does not read it … feedforward = true",
     ),
     "no law": (
         (*COLUMNS, "reference:elbow"),
         {},
-        ("states no law for this actuator", "[controllers.elbow]"),
+        "states no law for this actuator … [controllers.elbow]",
     ),
     "stated control": (
         COLUMNS,
         {"ctrl:shoulder": "torque"},
-        ("[controllers.shoulder] computes this control", "<actuatorfrc>"),
+        "[controllers.shoulder] computes this control … <actuatorfrc>",
     ),
     "unit": (
         COLUMNS,
         {"reference:shoulder": {"column": "reference:shoulder", "unit": "m"}},
-        ("recording.columns.reference:shoulder.unit", "valid: deg, rad, rev"),
+        "recording.columns.reference:shoulder.unit … valid: deg, rad, rev",
     ),
 }
 
 
 @pytest.mark.parametrize("name", LOG_FAULTS)
 def test_faults_of_logs_are_named(name: str, tmp_path: Path) -> None:
-    names, columns, fragments = LOG_FAULTS[name]
+    names, columns, parts = LOG_FAULTS[name]
     experiment = arm_experiment({"shoulder": PD}, recording={"columns": columns})
     with pytest.raises((RecordingError, ExperimentError)) as caught:
         read_recording(log(tmp_path, names), System.resolve(experiment).channels)
     message = str(caught.value)
-    assert [part for part in fragments if part not in message] == []
+    assert unsaid(parts, message) == []
 
 
 def test_a_reference_in_degrees_is_refused(tmp_path: Path) -> None:
-    t = np.arange(60) * 0.002
-    wave = np.sin(9.0 * t)
-    values = np.column_stack([t, 57.3 * wave, wave, 0.9 * wave, 0.2 * wave])
-    path = tmp_path / "log.csv"
-    np.savetxt(path, values, delimiter=",", header=",".join(COLUMNS), comments="")
+    wave = np.sin(9.0 * T)
+    path = log(tmp_path, COLUMNS, [57.3 * wave, wave, 0.9 * wave, 0.2 * wave])
     experiment = arm_experiment({"shoulder": PD})
     with pytest.raises(RecordingError, match=r"'reference:shoulder' moves .* probably in deg"):
         read_recording(path, System.resolve(experiment).channels)

@@ -26,6 +26,7 @@ from tests.support.numerics import (
 )
 
 ARM = {"inertial": "arm"}
+MASS = {"m": {"target": "body/arm:mass"}}
 
 
 def named(task: DesignTask) -> dict[str, Parameter]:
@@ -196,6 +197,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"g": {"target": "body/arm:gravcomp"}},
         r"parameters\.g\.scale: .* is 0; state another guess, or a scale",
     ),
+    "free joint without a part": (
+        {"p": {"target": "initial/float:qpos"}},
+        r"initial/float:qpos'.*valid: .*initial/float:qpos\.rx",
+    ),
     "not in the model": (
         {"g": {"target": "output/acc:bias"}},
         r"parameters\.g: .*unknown output 'acc'.*valid: .*acc\[0\]",
@@ -258,9 +263,7 @@ def test_deviations_of_all_components_of_the_initial_state(tmp_path: Path) -> No
     """One deviation for each degree of freedom in position and velocity, with the prior, as
     nuisance.
     """
-    task = body_task(
-        tmp_path, parameters={"m": {"target": "body/arm:mass"}}, nuisance={"initial": 0.02}
-    )
+    task = body_task(tmp_path, parameters=MASS, nuisance={"initial": 0.02})
     found = task.parameters.parameters
     assert len(found) == 1 + 9 + 9
     names = [f"initial qpos:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [
@@ -276,59 +279,32 @@ def test_deviations_of_all_components_of_the_initial_state(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("written", "right"),
+    ("joint", "written", "right"),
     [
-        ("qpos:float[3]", "qpos:float.rx"),
-        ("qvel:float[0]", "qvel:float.x"),
-        ("qpos:ball[2]", "qpos:ball.rz"),
+        ("float", "qpos[3]", "qpos.rx"),
+        ("float", "qvel[0]", "qvel.x"),
+        ("ball", "qpos[2]", "qpos.rz"),
     ],
 )
-def test_an_indexed_deviation_is_refused_with_its_present_name(
-    written: str, right: str, tmp_path: Path
+def test_an_index_of_a_joint_is_refused_with_its_present_name(
+    joint: str, written: str, right: str, tmp_path: Path
 ) -> None:
-    """In the nuisance table."""
-    message = f"nuisance.initial: '{written}' is now written '{right}'"
+    """In the nuisance table, and in the paths of parameters."""
+    quantity, right_quantity = (f"{w[:4]}:{joint}{w[4:]}" for w in (written, right))
+    message = f"nuisance.initial: '{quantity}' is now written '{right_quantity}'"
     with pytest.raises(ExperimentError, match=re.escape(message)):
-        body_task(
-            tmp_path,
-            parameters={"m": {"target": "body/arm:mass"}},
-            nuisance={"initial": {written: 0.1}},
-        )
+        body_task(tmp_path, parameters=MASS, nuisance={"initial": {quantity: 0.1}})
 
-
-@pytest.mark.parametrize(
-    ("written", "right"),
-    [
-        ("initial/float:qpos[3]", "initial/float:qpos.rx"),
-        ("initial/float:qvel[0]", "initial/float:qvel.x"),
-        ("initial/ball:qpos[2]", "initial/ball:qpos.rz"),
-    ],
-)
-def test_an_indexed_path_is_refused_with_its_present_spelling(
-    written: str, right: str, tmp_path: Path
-) -> None:
-    """In the paths of parameters."""
-    message = f"parameters.p: in parameter path '{written}': '{written}' is now written '{right}'"
-    with pytest.raises(ExperimentError, match=re.escape(message)):
-        body_task(tmp_path, parameters={"p": {"target": written}})
+    path = f"initial/{joint}:{written}"
+    message = f"parameter path '{path}': '{path}' is now written 'initial/{joint}:{right}'"
+    with pytest.raises(ExperimentError, match=re.escape(f"parameters.p: in {message}")):
+        body_task(tmp_path, parameters={"p": {"target": path}})
 
 
 def test_a_deviation_of_an_orientation_is_a_rotation_vector(tmp_path: Path) -> None:
     """A quaternion's component is refused with the names of the rotation vector."""
     with pytest.raises(ExperimentError, match=r"rotation vector here; valid: qpos:ball\.rx, .*rz"):
-        body_task(
-            tmp_path,
-            parameters={"m": {"target": "body/arm:mass"}},
-            nuisance={"initial": {"qpos:ball.qw": 0.1}},
-        )
-
-
-def test_a_deviation_of_a_free_joint_needs_a_part(tmp_path: Path) -> None:
-    """A path without a part names six numbers."""
-    with pytest.raises(
-        ExperimentError, match=r"initial/float:qpos'.*valid: .*initial/float:qpos\.rx"
-    ):
-        body_task(tmp_path, parameters={"p": {"target": "initial/float:qpos"}})
+        body_task(tmp_path, parameters=MASS, nuisance={"initial": {"qpos:ball.qw": 0.1}})
 
 
 def test_deviations_and_biases_by_name(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Sign
 from mjfim.experiment.task_tables import LimitKind, Robust
 from mjfim.model.limited_elements import KINDS
 from mjfim.recordings.section import Section
+from tests.support.messages import unsaid
 from tests.support.paths import MODELS
 
 # All keys of the contract.
@@ -353,308 +354,237 @@ def test_shipped_experiments_resolve(name: str) -> None:
     assert np.allclose(task.control[:, 0], (1 + t / 4) * np.sin(2 * t), rtol=0, atol=1e-12)
 
 
-E, M, R = ExperimentError, ModelError, RecordingError
 HOME = "bad.toml"
 
-# By name: text of the file, kind of the error, fragments of the message. The first fragment is the
-# file.
-FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
-    # keys
-    "top-level key": (
-        "modle = 1\n" + SHORT,
-        E,
-        [HOME, "modle", "unknown key", "'model'", "valid:", "horizon"],
-    ),
-    "nested key": (
-        edited("[cost]", "[cost]\ncontrl = 1"),
-        E,
-        [HOME, "cost.contrl", "'control'", "tracking"],
-    ),
-    "initial key": (
-        edited("keyframe =", "keyfrme ="),
-        E,
-        [HOME, "initial.keyfrme", "'keyframe'", "qpos"],
-    ),
-    "signal key": (
-        control('{ kind = "sine", amp = 1 }'),
-        E,
-        [HOME, "initial.control.amp", "amplitude, "],
-    ),
+# By name: text of the file, and parts of the message, which begins with the name of the file.
+FAULTS: dict[str, tuple[str, str]] = {
+    "top-level key": ("modle = 1\n" + SHORT, "modle … unknown key … 'model' … valid: … horizon"),
+    "nested key": (edited("[cost]", "[cost]\ncontrl = 1"), "cost.contrl … 'control' … tracking"),
+    "initial key": (edited("keyframe =", "keyfrme ="), "initial.keyfrme … 'keyframe' … qpos"),
+    "signal key": (control('{ kind = "sine", amp = 1 }'), "initial.control.amp … amplitude, "),
     "limits key": (
         SHORT + "[limits]\nspeed = 1\n",
-        E,
-        [
-            HOME,
-            "limits.speed",
-            "acceleration, angular_velocity, bandwidth, clearance, control, control_rate, enforce, "
-            "floor, force, ignored, joint_force, position, reserve, tendon_force, tendon_length, "
-            "tilt, velocity",
-        ],
+        "limits.speed … acceleration, angular_velocity, bandwidth, clearance, control, "
+        "control_rate, enforce, floor, force, ignored, joint_force, position, reserve, "
+        "tendon_force, tendon_length, tilt, velocity",
     ),
-    "reserved key": ('source = "x"\n' + SHORT, E, [HOME, "source", "valid:", "model"]),
+    "reserved key": ('source = "x"\n' + SHORT, "source … valid: … model"),
     "missing key": (
         edited("rate = 100.0", ""),
-        E,
-        [HOME, "rate: this key is required: rate of the samples and of the control", "[Hz]"],
+        "rate: this key is required: rate of the samples and of the control … [Hz]",
     ),
-    # names
     "tracking joint": (
         edited("[cost]", "[cost]\ntracking = { slid = 1 }"),
-        E,
-        [HOME, "cost.tracking", "hinge, slide"],
+        "cost.tracking … hinge, slide",
     ),
     "limit joint": (
         SHORT + "[limits]\nposition = { slid = [-1, 1] }\n",
-        E,
-        [HOME, "limits.position", "joint 'slid'", "hinge, slide"],
+        "limits.position … joint 'slid' … hinge, slide",
     ),
     "cost actuator": (
         edited("[cost]", "[cost]\ncontrol = { motor = 1 }"),
-        E,
-        [HOME, "cost.control", "actuator 'motor'", "force"],
+        "cost.control … actuator 'motor' … force",
     ),
     "sensor": (
         edited("state =", "angle ="),
-        E,
-        [HOME, "noise", "sensor 'angle'", "hinge_angle", "qpos:hinge", "state"],
+        "noise … sensor 'angle' … hinge_angle … qpos:hinge … state",
     ),
     "keyframe": (
         edited('"hanging"', '"hangin"'),
-        E,
-        [HOME, "initial.keyframe", "'hangin'", "did you mean 'hanging'"],
+        "initial.keyframe … 'hangin' … did you mean 'hanging'",
     ),
-    # parameter paths
-    "path form": (
-        target("body/bob"),
-        E,
-        [HOME, "parameters.m", "'body/bob'", "kind/name:field[index]"],
-    ),
-    # model
-    "model missing": (
-        edited("cart_pendulum.xml", "gone.xml"),
-        M,
-        [HOME, ": model: ", "gone.xml: no such model file", "folder of the experiment file"],
-    ),
-    "model not XML": (
-        edited("cart_pendulum.xml", "text.xml"),
-        M,
-        ["text.xml", "MuJoCo cannot read", "XML"],
-    ),
-    "timestep not a number": (
-        edited("cart_pendulum.xml", "nan.xml"),
-        M,
-        ["nan.xml", "NaN", "finite"],
-    ),
-    # time
+    "path form": (target("body/bob"), "parameters.m … 'body/bob' … kind/name:field[index]"),
     "rate vanishing": (
         edited("rate = 100.0", "rate = 5e-324"),
-        E,
-        [HOME, "rate", "should be of a size from 1e-100 to 1e+100", "5e-324"],
+        "rate … should be of a size from 1e-100 to 1e+100 … 5e-324",
     ),
     "rate far too low": (
         edited("rate = 100.0", "rate = 1e-6"),
-        E,
-        [HOME, "rate: at 1e-06 Hz", "1e+08 timesteps", "at most 100000", "0.001 Hz or more"],
+        "rate: at 1e-06 Hz … 1e+08 timesteps … at most 100000 … 0.001 Hz or more",
     ),
     "rate": (
         edited("rate = 100.0", "rate = 30.0"),
-        E,
-        [HOME, "rate: at 30 Hz", "0.01 s", "25, 33.3333, 50 Hz", "A log keeps its own rate"],
+        "rate: at 30 Hz … 0.01 s … 25, 33.3333, 50 Hz … A log keeps its own rate",
     ),
-    "rate negative": (
-        edited("rate = 100.0", "rate = -1.0"),
-        E,
-        [HOME, "rate", "greater than 0", "-1.0"],
-    ),
-    "measure rate": (
-        "measure_rate = 30.0" + SHORT,
-        E,
-        [HOME, "measure_rate: 30 Hz", "100 Hz", "50, 25"],
-    ),
+    "rate negative": (edited("rate = 100.0", "rate = -1.0"), "rate … greater than 0 … -1.0"),
+    "measure rate": ("measure_rate = 30.0" + SHORT, "measure_rate: 30 Hz … 100 Hz … 50, 25"),
     "horizon": (
         edited("horizon = 1.0", "horizon = 1.005"),
-        E,
-        [HOME, "horizon: 1.005 s", "whole number", "samples"],
+        "horizon: 1.005 s … whole number … samples",
     ),
-    "horizon of one sample": (
-        edited("horizon = 1.0", "horizon = 0.01"),
-        E,
-        [HOME, "horizon: 0.01 s", ">= 2"],
-    ),
-    # amounts
+    "horizon of one sample": (edited("horizon = 1.0", "horizon = 0.01"), "horizon: 0.01 s … >= 2"),
     "many starts": (
         edited("[cost]", "[descent]\nstarts = 1000000000\n[cost]"),
-        E,
-        [HOME, "descent.starts", "less than or equal to 10000", "1000000000"],
+        "descent.starts … less than or equal to 10000 … 1000000000",
     ),
-    # parameter values
     "bounds inverted": (
         parameter('target = "body/bob:mass"\nbounds = [5, 1]'),
-        E,
-        [HOME, "parameters.m", "bounds", "[5.0, 1.0]", "lower < upper"],
+        "parameters.m … bounds … [5.0, 1.0] … lower < upper",
     ),
     "guess outside": (
         parameter('target = "body/bob:mass"\nbounds = [1, 5]\nguess = 6'),
-        E,
-        [HOME, "parameters.m.guess", "the value 6 is outside bounds [1.0, 5.0]"],
+        "parameters.m.guess … the value 6 is outside bounds [1.0, 5.0]",
     ),
     "model's value outside": (
         parameter('target = "body/bob:mass"\nbounds = [3, 5]'),
-        E,
-        [HOME, "parameters.m.guess", "the value 2 in the model", "[3.0, 5.0]"],
+        "parameters.m.guess … the value 2 in the model … [3.0, 5.0]",
     ),
     "wrong unit and outside": (
         parameter('target = "body/bob:mass"\nguess = "2.5 deg"\nbounds = [1, 5]'),
-        E,
-        [HOME, "parameters.m.guess: '2.5 deg' is no number in kg", "kg, g"],
+        "parameters.m.guess: '2.5 deg' is no number in kg … kg, g",
     ),
     "right unit and outside": (
         parameter('target = "body/bob:mass"\nguess = "2.5 g"\nbounds = [1, 5]'),
-        E,
-        [HOME, "parameters.m.guess: the value 0.0025 is outside bounds [1.0, 5.0]"],
+        "parameters.m.guess: the value 0.0025 is outside bounds [1.0, 5.0]",
     ),
     "scale word": (
         parameter('target = "body/bob:mass"\nscale = "gues"'),
-        E,
-        [HOME, "parameters.m.scale", "'guess'", "'gues'"],
+        "parameters.m.scale … 'guess' … 'gues'",
     ),
     "no target": (
         parameter("guess = 1"),
-        E,
-        [HOME, "parameters.m", "exactly one of target, targets and inertial"],
+        "parameters.m … exactly one of target, targets and inertial",
     ),
     "dead target": (
         parameter('targets = [{ path = "body/bob:mass", scale = 0 }]'),
-        E,
-        [HOME, "parameters.m", "scale is 0"],
+        "parameters.m … scale is 0",
     ),
-    # noise and weights
     "sigma negative": (
         edited("state = 0.05", "state = -0.1"),
-        E,
-        [HOME, "noise.state", "greater than 0", "-0.1"],
+        "noise.state … greater than 0 … -0.1",
     ),
-    "sigma text": (
-        edited("state = 0.05", 'state = "loud"'),
-        E,
-        [HOME, "noise.state", "number", "'loud'"],
-    ),
-    # a weight of 0 is for controls with a hard range; without one it is the fault after this one
+    "sigma text": (edited("state = 0.05", 'state = "loud"'), "noise.state … number … 'loud'"),
     "control weight": (
         edited("[cost]", "[cost]\ncontrol = -1"),
-        E,
-        [HOME, "cost.control", "greater than or equal to 0", "-1"],
+        "cost.control … greater than or equal to 0 … -1",
     ),
     "no control weight": (
         edited("[cost]", "[cost]\ncontrol = {}"),
-        E,
-        [
-            HOME,
-            "cost.control",
-            "actuator 'force' has neither a weight nor a range",
-            "limits.control.force",
-        ],
+        "cost.control … actuator 'force' has neither a weight nor a range … limits.control.force",
     ),
     "criterion": (
         edited("[cost]", '[cost]\ncriterion = "F"'),
-        E,
-        [HOME, "cost.criterion", "'E', 'A', 'D'", "or 'c'", "'F'"],
+        "cost.criterion … 'E', 'A', 'D' … or 'c' … 'F'",
     ),
     "criterion c alone": (
         edited("[cost]", '[cost]\ncriterion = "c"'),
-        E,
-        [HOME, "cost", "exactly one of combination and subset"],
+        "cost … exactly one of combination and subset",
     ),
     "combination of a stranger": (
         edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { l = 1 }'),
-        E,
-        [HOME, "cost.combination", "wanted parameter 'l'", "valid: m"],
+        "cost.combination … wanted parameter 'l' … valid: m",
     ),
     "metric weight without the metric": (
         SHORT + "[descent]\npsi_weight = 1\n",
-        E,
-        [HOME, "descent", "psi_weight can only be given together with method"],
+        "descent … psi_weight can only be given together with method",
     ),
-    "coarse word": (
-        SHORT + '[descent]\ncoarse = "no"\n',
-        E,
-        [HOME, "descent.coarse", "integer", "'no'"],
-    ),
-    # further tables
-    "nuisance false": (SHORT + "[nuisance]\ndelay = false\n", E, [HOME, "nuisance.delay", "True"]),
+    "coarse word": (SHORT + '[descent]\ncoarse = "no"\n', "descent.coarse … integer … 'no'"),
+    "nuisance false": (SHORT + "[nuisance]\ndelay = false\n", "nuisance.delay … True"),
     "robust over": (
         SHORT + '[robust]\nover = "best"\n',
-        E,
-        [HOME, "robust.over", "'mean' or 'worst'", "'best'"],
+        "robust.over … 'mean' or 'worst' … 'best'",
     ),
-    "robust without knowledge": (
-        SHORT + "[robust]\n",
-        E,
-        [HOME, "robust", "state `prior` or `bounds`"],
-    ),
-    "earlier": (
-        'earlier = ["gone.json"]\n' + SHORT,
-        E,
-        [HOME, "earlier", "gone.json", "cannot read"],
-    ),
+    "robust without knowledge": (SHORT + "[robust]\n", "robust … state `prior` or `bounds`"),
+    "earlier": ('earlier = ["gone.json"]\n' + SHORT, "earlier … gone.json … cannot read"),
     "earlier that is no file of ours": (
         'earlier = ["cart_pendulum.csv"]\n' + SHORT,
-        E,
-        [HOME, "earlier", "cart_pendulum.csv", "not a JSON file"],
+        "earlier … cart_pendulum.csv … not a JSON file",
     ),
-    # limits
     "position limits inverted": (
         SHORT + "[limits]\nposition = { slide = [1, -1] }\n",
-        E,
-        [HOME, "limits.position.slide", "[1, -1]", "lower < upper"],
+        "limits.position.slide … [1, -1] … lower < upper",
     ),
-    # start
     "qpos length": (
         edited('keyframe = "hanging"', "qpos = [0, 0, 0]"),
-        E,
-        [HOME, "initial.qpos", "3 numbers", "this model needs 2"],
+        "initial.qpos … 3 numbers … this model needs 2",
     ),
     "act of a model without": (
         edited('keyframe = "hanging"', "act = [0]"),
-        E,
-        [HOME, "initial.act", "1 numbers", "this model needs 0"],
+        "initial.act … 1 numbers … this model needs 0",
     ),
     "keyframe and qpos": (
         edited('keyframe = "hanging"', 'keyframe = "hanging"\nqpos = [0, 0]'),
-        E,
-        [HOME, "initial", "either keyframe or qpos"],
+        "initial … either keyframe or qpos",
     ),
     "signal kind": (
         control('{ kind = "noise" }'),
-        E,
-        [HOME, "initial.control", "'constant', 'sine', 'chirp'", "noise"],
+        "initial.control … 'constant', 'sine', 'chirp' … noise",
     ),
-    # control tables
-    "table missing": (control('"gone.csv"'), R, ["gone.csv", "no such file"]),
+}
+
+# The same, with the kind of the error, where it is not one of the experiment file.
+OTHER_FAULTS: dict[str, tuple[str, type[MjfimError], str]] = {
+    "model missing": (
+        edited("cart_pendulum.xml", "gone.xml"),
+        ModelError,
+        "bad.toml … : model:  … gone.xml: no such model file … folder of the experiment file",
+    ),
+    "model not XML": (
+        edited("cart_pendulum.xml", "text.xml"),
+        ModelError,
+        "text.xml … MuJoCo cannot read … XML",
+    ),
+    "timestep not a number": (
+        edited("cart_pendulum.xml", "nan.xml"),
+        ModelError,
+        "nan.xml … NaN … finite",
+    ),
+    "table missing": (control('"gone.csv"'), RecordingError, "gone.csv … no such file"),
     "table columns": (
         control('"columns.csv"'),
-        R,
-        ["columns.csv", "'force'", "expected columns: t, force", "t, forc"],
+        RecordingError,
+        "columns.csv … 'force' … expected columns: t, force … t, forc",
     ),
-    "table NaN": (control('"nan.csv"'), R, ["nan.csv", "'force'", "row 2", "finite"]),
+    "table NaN": (control('"nan.csv"'), RecordingError, "nan.csv … 'force' … row 2 … finite"),
     "table too short": (
         control('"short.csv"'),
-        R,
-        ["short.csv", "too few rows", "3 rows", "0 ... 1 s", "100 samples"],
+        RecordingError,
+        "short.csv … too few rows … 3 rows … 0 ... 1 s … 100 samples",
     ),
-    "table repeats t": (control('"repeated.csv"'), R, ["repeated.csv", "'t' must increase"]),
+    "table repeats t": (
+        control('"repeated.csv"'),
+        RecordingError,
+        "repeated.csv … 't' must increase",
+    ),
+    "dead target with a guess": (
+        parameter('guess = 1.0\ntargets = [{ path = "body/bob:mass", scale = 0 }]'),
+        MjfimError,
+        "parameters.m … scale is 0",
+    ),
+    "two parameters for one number": (
+        SHORT + '[parameters.n]\ntarget = "body/bob:mass"\n',
+        MjfimError,
+        "parameters.n … body/bob:mass",
+    ),
+    "negative signal seed": (
+        control('{ kind = "multisine", seed = -1 }'),
+        MjfimError,
+        "initial.control.seed … -1",
+    ),
+    "negative descent seed": (SHORT + "[descent]\nseed = -1\n", MjfimError, "descent.seed … -1"),
+    "column twice": (control('"twice.csv"'), MjfimError, "twice.csv … force"),
+    "table not UTF-8": (control('"latin.csv"'), MjfimError, "latin.csv"),
 }
 
 
-@pytest.mark.parametrize("name", FAULTS)
-def test_faults_are_named(name: str, resolve: Callable[[str], DesignTask]) -> None:
+@pytest.mark.parametrize(
+    ("text", "kind", "parts"),
+    [
+        *((text, ExperimentError, f"{HOME} … {parts}") for text, parts in FAULTS.values()),
+        *OTHER_FAULTS.values(),
+    ],
+    ids=[*FAULTS, *OTHER_FAULTS],
+)
+def test_faults_are_named(
+    text: str, kind: type[MjfimError], parts: str, resolve: Callable[[str], DesignTask]
+) -> None:
     """The message names the file, the key, the fault and the valid choices."""
-    text, kind, fragments = FAULTS[name]
     with pytest.raises(kind) as caught:
         resolve(text)
     message = str(caught.value)
-    assert fragments[0] in message.splitlines()[0].split(": ")[0]
-    assert [f for f in fragments if f not in message] == []
+    if kind is not MjfimError:
+        assert parts.split(" … ")[0] in message.splitlines()[0].split(": ")[0]
+    assert unsaid(parts, message) == []
 
 
 def test_a_free_control_is_named_by_its_actuator(resolve: Callable[[str], DesignTask]) -> None:
@@ -740,77 +670,44 @@ def test_integers_and_truth_values_are_not_converted(
 
 
 @pytest.mark.parametrize(
-    ("text", "fragments"),
+    ("text", "parts"),
     [
         (
             SHORT + "[limits]\n" + "".join(f"k{i} = 1.0\n" for i in range(5000)),
-            [
-                "limits.k0: unknown key 'k0'; valid: acceleration, angular_velocity",
-                "further faults",
-            ],
+            "limits.k0: unknown key 'k0'; valid: acceleration, angular_velocity … further faults",
         ),
-        (SHORT + f"[limits]\n{'x' * 2000} = 1.0\n", ["limits.xxx", "the beginning of 2002 char"]),
+        (SHORT + f"[limits]\n{'x' * 2000} = 1.0\n", "limits.xxx … the beginning of 2002 char"),
         (
             edited("rate = 100.0", f"rate = '{'x' * 100_000}'"),
-            ["rate: should be a number", "the beginning of 100002 characters"],
+            "rate: should be a number … the beginning of 100002 characters",
         ),
     ],
     ids=["many faults", "long key", "long value"],
 )
-def test_messages_stay_short(
-    text: str, fragments: list[str], resolve: Callable[[str], DesignTask]
-) -> None:
+def test_messages_stay_short(text: str, parts: str, resolve: Callable[[str], DesignTask]) -> None:
     """Long texts of the user are shortened, and of many faults the first ones are described."""
     with pytest.raises(ExperimentError) as caught:
         resolve(text)
     message = str(caught.value)
     assert len(message.replace(HOME, "")) < 1000
-    assert [fragment for fragment in fragments if fragment not in message] == []
+    assert unsaid(parts, message) == []
 
 
-ONE_LINE: dict[str, str] = {
-    "signal kind": control('{ kind = "noise" }'),
-    "signal key": control('{ kind = "sine", amp = 1 }'),
-    "control weight": edited("[cost]", "[cost]\ncontrol = -1"),
-    "velocity limit": SHORT + "[limits]\nvelocity = { hinge = -8 }\n",
-    "scale": parameter('target = "body/bob:mass"\nscale = 0.0'),
-}
-
-
-@pytest.mark.parametrize("name", ONE_LINE)
-def test_one_fault_one_line(name: str, resolve: Callable[[str], DesignTask]) -> None:
+@pytest.mark.parametrize(
+    "text",
+    [
+        control('{ kind = "noise" }'),
+        control('{ kind = "sine", amp = 1 }'),
+        edited("[cost]", "[cost]\ncontrol = -1"),
+        SHORT + "[limits]\nvelocity = { hinge = -8 }\n",
+        parameter('target = "body/bob:mass"\nscale = 0.0'),
+    ],
+)
+def test_one_fault_one_line(text: str, resolve: Callable[[str], DesignTask]) -> None:
     """A key that may have several types is reported once, not once per type."""
     with pytest.raises(ExperimentError) as caught:
-        resolve(ONE_LINE[name])
-    assert len(str(caught.value).splitlines()) == 1
-
-
-MISUSE: dict[str, tuple[str, list[str]]] = {
-    "dead target with a guess": (
-        parameter('guess = 1.0\ntargets = [{ path = "body/bob:mass", scale = 0 }]'),
-        ["parameters.m", "scale is 0"],
-    ),
-    "two parameters for one number": (
-        SHORT + '[parameters.n]\ntarget = "body/bob:mass"\n',
-        ["parameters.n", "body/bob:mass"],
-    ),
-    "negative signal seed": (
-        control('{ kind = "multisine", seed = -1 }'),
-        ["initial.control.seed", "-1"],
-    ),
-    "negative descent seed": (SHORT + "[descent]\nseed = -1\n", ["descent.seed", "-1"]),
-    "column twice": (control('"twice.csv"'), ["twice.csv", "force"]),
-    "table not UTF-8": (control('"latin.csv"'), ["latin.csv"]),
-}
-
-
-@pytest.mark.parametrize("name", MISUSE)
-def test_misuse_is_not_accepted(name: str, resolve: Callable[[str], DesignTask]) -> None:
-    """Mistakes that would otherwise pass silently or end in a traceback."""
-    text, fragments = MISUSE[name]
-    with pytest.raises(MjfimError) as caught:
         resolve(text)
-    assert [f for f in fragments if f not in str(caught.value)] == []
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def described_tables(annotation: Any) -> set[type[Section]]:

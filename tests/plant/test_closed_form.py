@@ -120,7 +120,7 @@ OPTIONS = (
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_first_derivatives_agree_with_differences(tmp_path, option: str) -> None:
+def test_first_derivatives_and_sensitivities_agree_with_differences(tmp_path, option: str) -> None:
     task = tree_task(tmp_path, option)
     trajectory, derivatives = curve(task), task.plant.derivatives
     p = len(task.theta)
@@ -133,11 +133,7 @@ def test_first_derivatives_agree_with_differences(tmp_path, option: str) -> None
     assert_close(found[0].A, expected.A, 1e-8)
     assert_close(found[0].B, expected.B, 1e-8)
 
-
-@pytest.mark.parametrize("option", OPTIONS)
-def test_sensitivities_agree_with_differences_of_rollouts(tmp_path, option: str) -> None:
-    task = tree_task(tmp_path, option)
-    trajectory, derivatives = curve(task), task.plant.derivatives
+    # The same by rollouts.
     expected = derivatives.sensitivity(task.theta, trajectory)
     before = task.plant.engine_steps
     found = derivatives.sensitivity(task.theta, trajectory, closed_form=True)

@@ -199,22 +199,13 @@ def test_bilinear_derivatives_contain_those_of_the_observations(
     )
     task = floating_task(tmp_path, noise=noise).relaxed()
     assert task.plant.simulator.sensors is sensors
-    observations, psi = (
-        observations_of(task),
-        task.plant.derivatives.sensitivity(task.theta, task.initial).psi,
-    )
-    directions = np.array([[1.0, 0.3], [-0.2, 0.9]])
-    found = task.plant.derivatives.bilinear(
-        task.theta, task.initial, psi, directions, accuracy, observations
-    )
+    observations, derivatives = observations_of(task), task.plant.derivatives
+    psi = derivatives.sensitivity(task.theta, task.initial).psi
+    given = (task.theta, task.initial, psi, np.array([[1.0, 0.3], [-0.2, 0.9]]), accuracy)
+    found = derivatives.bilinear(*given, observations)
     assert found.observation_jacobian is not None
     assert_slopes(found.observation_jacobian, task, observations, 2e-3)
-    assert (
-        task.plant.derivatives.bilinear(
-            task.theta, task.initial, psi, directions, accuracy
-        ).observation_jacobian
-        is None
-    )
+    assert derivatives.bilinear(*given).observation_jacobian is None
 
 
 def test_differences_from_a_shared_origin_agree_with_central_ones_to_a_hundredth(
@@ -222,19 +213,13 @@ def test_differences_from_a_shared_origin_agree_with_central_ones_to_a_hundredth
 ) -> None:
     """One-sided differences need less than 0.4 of the engine steps."""
     task = floating_task(tmp_path).relaxed()
-    observations, psi = (
-        observations_of(task),
-        task.plant.derivatives.sensitivity(task.theta, task.initial).psi,
-    )
-    directions = np.array([[1.0, 0.3], [-0.2, 0.9], [0.0, -1.0]])
+    observations, derivatives = observations_of(task), task.plant.derivatives
+    psi = derivatives.sensitivity(task.theta, task.initial).psi
+    given = (task.theta, task.initial, psi, np.array([[1.0, 0.3], [-0.2, 0.9], [0.0, -1.0]]))
     begun = task.plant.simulator.steps
-    draft = task.plant.derivatives.bilinear(
-        task.theta, task.initial, psi, directions, SHARED_ORIGIN, observations
-    )
+    draft = derivatives.bilinear(*given, SHARED_ORIGIN, observations)
     spent, begun = task.plant.simulator.steps - begun, task.plant.simulator.steps
-    careful = task.plant.derivatives.bilinear(
-        task.theta, task.initial, psi, directions, CENTRAL_DIFFERENCES, observations
-    )
+    careful = derivatives.bilinear(*given, CENTRAL_DIFFERENCES, observations)
     assert spent < 0.4 * (task.plant.simulator.steps - begun)
     for name in ("A", "B", "C", "D", "observation_jacobian"):
         if getattr(careful, name).any():

@@ -167,7 +167,9 @@ def test_robust_redesigns_sample_around_the_estimate(campaign: Campaign) -> None
 def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path) -> None:
     """A target is not reached where the estimate is wrong by many standard deviations."""
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
-    easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
+    easy = STUDY.replace(
+        parameters={name: {"wanted": 0.03} for name in "mlc"}, fit={"bootstrap": 0}
+    )
     found = mjfim.run_campaign(
         easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=2
     )
@@ -176,27 +178,29 @@ def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path)
     assert any("misfit" in sentence for sentence in found.warnings)
 
 
+def earlier(campaign: Campaign) -> EarlierRound:
+    """The first round, as another call reads it from its folder."""
+    first = campaign.rounds[0]
+    return EarlierRound(
+        recordings=first.recordings,
+        theta=first.theta,
+        predicted=first.predicted,
+        control=first.control,
+    )
+
+
+def after_two(campaign: Campaign, second: Recording) -> Campaign:
+    """The campaign after its first round and a second one with this recording."""
+    done = [earlier(campaign), EarlierRound(recordings=(second,))]
+    return mjfim.run_campaign(STUDY.replace(fit={"bootstrap": 0}), never, rounds=2, done=done)
+
+
 def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
     """Three rows of a recording are no progress; the rounds are used up, and it says what is
     missing.
     """
-    first = campaign.rounds[0]
-    start = replace(
-        first.recordings[0],
-        t=first.recordings[0].t[:3],
-        ctrl=first.control[:2],
-        y=first.recordings[0].y[:3],
-    )
-    done = [
-        EarlierRound(
-            recordings=first.recordings,
-            theta=first.theta,
-            predicted=first.predicted,
-            control=first.control,
-        ),
-        EarlierRound(recordings=(start,)),
-    ]
-    found = mjfim.run_campaign(STUDY, never, rounds=2, done=done)
+    whole = campaign.rounds[0].recordings[0]
+    found = after_two(campaign, replace(whole, t=whole.t[:3], ctrl=whole.ctrl[:2], y=whole.y[:3]))
     assert found.status is CampaignStatus.EXHAUSTED and not found.reached
     assert any("round 2: no progress" in sentence for sentence in found.warnings)
     assert "wanted 0.008" in found.short and "wanted 0.008" in str(found)
@@ -204,19 +208,8 @@ def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
 
 def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     """The bob loses a tenth of its mass between two rounds."""
-    first = campaign.rounds[0]
     light = STUDY.replace(parameters={"m": {"true": 1.8}})
-    second = mjfim.simulate(light, campaign.designs[1].trajectory, seed=1)
-    done = [
-        EarlierRound(
-            recordings=first.recordings,
-            theta=first.theta,
-            predicted=first.predicted,
-            control=first.control,
-        ),
-        EarlierRound(recordings=(second,)),
-    ]
-    found = mjfim.run_campaign(STUDY, never, rounds=2, done=done)
+    found = after_two(campaign, mjfim.simulate(light, campaign.designs[1].trajectory, seed=1))
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
 
 
@@ -262,15 +255,7 @@ def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_are_
         return campaign.designs[1]
 
     monkeypatch.setattr(campaign_module._CampaignRun, "_redesign", fails_once)
-    done = [
-        EarlierRound(
-            recordings=first.recordings,
-            theta=first.theta,
-            predicted=first.predicted,
-            control=first.control,
-        )
-    ]
-    found = mjfim.run_campaign(STUDY, robot, rounds=2, done=done)
+    found = mjfim.run_campaign(STUDY, robot, rounds=2, done=[earlier(campaign)])
     np.testing.assert_array_equal(asked, [first.estimate.theta, first.theta])
     assert any(
         "no design could be made at the estimate" in warning and "too fast" in warning
@@ -285,7 +270,7 @@ def test_each_recording_has_a_separate_initial_state() -> None:
     loose = STUDY.replace(
         nuisance={"initial": 0.05},
         parameters={name: {"wanted": 1e-4} for name in "mlc"},
-        descent={"max_iterations": 10},
+        descent={"max_iterations": 5},
     )
     rng = np.random.default_rng(3)
 
@@ -367,68 +352,73 @@ def write_study(folder: Path) -> Path:
     return folder / "study.toml"
 
 
-def test_round_by_round_is_the_simulated_campaign(tmp_path: Path) -> None:
-    """Calls that share nothing but the folder design and estimate as one call does; misuse is
-    named.
-    """
-    study = write_study(tmp_path)
-    together, apart = tmp_path / "together", tmp_path / "apart"
+WANTED = ("--wanted", 0.0055)
 
-    def call(*words: object, code: int) -> Result:
-        """Run the verb on the study."""
-        result = run("campaign", study, *words)
-        assert result.exit_code == code, result.stderr
-        return result
 
-    wanted = ("--wanted", 0.0055)
-    call("-o", together, *wanted, "--seed", 5, code=0)
-    first = read(together / "campaign.json")
-    assert first["reached"] and len(first["rounds"]) >= 2
-    assert (together / "campaign.png").stat().st_size > 10_000
-    assert (together / "identified.xml").is_file()
-
-    shown = call("-o", apart, *wanted, "--real", code=1)
-    files: list[object] = []
-    for k in range(1, len(first["rounds"]) + 1):
-        assert f"round_{k}/design.csv" in shown.stdout.replace("\n", "")
-        if k == 1:  # asked again, it still waits
-            call("-o", apart, *wanted, "--real", code=1)
-
-        # Recordings that are in the folder already do no harm.
-        files += ["--recordings", together / f"round_{k}" / "recording.csv"]
-        shown = call("-o", apart, *wanted, *files, code=0 if k == len(first["rounds"]) else 1)
-
-    second = read(apart / "campaign.json")
-    assert second["reached"]
-    assert not second["simulated"]
-    assert len(second["rounds"]) == len(first["rounds"])
-    for one, other in zip(first["rounds"], second["rounds"], strict=True):
-        for key in ("theta", "std", "predicted", "designed_at"):
-            np.testing.assert_allclose(one[key], other[key], rtol=1e-6)
-
-    again = call("-o", together, *wanted, code=2).stderr
-    assert "--real" in again
-    assert "--resume" in again
-    assert "real robot" in call("-o", apart, *wanted, "--resume", code=2).stderr
-    assert "wanted" in call("-o", tmp_path / "none", "--real", code=2).stderr
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a campaign by the command line, beside the file of its study."""
+    home = tmp_path_factory.mktemp("whole")
+    result = run("campaign", write_study(home), *WANTED, "--seed", 5, "-o", home / "whole")
+    assert result.exit_code == 0, result.stderr
+    return home / "whole"
 
 
 def require_equal_rounds(folder: Path, other: Path) -> None:
     """Assert that the campaigns of two folders have the same rounds."""
     rounds = [read(place / "campaign.json")["rounds"] for place in (folder, other)]
+    assert len(rounds[1]) >= 2
     for one, two in zip(*rounds, strict=True):
         for key in ("theta", "std", "predicted", "designed_at"):
             np.testing.assert_allclose(one[key], two[key], rtol=1e-6)
 
 
 @pytest.mark.usefixtures("empty_figures")
-def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
+def test_round_by_round_is_the_simulated_campaign(whole: Path, tmp_path: Path) -> None:
+    """Calls that share nothing but the folder design and estimate as one call does; misuse is
+    named.
+    """
+    apart = tmp_path / "apart"
+
+    def call(*words: object, code: int) -> Result:
+        """Run the verb on the study."""
+        result = run("campaign", whole.parent / "study.toml", *words)
+        assert result.exit_code == code, result.stderr
+        return result
+
+    assert read(whole / "campaign.json")["reached"]
+    assert (whole / "campaign.png").stat().st_size > 10_000
+    assert (whole / "identified.xml").is_file()
+
+    shown = call("-o", apart, *WANTED, "--real", code=1)
+    files: list[object] = []
+    last = len(read(whole / "campaign.json")["rounds"])
+    for k in range(1, last + 1):
+        assert f"round_{k}/design.csv" in shown.stdout.replace("\n", "")
+        if k == 1:  # asked again, it still waits
+            call("-o", apart, *WANTED, "--real", code=1)
+
+        # Recordings that are in the folder already do no harm.
+        files += ["--recordings", whole / f"round_{k}" / "recording.csv"]
+        shown = call("-o", apart, *WANTED, *files, code=0 if k == last else 1)
+
+    second = read(apart / "campaign.json")
+    assert second["reached"]
+    assert not second["simulated"]
+    require_equal_rounds(apart, whole)
+
+    again = call("-o", whole, *WANTED, code=2).stderr
+    assert "--real" in again
+    assert "--resume" in again
+    assert "real robot" in call("-o", apart, *WANTED, "--resume", code=2).stderr
+    assert "wanted" in call("-o", tmp_path / "none", "--real", code=2).stderr
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_killed_campaign_is_resumed(whole: Path, tmp_path: Path) -> None:
     """Its result is that of a campaign that nobody stopped, wherever in a round it was killed."""
-    study = write_study(tmp_path)
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    words = ("campaign", study, "--wanted", 0.0055, "--seed", 5, "-o")
-    assert run(*words, whole).exit_code == 0
-    assert len(read(whole / "campaign.json")["rounds"]) >= 2
+    killed = tmp_path / "killed"
+    words = ("campaign", whole.parent / "study.toml", *WANTED, "--seed", 5, "-o")
 
     # A process that is killed as soon as its first round is complete.
     command = [*PROCESS, *map(str, words), str(killed)]
@@ -442,24 +432,22 @@ def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
             process.kill()
 
     assert not (killed / "campaign.json").exists()
-    result = run(*words, killed, "--resume")
-    assert result.exit_code == 0, result.stderr
-    require_equal_rounds(killed, whole)
 
     # What remains of the second round if the campaign is killed at several moments of it.
     incomplete = {
-        "while-writing": ["design.npz", "design.csv"],
-        "before-recording": ["design.npz", "design.csv", "reference.csv", "design.json"],
+        "while-writing": {"design.npz", "design.csv"},
+        "before-recording": {"design.npz", "design.csv", "reference.csv", "design.json"},
     }
     for name, kept in incomplete.items():
         folder = tmp_path / name
         shutil.copytree(whole, folder)
         for path in (folder / "round_2").iterdir():
-            if path.name not in (*kept, MANIFEST):
+            if path.name not in kept | {MANIFEST}:
                 path.unlink()
         for number in range(3, 10):
             shutil.rmtree(folder / f"round_{number}", ignore_errors=True)
 
+    for folder in (killed, *(tmp_path / name for name in incomplete)):
         result = run(*words, folder, "--resume")
         assert result.exit_code == 0, result.stderr
         require_equal_rounds(folder, whole)

@@ -39,9 +39,15 @@ LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-
 
 
 @cache
-def small(seconds: float = 2.0) -> Comparison:
-    """A chirp and a Fourier series against the design of the cart-pendulum."""
-    return mjfim.compare(pendulum(), seconds=seconds, seed=1, methods=["chirp", "fourier5"])
+def small() -> Comparison:
+    """A chirp and a Fourier series against the design of the cart-pendulum.
+
+    What can be identified is known before the time of the design begins.
+    """
+    # Seconds of the processor, so that a busy computer decides nothing.
+    with pytest.MonkeyPatch.context() as patch, measured_by(time.process_time):
+        patch.delattr(design_module, "identifiability_along")
+        return mjfim.compare(pendulum(), seconds=1.0, seed=1, methods=["chirp", "fourier5"])
 
 
 def row(method: str, cost: float, outcome: MethodOutcome = MethodOutcome.INSIDE) -> MethodResult:
@@ -91,19 +97,8 @@ def test_each_method_has_its_budget_and_the_design_comes_last() -> None:
     c = small()
     assert [r.method for r in c.rows] == ["chirp", "fourier5", DESIGN]
     assert all(r.sound for r in c.rows)
-    assert all(r.steps > 0 and r.seconds >= 1.9 for r in c.rows[:1])
+    assert all(r.steps > 0 and r.seconds >= 0.95 for r in c.rows[:1])
     assert not c.interrupted
-
-
-@pytest.mark.slow
-def test_no_method_has_to_find_what_can_be_identified(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise AssertionError("it is known before the time of the design begins")
-
-    monkeypatch.setattr(design_module, "identifiability_along", refuse)
-    c = mjfim.compare(pendulum(), seconds=1.0, methods=["chirp"])
-    assert [r.method for r in c.rows] == ["chirp", DESIGN]
-    assert c.rows[1].sound
 
 
 @pytest.mark.slow
@@ -247,56 +242,27 @@ def test_the_picture_of_any_result_is_drawn(rows: tuple[MethodResult, ...], tmp_
 @pytest.mark.slow
 def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = (
-        study,
-        "-o",
-        out,
-        "--seconds",
-        2,
-        "--methods",
-        "chirp,steps",
-        "--json",
-    )
     with measured_by(time.process_time):
-        result = run("compare", *words)
+        result = run(
+            "compare", study, "-o", out, "--seconds", 1, "--methods", "chirp,steps", "--json"
+        )
     assert result.exit_code == 0, result.stderr
     assert "1/3 chirp" in result.stderr
     told = loads(result.stdout)
     assert told == read(out / "compare.json")
     assert [m["method"] for m in told["methods"]] == ["chirp", "steps", DESIGN]
     assert told["ok"] is True
-    assert told["budget"] == {"seconds": 2.0}
+    assert told["budget"] == {"seconds": 1.0}
     assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
     controls = {f"control_{m}.csv" for m in ("chirp", "steps", DESIGN)}
-    assert names(out) - {MANIFEST} == {
-        "compare.json",
-        "compare.npz",
-        "compare.png",
-        "report.html",
-        *controls,
-    }
+    files = {MANIFEST, "report.html", *controls, *(f"compare.{e}" for e in ("json", "npz", "png"))}
+    assert names(out) == files
     assert imread(out / "compare.png").shape[0] > 300
-    # Seconds of the processor, so that a busy computer decides nothing.
     with measured_by(time.process_time):
-        again = run("compare", study, "-o", out, "--seconds", 2, "--methods", "chirp", "-v")
+        again = run("compare", study, "-o", out, "--seconds", 1, "--methods", "chirp", "-v")
     assert again.exit_code == 0, again.stderr
-    assert names(out) == {
-        MANIFEST,
-        "compare.json",
-        "compare.npz",
-        "compare.png",
-        "report.html",
-        "control_chirp.csv",
-        f"control_{DESIGN}.csv",
-    }
-    for word in (
-        "chirp",
-        "mjfim's design",
-        "worst σ",
-        "σ of each parameter",
-        "m (kg)",
-        "The design is",
-    ):
+    assert names(out) == files - {"control_steps.csv"}
+    for word in ("mjfim's design", "worst σ", "σ of each parameter", "m (kg)", "The design is"):
         assert word in " ".join(again.stdout.split())
     assert "…" not in again.stdout  # every number whole
     # a control of it is the initial control of another experiment
@@ -325,17 +291,8 @@ def test_a_design_that_is_worse_is_reported_as_beaten(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compare_module, "design_task", worse(design_task))
-    result = run(
-        "compare",
-        study,
-        "-o",
-        tmp_path,
-        "--seconds",
-        1,
-        "--methods",
-        "chirp",
-        "-v",
-    )
+    with measured_by(time.process_time):
+        result = run("compare", study, "-o", tmp_path, "--seconds", 1, "--methods", "chirp", "-v")
     assert result.exit_code == 1
     assert "beaten by chirp" in " ".join(result.stdout.split())
     assert "beaten by chirp" in result.stderr

@@ -138,7 +138,6 @@ PENDULUM = """
 
 def pendulum(folder: Path, *, length: float, mass: float) -> Path:
     """A pendulum of some length [m] and mass [kg] with 1 % of critical damping."""
-    path = folder / f"pendulum_{length:g}_{mass:g}.xml"
     omega = np.sqrt(9.81 / length)
     text = PENDULUM.format(
         timestep=f"{0.002 / omega:.6g}",
@@ -148,6 +147,12 @@ def pendulum(folder: Path, *, length: float, mass: float) -> Path:
         mass=mass,
         length=length,
     )
+    return written(folder, text, f"pendulum_{length:g}_{mass:g}.xml")
+
+
+def written(folder: Path, text: str, name: str = "model.xml") -> Path:
+    """A model file."""
+    path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
 
@@ -156,23 +161,19 @@ def proposed(path: Path, folder: Path, **options: object) -> tuple[Proposal, Exp
     """The proposal for a model, and the experiment that its file states."""
     proposal = propose_experiment(path, folder, Wishes(**options), companion_name="motors.xml")
     if proposal.companion is not None:
-        (folder / "motors.xml").write_text(proposal.companion, encoding="utf-8")
-    file = folder / "first.toml"
-    file.write_text(experiment_text(proposal), encoding="utf-8")
+        written(folder, proposal.companion, "motors.xml")
+    file = written(folder, experiment_text(proposal), "first.toml")
     return proposal, Experiment.from_file(file)
-
-
-SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
     "name",
     [
         "cart_pendulum",
-        *(
-            pytest.param(name, marks=SLOW)
-            for name in ("filtered_drive", "four_bar", "quadrotor", "dfki_simple_pendulum")
-        ),
+        "filtered_drive",
+        "four_bar",
+        "quadrotor",
+        "dfki_simple_pendulum",
     ],
 )
 def test_the_file_runs_as_it_stands_and_keeps_all_limits(name: str, tmp_path: Path) -> None:
@@ -196,7 +197,6 @@ def test_commented_parameters_are_valid_when_they_are_uncommented(tmp_path: Path
     assert names == {each.name for each in (*proposal.chosen, *proposal.others)}
 
 
-@SLOW
 @pytest.mark.parametrize(("length", "mass"), [(1e-3, 1e-6), (1e3, 1e6)])
 def test_proposals_scale_with_the_size_of_the_robot(
     length: float, mass: float, tmp_path: Path
@@ -212,8 +212,7 @@ def test_proposals_scale_with_the_size_of_the_robot(
 
 
 def test_a_urdf_gets_motors_and_keeps_its_limits(tmp_path: Path) -> None:
-    path = tmp_path / "two.urdf"
-    path.write_text(URDF, encoding="utf-8")
+    path = written(tmp_path, URDF, "two.urdf")
     proposal, experiment = proposed(path, tmp_path)
     assert experiment.model == "motors.xml"
 
@@ -232,8 +231,7 @@ def test_a_urdf_gets_motors_and_keeps_its_limits(tmp_path: Path) -> None:
 
 
 def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Path) -> None:
-    path = tmp_path / "two.urdf"
-    path.write_text(URDF, encoding="utf-8")
+    path = written(tmp_path, URDF, "two.urdf")
     _, experiment = proposed(path, tmp_path, payload="lower", groups=("payload",))
     spec = experiment.parameters["payload"]
     assert spec.guess == 0.0
@@ -242,15 +240,14 @@ def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Pat
 
 
 def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
-    path = tmp_path / "bolted.xml"
-    path.write_text(BOLTED, encoding="utf-8")
+    path = written(tmp_path, BOLTED)
     found = propose_experiment(path, tmp_path, Wishes(payload="arm"))
     assert found.chosen[0].name == "payload"
     with pytest.raises(ExperimentError, match="does not show a load at 'base'"):
         propose_experiment(path, tmp_path, Wishes(payload="base", groups=("friction",)))
 
     # The load of a light wrist follows from what the motors lift.
-    path.write_text(SERVO_ARM.format(floor=""), encoding="utf-8")
+    path = written(tmp_path, SERVO_ARM.format(floor=""))
     found = propose_experiment(path, tmp_path, Wishes(payload="wrist"))
     assert found.chosen[0].name == "payload"
     # Nothing is below this arm: it gets a floor at the height of its base.
@@ -292,8 +289,7 @@ SERVO_ARM = """
 
 def test_an_arm_with_servos_gets_a_file_that_a_person_would_play(tmp_path: Path) -> None:
     """Unknowns of equal servos, limits that the motion keeps, and an end at rest."""
-    path = tmp_path / "arm.xml"
-    path.write_text(SERVO_ARM.format(floor='<geom type="plane" size="1 1 1"/>'), encoding="utf-8")
+    path = written(tmp_path, SERVO_ARM.format(floor='<geom type="plane" size="1 1 1"/>'))
     proposal, experiment = proposed(path, tmp_path)
 
     # Equal joints share one unknown; what the MJCF does not have stands in a comment.
@@ -321,10 +317,8 @@ def test_faults_are_named(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match="no parameter of motors can be proposed"):
         propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(groups=("motors",)))
 
-    bare = tmp_path / "bare.xml"
-    bare.write_text(FREE_BODY, encoding="utf-8")
     with pytest.raises(ExperimentError, match=r"neither an actuator nor a slide, hinge or ball"):
-        propose_experiment(bare, tmp_path)
+        propose_experiment(written(tmp_path, FREE_BODY), tmp_path)
     with pytest.raises(ModelError, match="no such model file"):
         propose_experiment(tmp_path / "absent.xml", tmp_path)
 
@@ -422,8 +416,8 @@ def test_a_servo_is_commanded_to_where_its_joint_is() -> None:
 
 
 def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> None:
-    path = tmp_path / "ball.xml"
-    path.write_text(
+    path = written(
+        tmp_path,
         """
     <mujoco>
       <option gravity="0 0 0"/>
@@ -435,7 +429,6 @@ def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> 
         <position name="elbow" joint="hinge" kp="2" kv="1"/></actuator>
     </mujoco>
     """,
-        encoding="utf-8",
     )
     model = mujoco.MjModel.from_xml_path(str(path))
     start = choose_start(model)
@@ -508,8 +501,8 @@ def test_the_driven_joints_of_a_robot_on_the_floor_may_stay_where_they_are() -> 
 
 def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path: Path) -> None:
     # Seen from this small drone, a slight tilt soon leads far away.
-    path = tmp_path / "drone.xml"
-    path.write_text(
+    path = written(
+        tmp_path,
         """
     <mujoco>
       <worldbody><body name="b" pos="0 0 1"><freejoint name="f"/>
@@ -520,7 +513,6 @@ def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path:
       <actuator><motor name="up" site="s" gear="0 0 1 0 0 0" ctrlrange="0 3"/></actuator>
     </mujoco>
     """,
-        encoding="utf-8",
     )
     proposal, _ = proposed(path, tmp_path)
     assert any("amplifies small disturbances" in remark for remark in proposal.remarks)
@@ -529,8 +521,7 @@ def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path:
 
 def test_the_horizon_ends_before_a_falling_robot_leaves_a_limit(tmp_path: Path) -> None:
     """A robot that no control holds falls one metre, to the end of its range, in 0.45 s."""
-    path = tmp_path / "falling.xml"
-    path.write_text(FALLING, encoding="utf-8")
+    path = written(tmp_path, FALLING)
     proposal = propose_experiment(path, tmp_path)
     assert 0.3 < proposal.times.horizon < 0.45
     [remark] = [text for text in proposal.remarks if "leaves a limit by itself" in text]
@@ -540,13 +531,10 @@ def test_the_horizon_ends_before_a_falling_robot_leaves_a_limit(tmp_path: Path) 
     task = DesignTask.resolve(experiment)
     assert verify(task, task.initial).is_feasible
 
-
-def test_a_horizon_that_the_user_wants_stays_and_the_limit_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "falling.xml"
-    path.write_text(FALLING, encoding="utf-8")
-    proposal = propose_experiment(path, tmp_path, Wishes(horizon=0.6))
-    assert proposal.times.horizon == pytest.approx(0.6)
-    [warning] = [text for text in proposal.remarks if text.startswith("Warning")]
+    # A horizon that the user wants stays, and the limit is named.
+    wished = propose_experiment(path, tmp_path, Wishes(horizon=0.6))
+    assert wished.times.horizon == pytest.approx(0.6)
+    [warning] = [text for text in wished.remarks if text.startswith("Warning")]
     assert "no motion about this start keeps all limits: position of lift is" in warning
 
 
@@ -588,13 +576,7 @@ def test_wishes_that_cannot_be_fulfilled_are_named(
 @pytest.mark.parametrize("kind", ["slide", "ball"])
 def test_a_model_without_actuators_is_released(kind: str, tmp_path: Path) -> None:
     """The release is away from the equilibrium, inside the ranges, and its motion keeps them."""
-    path = tmp_path / "double.xml"
-    path.write_text(DOUBLE.format(kind=kind), encoding="utf-8")
-    proposal = propose_experiment(path, tmp_path)
-    file = tmp_path / "double.toml"
-    file.write_text(experiment_text(proposal), encoding="utf-8")
-
-    experiment = Experiment.from_file(file)
+    _, experiment = proposed(written(tmp_path, DOUBLE.format(kind=kind)), tmp_path)
     assert experiment.initial.control is None
     low, high = experiment.initial.free["qpos:hinge"]
     assert -0.5 < low < high < 2.0
@@ -630,9 +612,7 @@ HANGING = """
 
 def test_a_soft_range_that_the_state_at_rest_exceeds_is_written_wider(tmp_path: Path) -> None:
     """A ball hangs at a string that gives way; no motion could keep the range of the MJCF."""
-    path = tmp_path / "cup.xml"
-    path.write_text(HANGING, encoding="utf-8")
-    proposal, experiment = proposed(path, tmp_path)
+    proposal, experiment = proposed(written(tmp_path, HANGING), tmp_path)
     assert not any("no motion about this start" in remark for remark in proposal.remarks)
     low, high = experiment.limits.tendon_length["string"]
     assert low == 0.0

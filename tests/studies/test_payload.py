@@ -16,6 +16,7 @@ from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.studies.payload import PayloadTask, RobotExperiment
 from tests.identification.test_parameter_draws import estimated
+from tests.support.made_records import bare_estimate
 
 # Two hinges about different axes, so that gravity and inertia show every coordinate of a load.
 ARM = """
@@ -104,23 +105,7 @@ def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Pa
     covariance = np.array([[4e-4, 1e-4, -4e-6], [1e-4, 9e-4, 6e-6], [-4e-6, 6e-6, 1e-6]])
     std = np.sqrt(np.diag(covariance))
     theta = np.array(list(ROBOT.values()))
-    estimate = mjfim.Estimate(
-        parameters=system.parameters.names,
-        theta=theta,
-        std=std,
-        covariance=covariance,
-        initial_theta=theta,
-        chi2=1.0,
-        dof=1,
-        status="converged",
-        success=True,
-        misfit=False,
-        iterations=1,
-        residual_rms={},
-        at_bound=(),
-        predicted=(),
-        recordings=(),
-    )
+    estimate = bare_estimate(system.parameters.names, theta, std, covariance=covariance)
     task = PayloadTask.of(robot, body="hand", robot=estimate)
     parameters = task.system().parameters
     index = [parameters.names.index(name) for name in ROBOT]

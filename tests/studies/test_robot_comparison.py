@@ -26,6 +26,7 @@ from mjfim.records.robots import RobotComparison
 from mjfim.records.trajectory import Recording
 from mjfim.studies.robot_comparison import compare_estimates, holm, honest_std
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
+from tests.support.made_records import bare_estimate
 
 NAMES = ("mass", "damping", "length")
 UNITS = ("kg", "N m s/rad", "m")
@@ -47,27 +48,16 @@ def recordings(count: int, seed: int) -> tuple[Recording, ...]:
 
 def estimate(seed: int = 0, count: int = 2, **changes: Any) -> mjfim.Estimate:
     """An estimate of three parameters."""
-    theta = np.array([2.0, 0.15, 1.0])
     std = np.array([0.02, 0.01, 0.01])
     fields: dict[str, Any] = {
         "parameters": NAMES,
         "units": UNITS,
-        "theta": theta,
+        "theta": np.array([2.0, 0.15, 1.0]),
         "std": std,
         "covariance": np.diag(std**2),
-        "initial_theta": theta,
-        "chi2": 1.0,
-        "dof": 1,
-        "status": "converged",
-        "success": True,
-        "misfit": False,
-        "iterations": 1,
-        "residual_rms": {},
-        "at_bound": (),
-        "predicted": (),
         "recordings": recordings(count, seed),
     }
-    return mjfim.Estimate(**{**fields, **changes})
+    return bare_estimate(**{**fields, **changes})
 
 
 # ---- one comparison

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -157,6 +159,28 @@ def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
     )
 
 
+def bare_estimate(parameters: Sequence[str], theta: Array, std: Array, **changes: Any) -> Estimate:
+    """An estimate that converged with independent errors, from no recording."""
+    fields: dict[str, Any] = {
+        "parameters": tuple(parameters),
+        "theta": theta,
+        "std": std,
+        "covariance": np.diag(std**2),
+        "initial_theta": 1.2 * theta,
+        "chi2": 1.0,
+        "dof": 1,
+        "status": "converged",
+        "success": True,
+        "misfit": False,
+        "iterations": 4,
+        "residual_rms": {},
+        "at_bound": (),
+        "predicted": (),
+        "recordings": (),
+    }
+    return Estimate(**{**fields, **changes})
+
+
 def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:
     """Make an estimate from one recording with gaps; the first parameter is at its bound."""
     t = np.linspace(0.0, 2.0, 51)
@@ -171,19 +195,13 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
         name="swing",
     )
     theta = np.linspace(1.0, 2.0, count)
-    return Estimate(
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
-        theta=theta,
-        std=0.02 * theta,
-        covariance=np.diag((0.02 * theta) ** 2),
-        initial_theta=1.2 * theta,
+    return bare_estimate(
+        [f"link_{j}.damping" for j in range(count)],
+        theta,
+        0.02 * theta,
         chi2=50.0,
         dof=48,
-        status="converged",
-        success=True,
         misfit=misfit,
-        iterations=4,
-        residual_rms={},
         at_bound=("link_0.damping",),
         predicted=(predicted,),
         recordings=(recording,),

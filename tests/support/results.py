@@ -34,7 +34,7 @@ from mjfim.records.studies import (
 )
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Labels, Recording, Trajectory
-from tests.support.made_records import make_recording_comparison, ten_iterates
+from tests.support.made_records import bare_estimate, make_recording_comparison, ten_iterates
 
 # Names of the parameters of all results.
 PARAMETERS = ("mass", "length", "damping")
@@ -158,21 +158,12 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
         for rms in (0.05, 0.2)
     ]
     fields: dict[str, object] = {
-        "parameters": PARAMETERS,
         "units": UNITS,
-        "theta": THETA,
-        "std": std,
         "covariance": covariance(std),
-        "initial_theta": 1.2 * THETA,
         "chi2": 201.0,
         "dof": 198,
-        "status": "converged",
-        "success": True,
-        "misfit": False,
-        "iterations": 4,
         "residual_rms": {output: 0.05},
         "sigma": {output: 0.05},
-        "at_bound": (),
         "predicted": (predicted,),
         "recordings": (recording,),
         "nominal": (0.7 * predicted,),
@@ -206,7 +197,8 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
             PARAMETERS, UNITS, ("swing.csv", "other.csv", "third.csv")
         ),
     }
-    return Estimate(**{**fields, **changes})  # type: ignore[arg-type]
+    arguments = {"parameters": PARAMETERS, "theta": THETA, "std": std, **fields, **changes}
+    return bare_estimate(**arguments)  # type: ignore[arg-type]
 
 
 def draws(std: Array) -> ParameterDraws:
