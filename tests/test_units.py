@@ -47,7 +47,7 @@ CART = """
 </mujoco>
 """
 
-EXPERIMENT: dict[str, Any] = {
+EXPERIMENT = {
     "model": "cart.xml",
     "rate": 50.0,
     "horizon": 1.6,
@@ -120,7 +120,7 @@ ONE_SIDED = {
 }
 
 # Tables of experiments whose designs take different paths.
-DESIGNS: dict[str, dict[str, Any]] = {
+DESIGNS = {
     "weights": {},
     "limits": {"limits": LIMITS, "cost": {"control": 0.0}},
     "single bounds": {"limits": ONE_SIDED},
@@ -175,7 +175,6 @@ def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path, name: str
     for units in (Units(), SCALES[name]):
         rescaled = rescale(original, units, tmp_path / "rescaled")
         clearance = constraint_set_of(DesignTask.resolve(rescaled.experiment)).clearance
-        assert clearance is not None
         distances, slope = clearance.distances(motion * [units.length, 1.0], slopes=True)
         assert slope is not None
         lengths = [clearance.distances.reach, clearance.least, clearance.scale]
@@ -191,7 +190,6 @@ def test_a_clearance_of_nearly_nothing_has_finite_margins(tmp_path) -> None:
     original = stated(tmp_path, limits={"clearance": 1e-100})
     (tmp_path / "cart.xml").write_text(WALLED)
     clearance = constraint_set_of(DesignTask.resolve(original)).clearance
-    assert clearance is not None
     assert clearance.scale > 1e-9
 
 
@@ -228,7 +226,7 @@ def test_series_with_which_a_search_goes_on_are_the_same_in_all_units(
 NUISANCE = {"initial": {"qpos:slide": 0.01, "qvel:slide": True}, "bias": {"qpos:hinge": True}}
 
 # Keys of experiments whose fits take different paths.
-FITS: dict[str, dict[str, Any]] = {
+FITS = {
     "stated start": {},
     "nuisance": {"nuisance": NUISANCE},
     "segments": {"fit": {"segments": 0.4}},

@@ -16,7 +16,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import spline_basis
 from mjfim.experiment.schema import Experiment
 from mjfim.output.pages import page_of
-from mjfim.records.design import Design, HistoryRow, Status
+from mjfim.records.design import Design, Status
 from tests.support.limits import ARM, HARD, cart_inside
 from tests.support.numerics import (
     CART_PARAMETERS,
@@ -226,7 +226,7 @@ def test_more_iterations_never_give_less(tmp_path: Path) -> None:
     """The result is the best feasible iterate of the run, and a larger budget improves on it."""
     costs = {}
     for iterations in (8, 200, 800):
-        rows: list[HistoryRow] = []
+        rows = []
         descent = {"max_iterations": iterations, "coarse": 1}
         task = cart_inside(tmp_path, horizon=0.4, descent=descent)
         design = design_task(task, callback=lambda event, rows=rows: rows.append(event.row))
@@ -247,7 +247,7 @@ def test_more_iterations_never_give_less(tmp_path: Path) -> None:
 
 def arm_task(folder: Path, **tables: Any) -> DesignTask:
     """The arm of two servos for half a second; it starts at rest, held against gravity."""
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 0.5,
         "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},

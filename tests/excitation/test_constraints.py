@@ -25,7 +25,7 @@ WIDE = {
     "velocity": 5.0,
 }  # wide tolerances, so that a missed final state does not dominate the barrier
 # tight limits: the motion below violates some of them and is close to others
-ALONE: dict[str, dict[str, Any]] = {
+ALONE = {
     "position": {"limits": {"position": {"shoulder": (-0.3, 0.7), "elbow": (-0.3, 0.5)}}},
     "velocity": {"limits": {"velocity": {"shoulder": 4.6, "elbow": (-5.0, 4.8)}}},
     "acceleration": {"limits": {"acceleration": 300.0}},
@@ -45,7 +45,7 @@ ALONE: dict[str, dict[str, Any]] = {
     },
 }
 EVERY = {key: value for name in list(ALONE)[:7] for key, value in ALONE[name]["limits"].items()}
-TOGETHER: dict[str, dict[str, Any]] = {
+TOGETHER = {
     "every kind, anywhere": {"limits": EVERY},
     "every kind, rest to rest": {
         "limits": EVERY,
@@ -59,7 +59,7 @@ KINDS = {"position", "velocity", "acceleration", "control", "control_rate", "for
 def arm_task(folder: Path, **tables: Any) -> DesignTask:
     """The relaxed arm, which starts at rest and is moved by sines of 1.5 Hz for 0.4 s."""
     swing = {"shoulder": 0.25, "elbow": 0.35}
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 0.4,
         "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
@@ -81,7 +81,6 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
     task = arm_task(tmp_path, **{**ALONE, **TOGETHER}[name])
     constraints = constraint_set_of(task)
     watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
     margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
     if name in KINDS:
         assert set(margins) == {name}
@@ -119,7 +118,6 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     )
     point = problem.point(task.control)
     expansion = problem.expand(point)
-    assert expansion.barrier is not None
     w, rng = expansion.barrier.weights, np.random.default_rng(4)
     for k in range(task.samples):
         form = np.block([[w.Q[k], w.S[k].T], [w.S[k], w.R[k]]])
@@ -129,7 +127,6 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     assert (np.linalg.eigvalsh(w.Q[-1]) >= -1e-12 * np.abs(w.Q[-1]).max()).all()
     assert (w.W >= 0.0).all()
     rate, clearance = constraints.rate, constraints.clearance
-    assert rate is not None
     free = rate.control_before is None, rate.control_after is None and not rate.periodic
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
@@ -142,9 +139,7 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
         task.theta, values.trajectory, constraints.observations
     )
     looked, ctrl = list(constraints.observations.derivative_rows), task.control
-    assert values.distances is not None
     assert values.distance_slopes is not None
-    assert clearance is not None
     m, least = values.distances.shape[1], np.full(values.distances.shape[1], 0.03)
     near = Bounds(lower=least, upper=np.full(m, np.inf), scale=clearance.distances.reach - least)
     bends = [
@@ -193,7 +188,6 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
         base=task.problem, constraints=narrow, mu=1.0, delta=delta, with_cost=False
     )
     barrier = problem.expand(problem.point(ctrl)).barrier
-    assert barrier is not None
     _, b = barrier.weights.half_gradient(
         TangentCurve(z=np.zeros((N + 1, task.space.nx)), v=1e-5 * way)
     )
@@ -209,7 +203,6 @@ def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Pa
         base=task.problem, constraints=constraints, mu=1.0, delta=0.1, with_cost=False
     )
     expansion = problem.expand(problem.point(task.control))
-    assert expansion.barrier is not None
     for way in 1e-4 * directions_of(task, 4, seed=2):
         zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
         up, down = (values_of(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
@@ -264,8 +257,6 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     )
     expansion = problem.expand(problem.point(task.control))
     barrier = expansion.barrier
-    assert barrier is not None
-    assert barrier.curvature is not None
     K = np.zeros((task.samples, 2, task.space.nx))
     way = directions_of(task, 1, seed=6)[0]
     weights, _, growth = barrier.curvature.along(expansion.lift(K, 0.0 * way), None)
@@ -284,7 +275,6 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     # with a smooth barrier, or where it is not asked for, the curvature is not followed
     for other in (replace(problem, mu=0.1), replace(problem, follows_curvature=False)):
         smooth = other.expand(other.point(task.control)).barrier
-        assert smooth is not None
         assert smooth.curvature is None
 
 
@@ -293,7 +283,6 @@ def along_control(
 ) -> ConstraintValues:
     """The limited quantities along a control."""
     observed = task.plant.observe(task.theta, ctrl, constraints.observations)
-    assert observed is not None
     return constraints.evaluate(*observed, slopes=slopes)
 
 
@@ -310,7 +299,6 @@ def test_margins_along_a_trajectory_are_those_of_single_engine_steps(tmp_path: P
         task.limits,
     )
     watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
     data, rows, near = mujoco.MjData(model), {kind: [] for kind in KINDS}, []
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     geoms = [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
@@ -368,7 +356,6 @@ def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path)
     )
     constraints = constraint_set_of(task)
     watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
     values = constraints.evaluate(*watched, slopes=False)
     shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(constraints.margins(values)))}
     tighter = {
@@ -379,9 +366,7 @@ def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path)
         1.0 + shares["clearance"]
     )  # the fraction of a clearance is relative to the least distance, which is raised
     raised = constraints.tightened(shares).clearance
-    assert raised is not None
     assert raised.least == pytest.approx(least)
-    assert values.distances is not None
     tighter["clearance"] = float(values.distances.min()) / least - 1.0
     assert found == pytest.approx(tighter, abs=1e-12)
     assert constraints.tightened({}).relative_margins(values) == pytest.approx(
@@ -396,7 +381,6 @@ def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path)
 def test_rates_at_both_ends_follow_the_boundary(tmp_path: Path) -> None:
     task = arm_task(tmp_path, limits={"control_rate": 9.0})
     rate, ctrl = constraint_set_of(task).rate, task.control
-    assert rate is not None
     inner = np.diff(ctrl, axis=0) / 0.01
     np.testing.assert_allclose(rate.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
     before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
@@ -415,7 +399,6 @@ def test_without_enforcement_only_the_boundary_constrains(tmp_path: Path) -> Non
     for every, kinds in ((False, set()), (True, KINDS)):
         constraints = constraint_set_of(task, every=every)
         watched = task.plant.observe(task.theta, task.control, constraints.observations)
-        assert watched is not None
         values = constraints.evaluate(*watched, slopes=False)
         assert isinstance(values, ConstraintValues)
         assert set(constraints.margins(values)) == kinds | {"end_position", "end_velocity"}

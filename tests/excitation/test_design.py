@@ -14,7 +14,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import Status
 from tests.support.numerics import CART_PARAMETERS, cart_task
 from tests.support.paths import ROOT
 
@@ -129,7 +129,7 @@ def test_metric_weight_on_psi_needs_the_metric_descent(experiment: Experiment) -
 
 @pytest.mark.slow
 def test_callback_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
-    rows: list[HistoryRow] = []
+    rows = []
     loose = experiment.replace(descent={"tolerance": 0.1}, rehearsal={"robots": 4})
     design = mjfim.design(loose, callback=lambda event: rows.append(event.row))
     assert [row.iteration for row in rows] == list(range(len(rows)))

@@ -26,7 +26,7 @@ RANGE = {"shoulder": (-0.35, 0.3)}
 
 def arm(folder: Path, **tables: Any) -> DesignTask:
     """The arm for a second."""
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 1.0,
         "parameters": {"m": {"target": "body/fore:mass"}},
         "noise": {"qpos:elbow": 0.01},

@@ -90,7 +90,7 @@ def ship_task(folder: Path, text: str | None = None, **tables: Any) -> DesignTas
         },
         "offset": {"thrust": 2.0, "aim[0]": 0.2, "pull": 0.2},
     }
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 0.2,
         "parameters": {"m": {"target": "body/fore:mass"}},
         "noise": {"qpos:elbow": 0.01},
@@ -104,7 +104,7 @@ def ship_task(folder: Path, text: str | None = None, **tables: Any) -> DesignTas
 
 
 # Limits that the motion of the ship partly violates.
-KINDS: dict[str, dict[str, Any]] = {
+KINDS = {
     "place": {"position": {"float": ((-0.1, 0.02), (-0.1, 0.1), (0.9, 1.02))}},
     "height": {"position": {"float.z": (0.9, 1.03)}},
     "turn": {"position": {"wrist": (0.0, 0.8)}},
@@ -347,7 +347,7 @@ def played(model: Any, task: DesignTask) -> dict[tuple[str, str], Array]:
     hull, mast = (reference_orientation(model, name) for name in ("hull", "mast"))
     body_up, mast_up = hull.T @ up, mast.T @ up
     between = hull.T @ mast
-    rows: dict[tuple[str, str], list[float]] = {}
+    rows = {}
 
     def see(kind: str, name: str, value: float) -> None:
         rows.setdefault((kind, name), []).append(float(value))
@@ -439,7 +439,6 @@ def test_a_clamped_sum_of_forces_is_lifted_in_the_search_and_kept_as_a_limit(
     free = task.relaxed()
     constraints = constraint_set_of(free)
     watched = free.plant.observe(free.theta, free.control, constraints.observations)
-    assert watched is not None
     margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
     assert margins["tendon_force"] < 0.0
     assert margins["force"] < 0.0
@@ -492,7 +491,7 @@ HOVER = 0.6 * 9.81 / 4
 
 def flight(folder: Path, **tables: Any) -> DesignTask:
     """The quadrotor flies for a second; its mass, centre of mass and inertia are unknown."""
-    defaults: dict[str, Any] = {
+    defaults = {
         "rate": 50.0,
         "horizon": 1.0,
         "parameters": {
@@ -512,7 +511,7 @@ def flown(ctrl: Array) -> dict[str, Array]:
     """Place, speeds and tilt of the quadrotor at every engine step in plain MuJoCo."""
     model = mujoco.MjModel.from_xml_string(QUADROTOR)
     data = mujoco.MjData(model)
-    rows: dict[str, list[Any]] = {"place": [], "speed": [], "spin": [], "tilt": []}
+    rows = {"place": [], "speed": [], "spin": [], "tilt": []}
     for held in ctrl:
         data.ctrl[:] = held
         for _ in range(4):

@@ -35,7 +35,7 @@ SIDE = (
 SOLID = ('contype="0" conaffinity="0" mass="0"', 'mass="0"')
 
 # name: lines at the end of the file, what the message must hold; edits of the model
-FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
+FAULTS = {
     "start outside": (
         "[limits]\nposition = { hinge = [-1.0, 1.0] }",
         [

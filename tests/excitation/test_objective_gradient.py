@@ -136,7 +136,7 @@ LATE = {"initial": {"qpos:hinge": 0.05, "qvel:slide": True}, "bias": 0.1, "delay
 KNOWN = {n: {**t, "bounds": (0.2, 3.0), "prior": 0.1} for n, t in CART_PARAMETERS.items()}
 BASIS = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 2)))[0]
 
-SETUPS: dict[str, Callable[[Path], DesignTask]] = {
+SETUPS = {
     "cart E tracking": cart(cost={**TRACKING, "criterion": "E"}),
     "cart A tracking": cart(cost={**TRACKING, "criterion": "A"}),
     "cart D tracking": cart(cost={**TRACKING, "criterion": "D"}),

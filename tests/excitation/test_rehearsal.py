@@ -141,7 +141,6 @@ def test_the_verdict_counts_robots(
 ) -> None:
     """A limit that the model keeps by a hair is broken by a half of the robots."""
     _, first = played(tmp_path)
-    assert first.rehearsal is not None
     exact = float(first.rehearsal.speed[0, 0]) * (1.0 + 1e-6)
     chosen = {key: exact if value is None else value for key, value in numbers.items()}
     experiment, design = played(tmp_path, **chosen)
@@ -259,7 +258,6 @@ def test_what_falls_below_the_floor_is_not_played(
 def test_an_end_that_no_control_can_brake_is_not_played(room: float, tmp_path: Path) -> None:
     """Held at its strongest brake after the end, the cart of plain MuJoCo leaves the limit."""
     _, first = played(tmp_path)
-    assert first.rehearsal is not None
     states = [looped(theta, first.trajectory.ctrl) for theta in first.rehearsal.theta]
     reach = float(max(np.abs(each[:, 0]).max() for each in states)) + room
     _, design = played(tmp_path, reach=reach)
@@ -309,7 +307,6 @@ def whitened_change(design: Design, step: np.ndarray, noise: float, friction: fl
 def test_finite_steps_agree_with_plain_loops(friction: float, noise: float, tmp_path: Path) -> None:
     """Along the principal axes of the covariance; for little noise the derivatives hold."""
     _, design = played(tmp_path, friction=friction, noise=noise)
-    assert design.rehearsal is not None
     steps, information = design.rehearsal.steps, design.final.information
     prior = np.diag([0.0, 0.0, 0.3**-2])
     size = np.sqrt(np.diag(information))

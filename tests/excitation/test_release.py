@@ -106,7 +106,6 @@ def test_an_optimum_at_the_end_of_a_range_is_said(tmp_path: Path) -> None:
 
 def test_the_ranges_of_the_model_narrow_those_of_the_release(tmp_path: Path) -> None:
     task = DesignTask.resolve(short(tmp_path, limits={"position": {"hinge": (-2.0, 1.5)}}))
-    assert task.release is not None
     assert (task.release.lower[0], task.release.upper[0]) == (0.1, 1.5)
 
     with pytest.raises(
@@ -169,7 +168,6 @@ def test_rotations_of_a_free_body_are_relative_to_the_stated_state(tmp_path: Pat
     )
     system = System.resolve(experiment)
     space = ReleaseSpace.of(system, ())
-    assert space is not None
     np.testing.assert_allclose(space.state(np.array([0.0, 0.5, 0.0]))[:7], [0, 0, 1, 0, 1, 0, 0])
 
     # A rotation of 0.5 rad about the same axis as the stated one, which is half a turn.

@@ -254,7 +254,6 @@ def test_samples_are_halved_until_their_bodies_can_exist() -> None:
 def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     table = {"B": {"inertial": "hull", "coordinates": "barycentric", "prior": 0.5}}
     task = body_task(tmp_path, parameters=table, robust={"samples": 8})
-    assert task.samples_of_parameters is not None
     moments = np.array(
         [
             task.plant.model(theta).body("hull").inertia

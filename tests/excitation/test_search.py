@@ -15,7 +15,7 @@ from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.search import search as search_module
 from mjfim.excitation.search.climb import Candidate, Move, tightened, without_jumps
 from mjfim.excitation.search.descent import Barrier, Ground
-from mjfim.excitation.search.inside import InsideControl, InsideSearch, LimitedCost, largest_share
+from mjfim.excitation.search.inside import InsideSearch, LimitedCost, largest_share
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, easier_level
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import Budget, StopToken
@@ -72,7 +72,6 @@ def test_a_start_outside_the_limits_is_scaled_and_improved(tmp_path: Path) -> No
     task = stiff_arm_task(tmp_path, descent={"max_iterations": 4})
     assert not cost_of(task).keeps(task.control)
     design = design_task(task)
-    assert design.scaled_start is not None
     assert 0.0 < design.scaled_start.share < 1.0
     assert design.final.cost <= design.scaled_start.cost
     assert verify(task, design.trajectory).is_feasible
@@ -92,7 +91,7 @@ def test_limits_that_nothing_keeps_end_as_infeasible(tmp_path: Path) -> None:
 
 
 def test_the_largest_share_is_found_and_a_stop_ends_the_search_for_a_larger_one() -> None:
-    tried: list[float] = []
+    tried = []
 
     def keeps(share: float) -> bool:
         """A limit at a share of 0.123."""
@@ -116,8 +115,7 @@ def test_random_changes_lower_the_cost_within_limits(
     task = cart_inside(tmp_path, limits=limits)
     cost = cost_of(task)
     first = InsideSearch(cost, 0).scaled(task.control, Budget())
-    assert first is not None
-    found: list[InsideControl] = []
+    found = []
     for each in InsideSearch(cost, 0).improvements(first, Budget(), patience=12):
         found.append(each)
         if len(found) == 3:
@@ -254,7 +252,7 @@ def test_long_moves_on_workers_are_cut_and_go_on(
     monkeypatch.setattr(search_module, "MOVE_SECONDS", 0.05)
     monkeypatch.setattr(search_module, "MOVE_EVALUATIONS", 0.0)
     task = cart_inside(tmp_path, descent={"max_iterations": 12})
-    moves: list[Move] = []
+    moves = []
     carry_out = search_module.move_in_worker
 
     def counted(move: Move) -> Candidate:

@@ -37,7 +37,7 @@ SPEED = SWING * 2 * np.pi * 10.0
 
 def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -> DesignTask:
     """One second of a mass on a spring, which oscillates at 10 Hz; the control is small."""
-    defaults: dict[str, Any] = {
+    defaults = {
         "rate": 10.0,
         "horizon": 1.0,
         "parameters": {"m": {"target": "body/ball:mass"}},
@@ -91,7 +91,6 @@ def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
     task = spring_task(tmp_path, limits={"clearance": 0.1})
     constraints = constraint_set_of(task)
     watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
     assert constraints.margins(constraints.evaluate(*watched, slopes=False))["clearance"] > 0.05
     found = verify(task, task.initial)
     assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.1, abs=1e-4)
@@ -165,7 +164,7 @@ def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
 ) -> None:
     """The table holds each sample for all its rows, so that the control jumps within one row."""
     control = {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0}
-    tables: dict[str, Any] = {"initial": {"qvel": (SPEED,), "control": control}}
+    tables = {"initial": {"qvel": (SPEED,), "control": control}}
     tables["playback_rate"] = 10.0 * rows
     task = spring_task(tmp_path, **tables)
 
@@ -210,7 +209,7 @@ def light_link(
 ) -> DesignTask:
     """The light link under a sine for 0.4 s, with two engine steps in each sample."""
     control = {"kind": "sine", "amplitude": 0.4, "frequency": 2.5}
-    defaults: dict[str, Any] = {
+    defaults = {
         "rate": 100.0,
         "horizon": 0.4,
         "parameters": {"m": {"target": "body/link:mass"}},
@@ -334,7 +333,7 @@ def test_limits_hold_with_the_solver_settings_of_the_model_too(
     solver: dict[str, Any], tmp_path: Path
 ) -> None:
     """The limit is between the speeds with the exact solver and with that of the model."""
-    tables: dict[str, Any] = {"parameters": {"m": {"target": "body/lower:mass"}}}
+    tables = {"parameters": {"m": {"target": "body/lower:mass"}}}
     tables["noise"] = {"state": 0.01}
     text = COARSE_SOLVER.format(**solver)
     task = make_task(text, tmp_path, **tables)
@@ -390,7 +389,6 @@ def test_a_clearance_beyond_the_reach_of_distances_is_measured_too(tmp_path: Pat
     """One position is farther from the wall than that, the other one is nearer."""
     task = spring_task(tmp_path, limits={"clearance": 1e-4})
     constraints = constraint_set_of(task, every=True)
-    assert constraints.clearance is not None
     distances = constraints.clearance.distances
     near = task.initial.qpos[:1] + 0.19 - 0.5 * distances.reach
     far = np.array([[-SWING]])

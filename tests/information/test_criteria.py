@@ -19,7 +19,7 @@ from mjfim.information.criteria import (
 from tests.support.numerics import Array, richardson
 
 CONTRAST = np.array([[1.0, 0.0], [-2.0, 0.0], [0.5, 1.0], [0.0, 3.0]])
-ALL: dict[str, Callable[[Array], Criterion]] = {
+ALL = {
     **CRITERIA,
     "smooth E 1": lambda info: smooth_e_optimality(info, 1.0),
     "smooth E 2.5": lambda info: smooth_e_optimality(info, 2.5),

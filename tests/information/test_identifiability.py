@@ -298,7 +298,7 @@ def test_data_must_show_every_parameter_even_nuisances_and_those_with_a_prior(tm
 
 def test_a_design_is_refused_before_any_optimisation(tmp_path) -> None:
     task = two_task(tmp_path)
-    told: list[object] = []
+    told = []
     with pytest.raises(UnidentifiableError, match="initial control does not excite"):
         design_task(task, callback=told.append)
     assert told == []

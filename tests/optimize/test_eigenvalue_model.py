@@ -11,7 +11,6 @@ from scipy.linalg import expm, logm
 from scipy.optimize import minimize
 
 from mjfim.excitation.limits.constraints import constraint_set_of
-from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import smooth_e_optimality
 from mjfim.optimize.cost_models import (
     EigenvalueModel,
@@ -132,7 +131,7 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
         },
     }[information]
     limits = {"control": {"force": (-9.0, 9.0)}}
-    task: DesignTask = cart_task(tmp_path, limits=limits, **tables).relaxed()
+    task = cart_task(tmp_path, limits=limits, **tables).relaxed()
     problem = task.problem
     problem = replace(
         problem, information=replace(problem.information, power=3.0, negligible_weight=0.0)

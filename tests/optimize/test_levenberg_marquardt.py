@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -211,9 +210,8 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
     """No evaluated point leaves the bounds, and the cost falls from iterate to iterate."""
     build, start = CASES[name]
     p = build()
-    reports: list[tuple[int, float, float]] = []
+    reports = []
     found = minimise(p, start, SHARP, callback=lambda *report: reports.append(report))
-    assert found is not None
     theta, starts, cost = reference(build(), start)
     assert found.success, found.status
     assert found.cost <= cost * (1 + 1e-9) + 1e-12
@@ -413,7 +411,6 @@ def test_an_exhausted_time_is_not_an_interruption() -> None:
     found = minimise(
         problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0), SHARP, Budget(seconds=0.0)
     )
-    assert found is not None
     assert not found.interrupted
     assert not found.success
     assert found.iterations == 0
@@ -436,7 +433,6 @@ def test_the_last_linearisation_is_at_the_solution() -> None:
     p = problem(*decays(), lower=[0.0, -5.0])
     found = solved(p, start, SearchSettings())
     fresh = p.condense(found.unknowns)
-    assert fresh is not None
     np.testing.assert_array_equal(found.condensed.blocks, fresh.blocks)
     saved = solved(p, start, SearchSettings(relinearise_at_end=False))
     np.testing.assert_allclose(saved.unknowns.theta, found.unknowns.theta, rtol=1e-5)
@@ -455,7 +451,6 @@ def test_a_first_step_is_the_last_one_only_where_it_is_short() -> None:
     start = alone(0.5)
     p = problem(halving, lower=[-5.0])
     condensed = p.condense(start)
-    assert condensed is not None
     settings = SearchSettings(tolerance=1e-2, relinearise_at_end=False, damped=True)
     free = np.array([FREE])
     first = condensed.step(0.0, condensed.column_norms, -free, free)
@@ -522,7 +517,6 @@ def test_a_search_ends_where_it_cannot_beat_a_cost() -> None:
     start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
     whole = drifting(0)
     exact = minimise(whole, start, SHARP)
-    assert exact is not None
 
     # A cost that lies below the minimum cannot be beaten; one that lies above it is.
     ended = drifting(0)
@@ -596,14 +590,13 @@ def test_longer_steps_reach_the_minimum_of_a_robust_loss_sooner() -> None:
     assert sooner.cost == longer.cost(sooner.unknowns)
 
     # Reported costs are those of the iterates at which the search went on.
-    costs: list[float] = []
+    costs = []
     again = minimise(
         outliers(),
         start,
         SearchSettings(tolerance=1e-6, lengthens=True),
         callback=lambda iteration, cost, length: costs.append(cost),
     )
-    assert again is not None
     assert costs == [longer.cost(at) for at in again.iterates[1:]]
     assert (np.diff(costs) < 0.0).all()
 
@@ -620,7 +613,6 @@ def test_a_step_that_is_shorter_along_a_weak_direction_is_tried() -> None:
     p = problem(beside_a_cliff, lower=[-FREE, -FREE])
     settings = SearchSettings(tolerance=1e-9, begins_near=True, max_iterations=1)
     found = minimise(p, alone(0.0, 0.0), settings)
-    assert found is not None
     sum_of_both, difference = found.unknowns.theta @ [[1.0, 1.0], [1.0, -1.0]]
     assert sum_of_both == pytest.approx(4.0, rel=1e-3)
 
@@ -669,8 +661,8 @@ def test_one_stagnant_iteration_may_be_chance(unit: float, promised: float, ends
     settings = SearchSettings(relinearise_at_end=False)
     p, start = problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0)
     search = _Search(p, settings, Budget(), None, start, 100.0, p.condense(start), unit=unit)
-    trial: Any = SimpleNamespace(cost=100.0 - 0.005 * unit)
-    predicted: Any = SimpleNamespace(predicted_decrease=promised)
+    trial = SimpleNamespace(cost=100.0 - 0.005 * unit)
+    predicted = SimpleNamespace(predicted_decrease=promised)
     assert search._stagnates(trial, predicted) == ends
     assert search._stagnates(trial, predicted)
 

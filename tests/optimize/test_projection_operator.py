@@ -5,7 +5,6 @@ Only the algorithm is tested, without MuJoCo.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -192,7 +191,7 @@ def optimum() -> float:
     return problem.value(problem.rollout(u[:, None]))
 
 
-DIRECTIONS: dict[str, Callable[[], Direction]] = {
+DIRECTIONS = {
     "metric": lambda: METRIC,
     "lbfgs": lambda: LBFGS(R * DT),
 }
@@ -440,7 +439,7 @@ def test_better_differences_are_used_before_a_stall_is_claimed() -> None:
 
 def test_the_consumer_may_stop_between_iterates() -> None:
     problem = Pendulum()
-    loop: Iterator[Iterate[Curve]] = optimize(
+    loop = optimize(
         problem, start(problem), METRIC, REGULATOR, Armijo(), tolerance=1e-12, max_iterations=100
     )
     first, second = next(loop), next(loop)

@@ -42,7 +42,7 @@ class FakeExecutor(Executor):
         self, lose: Callable[[int, int], BaseException | None], count: int | None = 2
     ) -> None:
         self.lose = lose
-        self.submitted: list[int] = []
+        self.submitted = []
         if count is not None:
             self._max_workers = count
 
@@ -50,7 +50,7 @@ class FakeExecutor(Executor):
         order = args[0]
         self.submitted.append(order)
         error = self.lose(order, self.submitted.count(order))
-        future: Future[Any] = Future()
+        future = Future()
         if error is not None:
             future.set_exception(error)
         else:
@@ -121,7 +121,7 @@ def test_results_come_in_the_order_of_the_orders() -> None:
 
 
 def test_without_workers_each_order_is_asked_for_after_the_one_before_is_done() -> None:
-    done: list[int] = []
+    done = []
     orders = (len(done) for _ in range(3))
     assert list(results(lambda order: done.append(order), orders, None, Budget())) == [None] * 3
     assert done == [0, 1, 2]
@@ -277,7 +277,7 @@ class FakeDaskExecutor(FakeExecutor):
     def __init__(self, client: FakeClient) -> None:
         super().__init__(lambda order, times: None, count=None)
         self._client = client
-        self.waited: list[bool] = []
+        self.waited = []
 
     def shutdown(self, wait: bool = True) -> None:  # type: ignore[override]
         self.waited.append(wait)
