@@ -17,7 +17,6 @@ from mjfim.excitation.limits.constraint_kinds import Magnitude
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import limits_of
 from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
-from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
@@ -26,7 +25,7 @@ from mjfim.output.pages.files import experiment_page
 from mjfim.output.plots.design import limits as limits_picture
 from mjfim.output.words import complete_labels
 from mjfim.studies.inventory import stated_experiment
-from tests.support.limits import barrier_check
+from tests.support.limits import along_control, barrier_check, barrier_problem
 from tests.support.numerics import Array, make_task
 
 # A hull that floats, with a mast on a ball joint and an arm on a hinge. The mast is turned by an
@@ -438,8 +437,7 @@ def test_a_clamped_sum_of_forces_is_lifted_in_the_search_and_kept_as_a_limit(
 
     free = task.relaxed()
     constraints = constraint_set_of(free)
-    watched = free.plant.observe(free.theta, free.control, constraints.observations)
-    margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
+    margins = constraints.margins(along_control(free, constraints))
     assert margins["tendon_force"] < 0.0
     assert margins["force"] < 0.0
     assert verify(task, task.initial).margins["tendon_force"] == pytest.approx(0.0, abs=1e-12)
@@ -502,7 +500,7 @@ def flight(folder: Path, **tables: Any) -> DesignTask:
         "noise": {"qpos:float": 0.005, "qvel:float": 0.05},
         "control": {"kind": "multisine", "amplitude": 0.05, "offset": HOVER},
         "cost": {"control": 0.0},
-        "descent": {"max_iterations": 25},
+        "descent": {"max_iterations": 12},
     }
     return make_task(QUADROTOR, folder, **{**defaults, **tables})
 
@@ -622,13 +620,7 @@ def test_limits_of_a_free_body_do_not_depend_on_units(
                 "tilt": 0.3,
             },
         ).relaxed()
-        problem = InteriorProblem(
-            base=task.problem,
-            constraints=constraint_set_of(task),
-            mu=1.0,
-            delta=0.05,
-            with_cost=False,
-        )
+        problem = barrier_problem(task, 0.05)
         point = problem.point(task.control)
         open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
         slope = float(np.sum(problem.expand(point).gradient(open_loop)[:, 0]) * force)

@@ -5,6 +5,8 @@ It is twice differentiable and defined outside the bounds.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -106,6 +108,8 @@ def test_the_barrier_of_bounds_is_the_sum_over_both_bounds(delta: float) -> None
     barrier = bounds.barrier(r, delta, weight)
     assert barrier.value == pytest.approx(value(r), rel=1e-12)
     assert (barrier.slope[:, 3] == 0.0).all() and (barrier.curvature[:, 3] == 0.0).all()  # free
+    middle = Bounds.from_range(np.array([-1.0]), np.array([3.0])).barrier(np.ones((1, 1)), 0.1, 1.0)
+    assert (middle.value, float(middle.slope[0, 0])) == (0.0, 0.0)
     h = 1e-5
     for k, i in np.ndindex(*r.shape):
         e = np.zeros_like(r)
@@ -121,24 +125,11 @@ def test_the_barrier_of_bounds_is_the_sum_over_both_bounds(delta: float) -> None
         np.testing.assert_allclose((up - down)[k, i] / (2 * h), barrier.curvature[k, i], rtol=1e-4)
 
 
-def test_the_middle_of_a_range_costs_nothing_and_the_gradient_points_there() -> None:
-    bounds = Bounds.from_range(np.array([-1.0]), np.array([3.0]))
-    middle, right, outside = (bounds.barrier(np.array([[r]]), 0.1, 1.0) for r in (1.0, 2.0, 3.5))
-    assert (middle.value, float(middle.slope[0, 0])) == (0.0, 0.0)
-    assert right.slope[0, 0] > 0.0
-    assert outside.slope[0, 0] > right.slope[0, 0]
-
-
 def test_the_largest_relative_move_is_over_observations_and_controls() -> None:
     N, nx, nu = 4, 2, 1
     observations = np.zeros((N, 1, 2, nx + nu))
     observations[2, 0, 1] = [0.0, 3.0, 1.0]  # what is shown there moves by 3 z_1 + v over its scale
-    free = Weights(
-        Q=np.zeros((N + 1, nx, nx)),
-        S=np.zeros((N, nu, nx)),
-        R=np.zeros((N, nu, nu)),
-        W=np.zeros((N + 1, nu)),
-    )
+    free = Weights.constant(N, np.zeros((nx, nx)), np.zeros((nu, nu)), np.zeros((nx, nx)))
     barrier = BarrierExpansion(
         a=np.zeros((N + 1, nx)),
         b=np.zeros((N, nu)),
@@ -154,27 +145,10 @@ def test_the_largest_relative_move_is_over_observations_and_controls() -> None:
     )  # the control alone
     z[2], v[2] = [9.0, -0.4], 0.1
     assert barrier.largest_relative_move(TangentCurve(z=z, v=v)) == pytest.approx(1.1)
-    a, b, twice = (
-        barrier.a + 1.0,
-        barrier.b + 2.0,
-        Weights(Q=free.Q + 1.0, S=free.S + 2.0, R=free.R + 3.0, W=free.W + 4.0),
-    )
-    double = BarrierExpansion(
-        a=a,
-        b=b,
-        weights=twice,
-        observations=observations,
-        control_scale=barrier.control_scale,
-        control_step_scale=barrier.control_step_scale,
-    ).scaled(2.0)
-    found = [
-        double.a,
-        double.b,
-        double.weights.Q,
-        double.weights.S,
-        double.weights.R,
-        double.weights.W,
-    ]
+    weights = Weights(Q=free.Q + 1.0, S=free.S + 2.0, R=free.R + 3.0, W=free.W + 4.0)
+    other = replace(barrier, a=barrier.a + 1.0, b=barrier.b + 2.0, weights=weights)
+    double = other.scaled(2.0)
+    found = [double.a, double.b, *(getattr(double.weights, name) for name in "QSRW")]
     assert [float(array.flat[0]) for array in found] == [2.0, 4.0, 2.0, 4.0, 6.0, 8.0]
     np.testing.assert_array_equal(double.observations, observations)  # ranges, not weights
 

@@ -170,21 +170,41 @@ def peak(theta: Array, private: Array) -> Array:
     return (theta[0] * np.exp(-((x - theta[1]) ** 2) / (2 * theta[2] ** 2)) - y) / 0.05
 
 
-def alone(*theta: float) -> UnknownValues:
+def alone(*theta: float, segments: int = 1) -> UnknownValues:
     """A start without private unknowns."""
-    return UnknownValues(theta=np.array(theta), private=np.zeros((1, 0)))
+    return UnknownValues(theta=np.array(theta), private=np.zeros((segments, 0)))
+
+
+def together(*theta: float) -> UnknownValues:
+    """A start of the decays, whose amplitudes are one."""
+    return UnknownValues(theta=np.array(theta), private=np.ones((3, 1)))
+
+
+def free_decays() -> Analytic:
+    """The decays within bounds that are far away."""
+    return problem(*decays(), lower=[0.0, -5.0])
+
+
+def valley(**more: object) -> Analytic:
+    """The valley of Rosenbrock within wide bounds."""
+    return problem(rosenbrock, lower=[-5.0, -5.0], upper=[5.0, 5.0], **more)
+
+
+def peaked(**more: object) -> Analytic:
+    """The peak within wide bounds."""
+    return problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0], **more)
 
 
 CASES = {
     "decays": (
-        lambda: problem(*decays(), lower=[0.0, -5.0]),
-        UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1))),
+        lambda: free_decays(),
+        together(0.3, 0.0),
     ),
     "bounded decays": (
         lambda: problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0]),
-        UnknownValues(theta=np.array([0.3, 1.0]), private=np.ones((3, 1))),
+        together(0.3, 1.0),
     ),
-    "valley": (lambda: problem(rosenbrock, lower=[-5.0, -5.0], upper=[5.0, 5.0]), alone(-1.2, 1.0)),
+    "valley": (valley, alone(-1.2, 1.0)),
     "walled valley": (
         lambda: problem(rosenbrock, lower=[-2.0, -2.0], upper=[0.6, 5.0]),
         alone(-1.2, 1.0),
@@ -195,7 +215,7 @@ CASES = {
     ),
     "badly scaled": (lambda: problem(powell, lower=[0.0, 0.0], upper=[1.0, 20.0]), alone(0.0, 1.0)),
     "peak": (
-        lambda: problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0]),
+        lambda: peaked(),
         alone(1.0, -0.5, 1.5),
     ),
     "held at a wall": (
@@ -231,7 +251,7 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
 def test_the_residuals_of_the_linearisation_are_those_of_the_estimate() -> None:
     """Also where the last step was taken without a linearisation at its end."""
     p = problem(*decays(), lower=[0.0, -2.0])
-    start = UnknownValues(theta=np.array([1.0, 0.4]), private=np.ones((3, 1)))
+    start = together(1.0, 0.4)
     found = solved(p, start, SearchSettings(tolerance=1e-2, relinearise_at_end=False))
     assert found.success
     free = np.full(2, FREE)
@@ -244,7 +264,7 @@ def test_the_residuals_of_the_linearisation_are_those_of_the_estimate() -> None:
 def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
     """Steps that would raise the cost are halved."""
     p = problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0])
-    start = UnknownValues(theta=np.array([1.0, 0.4]), private=np.ones((3, 1)))
+    start = together(1.0, 0.4)
     p.lower, p.upper = np.full(2, -FREE), np.full(2, FREE)
     found = solved(p, start, SearchSettings(max_iterations=50, tolerance=1e-9, damped=False))
     theta, starts, _ = reference(p, start)
@@ -252,13 +272,13 @@ def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
     np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6)
     np.testing.assert_allclose(found.unknowns.private, starts, rtol=1e-6)
     assert found.unknowns.theta[0] > 1.2
-    valley = problem(rosenbrock, lower=[-FREE, -FREE])
+    curved = problem(rosenbrock, lower=[-FREE, -FREE])
     through = solved(
-        valley, alone(-1.2, 1.0), SearchSettings(max_iterations=100, tolerance=1e-9, damped=False)
+        curved, alone(-1.2, 1.0), SearchSettings(max_iterations=100, tolerance=1e-9, damped=False)
     )
     np.testing.assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
     lengths = {
-        np.abs(a.theta - b.theta).max() for a, b in zip(valley.seen[1:], valley.seen, strict=False)
+        np.abs(a.theta - b.theta).max() for a, b in zip(curved.seen[1:], curved.seen, strict=False)
     }
     assert len(lengths) > 3
 
@@ -334,7 +354,7 @@ def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
         "swapped": lambda J: J[:, ::-1],
         "noise": lambda J: rng.standard_normal(J.shape) * np.linalg.norm(J, axis=0),
     }
-    p = problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0], spoil=spoils[fault])
+    p = peaked(spoil=spoils[fault])
     found = solved(p, alone(1.0, -0.5, 1.5), SearchSettings(damped=damped))
     assert found.cost > 1.05 * reference(p, alone(1.0, -0.5, 1.5))[2], (
         "it is at the minimum in spite of all"
@@ -356,7 +376,7 @@ def test_numerical_noise_does_not_prevent_convergence() -> None:
             alone(1.0, -0.5, 1.5),
             SearchSettings(tolerance=1e-6),
         )
-        theta, _, cost = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(2.0, 0.4, 0.7))
+        theta, _, cost = reference(peaked(), alone(2.0, 0.4, 0.7))
         assert found.success, found.status
         assert found.cost < cost + 1e-3
         np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
@@ -364,11 +384,11 @@ def test_numerical_noise_does_not_prevent_convergence() -> None:
 
 def test_a_search_from_the_minimum_ends_at_once() -> None:
     """Residuals vanish at the minimum, or they do not."""
-    exact = solved(problem(rosenbrock, lower=[-5.0, -5.0]), alone(1.0, 1.0))
+    exact = solved(valley(), alone(1.0, 1.0))
     assert exact.success
     assert exact.iterations == 1
-    theta, _, _ = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5))
-    again = solved(problem(peak, lower=[0.0, -3.0, 0.1]), alone(*theta), SearchSettings())
+    theta, _, _ = reference(peaked(), alone(1.0, -0.5, 1.5))
+    again = solved(peaked(), alone(*theta), SearchSettings())
     assert again.success
     assert again.iterations <= 2
     np.testing.assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
@@ -395,7 +415,7 @@ def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
 @pytest.mark.parametrize("stop", [1, 2, 3, 7])
 def test_a_requested_stop_returns_the_best_so_far(stop: int) -> None:
     """The token is set during the evaluation with this number; no further point is evaluated."""
-    p = problem(rosenbrock, lower=[-5.0, -5.0], stop=stop)
+    p = valley(stop=stop)
     found = solved(p, alone(-1.2, 1.0))
     assert found.interrupted
     assert not found.success
@@ -408,9 +428,7 @@ def test_a_requested_stop_returns_the_best_so_far(stop: int) -> None:
 
 def test_an_exhausted_time_is_not_an_interruption() -> None:
     """The first point is returned with the reason, and nothing is raised."""
-    found = minimise(
-        problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0), SHARP, Budget(seconds=0.0)
-    )
+    found = minimise(valley(), alone(-1.2, 1.0), SHARP, Budget(seconds=0.0))
     assert not found.interrupted
     assert not found.success
     assert found.iterations == 0
@@ -419,7 +437,7 @@ def test_an_exhausted_time_is_not_an_interruption() -> None:
 
 def test_the_limit_of_iterations_is_kept_and_reported() -> None:
     """The returned cost belongs to the returned unknowns."""
-    p = problem(rosenbrock, lower=[-5.0, -5.0])
+    p = valley()
     found = solved(p, alone(-1.2, 1.0), SearchSettings(max_iterations=3))
     assert found.iterations == 3
     assert not found.success
@@ -429,8 +447,8 @@ def test_the_limit_of_iterations_is_kept_and_reported() -> None:
 
 def test_the_last_linearisation_is_at_the_solution() -> None:
     """Without `relinearise_at_end`, it is the previous one."""
-    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
-    p = problem(*decays(), lower=[0.0, -5.0])
+    start = together(0.3, 0.0)
+    p = free_decays()
     found = solved(p, start, SearchSettings())
     fresh = p.condense(found.unknowns)
     np.testing.assert_array_equal(found.condensed.blocks, fresh.blocks)
@@ -462,8 +480,8 @@ def test_a_first_step_is_the_last_one_only_where_it_is_short() -> None:
 
 
 def test_a_rough_search_ends_where_a_step_hardly_lowers_the_cost() -> None:
-    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
-    p = problem(*decays(), lower=[0.0, -5.0])
+    start = together(0.3, 0.0)
+    p = free_decays()
     exact = solved(p, start, SearchSettings())
     rough = solved(p, start, SearchSettings(relinearise_at_end=False, rough_share=0.1))
     assert rough.success
@@ -498,7 +516,7 @@ def drifting(seed: int) -> Analytic:
 
 
 def test_lengths_in_true_deviations_end_a_search_earlier_where_residuals_drift() -> None:
-    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    start = alone(60.0, 0.3, segments=40)
     formal = drifting(0)
     true = drifting(0)
     exact = minimise(formal, start, SearchSettings(tolerance=1e-3))
@@ -514,7 +532,7 @@ def test_lengths_in_true_deviations_end_a_search_earlier_where_residuals_drift()
 
 
 def test_a_search_ends_where_it_cannot_beat_a_cost() -> None:
-    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    start = alone(60.0, 0.3, segments=40)
     whole = drifting(0)
     exact = minimise(whole, start, SHARP)
 
@@ -620,13 +638,8 @@ def test_a_step_that_is_shorter_along_a_weak_direction_is_tried() -> None:
     assert 0.1 < difference <= 3.0
 
 
-def _with_all_segments(iterates: tuple[UnknownValues, ...], count: int) -> list[UnknownValues]:
-    """Iterates of a search without private unknowns, with entries for all segments again."""
-    return [UnknownValues(theta=at.theta, private=np.zeros((count, 0))) for at in iterates]
-
-
 def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
-    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    start = alone(60.0, 0.3, segments=40)
     settings = SearchSettings(
         tolerance=1e-9, in_true_deviations=True, relinearise_at_end=False, begins_near=True
     )
@@ -638,7 +651,7 @@ def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
 
     # Only the last decrease is below a hundredth of the square of a true standard deviation.
     negligible = ABSOLUTE_STAGNATION * 2.0 * found.condensed.true_deviation**2
-    costs = [p.cost(at) for at in _with_all_segments(found.iterates, 40)] + [found.cost]
+    costs = [p.cost(alone(*at.theta, segments=40)) for at in found.iterates] + [found.cost]
     is_negligible = -np.diff(costs) <= negligible
     assert is_negligible[-1]
     assert not is_negligible[:-1].any()
@@ -659,7 +672,7 @@ def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
 )
 def test_one_stagnant_iteration_may_be_chance(unit: float, promised: float, ends: bool) -> None:
     settings = SearchSettings(relinearise_at_end=False)
-    p, start = problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0)
+    p, start = valley(), alone(-1.2, 1.0)
     search = _Search(p, settings, Budget(), None, start, 100.0, p.condense(start), unit=unit)
     trial = SimpleNamespace(cost=100.0 - 0.005 * unit)
     predicted = SimpleNamespace(predicted_decrease=promised)
@@ -668,8 +681,8 @@ def test_one_stagnant_iteration_may_be_chance(unit: float, promised: float, ends
 
 
 def test_a_search_that_leads_to_a_start_ends_where_its_cost_hardly_falls() -> None:
-    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
-    whole, ended = (problem(*decays(), lower=[0.0, -5.0]) for _ in range(2))
+    start = together(0.3, 0.0)
+    whole, ended = (free_decays() for _ in range(2))
     exact = solved(whole, start, SearchSettings())
     found = solved(ended, start, SearchSettings(stagnant_share=0.9))
     assert found.iterations < exact.iterations
