@@ -138,8 +138,8 @@ def test_every_range_of_the_model_is_a_limit() -> None:
             r"limits\.position\.ball: \[-1, 1\] should be one number.* a magnitude",
         ),
         (
-            {"velocity": {"turm": 1.0}},
-            r"limits\.velocity: unknown joint 'turm' \(did you mean 'turn'\?\)",
+            {"acceleration": {"turm": 1.0}},
+            r"limits\.acceleration: unknown joint 'turm' \(did you mean 'turn'\?\)",
         ),
         (
             {"control": {"lift": (-1, 1)}},

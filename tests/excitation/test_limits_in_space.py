@@ -220,12 +220,18 @@ def test_a_limit_that_an_element_cannot_have_is_refused(
         limits(**tables)
 
 
-def test_a_limit_of_free_bodies_alone_is_refused_without_one() -> None:
-    text = """<mujoco><worldbody><body><joint name="turn"/><geom size="0.1"/></body></worldbody>
-    </mujoco>"""
-    said = "limits.tilt applies to nothing in this model: 'turn' is a hinge. It limits ball joints"
+@pytest.mark.parametrize(
+    ("joint", "key", "said"),
+    [
+        ('<joint name="j"/>', "tilt", "'j' is a hinge. It limits ball joints"),
+        ('<freejoint name="j"/>', "joint_force", "'j' is a free joint. It limits slides"),
+    ],
+)
+def test_a_limit_that_applies_to_nothing_is_refused(joint: str, key: str, said: str) -> None:
+    text = f'<mujoco><worldbody><body>{joint}<geom size="0.1"/></body></worldbody></mujoco>'
+    said = f"limits.{key} applies to nothing in this model: {said}"
     with pytest.raises(ExperimentError, match=re.escape(said)):
-        limits(text, tilt=0.5)
+        limits(text, **{key: 0.5})
 
 
 def test_units_are_those_of_the_quantities() -> None:

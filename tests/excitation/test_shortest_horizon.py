@@ -228,9 +228,10 @@ def test_the_command_line(tmp_path: Path) -> None:
     for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
         shutil.copy(MODELS / name, tmp_path)
     text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
+    text = f"rehearsal.robots = 1\n{text}"
     for old, new in (
         ("horizon = 4.0", "horizon = 1.0"),
-        ("max_iterations = 200", "max_iterations = 10"),
+        ("max_iterations = 200", "max_iterations = 4"),
         ("tolerance = 1e-7", "tolerance = 1e-2"),
         ("[parameters.m] ", "[parameters.m]\nwanted = 0.03\n#"),
     ):
