@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.design import design
 from mjfim.excitation.initial_controls import series_of
@@ -183,7 +184,7 @@ def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path, name: str
 
     assert (found[0][1] < 0.0).any() and (found[0][1] == found[0][0][0]).any()
     for value, expected in zip(found[1], found[0], strict=True):
-        np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
+        assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_clearance_of_nearly_nothing_has_finite_margins(tmp_path) -> None:
@@ -203,7 +204,7 @@ def test_the_control_of_least_drift_is_the_same_in_all_units(tmp_path, name: str
     rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
     found = DesignTask.resolve(rescaled.experiment).centres
     factor = rescaled.controls["force"]
-    np.testing.assert_allclose(np.array(found) / factor, expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(np.array(found) / factor, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("harmonics", [15, None])
@@ -220,7 +221,7 @@ def test_series_with_which_a_search_goes_on_are_the_same_in_all_units(
         series = islice(series_of(task, np.random.default_rng(0), harmonics), 8)
         found.append([each.control / rescaled.controls["force"] for each in series])
     assert len(found[0]) == 8
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-9)
+    assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-9)
 
 
 NUISANCE = {"initial": {"qpos:slide": 0.01, "qvel:slide": True}, "bias": {"qpos:hinge": True}}
@@ -310,7 +311,7 @@ def test_a_check_says_the_same_in_all_units(tmp_path, name: str) -> None:
     found = check(rescaled.experiment)
     assert without_quantities(found.verdict) == without_quantities(expected.verdict)
     assert found.not_separable == expected.not_separable
-    np.testing.assert_allclose(found.correlation, expected.correlation, rtol=1e-6, atol=1e-6)
+    assert_allclose(found.correlation, expected.correlation, rtol=1e-6, atol=1e-6)
     assert found.self_test.recursion == pytest.approx(expected.self_test.recursion, abs=1e-6)
 
 
@@ -331,7 +332,7 @@ def assert_same(
             assert found[key] == value
         else:
             rtol = 1e-3 if key in rough else 1e-9
-            np.testing.assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
+            assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
 
 
 DECIMAL = {"small, light, quick": Units(length=1e-3, mass=1e-6, time=1e-3)}
@@ -353,13 +354,13 @@ def test_converged_designs_and_estimates_agree_in_decimal_units(
         assert found["status"] == expected["status"]
         assert found["cost"] == pytest.approx(expected["cost"], rel=1e-5)
         largest = np.abs(expected["control"]).max()
-        np.testing.assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
+        assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
 
         estimate = identify(rescaled.experiment, [rescaled.recording(recording)])
         again = fit_in_units(rescaled, estimate)
-        np.testing.assert_allclose(again["theta"], fitted["theta"], rtol=1e-6)
-        np.testing.assert_allclose(again["std"], fitted["std"], rtol=1e-6)
+        assert_allclose(again["theta"], fitted["theta"], rtol=1e-6)
+        assert_allclose(again["std"], fitted["std"], rtol=1e-6)
         assert again["misfit"] == fitted["misfit"]
 
         assert again["terms"] == fitted["terms"]
-        np.testing.assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)
+        assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)

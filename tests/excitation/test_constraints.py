@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.limits.constraint_kinds import END_WEIGHT
@@ -129,7 +130,7 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
         form = np.block([[w.Q[k], w.S[k].T], [w.S[k], w.R[k]]])
         values = np.linalg.eigvalsh(0.5 * (form + form.T))
         assert values[0] > -1e-10 * values[-1]
-        np.testing.assert_allclose(form, form.T, rtol=0, atol=1e-9 * values[-1])
+        assert_allclose(form, form.T, rtol=0, atol=1e-9 * values[-1])
     assert (np.linalg.eigvalsh(w.Q[-1]) >= -1e-12 * np.abs(w.Q[-1]).max()).all()
     assert (w.W >= 0.0).all()
     rate, clearance = constraints.rate, constraints.clearance
@@ -247,7 +248,7 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     assert growth == 1.0
     for name in "QRW":
         expected = getattr(barrier.weights, name)
-        np.testing.assert_allclose(getattr(weights, name), expected, rtol=1e-9, atol=0)
+        assert_allclose(getattr(weights, name), expected, rtol=1e-9, atol=0)
 
     step = expansion.lift(K, way)
     _, once, growth = barrier.curvature.along(step, None)
@@ -337,13 +338,11 @@ def test_rates_at_both_ends_follow_the_boundary(tmp_path: Path) -> None:
     task = arm_task(tmp_path, limits={"control_rate": 9.0})
     rate, ctrl = constraint_set_of(task).rate, task.control
     inner = np.diff(ctrl, axis=0) / 0.01
-    np.testing.assert_allclose(rate.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
+    assert_allclose(rate.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
     before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
     rested = replace(rate, control_before=before, control_after=after).rates(ctrl)
-    np.testing.assert_allclose(
-        rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01]
-    )
-    np.testing.assert_allclose(
+    assert_allclose(rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01])
+    assert_allclose(
         replace(rate, periodic=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01]
     )
 

@@ -284,22 +284,6 @@ def test_the_slope_of_all_limits_together_holds_with_every_integrator(
     assert barrier_check(task, 0.05) < 2e-3
 
 
-@pytest.mark.parametrize("name", ["tilt", "velocity", "turn"])
-def test_a_wrong_slope_of_a_magnitude_would_be_noticed(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    right = Magnitude.barrier
-
-    def wrong(*args: Any, **kwargs: Any) -> BarrierDerivatives:
-        found = right(*args, **kwargs)
-        slope = 1.05 * found.slope
-        return BarrierDerivatives(value=found.value, slope=slope, curvature=found.curvature)
-
-    monkeypatch.setattr(Magnitude, "barrier", wrong)
-    task = ship_task(tmp_path, limits=KINDS[name], horizon=0.1).relaxed()
-    assert barrier_check(task, 0.1) > 1e-2
-
-
 @pytest.mark.parametrize("is_angle", [False, True])
 def test_derivatives_of_the_barrier_of_a_norm_are_those_of_differences(is_angle: bool) -> None:
     """Also at the norm zero, near the bound and beyond it."""

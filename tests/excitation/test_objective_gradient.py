@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel
@@ -380,11 +381,9 @@ def test_gradient_and_lift_are_dual_to_the_slope_under_any_feedback(case: str, t
             float(np.sum(expansion.gradient(K) * c)), rel=1e-9
         )
         residual = zeta.z[1:] - np.einsum("kij,kj->ki", expansion.A, zeta.z[:-1])
-        np.testing.assert_allclose(
-            residual, np.einsum("kij,kj->ki", expansion.B, zeta.v), rtol=0, atol=1e-9
-        )
+        assert_allclose(residual, np.einsum("kij,kj->ki", expansion.B, zeta.v), rtol=0, atol=1e-9)
         coordinate = zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1])
-        np.testing.assert_allclose(coordinate, c, rtol=0, atol=1e-9)
+        assert_allclose(coordinate, c, rtol=0, atol=1e-9)
 
 
 def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
@@ -400,9 +399,9 @@ def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
         0.5 * 0.01 * 1e-2 * np.sum(task.control**2), rel=1e-12
     )
     a, b = running.gradient(curve)
-    np.testing.assert_allclose(a[1:], 0.01 * (curve.state - task.initial.state)[1:] * Q, rtol=1e-12)
-    np.testing.assert_array_equal(a[0], 0.0)
-    np.testing.assert_allclose(b, 0.01 * 1e-2 * curve.ctrl, rtol=1e-12)
+    assert_allclose(a[1:], 0.01 * (curve.state - task.initial.state)[1:] * Q, rtol=1e-12)
+    assert_array_equal(a[0], 0.0)
+    assert_allclose(b, 0.01 * 1e-2 * curve.ctrl, rtol=1e-12)
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])

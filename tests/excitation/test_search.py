@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.design import design_task
@@ -62,7 +63,7 @@ def test_a_stop_before_the_first_iterate_leaves_the_start(workers: int, tmp_path
     assert design.status is Status.INTERRUPTED
     assert design.final.cost <= design.initial.cost
     if not workers:
-        np.testing.assert_allclose(design.trajectory.ctrl, task.control, atol=1e-12)
+        assert_allclose(design.trajectory.ctrl, task.control, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -126,7 +127,7 @@ def test_random_changes_lower_the_cost_within_limits(
         basis = bandwidth_basis(task, task.t)
         if basis is not None:
             fitted = basis @ np.linalg.lstsq(basis, each.deviation)[0]
-            np.testing.assert_allclose(fitted, each.deviation, atol=1e-9)
+            assert_allclose(fitted, each.deviation, atol=1e-9)
 
 
 def test_the_barrier_alone_steers_a_control_inside(tmp_path: Path) -> None:
@@ -148,7 +149,7 @@ def test_the_weights_of_the_barrier_fall_from_the_first_to_the_last() -> None:
     assert weights[0] == pytest.approx(0.1)
     assert weights[-1] == pytest.approx(1e-4)
     ratios = np.divide(weights[:-1], weights[1:])
-    np.testing.assert_allclose(ratios, ratios[0])
+    assert_allclose(ratios, ratios[0])
     assert 2.0 < ratios[0] < 4.0
 
 
@@ -163,7 +164,7 @@ def test_a_control_of_long_samples_has_no_steps_where_its_rate_is_limited(tmp_pa
     limited, free = cost_of(cart_inside(tmp_path, limits=limits)), cost_of(cart_inside(tmp_path))
     steps = np.repeat(np.arange(25.0)[:, None], 4, axis=0)
     smooth = without_jumps(limited, steps, 4)
-    np.testing.assert_allclose(np.diff(smooth[2:-2], axis=0), 0.25)
+    assert_allclose(np.diff(smooth[2:-2], axis=0), 0.25)
     assert np.array_equal(without_jumps(free, steps, 4), steps)
     assert np.array_equal(without_jumps(limited, smooth, 4), smooth)
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import UnidentifiableError
 from mjfim.excitation.design import design_task
@@ -71,9 +72,7 @@ def test_information_leaves_out_the_known_start() -> None:
     S = random_sensitivity(2)
     G = np.array(S.G)
     G[0] += 100.0
-    np.testing.assert_array_equal(
-        information().matrix(Sensitivity(psi=S.psi, G=G)), information().matrix(S)
-    )
+    assert_array_equal(information().matrix(Sensitivity(psi=S.psi, G=G)), information().matrix(S))
     G[1] += 100.0
     assert (
         np.abs(information().matrix(Sensitivity(psi=S.psi, G=G)) - information().matrix(S)).max()
@@ -94,7 +93,7 @@ def test_criterion_is_that_of_the_scaled_information_per_second(criterion: str) 
     ]
     found = made.evaluate(matrix)
     assert found.value == pytest.approx(3.0 * expected, rel=1e-12)
-    np.testing.assert_allclose(found.eigenvalues, values, rtol=1e-12)
+    assert_allclose(found.eigenvalues, values, rtol=1e-12)
 
 
 NUISANCE = {"interest": np.array([0, 2])}
@@ -147,11 +146,9 @@ def test_the_information_without_nuisance_is_the_inverse_of_the_block_of_the_ful
     scaled = made.scaled(matrix)
     R, P = made.reduced(matrix)
     block = np.linalg.inv(scaled)[np.ix_(t, t)]
-    np.testing.assert_allclose(R, np.linalg.inv(block), rtol=1e-10)
-    np.testing.assert_allclose(R, P @ scaled @ P.T, rtol=1e-10)
-    np.testing.assert_allclose(
-        made.covariance(matrix), np.linalg.inv(matrix)[np.ix_(t, t)], rtol=1e-10
-    )
+    assert_allclose(R, np.linalg.inv(block), rtol=1e-10)
+    assert_allclose(R, P @ scaled @ P.T, rtol=1e-10)
+    assert_allclose(made.covariance(matrix), np.linalg.inv(matrix)[np.ix_(t, t)], rtol=1e-10)
     assert np.linalg.norm(R - scaled[np.ix_(t, t)]) > 0.1 * np.linalg.norm(
         R
     )  # forgetting the nuisance would be seen
@@ -201,17 +198,13 @@ def test_combinations_project_the_information_and_show_which_parameters_are_iden
     told = J[:, [0, 1, 3]]
     exact = np.linalg.inv(told.T @ told)
     covariance = made.covariance(matrix)
-    np.testing.assert_allclose(
-        covariance[np.ix_([0, 3], [0, 3])], exact[np.ix_([0, 2], [0, 2])], rtol=1e-9
-    )
+    assert_allclose(covariance[np.ix_([0, 3], [0, 3])], exact[np.ix_([0, 2], [0, 2])], rtol=1e-9)
     assert np.isnan(covariance[1:3]).all()
-    np.testing.assert_allclose(made.std(matrix)[[0, 3]], np.sqrt(np.diag(exact))[[0, 2]], rtol=1e-9)
+    assert_allclose(made.std(matrix)[[0, 3]], np.sqrt(np.diag(exact))[[0, 2]], rtol=1e-9)
     assert np.isinf(made.std(matrix)[1:3]).all()
     with_prior = replace(made, prior=np.diag([0.0, 4.0, 0.0, 0.0]))
     total = matrix + with_prior.prior
-    np.testing.assert_allclose(
-        with_prior.covariance(total), np.linalg.inv(total), rtol=1e-7, atol=1e-12
-    )
+    assert_allclose(with_prior.covariance(total), np.linalg.inv(total), rtol=1e-7, atol=1e-12)
 
 
 def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_covariance() -> None:
@@ -246,13 +239,13 @@ def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tm
     )
     here = [evaluate_task(s, s.initial) for s in (plain, exact, vague)]
     assert here[1].criterion == pytest.approx(here[0].criterion, rel=1e-6)
-    np.testing.assert_allclose(here[1].std[:3], here[0].std, rtol=1e-6)
-    np.testing.assert_allclose(here[1].std[3:], 1e-9, rtol=1e-6)
+    assert_allclose(here[1].std[:3], here[0].std, rtol=1e-6)
+    assert_allclose(here[1].std[3:], 1e-9, rtol=1e-6)
     assert here[2].criterion > 1.1 * here[0].criterion
     recording = simulate_system(plain.system, plain.initial, seed=4)
     found = [identify_system(s.system, [recording]) for s in (plain, exact, vague)]
-    np.testing.assert_allclose(found[1].theta[:3], found[0].theta, atol=1e-4 * found[0].std.min())
-    np.testing.assert_allclose(found[1].std[:3], found[0].std, rtol=1e-5)
+    assert_allclose(found[1].theta[:3], found[0].theta, atol=1e-4 * found[0].std.min())
+    assert_allclose(found[1].std[:3], found[0].std, rtol=1e-5)
     assert (found[2].std[:3] > 1.01 * found[0].std).all()
 
 
@@ -300,9 +293,7 @@ def test_standard_deviations_survive_parameters_of_very_different_size() -> None
     unit = spread_matrix(rng)
     scale = np.array([1.0, 1e6, 1e-6, 1.0])
     expected = np.sqrt(np.diag(np.linalg.inv(unit))) / scale
-    np.testing.assert_allclose(
-        standard_deviations(unit * np.outer(scale, scale)), expected, rtol=1e-9
-    )
+    assert_allclose(standard_deviations(unit * np.outer(scale, scale)), expected, rtol=1e-9)
     assert np.isinf(standard_deviations(np.diag([0.0, 1.0]))).all()
 
 
@@ -329,7 +320,7 @@ def test_a_product_is_designed_on_what_can_be_identified_of_it(tmp_path) -> None
     # the criterion sees (gear + gain) / sqrt(2) and the mass, in units of their guesses
     T = np.array([[np.sqrt(0.5), 0.0], [np.sqrt(0.5), 0.0], [0.0, 1.5]])
     seen = np.linalg.eigvalsh(T.T @ result.final.information @ T / task.system.measure_rate)
-    np.testing.assert_allclose(result.final.eigenvalues, seen, rtol=1e-6)
+    assert_allclose(result.final.eigenvalues, seen, rtol=1e-6)
 
 
 def test_coefficients_of_a_combination_are_in_the_units_of_the_parameters(tmp_path) -> None:
@@ -344,7 +335,7 @@ def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -
     known = {**PRODUCT, "gear": {"target": "actuator/force:gear[0]", "prior": 0.01}}
     result = design_task(cart_task(tmp_path, parameters=known, descent={"max_iterations": 0}))
     exact = np.sqrt(np.diag(np.linalg.inv(result.final.information)))
-    np.testing.assert_allclose(result.final.std, exact, rtol=1e-4)
+    assert_allclose(result.final.std, exact, rtol=1e-4)
     assert result.final.std[0] == pytest.approx(
         0.01, rel=1e-3
     )  # the data add nothing about the gear

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.linalg import lstsq
 from scipy.optimize import lsq_linear
 
@@ -132,7 +133,7 @@ FREE = np.inf
 def close(value: Array, expected: Array, rtol: float = 1e-7) -> None:
     """Equal up to round-off of the largest entry."""
     assert value.shape == expected.shape
-    np.testing.assert_allclose(
+    assert_allclose(
         value, expected, rtol=rtol, atol=rtol * max(float(np.abs(expected).max(initial=0.0)), 1e-12)
     )
 
@@ -185,7 +186,7 @@ def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int
             max_iter=500,
         )
         assert dense.halves(step) <= expected.cost * (1 + 1e-9)
-        np.testing.assert_allclose(
+        assert_allclose(
             step.common * unit[-dense.c :], expected.x[-dense.c :], rtol=1e-4, atol=1e-5
         )
         active += int(((step.common == lower) | (step.common == upper)).sum())
@@ -288,7 +289,7 @@ def test_scores_and_information_of_blocks_sum_to_the_whole(
                 (C.block_information, J.T @ J),
             ):
                 size = np.abs(found).max()
-                np.testing.assert_allclose(found[b], wanted, rtol=1e-7, atol=1e-9 * size)
+                assert_allclose(found[b], wanted, rtol=1e-7, atol=1e-9 * size)
         known = np.concatenate([C.reduced_private_rows.reshape(-1, dense.c + 1), C.common_rows])
         gradient = C.block_scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
         basis = np.linalg.qr(dense.starts)[0]
@@ -384,13 +385,13 @@ def test_the_linearisation_after_a_step_has_its_residuals(shape: tuple[int, int,
     before = gradients_after(C, step.common)
     after = gradients_after(moved, np.zeros(dense.c))
     scale = np.abs(before).max(initial=1e-300)
-    np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-7 * scale)
+    assert_allclose(after, before, rtol=1e-6, atol=1e-7 * scale)
     scores = np.zeros((dense.P, dense.c))
     np.add.at(scores, moved.segment_of_block, moved.block_scores)
     if not n:
         of_private = moved.reduced_private_rows
         scores += np.einsum("pkc,pk->pc", of_private[..., :-1], of_private[..., -1])
-        np.testing.assert_allclose(after, scores, rtol=1e-6, atol=1e-7 * scale)
+        assert_allclose(after, scores, rtol=1e-6, atol=1e-7 * scale)
 
 
 def test_without_some_blocks_and_segments_the_rows_of_the_others_count() -> None:
@@ -405,12 +406,12 @@ def test_without_some_blocks_and_segments_the_rows_of_the_others_count() -> None
     for block in np.flatnonzero(left_out):
         kept[first[block] : first[block + 1]] = False
     exact = lstsq(dense.J[kept], -dense.r[kept])[0]
-    np.testing.assert_allclose(step.common, exact[dense.P * dense.n :], rtol=1e-7)
+    assert_allclose(step.common, exact[dense.P * dense.n :], rtol=1e-7)
 
     some = np.array([2, 0])
     part = dense.condensed.of_segments(some)
     assert part.segment_count == 2
-    np.testing.assert_allclose(
+    assert_allclose(
         np.abs(part.triangles[0]), np.abs(dense.condensed.triangles[2]), rtol=1e-9, atol=1e-9
     )
 
@@ -420,7 +421,7 @@ def test_private_unknowns_follow_a_given_step_of_the_common_ones() -> None:
     common = np.random.default_rng(0).standard_normal(dense.c) / dense.condensed.column_norms[2:]
     private = dense.condensed.step_to(common, 0.0, dense.condensed.column_norms).private
     exact = lstsq(dense.starts, -(dense.r + dense.shared @ common))[0]
-    np.testing.assert_allclose(private.ravel(), exact, rtol=1e-6)
+    assert_allclose(private.ravel(), exact, rtol=1e-6)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
@@ -455,4 +456,4 @@ def test_a_tall_triangle_has_the_inner_products_of_its_rows(columns: int) -> Non
     rows = np.random.default_rng(0).standard_normal((2500, columns))
     R = triangle(rows)
     assert R.shape == (columns, columns)
-    np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-9 * len(rows))
+    assert_allclose(R.T @ R, rows.T @ rows, atol=1e-9 * len(rows))

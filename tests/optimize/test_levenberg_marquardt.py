@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
 from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step
@@ -235,8 +236,8 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
     theta, starts, cost = reference(build(), start)
     assert found.success, found.status
     assert found.cost <= cost * (1 + 1e-9) + 1e-12
-    np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(found.unknowns.private, starts, rtol=1e-6, atol=1e-8)
+    assert_allclose(found.unknowns.theta, theta, rtol=1e-6, atol=1e-8)
+    assert_allclose(found.unknowns.private, starts, rtol=1e-6, atol=1e-8)
     assert len(p.seen) > 3
     for at in p.seen:
         assert (at.theta >= p.lower).all()
@@ -269,14 +270,14 @@ def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
     found = solved(p, start, SearchSettings(max_iterations=50, tolerance=1e-9, damped=False))
     theta, starts, _ = reference(p, start)
     assert found.success
-    np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6)
-    np.testing.assert_allclose(found.unknowns.private, starts, rtol=1e-6)
+    assert_allclose(found.unknowns.theta, theta, rtol=1e-6)
+    assert_allclose(found.unknowns.private, starts, rtol=1e-6)
     assert found.unknowns.theta[0] > 1.2
     curved = problem(rosenbrock, lower=[-FREE, -FREE])
     through = solved(
         curved, alone(-1.2, 1.0), SearchSettings(max_iterations=100, tolerance=1e-9, damped=False)
     )
-    np.testing.assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
+    assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
     lengths = {
         np.abs(a.theta - b.theta).max() for a, b in zip(curved.seen[1:], curved.seen, strict=False)
     }
@@ -379,7 +380,7 @@ def test_numerical_noise_does_not_prevent_convergence() -> None:
         theta, _, cost = reference(peaked(), alone(2.0, 0.4, 0.7))
         assert found.success, found.status
         assert found.cost < cost + 1e-3
-        np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
+        assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
 
 
 def test_a_search_from_the_minimum_ends_at_once() -> None:
@@ -391,7 +392,7 @@ def test_a_search_from_the_minimum_ends_at_once() -> None:
     again = solved(peaked(), alone(*theta), SearchSettings())
     assert again.success
     assert again.iterations <= 2
-    np.testing.assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
+    assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
 
 
 def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
@@ -407,9 +408,7 @@ def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
 
         found = solved(problem(rows, lower=[-FREE, -FREE]), alone(1.0, 1.0), SearchSettings())
         assert found.success, found.status
-        np.testing.assert_allclose(
-            thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02
-        )
+        assert_allclose(thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("stop", [1, 2, 3, 7])
@@ -451,12 +450,12 @@ def test_the_last_linearisation_is_at_the_solution() -> None:
     p = free_decays()
     found = solved(p, start, SearchSettings())
     fresh = p.condense(found.unknowns)
-    np.testing.assert_array_equal(found.condensed.blocks, fresh.blocks)
+    assert_array_equal(found.condensed.blocks, fresh.blocks)
     saved = solved(p, start, SearchSettings(relinearise_at_end=False))
-    np.testing.assert_allclose(saved.unknowns.theta, found.unknowns.theta, rtol=1e-5)
+    assert_allclose(saved.unknowns.theta, found.unknowns.theta, rtol=1e-5)
     assert saved.cost == p.cost(saved.unknowns)
     assert not np.array_equal(saved.condensed.blocks, fresh.blocks)
-    np.testing.assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)
+    assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)
 
 
 def halving(theta: Array, private: Array) -> Array:
@@ -604,7 +603,7 @@ def test_longer_steps_reach_the_minimum_of_a_robust_loss_sooner() -> None:
         ftol=1e-14,
         gtol=1e-14,
     ).x
-    np.testing.assert_allclose(sooner.unknowns.theta, expected, rtol=0.0, atol=1e-4)
+    assert_allclose(sooner.unknowns.theta, expected, rtol=0.0, atol=1e-4)
     assert sooner.cost == longer.cost(sooner.unknowns)
 
     # Reported costs are those of the iterates at which the search went on.

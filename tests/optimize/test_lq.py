@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
 from mjfim.optimize.lq import (
@@ -50,9 +51,9 @@ def test_recursions_are_plain_loops(sizes: tuple[int, int]) -> None:
     for _ in range(2):
         for found, wanted in ((recursion.forward(z0, c), z), (recursion.adjoint(a), costate)):
             atol = 1e-12 * np.abs(wanted).max()
-            np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=atol)
+            assert_allclose(found, wanted, rtol=1e-12, atol=atol)
     for now, before in zip((A, c, a), kept, strict=True):
-        np.testing.assert_array_equal(now, before)
+        assert_array_equal(now, before)
 
 
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
@@ -70,9 +71,9 @@ def test_many_tangent_curves_at_once_are_those_one_by_one(steps: bool, feedback:
     curves, minima = coordinates.lift(b), solution.descent(a, b)
     forces = weights.half_gradient(curves)
     gradients, back = coordinates.gradient(a, b), coordinates.coordinate(curves)
-    np.testing.assert_allclose(back, b, rtol=0, atol=1e-9)
+    assert_allclose(back, b, rtol=0, atol=1e-9)
 
-    equal = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
+    equal = partial(assert_allclose, rtol=1e-9, atol=1e-9)
     for i in range(4):
         curve, minimum = coordinates.lift(b[i]), solution.descent(a[i], b[i])
         equal(curves.z[i], curve.z)
@@ -94,8 +95,8 @@ def test_regulator_gain_minimises_its_cost_over_a_finite_time_varying_horizon() 
     A, B = random_system(rng, 9, 3, 2)
     Q, R, terminal = positive(rng, 3), positive(rng, 2), positive(rng, 3)
     weights = Weights.constant(9, Q, R, terminal)
-    np.testing.assert_array_equal(weights.Q, [*[Q] * 9, terminal])
-    np.testing.assert_array_equal(weights.R, [R] * 9)
+    assert_array_equal(weights.Q, [*[Q] * 9, terminal])
+    assert_array_equal(weights.R, [R] * 9)
     assert not weights.S.any() and not weights.W.any()
     K, z0 = regulator(A, B, Q, R, terminal), rng.normal(size=3)
 
@@ -157,10 +158,8 @@ def test_weighted_descent_solves_the_dense_normal_equations(
     H = 0.5 * (pairs - diagonal[:, None] - diagonal)  # by polarisation
     best = -np.linalg.solve(H, g).reshape(N, nu)
     zeta = RiccatiSolution.solve(A, B, weights).descent(a, b)
-    np.testing.assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
-    np.testing.assert_allclose(
-        zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0)
-    )
+    assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
+    assert_allclose(zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0))
     # every weight is seen
     for name in ("S", "W") if steps else ("S",):
         other = Weights(**{**weights.__dict__, name: 0.5 * getattr(weights, name)})

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import minimize
 
 from mjfim.optimize import projection_operator
@@ -467,14 +468,14 @@ def test_lbfgs_direction_is_minus_the_inverse_bfgs_matrix_times_the_gradient() -
     zeta = direction(expansion, K)
     c = zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1])
     expected = -H @ expansion.gradient(K).ravel()
-    np.testing.assert_allclose(c.ravel(), expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    assert_allclose(c.ravel(), expected, rtol=0, atol=1e-9 * np.abs(expected).max())
     assert expansion.slope(zeta) < 0.0
 
 
 def test_lbfgs_without_memory_is_steepest_descent_in_the_control_metric() -> None:
     _, expansion, K, zeta = begun(Pendulum(), LBFGS(R * DT))
     c = zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1])
-    np.testing.assert_allclose(c, -expansion.gradient(K) / (R * DT), rtol=1e-10)
+    assert_allclose(c, -expansion.gradient(K) / (R * DT), rtol=1e-10)
 
 
 def test_lbfgs_refuses_pairs_of_negative_curvature_and_can_be_reset() -> None:
@@ -509,9 +510,7 @@ def test_lbfgs_on_a_finer_grid_keeps_its_curvature_and_direction() -> None:
         b=np.repeat(g, 4, axis=0) / 4,
     )
     coarse = direction(still, np.zeros((N, 1, 1))).v
-    np.testing.assert_allclose(
-        fine(dense, np.zeros((4 * N, 1, 1))).v, np.repeat(coarse, 4, axis=0), rtol=1e-9
-    )
+    assert_allclose(fine(dense, np.zeros((4 * N, 1, 1))).v, np.repeat(coarse, 4, axis=0), rtol=1e-9)
     assert direction._pairs[0][0].shape == (N, 1)  # the coarse memory is left alone
 
 
@@ -519,7 +518,7 @@ def test_feedback_only_above_the_threshold_of_amplification() -> None:
     expansion = Pendulum().expand(start(Pendulum()))
     amplification = amplification_in_best_units(expansion.A)
     assert not replace(REGULATOR, feedback_threshold=1.01 * amplification).gain(expansion).any()
-    np.testing.assert_array_equal(
+    assert_array_equal(
         replace(REGULATOR, feedback_threshold=0.99 * amplification).gain(expansion),
         REGULATOR.gain(expansion),
     )

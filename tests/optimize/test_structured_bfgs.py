@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
 from mjfim.experiment.initial import spline_basis
@@ -71,15 +72,15 @@ def test_a_metric_is_symmetric_positive_and_its_solve_inverts_it(feedback: bool)
     K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
     metric = curve_metric(expansion, weights, K)
     H = dense(metric)
-    np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
+    assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(H)[0] > 0.0
     g = rng.normal(size=(N, NU))
-    np.testing.assert_allclose(
+    assert_allclose(
         metric.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1)), rtol=1e-7, atol=1e-9
     )
     many = rng.normal(size=(3, N, NU))
     solved = [metric.solve(each) for each in many]
-    np.testing.assert_allclose(metric.solve(many), solved, rtol=1e-9, atol=1e-12)
+    assert_allclose(metric.solve(many), solved, rtol=1e-9, atol=1e-12)
 
     # its own form on the curve that a step makes
     s = rng.normal(size=(N, NU))
@@ -118,7 +119,7 @@ def test_the_metric_of_a_basis_is_the_projected_metric() -> None:
 
     many = rng.normal(size=(3, 5, NU))
     for of_many, of_one in ((based.apply(many), based.apply), (based.solve(many), based.solve)):
-        np.testing.assert_allclose(of_many, [of_one(each) for each in many], rtol=1e-9)
+        assert_allclose(of_many, [of_one(each) for each in many], rtol=1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,9 +284,7 @@ def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) 
     assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
     assert (np.diff(values) <= 0.0).all()
     assert values[-1] == pytest.approx(best.fun, abs=1e-6 * abs(best.fun))
-    np.testing.assert_allclose(
-        iterates[-1].point.u, curves @ best.x.reshape(-1, NU), rtol=0, atol=2e-3
-    )
+    assert_allclose(iterates[-1].point.u, curves @ best.x.reshape(-1, NU), rtol=0, atol=2e-3)
     assert len(iterates) < 60
     if mu < 1e-2:  # the bound is reached, and kept
         assert 0.0 < toy.shown.margin(iterates[-1].point.x[:, :1]).min() < 0.05
@@ -306,7 +305,7 @@ def test_stored_pairs_do_not_contain_the_barrier() -> None:
 
     step, change = pairs[-1]
     wanted = gradient(point.u) - gradient(point.u - step)
-    np.testing.assert_allclose(change, wanted, rtol=0, atol=1e-9 * max(np.abs(wanted).max(), 1.0))
+    assert_allclose(change, wanted, rtol=0, atol=1e-9 * max(np.abs(wanted).max(), 1.0))
     assert direction.reset() is True
     assert direction.reset() is False
 
