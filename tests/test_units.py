@@ -228,10 +228,10 @@ NUISANCE = {"initial": {"qpos:slide": 0.01, "qvel:slide": True}, "bias": {"qpos:
 
 # Keys of experiments whose fits take different paths.
 FITS = {
-    "stated start": {},
-    "nuisance": {"nuisance": NUISANCE},
-    "segments": {"fit": {"segments": 0.4}},
-    "delay": {"fit": {"segments": 0.4}, "nuisance": {"delay": True}},
+    "stated start": {"fit": {"bootstrap": 0}},
+    "nuisance": {"nuisance": NUISANCE, "fit": {"bootstrap": 0}},
+    "segments": {"fit": {"segments": 0.4, "bootstrap": 0}},
+    "delay": {"fit": {"segments": 0.4, "bootstrap": 0}, "nuisance": {"delay": True}},
 }
 
 
@@ -282,7 +282,7 @@ def own_fits(tmp_path_factory, recording: Recording) -> Callable[[str], dict[str
 @pytest.mark.parametrize("name", SCALES)
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=[] if path == "segments" else pytest.mark.slow) for path in FITS],
+    FITS,
 )
 def test_estimates_and_misfits_are_the_same_in_all_units(
     tmp_path, recording: Recording, own_fits: Callable[[str], dict[str, Any]], name: str, path: str
