@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.arrays import (
     evenly_spread_indices,
@@ -29,8 +30,8 @@ def test_scaling_gives_a_unit_diagonal_whatever_the_units() -> None:
     stacked = np.stack([semidefinite(3) * np.outer(UNITS, UNITS), np.diag([4.0, 0.0, 9.0])])
     scaled, scale = scaled_to_unit_diagonal(stacked)
 
-    np.testing.assert_allclose(scaled[0], plain, rtol=1e-12)
-    np.testing.assert_array_equal(scaled[1], np.diag([1.0, 0.0, 1.0]))
+    assert_allclose(scaled[0], plain, rtol=1e-12)
+    assert_array_equal(scaled[1], np.diag([1.0, 0.0, 1.0]))
     assert scale[1, [0, 2]].tolist() == [2.0, 3.0]
 
 
@@ -38,15 +39,15 @@ def test_the_pseudo_inverse_of_a_regular_matrix_is_its_inverse_in_any_units() ->
     H = semidefinite(3)
     inverse = np.linalg.inv(H)
     found = scaled_pseudo_inverse(H * np.outer(UNITS, UNITS), 1e-14)
-    np.testing.assert_allclose(found * np.outer(UNITS, UNITS), inverse, rtol=1e-8)
+    assert_allclose(found * np.outer(UNITS, UNITS), inverse, rtol=1e-8)
 
 
 @pytest.mark.parametrize("rank", [1, 2])
 def test_the_pseudo_inverse_of_a_singular_matrix_is_a_generalised_inverse(rank: int) -> None:
     H = semidefinite(rank)
     inverse = scaled_pseudo_inverse(H, 1e-12)
-    np.testing.assert_allclose(H @ inverse @ H, H, atol=1e-10)
-    np.testing.assert_allclose(inverse, inverse.T, atol=1e-12)
+    assert_allclose(H @ inverse @ H, H, atol=1e-10)
+    assert_allclose(inverse, inverse.T, atol=1e-12)
     assert np.linalg.matrix_rank(inverse, tol=1e-8) == rank
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -115,7 +114,7 @@ def test_the_verdict_of_a_check_is_short() -> None:
         "rehearsal": None,
     }
     for rows in (known, known[:1]):
-        check: Any = SimpleNamespace(rows=rows, **findings)
+        check = SimpleNamespace(rows=rows, **findings)
         sentences = list(verdict_of_check(check))
         assert max(map(len, sentences)) < LONGEST_MESSAGE
         assert sum(" more" in sentence for sentence in sentences) == 3

@@ -35,7 +35,7 @@ nbformat.write(notebook, sys.argv[2])
 
 def cells(path: Path) -> list[dict[str, Any]]:
     """Return the cells of a notebook that hold code."""
-    found: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    found = json.loads(path.read_text(encoding="utf-8"))["cells"]
     return [cell for cell in found if cell["cell_type"] == "code"]
 
 

@@ -25,7 +25,7 @@ KEEPERS = (BatchSimulator, ModelSource, ParameterSet, PlantModel)
 @pytest.fixture
 def living(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], int]]:
     """Number of living keepers that were made in the test; the garbage collector is off."""
-    made: list[weakref.ref[object]] = []
+    made = []
 
     def noted(kind: type) -> None:
         prepare = kind.__init__

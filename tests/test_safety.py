@@ -35,14 +35,14 @@ def unsafe_code(source: str) -> list[str]:
 
     Pickling modules, functions that execute text and pickles in NumPy files are unsafe.
     """
-    found: list[str] = []
+    found = []
 
     # Python reads names in this normal form.
     if not UNSAFE_WORDS.search(normalize("NFKC", source)):
         return found
 
     for node in ast.walk(ast.parse(source)):
-        names: set[str] = set()
+        names = set()
 
         if isinstance(node, ast.Import):
             names = {alias.name.split(".")[0] for alias in node.names} & PICKLING_MODULES

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.design import design
 from mjfim.excitation.initial_controls import series_of
@@ -47,7 +48,7 @@ CART = """
 </mujoco>
 """
 
-EXPERIMENT: dict[str, Any] = {
+EXPERIMENT = {
     "model": "cart.xml",
     "rate": 50.0,
     "horizon": 1.6,
@@ -120,7 +121,7 @@ ONE_SIDED = {
 }
 
 # Tables of experiments whose designs take different paths.
-DESIGNS: dict[str, dict[str, Any]] = {
+DESIGNS = {
     "weights": {},
     "limits": {"limits": LIMITS, "cost": {"control": 0.0}},
     "single bounds": {"limits": ONE_SIDED},
@@ -175,7 +176,6 @@ def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path, name: str
     for units in (Units(), SCALES[name]):
         rescaled = rescale(original, units, tmp_path / "rescaled")
         clearance = constraint_set_of(DesignTask.resolve(rescaled.experiment)).clearance
-        assert clearance is not None
         distances, slope = clearance.distances(motion * [units.length, 1.0], slopes=True)
         assert slope is not None
         lengths = [clearance.distances.reach, clearance.least, clearance.scale]
@@ -184,14 +184,13 @@ def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path, name: str
 
     assert (found[0][1] < 0.0).any() and (found[0][1] == found[0][0][0]).any()
     for value, expected in zip(found[1], found[0], strict=True):
-        np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
+        assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_clearance_of_nearly_nothing_has_finite_margins(tmp_path) -> None:
     original = stated(tmp_path, limits={"clearance": 1e-100})
     (tmp_path / "cart.xml").write_text(WALLED)
     clearance = constraint_set_of(DesignTask.resolve(original)).clearance
-    assert clearance is not None
     assert clearance.scale > 1e-9
 
 
@@ -205,7 +204,7 @@ def test_the_control_of_least_drift_is_the_same_in_all_units(tmp_path, name: str
     rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
     found = DesignTask.resolve(rescaled.experiment).centres
     factor = rescaled.controls["force"]
-    np.testing.assert_allclose(np.array(found) / factor, expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(np.array(found) / factor, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("harmonics", [15, None])
@@ -222,17 +221,17 @@ def test_series_with_which_a_search_goes_on_are_the_same_in_all_units(
         series = islice(series_of(task, np.random.default_rng(0), harmonics), 8)
         found.append([each.control / rescaled.controls["force"] for each in series])
     assert len(found[0]) == 8
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-9)
+    assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-9)
 
 
 NUISANCE = {"initial": {"qpos:slide": 0.01, "qvel:slide": True}, "bias": {"qpos:hinge": True}}
 
 # Keys of experiments whose fits take different paths.
-FITS: dict[str, dict[str, Any]] = {
-    "stated start": {},
-    "nuisance": {"nuisance": NUISANCE},
-    "segments": {"fit": {"segments": 0.4}},
-    "delay": {"fit": {"segments": 0.4}, "nuisance": {"delay": True}},
+FITS = {
+    "stated start": {"fit": {"bootstrap": 0}},
+    "nuisance": {"nuisance": NUISANCE, "fit": {"bootstrap": 0}},
+    "segments": {"fit": {"segments": 0.4, "bootstrap": 0}},
+    "delay": {"fit": {"segments": 0.4, "bootstrap": 0}, "nuisance": {"delay": True}},
 }
 
 
@@ -283,7 +282,7 @@ def own_fits(tmp_path_factory, recording: Recording) -> Callable[[str], dict[str
 @pytest.mark.parametrize("name", SCALES)
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=[] if path == "segments" else pytest.mark.slow) for path in FITS],
+    FITS,
 )
 def test_estimates_and_misfits_are_the_same_in_all_units(
     tmp_path, recording: Recording, own_fits: Callable[[str], dict[str, Any]], name: str, path: str
@@ -312,7 +311,7 @@ def test_a_check_says_the_same_in_all_units(tmp_path, name: str) -> None:
     found = check(rescaled.experiment)
     assert without_quantities(found.verdict) == without_quantities(expected.verdict)
     assert found.not_separable == expected.not_separable
-    np.testing.assert_allclose(found.correlation, expected.correlation, rtol=1e-6, atol=1e-6)
+    assert_allclose(found.correlation, expected.correlation, rtol=1e-6, atol=1e-6)
     assert found.self_test.recursion == pytest.approx(expected.self_test.recursion, abs=1e-6)
 
 
@@ -333,7 +332,7 @@ def assert_same(
             assert found[key] == value
         else:
             rtol = 1e-3 if key in rough else 1e-9
-            np.testing.assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
+            assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
 
 
 DECIMAL = {"small, light, quick": Units(length=1e-3, mass=1e-6, time=1e-3)}
@@ -355,13 +354,13 @@ def test_converged_designs_and_estimates_agree_in_decimal_units(
         assert found["status"] == expected["status"]
         assert found["cost"] == pytest.approx(expected["cost"], rel=1e-5)
         largest = np.abs(expected["control"]).max()
-        np.testing.assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
+        assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
 
         estimate = identify(rescaled.experiment, [rescaled.recording(recording)])
         again = fit_in_units(rescaled, estimate)
-        np.testing.assert_allclose(again["theta"], fitted["theta"], rtol=1e-6)
-        np.testing.assert_allclose(again["std"], fitted["std"], rtol=1e-6)
+        assert_allclose(again["theta"], fitted["theta"], rtol=1e-6)
+        assert_allclose(again["std"], fitted["std"], rtol=1e-6)
         assert again["misfit"] == fitted["misfit"]
 
         assert again["terms"] == fitted["terms"]
-        np.testing.assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)
+        assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from mjfim.excitation.shortest_horizon import SampleGrid, smallest_feasible
 
-LAWS: dict[str, Callable[[int], float]] = {
+LAWS = {
     "square root": lambda n: (173 / n) ** 0.5,
     "steep": lambda n: (173 / n) ** 4,
     "knee": lambda n: max((173 / n) ** 0.5, (150 / n) ** 6),
@@ -32,7 +30,7 @@ LAWS: dict[str, Callable[[int], float]] = {
 def test_the_search_finds_the_smallest_feasible_number(
     first: int, law: str, grid: SampleGrid
 ) -> None:
-    asked: list[int] = []
+    asked = []
 
     def ratio(n: int) -> float:
         asked.append(n)

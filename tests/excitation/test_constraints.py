@@ -9,23 +9,33 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
-from mjfim.excitation.limits.constraint_kinds import END_WEIGHT, ConstraintValues
-from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.search.interior_problem import InteriorProblem, values_of
+from mjfim.excitation.limits.constraint_kinds import END_WEIGHT
+from mjfim.excitation.limits.constraints import constraint_set_of
+from mjfim.excitation.search.interior_problem import values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.cost_models import Bounds
 from mjfim.optimize.lq import TangentCurve
-from tests.support.limits import ARM, barrier_check, directions_of, floating_task
-from tests.support.numerics import Array, make_task, relative_error
+from tests.support.limits import (
+    ARM,
+    along_control,
+    barrier_check,
+    barrier_problem,
+    directions_of,
+    distances_of_arm,
+    floating_task,
+    played,
+)
+from tests.support.numerics import make_task, relative_error
 
 WIDE = {
     "position": 0.5,
     "velocity": 5.0,
 }  # wide tolerances, so that a missed final state does not dominate the barrier
 # tight limits: the motion below violates some of them and is close to others
-ALONE: dict[str, dict[str, Any]] = {
+ALONE = {
     "position": {"limits": {"position": {"shoulder": (-0.3, 0.7), "elbow": (-0.3, 0.5)}}},
     "velocity": {"limits": {"velocity": {"shoulder": 4.6, "elbow": (-5.0, 4.8)}}},
     "acceleration": {"limits": {"acceleration": 300.0}},
@@ -45,7 +55,7 @@ ALONE: dict[str, dict[str, Any]] = {
     },
 }
 EVERY = {key: value for name in list(ALONE)[:7] for key, value in ALONE[name]["limits"].items()}
-TOGETHER: dict[str, dict[str, Any]] = {
+TOGETHER = {
     "every kind, anywhere": {"limits": EVERY},
     "every kind, rest to rest": {
         "limits": EVERY,
@@ -59,7 +69,7 @@ KINDS = {"position", "velocity", "acceleration", "control", "control_rate", "for
 def arm_task(folder: Path, **tables: Any) -> DesignTask:
     """The relaxed arm, which starts at rest and is moved by sines of 1.5 Hz for 0.4 s."""
     swing = {"shoulder": 0.25, "elbow": 0.35}
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 0.4,
         "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
@@ -80,9 +90,7 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
 ) -> None:
     task = arm_task(tmp_path, **{**ALONE, **TOGETHER}[name])
     constraints = constraint_set_of(task)
-    watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
-    margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
+    margins = constraints.margins(along_control(task, constraints))
     if name in KINDS:
         assert set(margins) == {name}
     elif name in TOGETHER:
@@ -114,37 +122,28 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     """The squares are those of the changes along a tangent curve, the weights the curvatures."""
     task = arm_task(tmp_path, **TOGETHER[name])
     constraints, delta = constraint_set_of(task), 0.05
-    problem = InteriorProblem(
-        base=task.problem, constraints=constraints, mu=1.0, delta=delta, with_cost=False
-    )
+    problem = barrier_problem(task, delta)
     point = problem.point(task.control)
     expansion = problem.expand(point)
-    assert expansion.barrier is not None
     w, rng = expansion.barrier.weights, np.random.default_rng(4)
     for k in range(task.samples):
         form = np.block([[w.Q[k], w.S[k].T], [w.S[k], w.R[k]]])
         values = np.linalg.eigvalsh(0.5 * (form + form.T))
         assert values[0] > -1e-10 * values[-1]
-        np.testing.assert_allclose(form, form.T, rtol=0, atol=1e-9 * values[-1])
+        assert_allclose(form, form.T, rtol=0, atol=1e-9 * values[-1])
     assert (np.linalg.eigvalsh(w.Q[-1]) >= -1e-12 * np.abs(w.Q[-1]).max()).all()
     assert (w.W >= 0.0).all()
     rate, clearance = constraints.rate, constraints.clearance
-    assert rate is not None
     free = rate.control_before is None, rate.control_after is None and not rate.periodic
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
     # squared change of every limited quantity, times the curvature of its barrier
-    values, N = (
-        constraints.evaluate(values_of(point).trajectory, values_of(point).observed, slopes=True),
-        task.samples,
-    )
+    values, N = along_control(task, constraints, slopes=True), task.samples
     _, _, rise = task.plant.derivatives.observation_jacobians(
         task.theta, values.trajectory, constraints.observations
     )
     looked, ctrl = list(constraints.observations.derivative_rows), task.control
-    assert values.distances is not None
     assert values.distance_slopes is not None
-    assert clearance is not None
     m, least = values.distances.shape[1], np.full(values.distances.shape[1], 0.03)
     near = Bounds(lower=least, upper=np.full(m, np.inf), scale=clearance.distances.reach - least)
     bends = [
@@ -189,11 +188,8 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
         clearance=None,
         end=None,
     )
-    problem = InteriorProblem(
-        base=task.problem, constraints=narrow, mu=1.0, delta=delta, with_cost=False
-    )
+    problem = barrier_problem(task, delta, constraints=narrow)
     barrier = problem.expand(problem.point(ctrl)).barrier
-    assert barrier is not None
     _, b = barrier.weights.half_gradient(
         TangentCurve(z=np.zeros((N + 1, task.space.nx)), v=1e-5 * way)
     )
@@ -204,12 +200,8 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
 def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Path) -> None:
     """They are relative to half of each range, and largest over the steps with derivatives."""
     task = arm_task(tmp_path, limits=EVERY)
-    constraints = constraint_set_of(task)
-    problem = InteriorProblem(
-        base=task.problem, constraints=constraints, mu=1.0, delta=0.1, with_cost=False
-    )
+    constraints, problem = constraint_set_of(task), barrier_problem(task, 0.1)
     expansion = problem.expand(problem.point(task.control))
-    assert expansion.barrier is not None
     for way in 1e-4 * directions_of(task, 4, seed=2):
         zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
         up, down = (values_of(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
@@ -225,22 +217,16 @@ def test_changes_of_distances_to_bounds_are_those_of_the_simulation(
     name: str, tmp_path: Path
 ) -> None:
     task = arm_task(tmp_path, **TOGETHER[name])
-    constraints = constraint_set_of(task)
-    problem = InteriorProblem(
-        base=task.problem, constraints=constraints, mu=1.0, delta=0.1, with_cost=False
-    )
+    constraints, problem = constraint_set_of(task), barrier_problem(task, 0.1)
     expansion = problem.expand(problem.point(task.control))
-    values = along_control(task, constraints, task.control, slopes=True)
+    values = along_control(task, constraints, slopes=True)
     _, _, rise = task.plant.derivatives.observation_jacobians(
         task.theta, values.trajectory, constraints.observations
     )
     values = replace(values, observation_jacobian=rise)
     for way in 1e-4 * directions_of(task, 2, seed=5):
         zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
-        up, down = (
-            along_control(task, constraints, task.control + s * way, slopes=False)
-            for s in (1.0, -1.0)
-        )
+        up, down = (along_control(task, constraints, task.control + s * way) for s in (1.0, -1.0))
         for member in constraints.members:
             high, low = member.slacks(up), member.slacks(down)
             bounded = np.isfinite(high)
@@ -253,26 +239,16 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     """A step that changes nothing has the curvature at its beginning; a second model continues with
     the factors of the first one."""
     task = arm_task(tmp_path, **TOGETHER[name])
-    mu = 3e-3
-    problem = InteriorProblem(
-        base=task.problem,
-        constraints=constraint_set_of(task),
-        mu=mu,
-        delta=0.05,
-        with_cost=False,
-        follows_curvature=True,
-    )
+    problem = barrier_problem(task, 0.05, mu=3e-3, follows_curvature=True)
     expansion = problem.expand(problem.point(task.control))
     barrier = expansion.barrier
-    assert barrier is not None
-    assert barrier.curvature is not None
     K = np.zeros((task.samples, 2, task.space.nx))
     way = directions_of(task, 1, seed=6)[0]
     weights, _, growth = barrier.curvature.along(expansion.lift(K, 0.0 * way), None)
     assert growth == 1.0
-    np.testing.assert_allclose(weights.Q, barrier.weights.Q, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(weights.R, barrier.weights.R, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(weights.W, barrier.weights.W, rtol=1e-9, atol=0)
+    for name in "QRW":
+        expected = getattr(barrier.weights, name)
+        assert_allclose(getattr(weights, name), expected, rtol=1e-9, atol=0)
 
     step = expansion.lift(K, way)
     _, once, growth = barrier.curvature.along(step, None)
@@ -282,19 +258,9 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     ratios = [b / a for a, b in zip(once, again, strict=True)]
     assert growth == pytest.approx(max(each.max() for each in ratios))
     # with a smooth barrier, or where it is not asked for, the curvature is not followed
-    for other in (replace(problem, mu=0.1), replace(problem, follows_curvature=False)):
-        smooth = other.expand(other.point(task.control)).barrier
-        assert smooth is not None
-        assert smooth.curvature is None
-
-
-def along_control(
-    task: DesignTask, constraints: ConstraintSet, ctrl: Array, slopes: bool
-) -> ConstraintValues:
-    """The limited quantities along a control."""
-    observed = task.plant.observe(task.theta, ctrl, constraints.observations)
-    assert observed is not None
-    return constraints.evaluate(*observed, slopes=slopes)
+    for change in ({"mu": 0.1}, {"follows_curvature": False}):
+        other = replace(problem, **change)
+        assert other.expand(other.point(task.control)).barrier.curvature is None
 
 
 def test_margins_along_a_trajectory_are_those_of_single_engine_steps(tmp_path: Path) -> None:
@@ -304,60 +270,39 @@ def test_margins_along_a_trajectory_are_those_of_single_engine_steps(tmp_path: P
         limits=EVERY,
         boundary={"start": "rest", "end": "rest", "position": 0.2, "velocity": 3.0},
     )
-    constraints, model, limits = (
-        constraint_set_of(task),
-        mujoco.MjModel.from_xml_string(ARM),
-        task.limits,
-    )
-    watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
-    data, rows, near = mujoco.MjData(model), {kind: [] for kind in KINDS}, []
+    constraints, model = constraint_set_of(task), mujoco.MjModel.from_xml_string(ARM)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    geoms = [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
-    for held in task.control:
-        data.ctrl[:] = held
-        for _ in range(task.system.grid.substeps):
-            before = data.qvel.copy()
-            mujoco.mj_step(model, data)
-            now = {
-                "position": data.qpos,
-                "velocity": data.qvel,
-                "acceleration": (data.qvel - before) / 0.002,
-                "force": data.actuator_force,
-            }
-            for kind, values in now.items():
-                rows[kind].append(values.copy())
-        mujoco.mj_kinematics(model, data)
-        for a, b in ((0, 1), (0, 2), (3, 1)):
-            near.append(mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None))
-    held = task.final_hold  # the start is the end
-    rows["control"] = list(task.control)
-    rows["control_rate"] = list(
-        np.diff(task.control, axis=0, prepend=task.initial_hold[None], append=held[None]) / 0.01
+    substeps = task.system.grid.substeps
+    plain = played(model, (np.zeros(2), np.zeros(2)), task.control, substeps)
+    rates = np.diff(
+        task.control, axis=0, prepend=task.initial_hold[None], append=task.final_hold[None]
     )
+    rows = {
+        "position": plain["q"],
+        "velocity": plain["v"],
+        "acceleration": plain["a"],
+        "force": plain["f"],
+        "control": task.control,
+        "control_rate": rates / 0.01,
+    }
     wanted, shares = {}, {}
-    for kind in KINDS - {"clearance"}:
+    for kind, values in rows.items():
         found = [
             (m, m / (0.5 * (x.upper - x.lower)))
-            for x in limits
+            for x in task.limits
             if x.kind == kind
-            for m in np.minimum(
-                np.array(rows[kind])[:, x.index] - x.lower,
-                x.upper - np.array(rows[kind])[:, x.index],
-            )
+            for m in np.minimum(values[:, x.index] - x.lower, x.upper - values[:, x.index])
         ]
         wanted[kind], shares[kind] = (min(column) for column in zip(*found, strict=True))
-    wanted["clearance"] = min(near) - 0.03
-    shares["clearance"] = wanted["clearance"] / 0.03
-    wanted["end_position"], wanted["end_velocity"] = (
-        0.2 - np.abs(data.qpos).max(),
-        3.0 - np.abs(data.qvel).max(),
-    )
-    shares["end_position"], shares["end_velocity"] = (
-        wanted["end_position"] / 0.2,
-        wanted["end_velocity"] / 3.0,
-    )
-    values = constraints.evaluate(*watched, slopes=False)
+    near = distances_of_arm(model, plain["q"][substeps - 1 :: substeps])
+    q, v = (np.abs(plain[key][-1]).max() for key in "qv")
+    for kind, room, size in (
+        ("clearance", near - 0.03, 0.03),
+        ("end_position", 0.2 - q, 0.2),
+        ("end_velocity", 3.0 - v, 3.0),
+    ):
+        wanted[kind], shares[kind] = room, room / size
+    values = along_control(task, constraints)
     assert constraints.margins(values) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
     assert constraints.relative_margins(values) == pytest.approx(shares, rel=1e-5, abs=1e-7)
 
@@ -367,9 +312,7 @@ def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path)
         tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0}
     )
     constraints = constraint_set_of(task)
-    watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
-    values = constraints.evaluate(*watched, slopes=False)
+    values = along_control(task, constraints)
     shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(constraints.margins(values)))}
     tighter = {
         kind: constraints.relative_margins(values)[kind] - share for kind, share in shares.items()
@@ -379,9 +322,7 @@ def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path)
         1.0 + shares["clearance"]
     )  # the fraction of a clearance is relative to the least distance, which is raised
     raised = constraints.tightened(shares).clearance
-    assert raised is not None
     assert raised.least == pytest.approx(least)
-    assert values.distances is not None
     tighter["clearance"] = float(values.distances.min()) / least - 1.0
     assert found == pytest.approx(tighter, abs=1e-12)
     assert constraints.tightened({}).relative_margins(values) == pytest.approx(
@@ -396,15 +337,12 @@ def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path)
 def test_rates_at_both_ends_follow_the_boundary(tmp_path: Path) -> None:
     task = arm_task(tmp_path, limits={"control_rate": 9.0})
     rate, ctrl = constraint_set_of(task).rate, task.control
-    assert rate is not None
     inner = np.diff(ctrl, axis=0) / 0.01
-    np.testing.assert_allclose(rate.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
+    assert_allclose(rate.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
     before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
     rested = replace(rate, control_before=before, control_after=after).rates(ctrl)
-    np.testing.assert_allclose(
-        rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01]
-    )
-    np.testing.assert_allclose(
+    assert_allclose(rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01])
+    assert_allclose(
         replace(rate, periodic=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01]
     )
 
@@ -414,10 +352,7 @@ def test_without_enforcement_only_the_boundary_constrains(tmp_path: Path) -> Non
     task = arm_task(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
     for every, kinds in ((False, set()), (True, KINDS)):
         constraints = constraint_set_of(task, every=every)
-        watched = task.plant.observe(task.theta, task.control, constraints.observations)
-        assert watched is not None
-        values = constraints.evaluate(*watched, slopes=False)
-        assert isinstance(values, ConstraintValues)
+        values = along_control(task, constraints)
         assert set(constraints.margins(values)) == kinds | {"end_position", "end_velocity"}
 
 
@@ -451,7 +386,7 @@ def test_a_design_stays_above_a_floor_that_only_the_file_states(tmp_path: Path) 
         "parameters": {"c": {"target": "joint/hinge:damping"}},
         "noise": {"state": 0.01},
         "cost": {"control": 0.0},
-        "descent": {"max_iterations": 15, "seconds": 20.0},
+        "descent": {"max_iterations": 8},
         "limits": {"clearance": 0.05},
     }
 

@@ -7,21 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mjfim.excitation.objective import extend
 from mjfim.excitation.task import DesignTask
-from mjfim.information.fisher import FisherInformation
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.optimize.directions import MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, Bilinear
-from mjfim.records.trajectory import Sensitivity
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from tests.support.numerics import (
     Array,
     Loop,
     body_task,
     cart_task,
-    independent_noise,
     relative_error,
 )
 
@@ -91,53 +87,6 @@ def test_with_weight_on_psi_the_extended_direction_is_another_descent_direction(
     expansion, plain, wide = both_directions(CASES["cart E"](tmp_path), 1.0)
     assert relative_error(wide.v, plain.v) > 1e-2
     assert expansion.slope(wide) < 0.0
-
-
-@pytest.mark.parametrize("criterion", ["E", "A", "D"])
-def test_the_slope_with_psi_eliminated_is_that_of_the_extended_system(criterion: str) -> None:
-    rng, (N, nx, nu, ny, p) = np.random.default_rng(2), (9, 3, 2, 2, 3)
-    A, B = 0.5 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
-    C, D = rng.normal(size=(N + 1, ny, nx)), rng.normal(size=(N + 1, ny, nu))
-    unit = Bilinear(
-        A=A,
-        B=B,
-        C=C,
-        D=D,
-        F_mixed=rng.normal(size=(p, N, nx + nu, nx)),
-        h_mixed=rng.normal(size=(p, N + 1, nx + nu, ny)),
-    )
-    S = Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, ny, p)))
-    noise = independent_noise([0.3, 2.0])
-    made = FisherInformation(
-        noise=noise,
-        measure_rate=20.0,
-        scale=np.array([1.0, 0.5, 3.0]),
-        prior=np.zeros((p, p)),
-        criterion=criterion,
-    )
-    found = made.evaluate(made.matrix(S))
-    F, h = (np.einsum("rj,jkzx->rkzx", found.directions, m) for m in (unit.F_mixed, unit.h_mixed))
-    a, b = made.gradient(found, S, Bilinear(A=A, B=B, C=C, D=D, F_mixed=F, h_mixed=h))
-    a_psi, a_h, b_h = made.partial_derivatives(found, S, unit)
-    wide = extend(unit, a_h, b_h, a_psi)
-    v = rng.normal(size=(N, nu))
-    z = LinearRecursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
-    full = LinearRecursion(wide.A).forward(
-        np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v)
-    )
-    reduced, slope = (
-        Expansion(A=A, B=B, a=a, b=b).slope(TangentCurve(z=z, v=v)),
-        wide.slope(TangentCurve(z=full, v=v)),
-    )
-    assert slope == pytest.approx(reduced, rel=1e-10)
-    R, Q = np.eye(nu), np.diag([1.0, 2.0, 0.0])
-    plain = MetricDescent(Q, R, Q)(Expansion(A=A, B=B, a=a, b=b), np.zeros((N, nu, nx)))
-    wide_Q = np.zeros((nx * (1 + p), nx * (1 + p)))
-    wide_Q[:nx, :nx] = Q
-    same = extended_direction(
-        Expansion(A=A, B=B, a=a, b=b, extended=wide), np.zeros((N, nu, nx)), wide_Q, R, wide_Q
-    )
-    assert relative_error(same.v, plain.v) < 1e-10
 
 
 @pytest.mark.parametrize("case", CASES)

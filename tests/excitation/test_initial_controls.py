@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.initial_controls import initial_controls_of
@@ -26,7 +27,7 @@ RANGE = {"shoulder": (-0.35, 0.3)}
 
 def arm(folder: Path, **tables: Any) -> DesignTask:
     """The arm for a second."""
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 1.0,
         "parameters": {"m": {"target": "body/fore:mass"}},
         "noise": {"qpos:elbow": 0.01},
@@ -41,12 +42,12 @@ def test_the_given_control_takes_the_place_of_the_initial_one(tmp_path: Path) ->
     starts = list(initial_controls_of(task, None))
     random = ["Fourier series of 1.5 Hz", "multisine 1 of 2", "multisine 2 of 2"]
     assert [s.name for s in starts] == ["initial control", *random]
-    np.testing.assert_array_equal(starts[0].control, task.control)
+    assert_array_equal(starts[0].control, task.control)
     given = list(initial_controls_of(task, 0.5 * task.control))
     assert [s.name for s in given] == ["given control", *random]
-    np.testing.assert_array_equal(given[0].control, 0.5 * task.control)
+    assert_array_equal(given[0].control, 0.5 * task.control)
     for own, other in zip(starts[1:], given[1:], strict=True):  # the seed alone decides them
-        np.testing.assert_array_equal(own.control, other.control)
+        assert_array_equal(own.control, other.control)
     assert len({s.control.tobytes() for s in starts}) == 4
     other = list(initial_controls_of(arm(tmp_path, descent={"starts": 3, "seed": 5}), None))
     assert not np.array_equal(other[1].control, starts[2].control)
@@ -92,9 +93,7 @@ def test_a_fourier_series_comes_with_its_basis(begins: bool, ends: bool, tmp_pat
         task = arm(tmp_path, boundary=boundary, limits=limits, descent={"fourier": (1.5,)})
         series = list(initial_controls_of(task, None))[1].basis
         assert series is not None
-        np.testing.assert_array_equal(
-            series, fourier_basis(task.t, 1.0, 1.5, harmonics, begins, ends)
-        )
+        assert_array_equal(series, fourier_basis(task.t, 1.0, 1.5, harmonics, begins, ends))
 
 
 @pytest.mark.parametrize(("limits", "most"), [({}, 50), ({"bandwidth": 5.0}, 5)])
@@ -125,9 +124,7 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
     )
     for start, length in ((old, 20), (short, 5)):
         row = (np.arange(100) // 2) % length
-        np.testing.assert_allclose(
-            start.control, np.stack([0.01 * row, -0.02 * row], axis=1), atol=1e-12
-        )
+        assert_allclose(start.control, np.stack([0.01 * row, -0.02 * row], axis=1), atol=1e-12)
     missing = arm(tmp_path, descent={"previous": ("gone.csv",)})
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
         list(initial_controls_of(missing, None))
@@ -145,9 +142,9 @@ def test_a_repeated_control_is_the_first_part_of_the_initial_one_faded_to_rest(
         task.samples // 2,
     )
     assert (quarter.repeats, len(quarter.control)) == (4, task.samples // 4)
-    np.testing.assert_allclose(half.control[0], task.centre)
+    assert_allclose(half.control[0], task.centre)
     middle = slice(len(half.control) // 10 + 1, 3 * len(half.control) // 4)
-    np.testing.assert_allclose(half.control[middle], task.control[: len(half.control)][middle])
+    assert_allclose(half.control[middle], task.control[: len(half.control)][middle])
     assert np.abs(half.control[-1] - task.centre).max() < 1e-9
 
 

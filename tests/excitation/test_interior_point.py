@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.search.interior_problem import DIVERGED_POINT, InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
 from tests.support.limits import directions_of
-from tests.support.numerics import Array, cart_task, directional_check
+from tests.support.numerics import cart_task, directional_check
 
 LIMITS = {
     "control": {"force": (-5.0, 4.5)},
@@ -22,7 +23,7 @@ LIMITS = {
     "velocity": 3.0,
     "control_rate": 60.0,
 }
-COSTS: dict[str, dict[str, Any]] = {
+COSTS = {
     "E": {},
     "smooth E": {},
     "A": {"cost": {"criterion": "A", "control": 1e-2}},
@@ -69,14 +70,12 @@ def test_the_slope_agrees_with_simulated_controls(name: str, tmp_path: Path) -> 
     expansion = problem.expand(point)
     assert check(task, problem, expansion) < 5e-3
     bare, barrier = replace(problem, mu=0.0), expansion.barrier
-    assert barrier is not None
     alone = Expansion(
         A=expansion.A, B=expansion.B, a=expansion.a - barrier.a, b=expansion.b - barrier.b
     )
     assert check(task, bare, alone) < 5e-3
     twice = replace(problem, mu=0.4, delta=0.05).expand(point).barrier
-    assert twice is not None
-    np.testing.assert_allclose(twice.b, 2.0 * barrier.b, rtol=1e-12)
+    assert_allclose(twice.b, 2.0 * barrier.b, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", COSTS)
@@ -84,7 +83,6 @@ def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> No
     """The merit is log J; for D-optimality it is J over the number of parameters and the weight."""
     task, problem = problem_of(name, tmp_path)
     point = problem.point(task.control)
-    assert point.point is not None
     J = task.problem.point(task.initial).cost
     if name == "smooth E":
         assert point.point.cost > J  # at most p^(1/q) above it
@@ -97,7 +95,7 @@ def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> No
     assert point.barrier == problem.constraints.value(values, 0.05)
     assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
     assert problem.size(point) == 1.0
-    np.testing.assert_array_equal(point.ctrl, task.control)
+    assert_array_equal(point.ctrl, task.control)
 
 
 def test_a_reevaluated_point_equals_that_of_the_new_problem(tmp_path: Path) -> None:
@@ -120,8 +118,8 @@ def test_a_reevaluated_point_equals_that_of_the_new_problem(tmp_path: Path) -> N
         assert (again.merit, again.barrier) == (fresh.merit, fresh.barrier)
         assert other.value(again) == other.value(fresh) != problem.value(point)
         e, f = other.expand(again), other.expand(fresh)
-        np.testing.assert_allclose(e.a, f.a, rtol=1e-9)
-        np.testing.assert_allclose(e.b, f.b, rtol=1e-9)
+        assert_allclose(e.a, f.a, rtol=1e-9)
+        assert_allclose(e.b, f.b, rtol=1e-9)
 
 
 def test_steering_inside_has_no_cost(tmp_path: Path) -> None:
@@ -136,8 +134,7 @@ def test_steering_inside_has_no_cost(tmp_path: Path) -> None:
     assert inward.value(point) == point.barrier == problem.point(task.control).barrier
     assert inward.size(point) == max(1.0, abs(point.barrier))
     expansion = inward.expand(point)
-    assert expansion.barrier is not None
-    np.testing.assert_array_equal(expansion.a, expansion.barrier.a)
+    assert_array_equal(expansion.a, expansion.barrier.a)
     assert check(task, inward, expansion) < 2e-3
     assert inward.reevaluate(point) is point
 
@@ -165,12 +162,12 @@ def test_a_projected_point_is_simulated_open_loop(tmp_path: Path) -> None:
         zeta = expansion.lift(K, way)
         moved = problem.project(point, zeta, 0.1, K)
         assert problem.value(moved) == problem.value(problem.point(moved.ctrl))
-        change: Array = moved.ctrl - task.control - 0.1 * zeta.v
+        change = moved.ctrl - task.control - 0.1 * zeta.v
         assert bool(np.abs(change).max() < 1e-12) is (K is open_loop)
         assert np.abs(change).max() < 0.05
         difference = problem.difference(moved, point)
-        np.testing.assert_allclose(difference.v, moved.ctrl - task.control, rtol=0, atol=1e-15)
-        np.testing.assert_allclose(
+        assert_allclose(difference.v, moved.ctrl - task.control, rtol=0, atol=1e-15)
+        assert_allclose(
             difference.z, values_of(moved).trajectory.state - task.initial.state, rtol=0, atol=1e-12
         )
     assert problem.refine(point) is None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
@@ -37,9 +38,7 @@ def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
     wanted = np.zeros((3, 3))
     wanted[np.ix_([1, 0], [1, 0])] += first
     wanted[np.ix_([2, 0], [2, 0])] += second
-    np.testing.assert_allclose(
-        information_of([design, estimate], ("a", "b", "c")), wanted, rtol=1e-12
-    )
+    assert_allclose(information_of([design, estimate], ("a", "b", "c")), wanted, rtol=1e-12)
     assert not information_of([], ("a", "b")).any()
 
 
@@ -48,9 +47,7 @@ def test_further_parameters_of_a_file_are_marginalised(tmp_path: Path) -> None:
     matrix = information(2, 4)
     path = design_file(tmp_path / "design.json", ["x", "a", "y", "b"], matrix)
     found = information_of([path], ("a", "b"))
-    np.testing.assert_allclose(
-        np.linalg.inv(found), np.linalg.inv(matrix)[np.ix_([1, 3], [1, 3])], rtol=1e-11
-    )
+    assert_allclose(np.linalg.inv(found), np.linalg.inv(matrix)[np.ix_([1, 3], [1, 3])], rtol=1e-11)
     assert np.abs(found - matrix[np.ix_([1, 3], [1, 3])]).max() > 0.1, (
         "nothing to marginalise: a weak test"
     )
@@ -60,7 +57,7 @@ def test_nothing_is_known_about_a_parameter_that_is_confounded_with_others(tmp_p
     """Only the sum of a and x is known, so that nothing is known about a."""
     matrix = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 9.0]])
     path = design_file(tmp_path / "design.json", ["a", "x", "b"], matrix)
-    np.testing.assert_allclose(information_of([path], ("a", "b")), np.diag([0.0, 9.0]), atol=1e-12)
+    assert_allclose(information_of([path], ("a", "b")), np.diag([0.0, 9.0]), atol=1e-12)
 
 
 def test_the_prior_of_a_file_is_left_out(tmp_path: Path) -> None:
@@ -68,11 +65,11 @@ def test_the_prior_of_a_file_is_left_out(tmp_path: Path) -> None:
     data = information(3, 3)
     prior = np.diag([5.0, 0.0, 7.0])
     path = design_file(tmp_path / "design.json", ["a", "b", "x"], data + prior, prior)
-    np.testing.assert_allclose(information_of([path], ("a", "b", "x")), data, rtol=1e-12)
+    assert_allclose(information_of([path], ("a", "b", "x")), data, rtol=1e-12)
     joint = data + np.diag([0.0, 0.0, 7.0])
     wanted = np.linalg.inv(np.linalg.inv(joint)[:2, :2])
     found = information_of([path], ("a", "b"))
-    np.testing.assert_allclose(found, wanted, rtol=1e-11)
+    assert_allclose(found, wanted, rtol=1e-11)
     unknown = np.linalg.inv(np.linalg.inv(data)[:2, :2])
     assert np.abs(found - unknown).max() > 0.1, "the prior on the rest does not matter: a weak test"
 
@@ -85,7 +82,7 @@ def test_deviations_of_the_initial_state_belong_to_one_experiment(tmp_path: Path
     found = information_of([path], tuple(names))
     assert not found[1].any() and not found[:, 1].any()
     marginal = np.linalg.inv(np.linalg.inv(data + prior)[np.ix_([0, 2], [0, 2])])
-    np.testing.assert_allclose(found[np.ix_([0, 2], [0, 2])], marginal, rtol=1e-11)
+    assert_allclose(found[np.ix_([0, 2], [0, 2])], marginal, rtol=1e-11)
 
 
 FAULTS = {
@@ -140,11 +137,11 @@ def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
         "m": {"target": "body/bob:mass"},
     }
     second = cart_task(tmp_path, parameters=turned, earlier=(earlier,), **tables)
-    np.testing.assert_allclose(second.prior, own[::-1, ::-1] + np.diag([0.25, 0.0]), rtol=1e-9)
+    assert_allclose(second.prior, own[::-1, ::-1] + np.diag([0.25, 0.0]), rtol=1e-9)
     again = design_task(second)
     archive.write_design(tmp_path / "two", again, second.system)
     late = str(tmp_path / "two" / "design.json")
     total = information_of([Path(earlier), Path(late)], ("c", "m"))
-    np.testing.assert_allclose(total, again.final.information - np.diag([0.25, 0.0]), rtol=1e-8)
+    assert_allclose(total, again.final.information - np.diag([0.25, 0.0]), rtol=1e-8)
     with pytest.raises(ExperimentError, match=r"experiment: earlier: .*gone\.json"):
         cart_task(tmp_path, earlier=("gone.json",))

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError
@@ -64,10 +65,25 @@ def played(folder: Path, *, friction: float = 0.0, **numbers: float) -> tuple[An
     return experiment, mjfim.design(experiment, threads=1, progress=False)
 
 
-def looped(theta: np.ndarray, ctrl: np.ndarray, friction: float = 0.0) -> np.ndarray:
-    """(n+1, 4) states of the cart under a control that is held for four engine steps."""
+Played = tuple[Any, Design]
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    """The cart within wide limits and its design."""
+    return played(tmp_path_factory.mktemp("plain"))
+
+
+def cart_of(theta: np.ndarray, friction: float = 0.0) -> Any:
+    """The cart in plain MuJoCo."""
     model = mujoco.MjModel.from_xml_string(CART.format(friction=friction))
     model.body_mass[2], model.dof_damping[1], model.jnt_stiffness[0] = theta
+    return model
+
+
+def looped(theta: np.ndarray, ctrl: np.ndarray, friction: float = 0.0) -> np.ndarray:
+    """(n+1, 4) states of the cart under a control that is held for four engine steps."""
+    model = cart_of(theta, friction)
     data = mujoco.MjData(model)
     states = [np.concatenate([data.qpos, data.qvel])]
     for u in np.repeat(ctrl, 4, axis=0):
@@ -77,9 +93,9 @@ def looped(theta: np.ndarray, ctrl: np.ndarray, friction: float = 0.0) -> np.nda
     return np.array(states)
 
 
-def test_robots_agree_with_a_plain_loop(tmp_path: Path) -> None:
+def test_robots_agree_with_a_plain_loop(plain: Played) -> None:
     """Margins, peaks, ends and heights of the model and of every robot."""
-    _, design = played(tmp_path)
+    _, design = plain
     found = design.rehearsal
     assert found is not None and found.robots == 40
     limits = [(limit.kind, limit.name) for limit in found.limits]
@@ -92,10 +108,10 @@ def test_robots_agree_with_a_plain_loop(tmp_path: Path) -> None:
     for i, theta in enumerate(found.theta):
         states = looped(theta, design.trajectory.ctrl)
         speeds = np.abs(states[:, 2:])
-        np.testing.assert_allclose(found.speed[i], speeds.max(axis=0), rtol=1e-9)
-        np.testing.assert_allclose(found.end_speed[i], speeds[-1], rtol=1e-9)
+        assert_allclose(found.speed[i], speeds.max(axis=0), rtol=1e-9)
+        assert_allclose(found.end_speed[i], speeds[-1], rtol=1e-9)
         change = np.abs(np.diff(states[:, 2:], axis=0)).max(axis=0) / 0.005
-        np.testing.assert_allclose(found.acceleration[i], change, rtol=1e-9)
+        assert_allclose(found.acceleration[i], change, rtol=1e-9)
         margins = {
             ("position", "slide"): 1.0 - np.abs(states[1:, 0]).max() / 3.0,
             ("velocity", "slide"): 1.0 - speeds[1:, 0].max() / 4.0,
@@ -103,7 +119,7 @@ def test_robots_agree_with_a_plain_loop(tmp_path: Path) -> None:
             ("control", "force"): 1.0 - np.abs(design.trajectory.ctrl).max() / 10.0,
         }
         wanted = [margins[limit] for limit in limits]
-        np.testing.assert_allclose(found.margins[i], wanted, rtol=1e-9, atol=1e-12)
+        assert_allclose(found.margins[i], wanted, rtol=1e-9, atol=1e-12)
         # The end of the rod has a radius of 2 cm. Nothing states a floor.
         height = -0.5 * np.cos(states[-1, 1]) - 0.02
         assert found.end_height[i] == pytest.approx(height, abs=1e-9)
@@ -111,9 +127,9 @@ def test_robots_agree_with_a_plain_loop(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_robots_are_drawn_as_stated(tmp_path: Path) -> None:
+def test_robots_are_drawn_as_stated(plain: Played) -> None:
     """From the prior, within the bounds, and within the share of the size."""
-    experiment, design = played(tmp_path)
+    experiment, design = plain
     found = mjfim.rehearse(experiment.replace(rehearsal={"robots": 300, "wrong": 0.3}), design)
     mass, damping, spring = found.theta[1:].T
     for values, size in ((mass, 0.8), (damping, 0.1)):
@@ -137,12 +153,10 @@ def test_robots_are_drawn_as_stated(tmp_path: Path) -> None:
     ],
 )
 def test_the_verdict_counts_robots(
-    numbers: dict[str, float | None], words: str, tmp_path: Path
+    numbers: dict[str, float | None], words: str, plain: Played, tmp_path: Path
 ) -> None:
     """A limit that the model keeps by a hair is broken by a half of the robots."""
-    _, first = played(tmp_path)
-    assert first.rehearsal is not None
-    exact = float(first.rehearsal.speed[0, 0]) * (1.0 + 1e-6)
+    exact = float(plain[1].rehearsal.speed[0, 0]) * (1.0 + 1e-6)
     chosen = {key: exact if value is None else value for key, value in numbers.items()}
     experiment, design = played(tmp_path, **chosen)
     page = page_of(design, experiment="cart.toml", design=tmp_path)
@@ -239,7 +253,7 @@ def test_what_falls_below_the_floor_is_not_played(
         parameters={"mass": {"target": "body/drone:mass"}},
         noise={"qpos:base.z": 0.01},
         descent={"max_iterations": 0},
-        rehearsal={"robots": 10, "wrong": 0.001},
+        rehearsal={"robots": 4, "wrong": 0.001},
     )
     design = mjfim.design(experiment, threads=1, progress=False)
     found = design.rehearsal
@@ -256,10 +270,11 @@ def test_what_falls_below_the_floor_is_not_played(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("room", [1e-4, 2.0])
-def test_an_end_that_no_control_can_brake_is_not_played(room: float, tmp_path: Path) -> None:
+def test_an_end_that_no_control_can_brake_is_not_played(
+    room: float, plain: Played, tmp_path: Path
+) -> None:
     """Held at its strongest brake after the end, the cart of plain MuJoCo leaves the limit."""
-    _, first = played(tmp_path)
-    assert first.rehearsal is not None
+    _, first = plain
     states = [looped(theta, first.trajectory.ctrl) for theta in first.rehearsal.theta]
     reach = float(max(np.abs(each[:, 0]).max() for each in states)) + room
     _, design = played(tmp_path, reach=reach)
@@ -267,8 +282,7 @@ def test_an_end_that_no_control_can_brake_is_not_played(room: float, tmp_path: P
     assert found is not None and found.all_kept == 40
     left = 0
     for theta, each in zip(found.theta[1:], states[1:], strict=True):
-        model = mujoco.MjModel.from_xml_string(CART.format(friction=0.0))
-        model.body_mass[2], model.dof_damping[1], model.jnt_stiffness[0] = theta
+        model = cart_of(theta)
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = each[-1, :2], each[-1, 2:]
         data.ctrl[:] = -10.0 * np.sign(data.qvel[0])
@@ -309,7 +323,6 @@ def whitened_change(design: Design, step: np.ndarray, noise: float, friction: fl
 def test_finite_steps_agree_with_plain_loops(friction: float, noise: float, tmp_path: Path) -> None:
     """Along the principal axes of the covariance; for little noise the derivatives hold."""
     _, design = played(tmp_path, friction=friction, noise=noise)
-    assert design.rehearsal is not None
     steps, information = design.rehearsal.steps, design.final.information
     prior = np.diag([0.0, 0.0, 0.3**-2])
     size = np.sqrt(np.diag(information))
@@ -328,9 +341,9 @@ def test_finite_steps_agree_with_plain_loops(friction: float, noise: float, tmp_
         weight[d] = axis @ prior @ axis + ratio**2 * of_data
     if np.isfinite(weight).all():
         std = np.sqrt(((vectors / size[:, None]) ** 2 / weight).sum(axis=1))
-        np.testing.assert_allclose(steps.std, std, rtol=1e-2)
+        assert_allclose(steps.std, std, rtol=1e-2)
     if noise == 0.004:
-        np.testing.assert_allclose(steps.ratio, 1.0, atol=0.02)
+        assert_allclose(steps.ratio, 1.0, atol=0.02)
         assert str(steps) == "" and (steps.stated == steps.predicted).all()
 
 
@@ -344,7 +357,7 @@ def test_a_standard_deviation_that_differs_is_stated_by_the_finite_step() -> Non
         ratio=np.array([0.9, 0.4]),
         causes=("dry friction of hinge",),
     )
-    np.testing.assert_array_equal(steps.stated, [0.1, 0.12])
+    assert_array_equal(steps.stated, [0.1, 0.12])
     assert "friction 0.12 in place of 0.05" in str(steps)
     assert "dry friction of hinge makes it approximate" in str(steps)
 
@@ -364,8 +377,8 @@ def test_the_verb_plays_a_folder(tmp_path: Path) -> None:
     assert (out / "rehearsal.png").stat().st_size > 10_000
 
 
-def test_misuse_is_one_sentence(tmp_path: Path) -> None:
-    experiment, design = played(tmp_path)
+def test_misuse_is_one_sentence(plain: Played) -> None:
+    experiment, design = plain
     with pytest.raises(RecordingError, match="give the experiment of the design"):
         mjfim.rehearse(experiment.replace(rate=100.0), design)
     silent = experiment.replace(rehearsal={"feedback": True})
@@ -374,8 +387,8 @@ def test_misuse_is_one_sentence(tmp_path: Path) -> None:
         mjfim.rehearse(silent, design)
 
 
-def test_a_model_alone_is_enough(tmp_path: Path) -> None:
-    experiment, design = played(tmp_path)
+def test_a_model_alone_is_enough(plain: Played) -> None:
+    experiment, design = plain
     alone = mjfim.rehearse(experiment.replace(rehearsal={"robots": 0}), design)
     assert alone.robots == 0 and alone.is_safe
     lost = replace(alone, margins=-alone.margins)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
 import mjfim
@@ -58,7 +59,7 @@ def test_weights_are_the_derivative_of_the_pooled_value(kind: str, size: float) 
 def test_the_mean_is_the_mean_and_the_worst_lies_just_below_the_largest() -> None:
     phi = np.array([1.0, 2.0, 10.0, 3.0])
     assert pool("mean").value(phi) == 4.0
-    np.testing.assert_array_equal(pool("mean").weights(phi), 0.25)
+    assert_array_equal(pool("mean").weights(phi), 0.25)
     assert pool("worst").value(phi) == pytest.approx(4.0 ** (-1.0 / 20.0) * 10.0, rel=1e-9)
     assert pool("worst").weights(phi) @ phi == pytest.approx(
         pool("worst").value(phi)
@@ -86,7 +87,7 @@ def test_pooling_a_logarithm_below_zero_works_and_does_not_overflow() -> None:
         assert pool("worst D").value(phi) - shift == pytest.approx(
             pool("worst D").value(phi - shift), rel=1e-9
         )
-        np.testing.assert_allclose(
+        assert_allclose(
             pool("worst D").weights(phi), pool("worst D").weights(phi - shift), rtol=1e-9
         )
 
@@ -98,8 +99,8 @@ def test_samples_fill_bounds_evenly_and_begin_with_the_guess() -> None:
     theta = np.array([2.5, 0.0, 7.0])
     drawn = sample_parameters(parameters, theta, 21, seed=3)
     assert drawn.shape == (21, 3)
-    np.testing.assert_array_equal(drawn[0], theta)
-    np.testing.assert_array_equal(drawn[:, 2], 7.0)  # neither prior nor bounds: it stays
+    assert_array_equal(drawn[0], theta)
+    assert_array_equal(drawn[:, 2], 7.0)  # neither prior nor bounds: it stays
     for column, (low, high) in enumerate([(1.0, 3.0), (-1e6, 1e6)]):
         strata = np.floor((drawn[1:, column] - low) / (high - low) * 20).astype(int)
         assert sorted(strata) == list(range(20))  # one in each twentieth: a Latin hypercube
@@ -124,11 +125,9 @@ def test_samples_of_a_prior_are_normal_and_within_bounds() -> None:
 def test_the_seed_decides_the_samples() -> None:
     parameters = unknowns({"bounds": (0.0, 1.0)}, {"prior": 1.0})
     a, b, c = (sample_parameters(parameters, np.zeros(2), 5, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(a, b)
+    assert_array_equal(a, b)
     assert not np.array_equal(a, c)
-    np.testing.assert_array_equal(
-        sample_parameters(parameters, np.zeros(2), 1, 0), np.zeros((1, 2))
-    )
+    assert_array_equal(sample_parameters(parameters, np.zeros(2), 1, 0), np.zeros((1, 2)))
 
 
 def test_parameters_without_prior_and_bounds_cannot_be_sampled(tmp_path) -> None:
@@ -185,7 +184,7 @@ def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples
         }
         single = vague_task(tmp_path, parameters=there)
         alone.append(evaluate_task(single, single.initial).criterion)
-    np.testing.assert_allclose(point.phi, alone, rtol=1e-6)
+    assert_allclose(point.phi, alone, rtol=1e-6)
     running = task.problem.running.value(task.initial)
     assert point.cost == pytest.approx(task.samples_of_parameters.value(alone) + running, rel=1e-6)
 
@@ -238,23 +237,18 @@ def test_samples_are_halved_until_their_bodies_can_exist() -> None:
         ),
     )
     drawn = sample_parameters(parameters, theta, 9, 0, lambda row: [0] if row[0] > 2.0 else [])
-    np.testing.assert_array_equal(drawn[:, 1], free[:, 1])
+    assert_array_equal(drawn[:, 1], free[:, 1])
     assert (free[:, 0] > 2.0).sum() >= 4
     times = np.log2((free[1:, 0] - 1.0) / (drawn[1:, 0] - 1.0))
-    np.testing.assert_allclose(
-        times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9
-    )
+    assert_allclose(times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9)
     assert (drawn[:, 0] <= 2.0).all()
     # where halving does not help, samples end at the guess
-    np.testing.assert_array_equal(
-        sample_parameters(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0
-    )
+    assert_array_equal(sample_parameters(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0)
 
 
 def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     table = {"B": {"inertial": "hull", "coordinates": "barycentric", "prior": 0.5}}
     task = body_task(tmp_path, parameters=table, robust={"samples": 8})
-    assert task.samples_of_parameters is not None
     moments = np.array(
         [
             task.plant.model(theta).body("hull").inertia

@@ -82,7 +82,7 @@ def test_an_experiment_shorter_by_the_tolerance_does_not(shorter: mjfim.Shortest
 @pytest.mark.slow
 def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperiment) -> None:
     """A search that begins at a horizon that is too short ends near the shortest one as well."""
-    messages: list[str] = []
+    messages = []
 
     def callback(event: DesignEvent | StudyEvent) -> None:
         if isinstance(event, StudyEvent):
@@ -160,7 +160,7 @@ def test_messages_about_faulty_requests_name_valid_values() -> None:
 @pytest.mark.slow
 def test_a_stopped_search_returns_the_shortest_so_far() -> None:
     stop = StopToken()
-    horizons: list[str] = []
+    horizons = []
 
     def callback(event: DesignEvent | StudyEvent) -> None:
         if isinstance(event, StudyEvent):
@@ -191,7 +191,6 @@ def test_a_duration_without_a_measurement_does_not_reach() -> None:
     loose = wanting(dict.fromkeys(SIGMA, 10.0), measure_rate=100.0 / 140.0)
     found = mjfim.shortest_experiment(loose, tolerance=0.05)
     assert 1.4 <= found.horizon <= 1.45
-    assert found.missed is not None
     assert "measures nothing" in found.missed.why
 
 
@@ -229,9 +228,10 @@ def test_the_command_line(tmp_path: Path) -> None:
     for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
         shutil.copy(MODELS / name, tmp_path)
     text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
+    text = f"rehearsal.robots = 1\n{text}"
     for old, new in (
         ("horizon = 4.0", "horizon = 1.0"),
-        ("max_iterations = 200", "max_iterations = 10"),
+        ("max_iterations = 200", "max_iterations = 4"),
         ("tolerance = 1e-7", "tolerance = 1e-2"),
         ("[parameters.m] ", "[parameters.m]\nwanted = 0.03\n#"),
     ):

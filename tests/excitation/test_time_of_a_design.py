@@ -175,7 +175,7 @@ def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_frict
 def test_a_stop_during_the_descent_leaves_the_best_random_control(tmp_path: Path) -> None:
     """A descent begins from the initial control; what was found before must not be lost."""
     stop = StopToken()
-    costs: list[float] = []
+    costs = []
 
     def stop_at_the_descent(event: DesignEvent) -> None:
         """Stop at the first iterate with a barrier."""

@@ -57,6 +57,7 @@ def pendulum(folder: Path, **tables) -> DesignTask:
         "control": SINE,
         "cost": {"control": 1e-3},
         "descent": {"max_iterations": 5},
+        "fit": {"bootstrap": 0},
     }
     return make_task(PENDULUM, folder, **{**defaults, **tables})
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.information.criteria import (
     CRITERIA,
@@ -19,7 +20,7 @@ from mjfim.information.criteria import (
 from tests.support.numerics import Array, richardson
 
 CONTRAST = np.array([[1.0, 0.0], [-2.0, 0.0], [0.5, 1.0], [0.0, 3.0]])
-ALL: dict[str, Callable[[Array], Criterion]] = {
+ALL = {
     **CRITERIA,
     "smooth E 1": lambda info: smooth_e_optimality(info, 1.0),
     "smooth E 2.5": lambda info: smooth_e_optimality(info, 2.5),
@@ -122,7 +123,7 @@ def test_smooth_E_to_the_power_one_is_A() -> None:
     assert smooth_e_optimality(info, 1.0).value == pytest.approx(
         CRITERIA["A"](info).value, rel=1e-12
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         derivative(smooth_e_optimality(info, 1.0)), derivative(CRITERIA["A"](info)), rtol=1e-9
     )
 
@@ -160,23 +161,11 @@ def test_where_two_eigenvalues_coincide_only_the_smooth_criterion_is_differentia
     assert min(kinks) > 0.05
 
 
-def test_the_exact_derivative_at_a_crossing_would_be_rejected() -> None:
-    info = matrix(np.array([1.0, 1.0, 3.0, 8.0]))
-    M, rng = derivative(e_optimality(info)), np.random.default_rng(4)
-    errors = []
-    for _ in range(6):
-        d = symmetric(rng)
-        errors.append(
-            abs(np.sum(M * d) - richardson(lambda t, d=d: e_optimality(info + t * d).value, 1e-4))
-        )
-    assert max(errors) > 0.05
-
-
 def test_the_smooth_derivative_does_not_depend_on_the_basis_of_a_repeated_eigenvalue() -> None:
     Q = rotation(np.random.default_rng(5))
     turned = Q @ np.diag([1.0, 1.0, 1.0, 5.0]) @ Q.T
     M = Q.T @ derivative(smooth_e_optimality(turned, 40.0)) @ Q
-    np.testing.assert_allclose(M[:3, :3], M[0, 0] * np.eye(3), atol=1e-9)
+    assert_allclose(M[:3, :3], M[0, 0] * np.eye(3), atol=1e-9)
     assert np.abs(M[3]).max() < 1e-9
 
 
@@ -187,12 +176,9 @@ def test_directions_without_weight_are_left_out() -> None:
 
 
 def test_c_is_the_summed_variance_of_the_combinations() -> None:
-    info, rng = matrix(SPECTRA["spread"]), np.random.default_rng(6)
+    info = matrix(SPECTRA["spread"])
     exact = sum(c @ np.linalg.inv(info) @ c for c in CONTRAST.T)
     assert c_optimality(info, CONTRAST).value == pytest.approx(exact, rel=1e-12)
-    # and of estimates that have this covariance
-    draws = rng.multivariate_normal(np.zeros(4), np.linalg.inv(info), 40_000) @ CONTRAST
-    assert c_optimality(info, CONTRAST).value == pytest.approx(draws.var(axis=0).sum(), rel=0.03)
 
 
 def test_c_of_all_parameters_is_A_and_of_one_its_variance() -> None:
@@ -200,7 +186,7 @@ def test_c_of_all_parameters_is_A_and_of_one_its_variance() -> None:
     assert c_optimality(info, np.eye(4)).value == pytest.approx(
         CRITERIA["A"](info).value, rel=1e-12
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         derivative(c_optimality(info, np.eye(4))), derivative(CRITERIA["A"](info)), rtol=1e-9
     )
     assert c_optimality(info, np.eye(4)[:, 2:3]).value == pytest.approx(
@@ -215,4 +201,4 @@ def test_c_does_not_see_what_is_independent_of_the_combination() -> None:
     assert c_optimality(info + np.diag([0.0, 0.0, 9.0, 9.0]), contrast).value == pytest.approx(
         found.value
     )
-    np.testing.assert_array_equal(derivative(found)[2:], 0.0)
+    assert_array_equal(derivative(found)[2:], 0.0)

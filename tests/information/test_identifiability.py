@@ -26,7 +26,6 @@ PRODUCT = {
     "gain": {"target": "actuator/force:gainprm[0]"},
     "mass": {"target": "body/bob:mass"},
 }
-REST = {"qpos": (0.0, np.pi), "control": {"kind": "constant", "amplitude": 0.0}}
 
 TWO = """
 <mujoco model="two">
@@ -110,10 +109,19 @@ def test_a_small_effect_that_adds_up_over_the_motion_counts(tmp_path) -> None:
     assert look(task).along_trajectory.count == 0
 
 
-def test_at_rest_nothing_is_identifiable_and_along_random_controls_everything(tmp_path) -> None:
-    seen = look(cart_task(tmp_path, initial=REST))
-    assert seen.along_trajectory.basis.shape == (3, 0)
+@pytest.mark.parametrize("angle", [0.0, np.pi], ids=["upright", "hanging, rounded"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_at_rest_nothing_is_identifiable_and_along_random_controls_everything(
+    count: int, angle: float, tmp_path
+) -> None:
+    rest = {"qpos": (0.0, angle), "control": {"kind": "constant", "amplitude": 0.0}}
+    parameters = dict(list(CART_PARAMETERS.items())[-count:])
+    task = cart_task(tmp_path, initial=rest, parameters=parameters)
+    seen = look(task)
+    assert seen.along_trajectory.basis.shape == (count, 0)
     assert seen.along_all.count == 0
+    with pytest.raises(UnidentifiableError, match="the initial control does not excite"):
+        require_designable(task, seen)
 
 
 def test_the_null_space_of_all_controls_is_that_of_the_initial_one(tmp_path) -> None:
@@ -298,7 +306,7 @@ def test_data_must_show_every_parameter_even_nuisances_and_those_with_a_prior(tm
 
 def test_a_design_is_refused_before_any_optimisation(tmp_path) -> None:
     task = two_task(tmp_path)
-    told: list[object] = []
+    told = []
     with pytest.raises(UnidentifiableError, match="initial control does not excite"):
         design_task(task, callback=told.append)
     assert told == []

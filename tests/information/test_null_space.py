@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
@@ -58,17 +59,15 @@ def test_a_known_null_space_is_found_for_parameters_of_any_size(case: str, noise
     assert found.count == null.shape[1]
     assert same_span(found.directions / SIZES[:, None], null)
     assert found.basis.shape == (5, 5 - found.count)
-    np.testing.assert_allclose(found.basis.T @ found.basis, np.eye(5 - found.count), atol=1e-12)
-    np.testing.assert_allclose(
-        found.basis.T @ null, 0.0, atol=1e-8
-    )  # the scales here are the sizes
+    assert_allclose(found.basis.T @ found.basis, np.eye(5 - found.count), atol=1e-12)
+    assert_allclose(found.basis.T @ null, 0.0, atol=1e-8)  # the scales here are the sizes
     assert np.linalg.matrix_rank(J * SIZES @ found.basis, tol=1e-6) == 5 - found.count
 
 
 def test_the_basis_is_in_scaled_units() -> None:
     null, scale = NULLS["one of all"], np.array([2.0, 1e-5, 3.0, 7.0, 1e3])
     found = look(rows(null) / SIZES, scale=scale)
-    np.testing.assert_allclose(
+    assert_allclose(
         found.basis.T @ (null[:, 0] * SIZES / scale / np.abs(SIZES / scale).max()), 0.0, atol=1e-9
     )
 
@@ -91,7 +90,7 @@ def test_nearly_alike_columns_are_visible_down_to_the_error_of_the_differences()
     exact, vague = (look(J, e * rng.normal(size=J.shape), np.ones(2)) for e in (1e-12, 1e-6))
     assert (exact.count, vague.count) == (0, 1)
     assert exact.smallest < 1e-5
-    np.testing.assert_allclose(vague.directions[0], -vague.directions[1], rtol=1e-4)
+    assert_allclose(vague.directions[0], -vague.directions[1], rtol=1e-4)
 
 
 @pytest.mark.parametrize("alive", [0, 1, 4])
@@ -183,7 +182,7 @@ def test_combinations_of_groups_do_not_change_along_the_null_space(case: str) ->
             assert combination.coefficients[0] == 1.0
             at = ["abcde".index(name) for name in combination.members]
             terms = np.array(combination.coefficients)[:, None] * found.directions[at]
-            np.testing.assert_allclose(terms.sum(axis=0), 0.0, atol=1e-7 * np.abs(terms).max())
+            assert_allclose(terms.sum(axis=0), 0.0, atol=1e-7 * np.abs(terms).max())
 
 
 def test_an_empty_null_space_gives_no_groups_and_silent_parameters_make_one() -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm, logm
 from scipy.optimize import minimize
 
 from mjfim.excitation.limits.constraints import constraint_set_of
-from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import smooth_e_optimality
 from mjfim.optimize.cost_models import (
     EigenvalueModel,
@@ -45,8 +45,8 @@ def test_coordinates_keep_scalar_products() -> None:
     rng = np.random.default_rng(0)
     for r in (1, 2, 4):
         d, e = rng.normal(size=(2, r * (r + 1) // 2))
-        np.testing.assert_allclose(symmetric_coordinates(symmetric_matrix(d, r)), d)
-        np.testing.assert_array_equal(symmetric_matrix(d, r), symmetric_matrix(d, r).T)
+        assert_allclose(symmetric_coordinates(symmetric_matrix(d, r)), d)
+        assert_array_equal(symmetric_matrix(d, r), symmetric_matrix(d, r).T)
         assert np.sum(symmetric_matrix(d, r) * symmetric_matrix(e, r)) == pytest.approx(d @ e)
 
 
@@ -87,8 +87,8 @@ def test_the_hessian_agrees_with_differences_of_the_gradient(values: list[float]
         d = size * rng.normal(size=m)
         rows = [model.gradient(d + h * e) - model.gradient(d - h * e) for e in np.eye(m)]
         H = model._changed(d).hessian
-        np.testing.assert_allclose(H, np.array(rows) / (2 * h), rtol=0, atol=1e-6)
-        np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-12)
+        assert_allclose(H, np.array(rows) / (2 * h), rtol=0, atol=1e-6)
+        assert_allclose(H, H.T, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("values", VALUES)
@@ -104,7 +104,7 @@ def test_the_minimising_gradient_solves_the_proximal_problem(values: str) -> Non
 
         w = model.minimising_gradient(d0, spread)
         best = minimize(cost, np.zeros(rank), method="BFGS", options={"gtol": 1e-10})
-        np.testing.assert_allclose(d0 - spread @ w, d0 + root @ best.x, rtol=0, atol=1e-5)
+        assert_allclose(d0 - spread @ w, d0 + root @ best.x, rtol=0, atol=1e-5)
 
 
 def test_divided_differences_give_the_derivative_of_the_matrix_logarithm() -> None:
@@ -112,9 +112,7 @@ def test_divided_differences_give_the_derivative_of_the_matrix_logarithm() -> No
     change = rng.normal(size=(3, 3))
     change = 1e-6 * (change + change.T)
     slope = (logm(np.diag(values) + change) - logm(np.diag(values) - change)) / 2.0
-    np.testing.assert_allclose(
-        divided_log_differences(values) * change, slope, rtol=1e-5, atol=1e-12
-    )
+    assert_allclose(divided_log_differences(values) * change, slope, rtol=1e-5, atol=1e-12)
 
 
 @pytest.mark.parametrize("information", ["plain", "nuisance", "delay and sensors"])
@@ -132,7 +130,7 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
         },
     }[information]
     limits = {"control": {"force": (-9.0, 9.0)}}
-    task: DesignTask = cart_task(tmp_path, limits=limits, **tables).relaxed()
+    task = cart_task(tmp_path, limits=limits, **tables).relaxed()
     problem = task.problem
     problem = replace(
         problem, information=replace(problem.information, power=3.0, negligible_weight=0.0)

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
 from mjfim.optimize.condensed_least_squares import Condensed, RobustLoss, Step
@@ -171,21 +171,41 @@ def peak(theta: Array, private: Array) -> Array:
     return (theta[0] * np.exp(-((x - theta[1]) ** 2) / (2 * theta[2] ** 2)) - y) / 0.05
 
 
-def alone(*theta: float) -> UnknownValues:
+def alone(*theta: float, segments: int = 1) -> UnknownValues:
     """A start without private unknowns."""
-    return UnknownValues(theta=np.array(theta), private=np.zeros((1, 0)))
+    return UnknownValues(theta=np.array(theta), private=np.zeros((segments, 0)))
+
+
+def together(*theta: float) -> UnknownValues:
+    """A start of the decays, whose amplitudes are one."""
+    return UnknownValues(theta=np.array(theta), private=np.ones((3, 1)))
+
+
+def free_decays() -> Analytic:
+    """The decays within bounds that are far away."""
+    return problem(*decays(), lower=[0.0, -5.0])
+
+
+def valley(**more: object) -> Analytic:
+    """The valley of Rosenbrock within wide bounds."""
+    return problem(rosenbrock, lower=[-5.0, -5.0], upper=[5.0, 5.0], **more)
+
+
+def peaked(**more: object) -> Analytic:
+    """The peak within wide bounds."""
+    return problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0], **more)
 
 
 CASES = {
     "decays": (
-        lambda: problem(*decays(), lower=[0.0, -5.0]),
-        UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1))),
+        lambda: free_decays(),
+        together(0.3, 0.0),
     ),
     "bounded decays": (
         lambda: problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0]),
-        UnknownValues(theta=np.array([0.3, 1.0]), private=np.ones((3, 1))),
+        together(0.3, 1.0),
     ),
-    "valley": (lambda: problem(rosenbrock, lower=[-5.0, -5.0], upper=[5.0, 5.0]), alone(-1.2, 1.0)),
+    "valley": (valley, alone(-1.2, 1.0)),
     "walled valley": (
         lambda: problem(rosenbrock, lower=[-2.0, -2.0], upper=[0.6, 5.0]),
         alone(-1.2, 1.0),
@@ -196,7 +216,7 @@ CASES = {
     ),
     "badly scaled": (lambda: problem(powell, lower=[0.0, 0.0], upper=[1.0, 20.0]), alone(0.0, 1.0)),
     "peak": (
-        lambda: problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0]),
+        lambda: peaked(),
         alone(1.0, -0.5, 1.5),
     ),
     "held at a wall": (
@@ -211,14 +231,13 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
     """No evaluated point leaves the bounds, and the cost falls from iterate to iterate."""
     build, start = CASES[name]
     p = build()
-    reports: list[tuple[int, float, float]] = []
+    reports = []
     found = minimise(p, start, SHARP, callback=lambda *report: reports.append(report))
-    assert found is not None
     theta, starts, cost = reference(build(), start)
     assert found.success, found.status
     assert found.cost <= cost * (1 + 1e-9) + 1e-12
-    np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(found.unknowns.private, starts, rtol=1e-6, atol=1e-8)
+    assert_allclose(found.unknowns.theta, theta, rtol=1e-6, atol=1e-8)
+    assert_allclose(found.unknowns.private, starts, rtol=1e-6, atol=1e-8)
     assert len(p.seen) > 3
     for at in p.seen:
         assert (at.theta >= p.lower).all()
@@ -233,7 +252,7 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
 def test_the_residuals_of_the_linearisation_are_those_of_the_estimate() -> None:
     """Also where the last step was taken without a linearisation at its end."""
     p = problem(*decays(), lower=[0.0, -2.0])
-    start = UnknownValues(theta=np.array([1.0, 0.4]), private=np.ones((3, 1)))
+    start = together(1.0, 0.4)
     found = solved(p, start, SearchSettings(tolerance=1e-2, relinearise_at_end=False))
     assert found.success
     free = np.full(2, FREE)
@@ -246,21 +265,21 @@ def test_the_residuals_of_the_linearisation_are_those_of_the_estimate() -> None:
 def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
     """Steps that would raise the cost are halved."""
     p = problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0])
-    start = UnknownValues(theta=np.array([1.0, 0.4]), private=np.ones((3, 1)))
+    start = together(1.0, 0.4)
     p.lower, p.upper = np.full(2, -FREE), np.full(2, FREE)
     found = solved(p, start, SearchSettings(max_iterations=50, tolerance=1e-9, damped=False))
     theta, starts, _ = reference(p, start)
     assert found.success
-    np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6)
-    np.testing.assert_allclose(found.unknowns.private, starts, rtol=1e-6)
+    assert_allclose(found.unknowns.theta, theta, rtol=1e-6)
+    assert_allclose(found.unknowns.private, starts, rtol=1e-6)
     assert found.unknowns.theta[0] > 1.2
-    valley = problem(rosenbrock, lower=[-FREE, -FREE])
+    curved = problem(rosenbrock, lower=[-FREE, -FREE])
     through = solved(
-        valley, alone(-1.2, 1.0), SearchSettings(max_iterations=100, tolerance=1e-9, damped=False)
+        curved, alone(-1.2, 1.0), SearchSettings(max_iterations=100, tolerance=1e-9, damped=False)
     )
-    np.testing.assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
+    assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
     lengths = {
-        np.abs(a.theta - b.theta).max() for a, b in zip(valley.seen[1:], valley.seen, strict=False)
+        np.abs(a.theta - b.theta).max() for a, b in zip(curved.seen[1:], curved.seen, strict=False)
     }
     assert len(lengths) > 3
 
@@ -336,7 +355,7 @@ def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
         "swapped": lambda J: J[:, ::-1],
         "noise": lambda J: rng.standard_normal(J.shape) * np.linalg.norm(J, axis=0),
     }
-    p = problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0], spoil=spoils[fault])
+    p = peaked(spoil=spoils[fault])
     found = solved(p, alone(1.0, -0.5, 1.5), SearchSettings(damped=damped))
     assert found.cost > 1.05 * reference(p, alone(1.0, -0.5, 1.5))[2], (
         "it is at the minimum in spite of all"
@@ -358,22 +377,22 @@ def test_numerical_noise_does_not_prevent_convergence() -> None:
             alone(1.0, -0.5, 1.5),
             SearchSettings(tolerance=1e-6),
         )
-        theta, _, cost = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(2.0, 0.4, 0.7))
+        theta, _, cost = reference(peaked(), alone(2.0, 0.4, 0.7))
         assert found.success, found.status
         assert found.cost < cost + 1e-3
-        np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
+        assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
 
 
 def test_a_search_from_the_minimum_ends_at_once() -> None:
     """Residuals vanish at the minimum, or they do not."""
-    exact = solved(problem(rosenbrock, lower=[-5.0, -5.0]), alone(1.0, 1.0))
+    exact = solved(valley(), alone(1.0, 1.0))
     assert exact.success
     assert exact.iterations == 1
-    theta, _, _ = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5))
-    again = solved(problem(peak, lower=[0.0, -3.0, 0.1]), alone(*theta), SearchSettings())
+    theta, _, _ = reference(peaked(), alone(1.0, -0.5, 1.5))
+    again = solved(peaked(), alone(*theta), SearchSettings())
     assert again.success
     assert again.iterations <= 2
-    np.testing.assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
+    assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
 
 
 def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
@@ -389,15 +408,13 @@ def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
 
         found = solved(problem(rows, lower=[-FREE, -FREE]), alone(1.0, 1.0), SearchSettings())
         assert found.success, found.status
-        np.testing.assert_allclose(
-            thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02
-        )
+        assert_allclose(thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("stop", [1, 2, 3, 7])
 def test_a_requested_stop_returns_the_best_so_far(stop: int) -> None:
     """The token is set during the evaluation with this number; no further point is evaluated."""
-    p = problem(rosenbrock, lower=[-5.0, -5.0], stop=stop)
+    p = valley(stop=stop)
     found = solved(p, alone(-1.2, 1.0))
     assert found.interrupted
     assert not found.success
@@ -410,10 +427,7 @@ def test_a_requested_stop_returns_the_best_so_far(stop: int) -> None:
 
 def test_an_exhausted_time_is_not_an_interruption() -> None:
     """The first point is returned with the reason, and nothing is raised."""
-    found = minimise(
-        problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0), SHARP, Budget(seconds=0.0)
-    )
-    assert found is not None
+    found = minimise(valley(), alone(-1.2, 1.0), SHARP, Budget(seconds=0.0))
     assert not found.interrupted
     assert not found.success
     assert found.iterations == 0
@@ -422,7 +436,7 @@ def test_an_exhausted_time_is_not_an_interruption() -> None:
 
 def test_the_limit_of_iterations_is_kept_and_reported() -> None:
     """The returned cost belongs to the returned unknowns."""
-    p = problem(rosenbrock, lower=[-5.0, -5.0])
+    p = valley()
     found = solved(p, alone(-1.2, 1.0), SearchSettings(max_iterations=3))
     assert found.iterations == 3
     assert not found.success
@@ -432,17 +446,16 @@ def test_the_limit_of_iterations_is_kept_and_reported() -> None:
 
 def test_the_last_linearisation_is_at_the_solution() -> None:
     """Without `relinearise_at_end`, it is the previous one."""
-    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
-    p = problem(*decays(), lower=[0.0, -5.0])
+    start = together(0.3, 0.0)
+    p = free_decays()
     found = solved(p, start, SearchSettings())
     fresh = p.condense(found.unknowns)
-    assert fresh is not None
-    np.testing.assert_array_equal(found.condensed.blocks, fresh.blocks)
+    assert_array_equal(found.condensed.blocks, fresh.blocks)
     saved = solved(p, start, SearchSettings(relinearise_at_end=False))
-    np.testing.assert_allclose(saved.unknowns.theta, found.unknowns.theta, rtol=1e-5)
+    assert_allclose(saved.unknowns.theta, found.unknowns.theta, rtol=1e-5)
     assert saved.cost == p.cost(saved.unknowns)
     assert not np.array_equal(saved.condensed.blocks, fresh.blocks)
-    np.testing.assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)
+    assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)
 
 
 def halving(theta: Array, private: Array) -> Array:
@@ -455,7 +468,6 @@ def test_a_first_step_is_the_last_one_only_where_it_is_short() -> None:
     start = alone(0.5)
     p = problem(halving, lower=[-5.0])
     condensed = p.condense(start)
-    assert condensed is not None
     settings = SearchSettings(tolerance=1e-2, relinearise_at_end=False, damped=True)
     free = np.array([FREE])
     first = condensed.step(0.0, condensed.column_norms, -free, free)
@@ -467,8 +479,8 @@ def test_a_first_step_is_the_last_one_only_where_it_is_short() -> None:
 
 
 def test_a_rough_search_ends_where_a_step_hardly_lowers_the_cost() -> None:
-    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
-    p = problem(*decays(), lower=[0.0, -5.0])
+    start = together(0.3, 0.0)
+    p = free_decays()
     exact = solved(p, start, SearchSettings())
     rough = solved(p, start, SearchSettings(relinearise_at_end=False, rough_share=0.1))
     assert rough.success
@@ -503,7 +515,7 @@ def drifting(seed: int) -> Analytic:
 
 
 def test_lengths_in_true_deviations_end_a_search_earlier_where_residuals_drift() -> None:
-    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    start = alone(60.0, 0.3, segments=40)
     formal = drifting(0)
     true = drifting(0)
     exact = minimise(formal, start, SearchSettings(tolerance=1e-3))
@@ -519,10 +531,9 @@ def test_lengths_in_true_deviations_end_a_search_earlier_where_residuals_drift()
 
 
 def test_a_search_ends_where_it_cannot_beat_a_cost() -> None:
-    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    start = alone(60.0, 0.3, segments=40)
     whole = drifting(0)
     exact = minimise(whole, start, SHARP)
-    assert exact is not None
 
     # A cost that lies below the minimum cannot be beaten; one that lies above it is.
     ended = drifting(0)
@@ -592,18 +603,17 @@ def test_longer_steps_reach_the_minimum_of_a_robust_loss_sooner() -> None:
         ftol=1e-14,
         gtol=1e-14,
     ).x
-    np.testing.assert_allclose(sooner.unknowns.theta, expected, rtol=0.0, atol=1e-4)
+    assert_allclose(sooner.unknowns.theta, expected, rtol=0.0, atol=1e-4)
     assert sooner.cost == longer.cost(sooner.unknowns)
 
     # Reported costs are those of the iterates at which the search went on.
-    costs: list[float] = []
+    costs = []
     again = minimise(
         outliers(),
         start,
         SearchSettings(tolerance=1e-6, lengthens=True),
         callback=lambda iteration, cost, length: costs.append(cost),
     )
-    assert again is not None
     assert costs == [longer.cost(at) for at in again.iterates[1:]]
     assert (np.diff(costs) < 0.0).all()
 
@@ -620,7 +630,6 @@ def test_a_step_that_is_shorter_along_a_weak_direction_is_tried() -> None:
     p = problem(beside_a_cliff, lower=[-FREE, -FREE])
     settings = SearchSettings(tolerance=1e-9, begins_near=True, max_iterations=1)
     found = minimise(p, alone(0.0, 0.0), settings)
-    assert found is not None
     sum_of_both, difference = found.unknowns.theta @ [[1.0, 1.0], [1.0, -1.0]]
     assert sum_of_both == pytest.approx(4.0, rel=1e-3)
 
@@ -628,13 +637,8 @@ def test_a_step_that_is_shorter_along_a_weak_direction_is_tried() -> None:
     assert 0.1 < difference <= 3.0
 
 
-def _with_all_segments(iterates: tuple[UnknownValues, ...], count: int) -> list[UnknownValues]:
-    """Iterates of a search without private unknowns, with entries for all segments again."""
-    return [UnknownValues(theta=at.theta, private=np.zeros((count, 0))) for at in iterates]
-
-
 def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
-    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    start = alone(60.0, 0.3, segments=40)
     settings = SearchSettings(
         tolerance=1e-9, in_true_deviations=True, relinearise_at_end=False, begins_near=True
     )
@@ -646,7 +650,7 @@ def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
 
     # Only the last decrease is below a hundredth of the square of a true standard deviation.
     negligible = ABSOLUTE_STAGNATION * 2.0 * found.condensed.true_deviation**2
-    costs = [p.cost(at) for at in _with_all_segments(found.iterates, 40)] + [found.cost]
+    costs = [p.cost(alone(*at.theta, segments=40)) for at in found.iterates] + [found.cost]
     is_negligible = -np.diff(costs) <= negligible
     assert is_negligible[-1]
     assert not is_negligible[:-1].any()
@@ -667,17 +671,17 @@ def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
 )
 def test_one_stagnant_iteration_may_be_chance(unit: float, promised: float, ends: bool) -> None:
     settings = SearchSettings(relinearise_at_end=False)
-    p, start = problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0)
+    p, start = valley(), alone(-1.2, 1.0)
     search = _Search(p, settings, Budget(), None, start, 100.0, p.condense(start), unit=unit)
-    trial: Any = SimpleNamespace(cost=100.0 - 0.005 * unit)
-    predicted: Any = SimpleNamespace(predicted_decrease=promised)
+    trial = SimpleNamespace(cost=100.0 - 0.005 * unit)
+    predicted = SimpleNamespace(predicted_decrease=promised)
     assert search._stagnates(trial, predicted) == ends
     assert search._stagnates(trial, predicted)
 
 
 def test_a_search_that_leads_to_a_start_ends_where_its_cost_hardly_falls() -> None:
-    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
-    whole, ended = (problem(*decays(), lower=[0.0, -5.0]) for _ in range(2))
+    start = together(0.3, 0.0)
+    whole, ended = (free_decays() for _ in range(2))
     exact = solved(whole, start, SearchSettings())
     found = solved(ended, start, SearchSettings(stagnant_share=0.9))
     assert found.iterations < exact.iterations

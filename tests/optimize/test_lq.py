@@ -1,7 +1,4 @@
-"""Linear recursions, regulator and descent against independent solutions.
-
-These are plain loops, the Riccati solver of SciPy and a dense KKT system.
-"""
+"""Linear recursions, regulator and descent against plain loops and dense normal equations."""
 
 from __future__ import annotations
 
@@ -9,7 +6,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, solve_discrete_are
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import expm
 
 from mjfim.optimize.lq import (
     CurveCoordinates,
@@ -22,30 +20,6 @@ from mjfim.optimize.lq import (
     regulator,
 )
 from tests.support.lq import positive, random_system, random_weights
-
-
-def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
-    """Solution (z, v) of the LQ problem by one dense KKT system.
-
-    Its unknowns are z_1 ... z_N, v_0 ... v_{N-1} and the multipliers.
-    """
-    N, nx, nu = B.shape
-    nz, nv = N * nx, N * nu
-    H, g, J = np.zeros((nz + nv, nz + nv)), np.zeros(nz + nv), np.zeros((nz, nz + nv))
-    for k in range(1, N + 1):
-        rows = slice((k - 1) * nx, k * nx)
-        H[rows, rows], g[rows] = terminal if k == N else Q, a[k]
-        J[rows, rows] = np.eye(nx)
-        if k > 1:
-            J[rows, (k - 2) * nx : (k - 1) * nx] = -A[k - 1]
-        J[rows, nz + (k - 1) * nu : nz + k * nu] = -B[k - 1]
-    for k in range(N):
-        cols = slice(nz + k * nu, nz + (k + 1) * nu)
-        H[cols, cols], g[cols] = R, b[k]
-    KKT = np.block([[H, J.T], [J, np.zeros((nz, nz))]])
-    solution = np.linalg.solve(KKT, np.concatenate([-g, np.zeros(nz)]))
-    z = np.concatenate([np.zeros((1, nx)), solution[:nz].reshape(N, nx)])
-    return z, solution[nz : nz + nv].reshape(N, nu)
 
 
 def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
@@ -61,40 +35,25 @@ def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("sizes", [(1, 1), (7, 1), (1, 3), (30, 4)])
-def test_forward_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
+def test_recursions_are_plain_loops(sizes: tuple[int, int]) -> None:
+    """They leave their inputs alone and can be used again."""
     N, n = sizes
     rng = np.random.default_rng(N)
     A, c, z0 = rng.normal(size=(N, n, n)), rng.normal(size=(N, n)), rng.normal(size=n)
-    z = [z0]
+    a = rng.normal(size=(N + 1, n))
+    z, costate = [z0], [a[N]]
     for k in range(N):
         z.append(A[k] @ z[-1] + c[k])
-    np.testing.assert_allclose(
-        LinearRecursion(A).forward(z0, c), z, rtol=1e-12, atol=1e-12 * np.abs(z).max()
-    )
-
-
-@pytest.mark.parametrize("sizes", [(1, 1), (7, 1), (1, 3), (30, 4)])
-def test_adjoint_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
-    N, n = sizes
-    rng = np.random.default_rng(N)
-    A, a = rng.normal(size=(N, n, n)), rng.normal(size=(N + 1, n))
-    costate = [a[N]]
     for k in range(N - 1, -1, -1):
         costate.insert(0, A[k].T @ costate[0] + a[k])
-    np.testing.assert_allclose(
-        LinearRecursion(A).adjoint(a), costate, rtol=1e-12, atol=1e-12 * np.abs(costate).max()
-    )
 
-
-def test_recursions_leave_their_inputs_alone_and_can_be_reused() -> None:
-    rng = np.random.default_rng(4)
-    A, c, a = rng.normal(size=(5, 2, 2)), rng.normal(size=(5, 2)), rng.normal(size=(6, 2))
-    kept, recursion = [v.copy() for v in (A, c, a)], LinearRecursion(A)
-    first = recursion.forward(np.ones(2), c)
-    recursion.adjoint(a)
-    np.testing.assert_array_equal(recursion.forward(np.ones(2), c), first)
+    recursion, kept = LinearRecursion(A), [v.copy() for v in (A, c, a)]
+    for _ in range(2):
+        for found, wanted in ((recursion.forward(z0, c), z), (recursion.adjoint(a), costate)):
+            atol = 1e-12 * np.abs(wanted).max()
+            assert_allclose(found, wanted, rtol=1e-12, atol=atol)
     for now, before in zip((A, c, a), kept, strict=True):
-        np.testing.assert_array_equal(now, before)
+        assert_array_equal(now, before)
 
 
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
@@ -112,9 +71,9 @@ def test_many_tangent_curves_at_once_are_those_one_by_one(steps: bool, feedback:
     curves, minima = coordinates.lift(b), solution.descent(a, b)
     forces = weights.half_gradient(curves)
     gradients, back = coordinates.gradient(a, b), coordinates.coordinate(curves)
-    np.testing.assert_allclose(back, b, rtol=0, atol=1e-9)
+    assert_allclose(back, b, rtol=0, atol=1e-9)
 
-    equal = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
+    equal = partial(assert_allclose, rtol=1e-9, atol=1e-9)
     for i in range(4):
         curve, minimum = coordinates.lift(b[i]), solution.descent(a[i], b[i])
         equal(curves.z[i], curve.z)
@@ -131,24 +90,14 @@ def test_recursion_overflows_to_infinity_without_a_warning() -> None:
     assert np.isinf(z[-1, 0])
 
 
-def test_regulator_over_a_long_horizon_is_the_stationary_riccati_gain() -> None:
-    rng = np.random.default_rng(5)
-    A = np.array([[1.05, 0.1, 0.0], [0.0, 1.1, 0.1], [0.05, 0.0, 0.95]])
-    B, Q, R = rng.normal(size=(3, 2)), positive(rng, 3), positive(rng, 2)
-    assert np.abs(np.linalg.eigvals(A)).max() > 1.05  # unstable: the gain matters
-    X = solve_discrete_are(A, B, Q, R)
-    stationary = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A)
-    K = regulator(np.tile(A, (300, 1, 1)), np.tile(B, (300, 1, 1)), Q, R, np.zeros((3, 3)))
-    np.testing.assert_allclose(K[0], stationary, rtol=1e-10)
-    assert np.abs(np.linalg.eigvals(A - B @ K[0])).max() < 1.0
-    # without a terminal weight the last control is worth nothing
-    np.testing.assert_allclose(K[-1], 0.0, atol=1e-14)
-
-
 def test_regulator_gain_minimises_its_cost_over_a_finite_time_varying_horizon() -> None:
     rng = np.random.default_rng(7)
     A, B = random_system(rng, 9, 3, 2)
     Q, R, terminal = positive(rng, 3), positive(rng, 2), positive(rng, 3)
+    weights = Weights.constant(9, Q, R, terminal)
+    assert_array_equal(weights.Q, [*[Q] * 9, terminal])
+    assert_array_equal(weights.R, [R] * 9)
+    assert not weights.S.any() and not weights.W.any()
     K, z0 = regulator(A, B, Q, R, terminal), rng.normal(size=3)
 
     def cost(v: np.ndarray) -> float:
@@ -182,21 +131,6 @@ def descent(
     return RiccatiSolution.solve(A, B, weights).descent(a, b)
 
 
-@pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
-def test_descent_is_the_dense_kkt_solution(sizes: tuple[int, int, int]) -> None:
-    N, nx, nu = sizes
-    rng = np.random.default_rng(N + nx)
-    A, B = random_system(rng, N, nx, nu)
-    a, b = rng.normal(size=(N + 1, nx)), rng.normal(size=(N, nu))
-    Q, R, terminal = positive(rng, nx), positive(rng, nu), 3.0 * positive(rng, nx)
-    zeta = descent(A, B, a, b, Q=Q, R=R, terminal=terminal)
-    z, v = dense_solution(A, B, a, b, Q, R, terminal)
-    np.testing.assert_allclose(zeta.z, z, rtol=0, atol=1e-9 * np.abs(z).max())
-    np.testing.assert_allclose(zeta.v, v, rtol=0, atol=1e-9 * np.abs(v).max())
-    wrong, _ = dense_solution(A, B, a, b, Q, R, Q)
-    assert np.abs(zeta.z - wrong).max() > 1e-3 * np.abs(z).max()  # the terminal weight is seen
-
-
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
 @pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
 def test_weighted_descent_solves_the_dense_normal_equations(
@@ -224,10 +158,8 @@ def test_weighted_descent_solves_the_dense_normal_equations(
     H = 0.5 * (pairs - diagonal[:, None] - diagonal)  # by polarisation
     best = -np.linalg.solve(H, g).reshape(N, nu)
     zeta = RiccatiSolution.solve(A, B, weights).descent(a, b)
-    np.testing.assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
-    np.testing.assert_allclose(
-        zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0)
-    )
+    assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
+    assert_allclose(zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0))
     # every weight is seen
     for name in ("S", "W") if steps else ("S",):
         other = Weights(**{**weights.__dict__, name: 0.5 * getattr(weights, name)})

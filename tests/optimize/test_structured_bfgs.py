@@ -11,11 +11,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
+from mjfim.experiment.initial import spline_basis
 from mjfim.optimize.cost_models import BarrierExpansion, Bounds
 from mjfim.optimize.lq import CurveCoordinates, LinearRecursion, TangentCurve, Weights
-from mjfim.optimize.projection_operator import Armijo, Expansion, Regulator, optimize
+from mjfim.optimize.projection_operator import (
+    Armijo,
+    Expansion,
+    Iterate,
+    Regulator,
+    optimize,
+)
 from mjfim.optimize.structured_bfgs import (
     BasisMetric,
     CurveMetric,
@@ -24,6 +32,7 @@ from mjfim.optimize.structured_bfgs import (
     basis_response,
 )
 from mjfim.records.design import Status
+from tests.support.limits import barrier_problem
 from tests.support.lq import random_system, random_weights
 from tests.support.numerics import Array, cart_task, relative_error
 
@@ -42,6 +51,14 @@ def basis_metric(expansion: Expansion, weights: Weights, basis: Array) -> BasisM
     return BasisMetric(H=basis_matrix(basis, basis_response(expansion, basis), weights))
 
 
+def curve_metric(expansion: Expansion, weights: Weights, K: Array | float = 0.0) -> CurveMetric:
+    """Metric of a quadratic form on the control, with feedback."""
+    gains = np.zeros((N, NU, NX)) + K
+    return CurveMetric(
+        coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=gains), weights=weights
+    )
+
+
 def dense(metric: CurveMetric) -> Array:
     """(N nu, N nu) matrix of a metric, from its product with every unit step."""
     units = np.eye(N * NU).reshape(-1, N, NU)
@@ -53,19 +70,17 @@ def test_a_metric_is_symmetric_positive_and_its_solve_inverts_it(feedback: bool)
     rng = np.random.default_rng(1)
     expansion, weights = random_expansion(rng)
     K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
-    metric = CurveMetric(
-        coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=K), weights=weights
-    )
+    metric = curve_metric(expansion, weights, K)
     H = dense(metric)
-    np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
+    assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(H)[0] > 0.0
     g = rng.normal(size=(N, NU))
-    np.testing.assert_allclose(
+    assert_allclose(
         metric.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1)), rtol=1e-7, atol=1e-9
     )
     many = rng.normal(size=(3, N, NU))
     solved = [metric.solve(each) for each in many]
-    np.testing.assert_allclose(metric.solve(many), solved, rtol=1e-9, atol=1e-12)
+    assert_allclose(metric.solve(many), solved, rtol=1e-9, atol=1e-12)
 
     # its own form on the curve that a step makes
     s = rng.normal(size=(N, NU))
@@ -79,10 +94,7 @@ def test_a_metric_is_symmetric_positive_and_its_solve_inverts_it(feedback: bool)
 def test_both_metrics_agree_on_an_identity_basis() -> None:
     rng = np.random.default_rng(2)
     expansion, weights = random_expansion(rng)
-    free = CurveMetric(
-        coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))),
-        weights=weights,
-    )
+    free = curve_metric(expansion, weights)
     based = basis_metric(expansion, weights, np.eye(N))
     for _ in range(3):
         s = rng.normal(size=(N, NU))
@@ -98,16 +110,7 @@ def test_the_metric_of_a_basis_is_the_projected_metric() -> None:
     weights.Q[4:9], weights.S[4:9], weights.W[::2] = 0.0, 0.0, 0.0
     basis = rng.normal(size=(N, 5))
     wide = np.einsum("km,uw->kumw", basis, np.eye(NU)).reshape(N * NU, -1)
-    H = (
-        wide.T
-        @ dense(
-            CurveMetric(
-                coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))),
-                weights=weights,
-            )
-        )
-        @ wide
-    )
+    H = wide.T @ dense(curve_metric(expansion, weights)) @ wide
     based = basis_metric(expansion, weights, basis)
     assert relative_error(based.H, H) < 1e-9
     g = rng.normal(size=(5, NU))
@@ -116,7 +119,7 @@ def test_the_metric_of_a_basis_is_the_projected_metric() -> None:
 
     many = rng.normal(size=(3, 5, NU))
     for of_many, of_one in ((based.apply(many), based.apply), (based.solve(many), based.solve)):
-        np.testing.assert_allclose(of_many, [of_one(each) for each in many], rtol=1e-9)
+        assert_allclose(of_many, [of_one(each) for each in many], rtol=1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +238,20 @@ class Toy:
         return None
 
 
+OPEN_LOOP = np.zeros((N, NU, NX))
 CALM = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX), feedback_threshold=np.inf)
 WITH_FEEDBACK = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX))
+
+
+def optimised(
+    toy: Toy, direction: StructuredBFGS, regulate: Regulator = CALM, tolerance: float = 1e-9
+) -> list[Iterate[ToyPoint]]:
+    """All iterates from a control of zeros."""
+    begin = toy.point(np.zeros((N, NU)))
+    steps = optimize(
+        toy, begin, direction, regulate, Armijo(), tolerance=tolerance, max_iterations=150
+    )
+    return list(steps)
 
 
 @pytest.mark.parametrize("mu", [1e-1, 1e-3])
@@ -252,7 +267,7 @@ def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) 
         return toy.value(toy.point(curves @ c.reshape(-1, NU)))
 
     def slope(c: Array) -> Array:
-        gradient = toy.expand(toy.point(curves @ c.reshape(-1, NU))).gradient(np.zeros((N, NU, NX)))
+        gradient = toy.expand(toy.point(curves @ c.reshape(-1, NU))).gradient(OPEN_LOOP)
         return (curves.T @ gradient).reshape(-1)
 
     best = minimize(
@@ -264,24 +279,12 @@ def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) 
     )
     direction = StructuredBFGS(np.full(NU, 1e-3), basis)
     regulate = WITH_FEEDBACK if kind == "with feedback" else CALM
-    iterates = list(
-        optimize(
-            toy,
-            toy.point(np.zeros((N, NU))),
-            direction,
-            regulate,
-            Armijo(),
-            tolerance=1e-9,
-            max_iterations=150,
-        )
-    )
+    iterates = optimised(toy, direction, regulate)
     values = [iterate.value for iterate in iterates]
     assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
     assert (np.diff(values) <= 0.0).all()
     assert values[-1] == pytest.approx(best.fun, abs=1e-6 * abs(best.fun))
-    np.testing.assert_allclose(
-        iterates[-1].point.u, curves @ best.x.reshape(-1, NU), rtol=0, atol=2e-3
-    )
+    assert_allclose(iterates[-1].point.u, curves @ best.x.reshape(-1, NU), rtol=0, atol=2e-3)
     assert len(iterates) < 60
     if mu < 1e-2:  # the bound is reached, and kept
         assert 0.0 < toy.shown.margin(iterates[-1].point.x[:, :1]).min() < 0.05
@@ -293,25 +296,16 @@ def test_stored_pairs_do_not_contain_the_barrier() -> None:
     So they stay valid for a sharper barrier.
     """
     direction, blunt = StructuredBFGS(np.full(NU, 1e-3)), Toy(1e-1)
-    for iterate in optimize(
-        blunt,
-        blunt.point(np.zeros((N, NU))),
-        direction,
-        CALM,
-        Armijo(),
-        tolerance=1e-6,
-        max_iterations=40,
-    ):
-        point = iterate.point
+    point = optimised(blunt, direction, tolerance=1e-6)[-1].point
     pairs = direction._pairs
     assert len(pairs) > 2
 
     def gradient(u: Array) -> Array:
-        return Toy(0.0).expand(Toy(0.0).point(u)).gradient(np.zeros((N, NU, NX)))
+        return Toy(0.0).expand(Toy(0.0).point(u)).gradient(OPEN_LOOP)
 
     step, change = pairs[-1]
     wanted = gradient(point.u) - gradient(point.u - step)
-    np.testing.assert_allclose(change, wanted, rtol=0, atol=1e-9 * max(np.abs(wanted).max(), 1.0))
+    assert_allclose(change, wanted, rtol=0, atol=1e-9 * max(np.abs(wanted).max(), 1.0))
     assert direction.reset() is True
     assert direction.reset() is False
 
@@ -319,14 +313,13 @@ def test_stored_pairs_do_not_contain_the_barrier() -> None:
 def test_no_step_changes_a_limited_quantity_by_more_than_the_reach() -> None:
     toy = Toy(1e-4)
     e = toy.expand(toy.point(np.zeros((N, NU))))
-    assert e.barrier is not None
-    K = np.zeros((N, NU, NX))
+    K = OPEN_LOOP
     long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(e, K)
     short = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)(e, K)
     assert e.barrier.largest_relative_move(long) > 1.0
     assert 0.05 < e.barrier.largest_relative_move(short) <= 0.25 * (1.0 + 1e-12)
     assert e.slope(short) < 0.0
-    tiny = Expansion(A=e.A, B=e.B, a=1e-9 * e.a, b=1e-9 * e.b, extended=None, barrier=e.barrier)
+    tiny = replace(e, a=1e-9 * e.a, b=1e-9 * e.b)
     assert (
         e.barrier.largest_relative_move(StructuredBFGS(np.full(NU, 1.0))(tiny, K)) < 1e-6
     )  # a short step stays as it is
@@ -340,9 +333,8 @@ def test_damping_keeps_the_step_back_inside_the_limits() -> None:
     toy, outside = Toy(1e-4), np.zeros((N, NU))
     outside[3, 0] = toy.control.upper[0] + 0.2 * toy.control.scale[0]
     e = toy.expand(toy.point(outside))
-    assert e.barrier is not None
     a = e.a + 50.0 * np.random.default_rng(2).normal(size=e.a.shape) * np.array([0.0, 1.0, 1.0])
-    pulled, K = replace(e, a=a), np.zeros((N, NU, NX))
+    pulled, K = replace(e, a=a), OPEN_LOOP
     long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(pulled, K)
     far = e.barrier.largest_relative_move(long) / 0.25
     assert far > 10.0
@@ -357,17 +349,7 @@ def test_damping_keeps_the_step_back_inside_the_limits() -> None:
 def test_damping_falls_where_steps_are_short() -> None:
     toy = Toy(1e-2)
     direction = StructuredBFGS(np.full(NU, 1e-3), damping=10.0)
-    iterates = list(
-        optimize(
-            toy,
-            toy.point(np.zeros((N, NU))),
-            direction,
-            CALM,
-            Armijo(),
-            tolerance=1e-9,
-            max_iterations=150,
-        )
-    )
+    iterates = optimised(toy, direction)
     assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
     assert direction.damping < 1e-3
 
@@ -376,22 +358,16 @@ def test_an_expansion_without_limits_is_refused() -> None:
     rng = np.random.default_rng(5)
     expansion, _ = random_expansion(rng)
     with pytest.raises(ValueError, match="needs their expansion"):
-        StructuredBFGS(np.ones(NU))(expansion, np.zeros((N, NU, NX)))
+        StructuredBFGS(np.ones(NU))(expansion, OPEN_LOOP)
 
 
 @pytest.mark.parametrize("based", [False, True])
 def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Path) -> None:
     """Its slope agrees with differences of simulated trials."""
-    from mjfim.excitation.limits.constraints import constraint_set_of
-    from mjfim.excitation.search.interior_problem import InteriorProblem
-    from mjfim.experiment.initial import spline_basis
-
     task = cart_task(
         tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}
     ).relaxed()
-    problem = InteriorProblem(
-        base=task.problem, constraints=constraint_set_of(task), mu=0.1, delta=0.03
-    )
+    problem = barrier_problem(task, 0.03, mu=0.1, with_cost=True)
     point = problem.point(task.control)
     expansion = problem.expand(point)
     basis = spline_basis(task.t, 0.5, 8.0, False, False, False) if based else None

@@ -39,10 +39,12 @@ class FakeExecutor(Executor):
     """
 
     def __init__(
-        self, lose: Callable[[int, int], BaseException | None], count: int | None = 2
+        self,
+        lose: Callable[[int, int], BaseException | None] = lambda order, times: None,
+        count: int | None = 2,
     ) -> None:
         self.lose = lose
-        self.submitted: list[int] = []
+        self.submitted = []
         if count is not None:
             self._max_workers = count
 
@@ -50,7 +52,7 @@ class FakeExecutor(Executor):
         order = args[0]
         self.submitted.append(order)
         error = self.lose(order, self.submitted.count(order))
-        future: Future[Any] = Future()
+        future = Future()
         if error is not None:
             future.set_exception(error)
         else:
@@ -101,7 +103,7 @@ def test_a_program_whose_processes_cannot_begin_reads_how_to_call_them() -> None
         (outcome,) = carry_out(workers, square, [3], Budget())
         assert outcome.found == (9,)
         assert "the memory was full" in workers.probable_fault
-    other = Workers(FakeExecutor(lambda order, times: None))
+    other = Workers(FakeExecutor())
     assert "the memory was full" in other.probable_fault
 
 
@@ -121,7 +123,7 @@ def test_results_come_in_the_order_of_the_orders() -> None:
 
 
 def test_without_workers_each_order_is_asked_for_after_the_one_before_is_done() -> None:
-    done: list[int] = []
+    done = []
     orders = (len(done) for _ in range(3))
     assert list(results(lambda order: done.append(order), orders, None, Budget())) == [None] * 3
     assert done == [0, 1, 2]
@@ -200,7 +202,7 @@ def test_a_cluster_without_workers_is_an_error_when_the_time_is_over(
 
 
 def test_without_time_the_first_order_is_carried_out_and_the_rest_is_left_out() -> None:
-    executor = FakeExecutor(lambda order, times: None)
+    executor = FakeExecutor()
     found = list(carry_out(executor, square, range(9), Budget(seconds=0.0)))
     assert found[0].result == 0
     assert len(found) <= Workers(executor).window
@@ -226,7 +228,7 @@ def test_a_task_that_is_refused_while_it_is_submitted_is_explained_as_well() -> 
             raise TypeError("cannot pickle '_thread.lock' object")
 
     with pytest.raises(ExperimentError, match="at the top of a module"):
-        squares(Refusing(lambda order, count: None))
+        squares(Refusing())
 
 
 def test_the_number_of_workers_is_stated_or_found() -> None:
@@ -236,11 +238,11 @@ def test_the_number_of_workers_is_stated_or_found() -> None:
     assert Workers(ThreadPoolExecutor(4), threads=3).threads_for(2) == 3
 
     # Only workers that are known to be on this computer share its cores.
-    far = FakeExecutor(lambda order, times: None, count=128)
+    far = FakeExecutor(count=128)
     assert Workers(far).threads_for(8) == 1
 
     # Where it is not known, all tasks are submitted, so that no worker is idle.
-    unknown = FakeExecutor(lambda order, times: None, count=None)
+    unknown = FakeExecutor(count=None)
     assert Workers(unknown).count == 1
     assert math.isinf(Workers(unknown).window)
 
@@ -275,9 +277,9 @@ class FakeDaskExecutor(FakeExecutor):
     """As the executor of a Dask client, which has no option `cancel_futures`."""
 
     def __init__(self, client: FakeClient) -> None:
-        super().__init__(lambda order, times: None, count=None)
+        super().__init__(count=None)
         self._client = client
-        self.waited: list[bool] = []
+        self.waited = []
 
     def shutdown(self, wait: bool = True) -> None:  # type: ignore[override]
         self.waited.append(wait)

@@ -127,7 +127,7 @@ def test_the_second_press_leaves_out_figures_and_the_program_goes_on(
 
 def test_what_a_press_says_is_said_before_the_end_of_the_context() -> None:
     """The thread that says it may be late; the sentence would stand among later ones."""
-    said: list[str] = []
+    said = []
 
     def say_late(sentence: str) -> None:
         time.sleep(0.1)

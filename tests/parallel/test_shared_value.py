@@ -30,14 +30,14 @@ class FakeProcesses(Executor):
     def __init__(self, count: int) -> None:
         self._max_workers = count
         self._processes = [shared_value._ReceivedValues() for _ in range(count)]
-        self.sizes: list[int] = []
+        self.sizes = []
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         sent = pickle.dumps((fn, args, kwargs))
         process = self._processes[len(self.sizes) % len(self._processes)]
         self.sizes.append(len(sent))
 
-        future: Future[Any] = Future()
+        future = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(shared_value, "_received", process)
             patch.setattr(shared_value, "_owned", WeakValueDictionary())

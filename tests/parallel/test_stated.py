@@ -60,10 +60,16 @@ def test_local_processes_are_counted() -> None:
     assert StatedExecutor.parse("dask://host:8786").processes is None
 
 
-def test_an_executor_of_a_file_is_made_by_its_function(tmp_path: Path) -> None:
+@pytest.fixture
+def factory(tmp_path: Path) -> Path:
+    """A file with functions that make executors."""
     path = tmp_path / "cluster.py"
     path.write_text(FACTORY, encoding="utf-8")
-    with StatedExecutor.parse(f"python:{path}:make").started() as workers:
+    return path
+
+
+def test_an_executor_of_a_file_is_made_by_its_function(factory: Path) -> None:
+    with StatedExecutor.parse(f"python:{factory}:make").started() as workers:
         assert workers.count == 3
         assert workers.submit(len, "four").result() == 4
 
@@ -71,21 +77,17 @@ def test_an_executor_of_a_file_is_made_by_its_function(tmp_path: Path) -> None:
         workers.submit(len, "ended")
 
 
-def test_the_end_does_not_wait_for_tasks_that_nobody_needs(tmp_path: Path) -> None:
-    path = tmp_path / "cluster.py"
-    path.write_text(FACTORY, encoding="utf-8")
+def test_the_end_does_not_wait_for_tasks_that_nobody_needs(factory: Path) -> None:
     go_on = threading.Event()
-    with StatedExecutor.parse(f"python:{path}:make").started() as workers:
+    with StatedExecutor.parse(f"python:{factory}:make").started() as workers:
         task = workers.submit(go_on.wait, 20.0)
     assert not task.done()
     go_on.set()
     assert task.result(timeout=20.0)
 
 
-def test_workers_of_a_file_keep_their_stated_numbers(tmp_path: Path) -> None:
-    path = tmp_path / "cluster.py"
-    path.write_text(FACTORY, encoding="utf-8")
-    with StatedExecutor.parse(f"python:{path}:make_stated").started() as workers:
+def test_workers_of_a_file_keep_their_stated_numbers(factory: Path) -> None:
+    with StatedExecutor.parse(f"python:{factory}:make_stated").started() as workers:
         assert (workers.count, workers.threads_for(2)) == (16, 4)
     assert "cluster" not in sys.modules
 

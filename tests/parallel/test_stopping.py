@@ -153,7 +153,7 @@ def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(
     task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
 
     # Both processes have imported what they need.
-    processes: set[int] = set()
+    processes = set()
     while len(processes) < 2:
         processes |= {future.result() for future in [pool.submit(identity) for _ in range(8)]}
 
@@ -201,7 +201,6 @@ def test_signals_on_the_command_line_reach_all_processes_and_leave_the_best(
     ) as p:
         try:
             # The first start has ended, and others are running.
-            assert p.stderr is not None
             assert any("iteration " in line for line in iter(p.stderr.readline, ""))
             os.killpg(p.pid, number)
             if presses > 1:
@@ -246,7 +245,6 @@ def test_the_workers_of_a_killed_process_end_by_themselves(tmp_path: Path) -> No
     with subprocess.Popen(
         [sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=environment
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "running\n"
 
         process.kill()

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from mjfim.excitation.limits.constraints import constraint_set_of
+from mjfim.excitation.limits.constraint_kinds import ConstraintValues
+from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from tests.support.numerics import Array, cart_task, directional_check, make_task
@@ -108,6 +110,38 @@ ARM = """
 """
 
 
+def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -> dict[str, Array]:
+    """Positions, velocities, accelerations and actuator forces at every step of a plain loop."""
+    data, rows = mujoco.MjData(model), {key: [] for key in ("q", "v", "a", "f")}
+    data.qpos[:], data.qvel[:] = start
+    for held in ctrl:
+        data.ctrl[:] = held
+        for _ in range(substeps):
+            before = data.qvel.copy()
+            mujoco.mj_step(model, data)
+            now = (
+                data.qpos,
+                data.qvel,
+                (data.qvel - before) / model.opt.timestep,
+                data.actuator_force,
+            )
+            for key, value in zip(rows, now, strict=True):
+                rows[key].append(np.array(value))
+    return {key: np.array(value) for key, value in rows.items()}
+
+
+def distances_of_arm(model: Any, positions: Array) -> float:
+    """Smallest distance of the links of `ARM` to post and floor at some positions [m]."""
+    data, near = mujoco.MjData(model), []
+    fore, post, floor, upper = (model.geom(n).id for n in ("fore", "post", "floor", "upper"))
+    for qpos in positions:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        for a, b in ((fore, post), (fore, floor), (upper, post), (upper, floor)):
+            near.append(mujoco.mj_geomDistance(model, data, a, b, 1.0, None))
+    return min(near)
+
+
 def directions_of(task: DesignTask, count: int, seed: int = 0) -> Array:
     """Random changes of the control, half of them smooth and half of them rough: (count, N, nu)."""
     rng = np.random.default_rng(seed)
@@ -122,11 +156,24 @@ def directions_of(task: DesignTask, count: int, seed: int = 0) -> Array:
     return np.array([*smooth, *rough])
 
 
+def along_control(
+    task: DesignTask, constraints: ConstraintSet, ctrl: Array | None = None, slopes: bool = False
+) -> ConstraintValues:
+    """The limited quantities along a control, by default the initial one."""
+    ctrl = task.control if ctrl is None else ctrl
+    observed = task.plant.observe(task.theta, ctrl, constraints.observations)
+    return constraints.evaluate(*observed, slopes=slopes)
+
+
+def barrier_problem(task: DesignTask, delta: float, **changes: Any) -> InteriorProblem:
+    """The barrier of the limits of a task alone."""
+    stated = {"constraints": constraint_set_of(task), "mu": 1.0, "with_cost": False, **changes}
+    return InteriorProblem(base=task.problem, delta=delta, **stated)
+
+
 def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
     """Largest relative error of the slope of the barrier, against differences of simulations."""
-    problem = InteriorProblem(
-        base=task.problem, constraints=constraint_set_of(task), mu=1.0, delta=delta, with_cost=False
-    )
+    problem = barrier_problem(task, delta)
     expansion = problem.expand(problem.point(task.control))
     open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
     gradient = expansion.gradient(open_loop)
