@@ -105,7 +105,7 @@ def experiments() -> Iterator[tuple[mjfim.Experiment, int, int]]:
         yield stated.replace(noise={"state": 1e-3}), 5, 5
     for name in EXPERIMENTS if SHARED_MODELS.is_dir() else ():
         tables = EXPERIMENTS[name]
-        yield mjfim.Experiment(**{**tables, "model": str(SHARED_MODELS / tables["model"])}), 4, 0
+        yield mjfim.Experiment(**{**tables, "model": str(SHARED_MODELS / tables["model"])}), 10, 0
 
 
 @pytest.mark.slow
