@@ -45,9 +45,9 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.search import refuse_same_data
 from mjfim.identification.segments import recorded_release
 from mjfim.information.criteria import shared
+from mjfim.information.finite_steps import visible_columns
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
-from mjfim.information.smoothness import visible_columns
 from mjfim.optimize.directions import LBFGS
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on

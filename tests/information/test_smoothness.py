@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.task import DesignTask
-from mjfim.information.smoothness import (
+from mjfim.information.finite_steps import (
     disagreement,
     is_rough,
     only_curved,

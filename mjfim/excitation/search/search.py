@@ -35,7 +35,7 @@ from mjfim.excitation.search.descent import MU_FACTOR, Barrier
 from mjfim.excitation.search.inside import InsideControl, InsideSearch, is_progress
 from mjfim.excitation.search.levels import DescentLevel, coarser_levels, easier_level
 from mjfim.experiment.packing import for_workers
-from mjfim.information.smoothness import is_rough
+from mjfim.information.finite_steps import is_rough
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
