@@ -94,12 +94,3 @@ def test_irregular_times_gaps_and_outliers() -> None:
     assert np.isfinite(spline.at(np.linspace(3.0, 3.4, 50))).all()
 
 
-def test_units_do_not_matter() -> None:
-    t, factor = grid(), 2.0**10
-    given = readings(t, 1e-2)
-    other = Readings(
-        t=factor * t, values=given.values / factor, sigma=given.sigma / factor, derivative=0
-    )
-    spline = fit_spline([given])
-    scaled = fit_spline([other])
-    np.testing.assert_allclose(factor * scaled.at(factor * t), spline.at(t), rtol=1e-9, atol=1e-9)

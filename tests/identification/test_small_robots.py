@@ -100,9 +100,6 @@ def furuta(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     return Experiment(**STATED, directory=folder, source="furuta")
 
 
-@pytest.mark.slow
-def test_a_table_top_furuta_has_no_misfit(furuta: Experiment) -> None:
-    assert_is_complete(fits(System.resolve(furuta), SEEDS[:1]))
 
 
 @pytest.mark.slow
