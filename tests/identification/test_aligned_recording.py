@@ -246,12 +246,6 @@ def test_the_measured_trajectory_has_measured_velocities_or_none(tmp_path: Path)
     assert np.isnan(shown.qvel[:, 0]).all()
 
 
-
-
-
-
-
-
 def test_a_long_measured_motion_ends_with_the_fitted_one(task: DesignTask) -> None:
     """The rows before are the same, also those of a clock that does not begin at zero."""
     recording = log(task)

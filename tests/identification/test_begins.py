@@ -11,6 +11,7 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import MODELS
 
 CLEAN = ("cart_pendulum", "quadrotor", "servo_arm", "four_bar")
@@ -19,7 +20,7 @@ CLEAN = ("cart_pendulum", "quadrotor", "servo_arm", "four_bar")
 @pytest.fixture(scope="module")
 def experiment() -> mjfim.Experiment:
     """The cart-pendulum, which hangs at rest at first."""
-    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return cart_pendulum()
 
 
 def swung(experiment: mjfim.Experiment, seed: int = 1) -> Recording:

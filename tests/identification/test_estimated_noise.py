@@ -10,15 +10,13 @@ import pytest
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch, FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.plant.outputs import Noise
 from mjfim.records.events import FitEvent
-from tests.support.paths import MODELS
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 
 # Error of the readings that the model cannot explain, so that the outputs contradict each other.
 DRIFT = 0.1
@@ -27,13 +25,11 @@ DRIFT = 0.1
 @pytest.fixture(scope="module")
 def task() -> FitTask:
     """A fit with estimated noise; the outputs contradict each other, because one reading drifts."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    experiment = experiment.replace(horizon=2.0, fit={"noise": "estimated"})
-    design = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(design.system, design.initial, 0)
+    made = fit_of(cart_pendulum(horizon=2.0, fit={"noise": "estimated"}), 0)
+    recording = made.recordings[0]
     y = np.array(recording.y)
     y[:, 0] += DRIFT * recording.t
-    return FitTask.of(System.resolve(experiment, threads=1), [replace(recording, y=y)])
+    return FitTask.of(made.system, [replace(recording, y=y)])
 
 
 @pytest.fixture(scope="module")

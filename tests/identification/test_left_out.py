@@ -7,29 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.arrays import Array
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.identification.left_out import LeftOutPart, fit_without, left_out_parts
 from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution
 from mjfim.parallel.budget import Budget
-from tests.support.paths import ROOT
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 
 TIGHT = SearchSettings(tolerance=1e-6)
 
 
 def fitted(fit: dict[str, object]) -> tuple[FitProblem, Solution]:
     """A fit to three recordings of the cart-pendulum."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    experiment = base.replace(horizon=2.0, fit={"bootstrap": 0, **fit})
-    task = DesignTask.resolve(experiment, threads=1)
-    problem = FitProblem.of(
-        task.system, [simulate_system(task.system, task.initial, i) for i in range(3)]
-    )
-    return problem, least_squares(problem, task.parameters.true, TIGHT)
+    task = fit_of(cart_pendulum(horizon=2.0, fit={"bootstrap": 0, **fit}), 0, 1, 2)
+    problem = task.problem()
+    return problem, least_squares(problem, task.system.parameters.true, TIGHT)
 
 
 def exact_fit(problem: FitProblem, solution: Solution, part: LeftOutPart) -> Array:

@@ -20,8 +20,8 @@ from mjfim.identification.assessment.residual_tests import (
 from mjfim.output.page import Level
 from mjfim.output.pages.estimate import estimate_page
 from mjfim.records.estimate import Whiteness, WorstResidual
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
-from tests.support.paths import MODELS
 
 NAMES = ("angle", "speed", "force")
 
@@ -228,8 +228,7 @@ def test_reasons_in_sentences() -> None:
 )
 def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, said: str) -> None:
     """The verdict says the size; coloured residuals remain a misfit."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    experiment = experiment.replace(noise={"state": 0.01}, fit={"bootstrap": 0})
+    experiment = cart_pendulum(noise={"state": 0.01}, fit={"bootstrap": 0})
     control = 5.0 * np.sin(0.04 * np.arange(400))[:, None]
     log, clean = (
         mjfim.simulate(experiment.replace(noise={"state": size}), control) for size in (0.01, 1e-9)

@@ -24,6 +24,7 @@ from mjfim.identification.assessment.parameter_draws import (
 from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unknown_bodies
 from mjfim.model.inertia import barycentric_of, logcholesky_derivatives
 from mjfim.records.events import stages_observed_by
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.hinged_arm import arm_experiment
 from tests.support.numerics import Array
 from tests.support.paths import MODELS
@@ -35,11 +36,6 @@ KNOWN = 1e-3
 STD = np.array([0.02, 0.03, 0.1])
 COVARIANCE = np.diag(STD**2)
 COVARIANCE[0, 1] = COVARIANCE[1, 0] = -0.8 * STD[0] * STD[1]
-
-
-def stated(**tables: Any) -> mjfim.Experiment:
-    """The cart-pendulum."""
-    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**tables)
 
 
 def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimate:
@@ -67,13 +63,13 @@ def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimat
 
 @pytest.fixture(scope="module")
 def system() -> System:
-    return System.resolve(stated())
+    return System.resolve(cart_pendulum())
 
 
 @pytest.mark.slow
 def test_the_moments_are_those_of_the_formal_covariance(system: System) -> None:
     estimate = estimated(system, COVARIANCE)
-    draws = draw_parameters(stated(), estimate, 2000, np.random.default_rng(1))
+    draws = draw_parameters(cart_pendulum(), estimate, 2000, np.random.default_rng(1))
     assert draws.parameters == ("m", "l", "c")
     assert draws.units == ("kg", "m", "N m s/rad")
     assert len(draws) == 2000
@@ -114,7 +110,7 @@ def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
     assert kstest(draws.values[:, 2], half_normal.cdf).pvalue > 1e-3
 
     # Both sides cut off: the deviations that led to the interval remain.
-    narrow = System.resolve(stated(parameters={"c": {"bounds": [0.9, 1.5]}}))
+    narrow = System.resolve(cart_pendulum(parameters={"c": {"bounds": [0.9, 1.5]}}))
     cut = replace(bounded, theta=np.array([2.0, 1.0, 1.0]), std=np.array([0.1, 0.1, 2.0]))
     cut = replace(cut, interval=np.array([[1.9, 2.1], [0.9, 1.1], [0.9, 1.5]]))
     assert np.sqrt(honest_covariance(narrow.parameters, cut)[2, 2]) == 2.0
@@ -161,7 +157,7 @@ def test_an_estimate_of_another_experiment(system: System) -> None:
 
 
 def test_initial_states_are_no_properties_of_a_robot() -> None:
-    system = System.resolve(stated(nuisance={"initial": 0.1, "delay": 0.01}))
+    system = System.resolve(cart_pendulum(nuisance={"initial": 0.1, "delay": 0.01}))
     names = system.parameters.names
     covariance = np.diag(np.full(len(names), 1e-4))
     # Nobody asks how well an initial state is known.
@@ -182,7 +178,7 @@ def test_unphysical_inertias_are_replaced() -> None:
         "Iyy": {"target": "body/cart:inertia[1]", "guess": 0.01},
         "Izz": {"target": "body/cart:inertia[2]", "guess": 0.01},
     }
-    base = stated()
+    base = cart_pendulum()
     values = {**base.model_dump(exclude_unset=True), "directory": MODELS}
     system = System.resolve(mjfim.Experiment(**{**values, "parameters": central}))
     assert system.parameters.names == ("Ixx", "Iyy", "Izz")
@@ -263,10 +259,18 @@ class KnownMoment:
             system=system, estimate=estimate, body=body, moment=moment, inertia=inertia
         )
 
+    def relative(self, robots: Array) -> tuple[Array, Array, Array]:
+        """(n, 10) linear coordinates of robots, and both known combinations over the estimate's."""
+        linear = np.array([self.body.linear(robot[self.body.columns]) for robot in robots])
+        theta = self.estimate.theta
+        begin = self.body.linear(theta[self.body.columns])
+        inertia = (linear[:, 9] + robots[:, 10]) / (begin[9] + theta[10])
+        return linear, linear[:, 1] / begin[1], inertia
+
 
 def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
     known = KnownMoment.of(tmp_path)
-    system, estimate, body = known.system, known.estimate, known.body
+    system, estimate = known.system, known.estimate
     for row in (known.moment, known.inertia):
         np.testing.assert_allclose(
             np.sqrt(row @ estimate.honest_covariance @ row), KNOWN, rtol=1e-3
@@ -276,21 +280,17 @@ def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
     assert "9 combinations of inertias that the recordings do not determine" in str(draws)
 
     # Standard deviations of 400 draws scatter by 3.5 %.
-    linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
-    begin = body.linear(estimate.theta[body.columns])
-    moment = linear[:, 1] / begin[1]
-    inertia = (linear[:, 9] + draws.values[:, 10]) / (begin[9] + estimate.theta[10])
-    for values in (moment, inertia):
+    linear, *combinations = known.relative(draws.values)
+    for values in combinations:
         assert np.std(values) == pytest.approx(KNOWN, rel=0.12)
         assert np.mean(values) == pytest.approx(1.0, abs=4 * KNOWN / 20)
-    assert all(body.is_physical(each) for each in linear)
+    assert all(known.body.is_physical(each) for each in linear)
 
     # Along straight lines of log-Cholesky coordinates, they are lost.
     curved = np.random.default_rng(7).multivariate_normal(
         estimate.theta, estimate.honest_covariance, 400, method="eigh"
     )
-    lost = [body.linear(robot[body.columns])[1] / begin[1] for robot in curved]
-    assert np.std(lost) > 50 * KNOWN
+    assert np.std(known.relative(curved)[1]) > 50 * KNOWN
 
 
 @pytest.mark.parametrize("prior", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
@@ -299,21 +299,18 @@ def test_a_wide_prior_on_a_whole_inertia_gives_physical_robots(
 ) -> None:
     """Nearly all draws of the normal distribution are no bodies, so that replacing them failed."""
     known = KnownMoment.of(tmp_path, cad_prior=False, prior=prior)
-    system, estimate, body = known.system, known.estimate, known.body
+    system = known.system
     stages: list[str] = []
     with stages_observed_by(lambda name, *_: stages.append(name)):
-        draws = draw_parameters_system(system, estimate, 50, np.random.default_rng(7))
+        draws = draw_parameters_system(system, known.estimate, 50, np.random.default_rng(7))
     assert set(stages) == {"drawing robots inside the physical inertias"}
-    linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
-    assert all(body.is_physical(each) for each in linear)
+    linear, *combinations = known.relative(draws.values)
+    assert all(known.body.is_physical(each) for each in linear)
     for values_of_robot in draws.values[:5]:
         assert system.model_at(values_of_robot).body("link1").mass[0] > 0.0
 
     # The combinations that the recordings determine stay known, and the mass is not.
-    begin = body.linear(estimate.theta[body.columns])
-    moment = linear[:, 1] / begin[1]
-    inertia = (linear[:, 9] + draws.values[:, 10]) / (begin[9] + estimate.theta[10])
-    for values in (moment, inertia):
+    for values in combinations:
         assert 0.65 * KNOWN < np.std(values) < 1.4 * KNOWN
         assert np.mean(values) == pytest.approx(1.0, abs=KNOWN)
-    assert np.std(linear[:, 0]) > 0.1 * begin[0]
+    assert np.std(linear[:, 0]) > 0.1 * np.mean(linear[:, 0])

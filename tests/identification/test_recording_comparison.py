@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
 from mjfim.identification.assessment.recording_comparison import compare_evidence
 from mjfim.identification.assessment.robust_covariance import (
     block_length,
@@ -19,8 +17,8 @@ from mjfim.identification.assessment.robust_covariance import (
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
+from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.numerics import Array
-from tests.support.paths import MODELS
 
 
 def compared(model: Linear, y: Array, length: float = 1.0) -> RecordingComparison:
@@ -212,23 +210,18 @@ def test_rate_of_true_alarms(K: int, least: float) -> None:
 @pytest.fixture(scope="module")
 def recordings() -> list[Recording]:
     """Five recordings of the cart-pendulum; the friction of the third is 70 % larger."""
-    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
-    stated = stated.replace(initial={"control": control}, horizon=2.0)
     found = []
     for k in range(5):
-        friction = 1.7 if k == 2 else 1.0
-        task = DesignTask.resolve(stated.replace(parameters={"c": {"true": friction}}))
-        recording = simulate_system(task.system, task.initial, k)
-        found.append(Recording(**{**vars(recording), "name": f"logs/run_{k + 1}.csv"}))
+        rubbing = {"c": {"true": 1.7 if k == 2 else 1.0}}
+        stated = cart_pendulum(initial={"control": control}, horizon=2.0, parameters=rubbing)
+        found.append(replace(logs_of(stated, k)[0], name=f"logs/run_{k + 1}.csv"))
     return found
 
 
 @pytest.mark.slow
 def test_a_fit_names_the_odd_recording(recordings: list[Recording]) -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
-        fit={"bootstrap": 0}
-    )
+    experiment = cart_pendulum(fit={"bootstrap": 0})
     estimate = mjfim.identify(experiment, recordings)
     comparison = estimate.recording_comparison
     assert comparison is not None

@@ -92,5 +92,3 @@ def test_irregular_times_gaps_and_outliers() -> None:
     inner = np.concatenate([np.linspace(0.5, 2.5, 100), np.linspace(4.0, 9.5, 100)])
     assert np.abs(spline.at(inner) - curve(inner)).max() < 3e-3
     assert np.isfinite(spline.at(np.linspace(3.0, 3.4, 50))).all()
-
-

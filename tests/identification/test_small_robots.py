@@ -100,8 +100,6 @@ def furuta(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     return Experiment(**STATED, directory=folder, source="furuta")
 
 
-
-
 @pytest.mark.slow
 def test_a_table_top_furuta_has_no_misfit_with_any_seed(furuta: Experiment) -> None:
     system = System.resolve(furuta)

@@ -124,5 +124,3 @@ def test_units_of_a_matrix_do_not_change_the_draws() -> None:
             draw_truncated_normal(mean, covariance, -INFINITE, INFINITE, 50, rng, matrices=[bound])
         )
     np.testing.assert_allclose(drawn[0], drawn[1], rtol=1e-6, atol=1e-9)
-
-
