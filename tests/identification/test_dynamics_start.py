@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,13 +102,8 @@ def test_a_model_that_diverges_at_the_start_begins_at_the_equation_of_motion(
 def test_what_it_needs_is_said(folder: Path, log: Recording) -> None:
     experiment = cart(folder, fit={"start": "inverse_dynamics"})
     kept = [i for i, name in enumerate(STATE) if not name.endswith("hinge")]
-    part = Recording(
-        t=log.t,
-        ctrl=log.ctrl,
-        y=log.y[:, kept],
-        outputs=tuple(STATE[i] for i in kept),
-        name="part.csv",
-    )
+    outputs = tuple(STATE[i] for i in kept)
+    part = replace(log, y=log.y[:, kept], outputs=outputs, name="part.csv")
     with pytest.raises(RecordingError, match=r"part\.csv: no measured position or velocity of h"):
         mjfim.identify(experiment, [part], progress=False)
 

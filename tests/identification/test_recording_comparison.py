@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,13 +40,17 @@ def compared(model: Linear, y: Array, length: float = 1.0) -> RecordingCompariso
     )
 
 
+def simulated(seed: int, K: int, truth: tuple[float, ...], N: int = 400) -> tuple[Array, Array]:
+    """Regressors of K recordings, and measured values with white noise."""
+    X = waves(K, N, len(truth))
+    return X, X @ np.array(truth) + noise(0.0, (K, N), np.random.default_rng(seed))
+
+
 @pytest.mark.parametrize("with_offsets", [False, True])
 def test_values_are_those_of_separate_fits(with_offsets: bool) -> None:
-    rng = np.random.default_rng(0)
     K, N, c = 4, 160, 3
-    X = waves(K, N, c)
+    X, y = simulated(0, K, (1.0, -2.0, 0.5), N)
     model = Linear(X=X, with_offsets=with_offsets)
-    y = X @ np.array([1.0, -2.0, 0.5]) + noise(0.0, (K, N), rng)
     y[1] += 1.0 * X[1, :, 0]
     found = compared(model, y)
     for k in range(K):
@@ -61,10 +66,7 @@ def test_values_are_those_of_separate_fits(with_offsets: bool) -> None:
 
 
 def test_an_odd_recording_is_named_with_its_parameter() -> None:
-    rng = np.random.default_rng(1)
-    K, N = 5, 400
-    X = waves(K, N, 3)
-    y = X @ np.array([1.0, -2.0, 0.5]) + noise(0.0, (K, N), rng)
+    X, y = simulated(1, 5, (1.0, -2.0, 0.5))
     y[2] += 1.0 * X[2, :, 0]
     found = compared(Linear(X=X), y)
     (odd,) = found.odd
@@ -82,9 +84,7 @@ def test_an_odd_recording_is_named_with_its_parameter() -> None:
 
 
 def test_two_odd_recordings_of_seven() -> None:
-    rng = np.random.default_rng(2)
-    X = waves(7, 400, 2)
-    y = X @ np.array([1.0, -2.0]) + noise(0.0, (7, 400), rng)
+    X, y = simulated(2, 7, (1.0, -2.0))
     y[1] -= 2.0 * X[1, :, 1]
     y[5] += 1.0 * X[5, :, 0]
     found = compared(Linear(X=X), y)
@@ -92,9 +92,7 @@ def test_two_odd_recordings_of_seven() -> None:
 
 
 def test_two_recordings_disagree_without_an_odd_one() -> None:
-    rng = np.random.default_rng(3)
-    X = waves(2, 400, 2)
-    y = X @ np.array([1.0, -2.0]) + noise(0.0, (2, 400), rng)
+    X, y = simulated(3, 2, (1.0, -2.0))
     y[1] += 1.0 * X[1, :, 0]
     found = compared(Linear(X=X), y)
     assert found.odd == ()
@@ -145,52 +143,44 @@ def test_a_combination_that_no_recording_determines() -> None:
 # ---- rates
 
 
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """Simulated sets of recordings.
+def rates(
+    sets: int, *, K: int, phi: float = 0.0, c: int = 3, noisy: float = 1.0, odd: float = 0.0
+) -> tuple[float, float, float]:
+    """Shares of sets with an odd recording, with the right one, and with a small joint p.
 
-    Attributes:
+    Args:
+        sets: Number of simulated sets of recordings.
         K: Number of recordings.
         phi: Correlation of successive noise values.
         c: Number of parameters.
         noisy: Factor of the noise of the first recording.
         odd: Difference of the first parameter of the last recording [standard deviations].
     """
-
-    K: int
-    phi: float = 0.0
-    c: int = 3
-    noisy: float = 1.0
-    odd: float = 0.0
-
-    def rates(self, sets: int) -> tuple[float, float, float]:
-        """Shares of sets with an odd recording, with the right one, and with a small joint p."""
-        N = 400
-        rng = np.random.default_rng(0)
-        X = waves(self.K, N, self.c)
-        growth = (1.0 + self.phi) / (1.0 - self.phi)
-        std = np.sqrt(2.0 / N * growth)
-        alarms, hits, joint = 0, 0, 0
-        for _ in range(sets):
-            y = noise(self.phi, (self.K, N), rng)
-            y[0] *= self.noisy
-            y[-1] += self.odd * std * X[-1, :, 0]
-            found = compared(Linear(X=X), y, block_length([growth], self.K * N))
-            alarms += bool(found.odd)
-            joint += found.joint_p < 1e-3
-            hits += bool(found.odd) and found.odd[0].index == self.K - 1
-        return alarms / sets, hits / sets, joint / sets
+    N = 400
+    rng = np.random.default_rng(0)
+    X = waves(K, N, c)
+    growth = (1.0 + phi) / (1.0 - phi)
+    std = np.sqrt(2.0 / N * growth)
+    alarms, hits, joint = 0, 0, 0
+    for _ in range(sets):
+        y = noise(phi, (K, N), rng)
+        y[0] *= noisy
+        y[-1] += odd * std * X[-1, :, 0]
+        found = compared(Linear(X=X), y, block_length([growth], K * N))
+        alarms += bool(found.odd)
+        joint += found.joint_p < 1e-3
+        hits += bool(found.odd) and found.odd[0].index == K - 1
+    return alarms / sets, hits / sets, joint / sets
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "setting",
-    [Setting(K=4), Setting(K=3, phi=0.9), Setting(K=5, phi=0.9, c=10), Setting(K=5, noisy=5.0)],
-    ids=str,
+    [{"K": 4}, {"K": 3, "phi": 0.9}, {"K": 5, "phi": 0.9, "c": 10}, {"K": 5, "noisy": 5.0}],
 )
-def test_rate_of_false_alarms(setting: Setting) -> None:
+def test_rate_of_false_alarms(setting: dict[str, Any]) -> None:
     """The stated level is 1 %; 80 sets give more than 3 with a probability of 0.9 %."""
-    alarms, _, joint = setting.rates(80)
+    alarms, _, joint = rates(80, **setting)
     assert alarms <= 3 / 80
     assert joint <= 0.02
 
@@ -199,7 +189,7 @@ def test_rate_of_false_alarms(setting: Setting) -> None:
 @pytest.mark.parametrize(("K", "least"), [(3, 0.75), (8, 0.95)])
 def test_rate_of_true_alarms(K: int, least: float) -> None:
     """A difference of eight standard deviations of one recording."""
-    alarms, hits, _ = Setting(K=K, phi=0.3, odd=8.0).rates(60)
+    alarms, hits, _ = rates(60, K=K, phi=0.3, odd=8.0)
     assert hits >= least
     assert alarms - hits <= 0.02
 

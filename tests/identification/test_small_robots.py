@@ -64,10 +64,8 @@ STATED: dict[str, Any] = {
     "fit": {"bootstrap": 0},
 }
 
-# The same robot as large as a crane, as small as an insect, and with other times and masses.
+# The same robot large, heavy and quick, and small, light and slow.
 SIZES = {
-    "crane": Units(length=1e2, mass=1e6, time=1e1),
-    "insect": Units(length=1e-1, mass=1e-3, time=0.3),
     "violent": Units(length=1e2, mass=1e3, time=1e-1),
     "sluggish": Units(length=1e-2, mass=1e-3, time=1e1),
 }

@@ -18,6 +18,7 @@ from mjfim.identification.search import FitTask
 from mjfim.parallel.budget import StopToken
 from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS
+from tests.support.terms import recorded
 
 MINIMAL = f"""
 model = "{(MODELS / "cart_pendulum.xml").as_posix()}"
@@ -52,11 +53,8 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> mjfim.Experiment:
 def recording(experiment: mjfim.Experiment) -> Recording:
     """A noisy recording at the true parameters."""
     system = System.resolve(experiment)
-    t = np.arange(301) * system.dt
-    ctrl = 10.0 * np.sin(2.0 * np.pi * 0.7 * t[:-1])[:, None]
-    y, _ = system.plant.measure(system.parameters.true[None], ctrl)
-    noise = 0.05 * np.random.default_rng(0).standard_normal(y[0].shape)
-    return Recording(t=t, ctrl=ctrl, y=y[0] + noise, outputs=system.outputs.names, name="log")
+    ctrl = 10.0 * np.sin(2.0 * np.pi * 0.7 * np.arange(300) * system.dt)[:, None]
+    return dataclasses.replace(recorded(system, ctrl, 0), name="log")
 
 
 def test_a_minimal_experiment_identifies_its_parameters(

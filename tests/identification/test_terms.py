@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +46,8 @@ def log_of(system: System, seed: int, duration: float = 2.0) -> Any:
     return recorded(system, motor_torque(duration, RATE, seed), seed)
 
 
-def some_fast(kinds: Iterable[str], fast: Collection[str]) -> list[Any]:
-    """Parameters of a test of which some are fast, and the others are marked slow."""
-    return [pytest.param(k, marks=[] if k in fast else pytest.mark.slow) for k in kinds]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", some_fast(KINDS, {"actuator_lag", "tilt"}))
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_term_is_identified_from_a_log(tmp_path: Path, kind: str) -> None:
     guesses = GUESSES.get(kind, {})
     parameters = {field: {"guess": value} for field, value in guesses.items()}
@@ -148,7 +142,7 @@ def solution_near(problem: FitProblem, theta: Any) -> Any:
     return found.unknowns
 
 
-@pytest.mark.parametrize("kind", some_fast(MISSED, {"stribeck"}))
+@pytest.mark.parametrize("kind", MISSED)
 @pytest.mark.slow
 def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind: str) -> None:
     stated, robot = without_term(tmp_path, kind)

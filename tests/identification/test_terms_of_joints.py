@@ -23,6 +23,7 @@ from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import selected_term
 from tests.support.numerics import Array
+from tests.support.terms import recorded
 
 JOINTS = ("pan", "lift", "roll")
 EXCESS = (0.5, 0.4, 0.1)
@@ -87,11 +88,7 @@ def log_of(experiment: mjfim.Experiment, seed: int, seconds: float = 3.0) -> Rec
     rng = np.random.default_rng(seed)
     t = np.arange(round(RATE * seconds)) / RATE
     control: Array = 0.4 * multisine(t, 3, 0.3, 4, rng)
-    theta = np.array(system.parameters.guess)
-    y = system.plant.measure(theta[None], control)[0][0]
-    y = y + rng.standard_normal(y.shape) * system.noise.sigma
-    times = np.arange(len(y)) / RATE
-    return Recording(t=times, ctrl=control, y=y, outputs=system.outputs.names, name=f"log {seed}")
+    return recorded(system, control, seed)
 
 
 def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
