@@ -12,7 +12,6 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
-from mjfim.identification.search import FitTask
 from mjfim.identification.starts import MIN_ROWS, segment_lengths
 from mjfim.parallel.budget import StopToken
 from mjfim.records.estimate import Estimate
@@ -159,20 +158,16 @@ def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Pa
     assert found.restart is not None and found.restart.cost <= found.restart.cost_before
 
 
-def test_segments_share_the_system_and_the_recordings_of_the_whole_problem(tmp_path: Path) -> None:
-    """Workers then receive them once."""
-    system = pendulum(tmp_path, 4.0)
-    problem = FitTask.of(system, [swings(system, 4.0)]).problem()
+def test_segments_are_shares_of_the_whole_problem_with_enough_rows(tmp_path: Path) -> None:
+    """They share the system and the recordings, which workers then receive once."""
+    system = pendulum(tmp_path, 12.0)
+    problem = FitProblem.of(system, [swings(system, 12.0)])
     part = problem.cut(1.0)
     assert part is not None
-    assert len(part.segments) == 4
+    assert len(part.segments) == 12
     assert part.recordings is problem.recordings and part.system is problem.system
     assert problem.cut(0.01) is None
 
-
-def test_segments_are_shares_of_the_recording_with_enough_rows(tmp_path: Path) -> None:
-    system = pendulum(tmp_path, 12.0)
-    problem = FitProblem.of(system, [swings(system, 12.0)])
     lengths = segment_lengths(problem.recordings)
     assert lengths[0] * RATE >= MIN_ROWS
     assert list(lengths) == sorted(set(lengths))

@@ -77,11 +77,14 @@ def exact(system: System, inputs: np.ndarray) -> Recording:
 def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> None:
     laws = {"shoulder": {**SHOULDER, "feedforward": True}, "elbow": ELBOW}
     experiment = arm_experiment(
-        laws, parameters={**PLANT, **GAINS}, noise=NOISE, fit={"bootstrap": 0}
+        laws,
+        parameters={**PLANT, **GAINS},
+        noise=NOISE,
+        fit={"bootstrap": 0, "segments": "whole"},
     )
     true = System.resolve(experiment).parameters.true
 
-    found = mjfim.identify(experiment, [recorded(experiment, 700, 1)], progress=False)
+    found = mjfim.identify(experiment, [recorded(experiment, 400, 1)], progress=False)
 
     assert found.success
     assert not found.misfit
@@ -103,7 +106,7 @@ def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
     """The rate matters: a slow law brakes less, and the plant would be blamed for it."""
     laws = {"shoulder": {**SHOULDER, "rate": 50.0}, "elbow": ELBOW}
     experiment = arm_experiment(laws, parameters=PLANT, noise=NOISE)
-    log = recorded(experiment, 500, 2)
+    log = recorded(experiment, 300, 2)
     wrong = experiment.replace(controllers={"shoulder": {**SHOULDER, "rate": 500.0}})
 
     costs = []
@@ -338,7 +341,7 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
     )
     system = System.resolve(experiment)
     true = system.parameters.true
-    trajectory = system.plant.simulate(true, references(400, 11))
+    trajectory = system.plant.simulate(true, references(250, 11))
 
     study = mjfim.monte_carlo(experiment, trajectory, trials=20, seed=1, progress=False)
 
@@ -352,7 +355,7 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
 
     inside = []
     for seed in range(3):
-        log = recorded(experiment, 400, 100 + seed)
+        log = recorded(experiment, 250, 100 + seed)
         settings = {"segments": 0.2, "bootstrap": 100}
         estimate = mjfim.identify(experiment.replace(fit=settings), [log], progress=False)
         low, high = estimate.interval.T
@@ -432,7 +435,7 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
 def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Path) -> None:
     experiment = arm_with_torques(
         tmp_path, {"shoulder": SHOULDER, "elbow": ELBOW}, TORQUE1 + TORQUE2
-    ).replace(fit={"start": "inverse_dynamics", "bootstrap": 0})
+    ).replace(fit={"start": "inverse_dynamics", "bootstrap": 0, "segments": "whole"})
     true = System.resolve(experiment).parameters.true
 
     found = mjfim.identify(experiment, [recorded(experiment, 500, 5)], progress=False)

@@ -149,12 +149,6 @@ def test_poor_data_are_described_and_good_data_are_not(base: mjfim.Experiment) -
     noisy = replace(good, ctrl=good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y=y)
     remarks = " ".join(plausibility_remarks(task.system.channels, noisy))
     assert "jumps from row to row" in remarks and "qvel:hinge is rough" in remarks
-    swung = recorded(task, 0, 20.0)
-    assert plausibility_remarks(task.system.channels, swung) == ()
-    y = np.array(swung.y)
-    y[:, 3] *= 2.0
-    remarks = plausibility_remarks(task.system.channels, replace(swung, y=y))
-    assert any("differ by" in remark for remark in remarks)
 
 
 def test_a_quick_motion_of_a_drone_is_not_taken_for_noise() -> None:

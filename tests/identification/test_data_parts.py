@@ -21,6 +21,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import of_subset
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import TermTestData
+from tests.identification.test_missing_terms import with_failing
 from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
 
 RATE = 100.0
@@ -157,12 +158,17 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     system = System.resolve(experiment)
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in (0, 1)]
     monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 100))
+    with_failing("joint/pivot:nothing", monkeypatch)
     found = mjfim.select_terms(experiment, logs)
     assert not found.misfit
     words = "Terms that the model may lack were tested on 25 % of the data, from all 2 recordings."
     assert found.selection is not None
-    assert found.selection.ending == f"No further term that was tested is significant. {words}"
-    assert str(found.tested_data) == words
+    assert found.selection.ending.startswith(
+        f"No further term that was tested is significant. {words}"
+    )
+    assert found.selection.ending.endswith("cannot have it: a strange spring.")
+    assert any("a strange spring" in sentence for sentence in found.warnings)
+    assert str(found.tested_data).startswith(words)
 
     found.save(tmp_path / "out")
     assert mjfim.Estimate.load(tmp_path / "out").tested_data == found.tested_data

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch, FitTask
-from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
+from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.plant.outputs import Noise
 from mjfim.records.events import FitEvent
@@ -37,12 +36,6 @@ def problem(task: FitTask) -> FitProblem:
     return task.problem()
 
 
-def minimum(problem: Any, begin: UnknownValues) -> UnknownValues:
-    found = minimise(problem, begin, SearchSettings(tolerance=1e-5), Budget())
-    assert found is not None and found.success
-    return found.unknowns
-
-
 def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, FitProblem, Array]:
     """The oracle: the noise of the residuals, and a fit with this noise, in turn.
 
@@ -59,7 +52,9 @@ def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, FitProblem, Array
         variances = [float(np.mean(e**2)) * correction for e in errors]
         noise = Noise(covariance=np.diag(variances), strides=problem.noise.strides)
         weighted = problem.with_noise(noise)
-        found = minimum(weighted, found)
+        solved = minimise(weighted, found, SearchSettings(tolerance=1e-5), Budget())
+        assert solved is not None and solved.success
+        found = solved.unknowns
 
     condensed = weighted.condense(found)
     assert condensed is not None

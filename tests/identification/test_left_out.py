@@ -32,14 +32,6 @@ def exact_fit(problem: FitProblem, solution: Solution, part: LeftOutPart) -> Arr
     return least_squares(others, problem.theta(solution.unknowns), TIGHT).unknowns.theta
 
 
-def spoilt(problem: FitProblem, solution: Solution, factors: Array) -> Solution:
-    """The solution at other parameters, with the linearisation there."""
-    unknowns = replace(solution.unknowns, theta=solution.unknowns.theta * factors)
-    condensed = problem.condense(unknowns)
-    assert condensed is not None
-    return replace(solution, unknowns=unknowns, condensed=condensed)
-
-
 @pytest.mark.parametrize("fit", [{}, pytest.param({"segments": 0.5}, marks=pytest.mark.slow)])
 def test_it_is_the_fit_to_the_others(fit: dict[str, object]) -> None:
     problem, solution = fitted(fit)
@@ -61,7 +53,10 @@ def test_a_search_follows_where_the_linearisation_does_not_lead_there() -> None:
     problem, solution = fitted({})
     sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     part = next(left_out_parts(problem))
-    away = spoilt(problem, solution, np.array([3.0, 1.5, 0.2]))
+    unknowns = replace(solution.unknowns, theta=solution.unknowns.theta * [3.0, 1.5, 0.2])
+    condensed = problem.condense(unknowns)
+    assert condensed is not None
+    away = replace(solution, unknowns=unknowns, condensed=condensed)
     found = fit_without(problem, Budget(), solution=away, part=part)
     assert found is not None
     missed = found.theta - exact_fit(problem, solution, part)

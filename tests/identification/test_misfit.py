@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,23 +135,10 @@ def test_a_worst_residual_in_words() -> None:
     )
 
 
-def seen(
-    output: str = "y",
-    p: float = 1.0,
-    inflation: float = 1.0,
-    variance: float = 1.0,
-    time: float = 1.0,
-    correlation: float = 0.3,
-) -> Whiteness:
-    return Whiteness(
-        output=output,
-        count=1000,
-        variance=variance,
-        correlation=correlation,
-        p=p,
-        inflation=inflation,
-        time=time,
-    )
+def seen(output: str = "y", p: float = 1.0, inflation: float = 1.0, **fields: Any) -> Whiteness:
+    """A test of whiteness, by default of white noise of the stated size."""
+    white = {"count": 1000, "variance": 1.0, "correlation": 0.3, "time": 1.0, **fields}
+    return Whiteness(output=output, p=p, inflation=inflation, **white)
 
 
 def test_larger_and_smaller_need_probability_and_size() -> None:
@@ -196,7 +184,7 @@ def test_reasons_in_sentences() -> None:
     assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
     assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (), "white: larger noise"
     burst = WorstResidual(output="y", recording="log", begin=0.0, end=0.1, size=9.0, share=0.5)
-    few = replace(seen(), count=20)
+    few = seen(count=20)
     larger = ("residuals are 2.00 times the stated noise",)
     assert misfit_reasons(4000.0, 1000, True, [seen()], (), burst) == larger
     assert misfit_reasons(4000.0, 1000, True, [few], ()) == larger

@@ -152,8 +152,10 @@ def test_feedback_on_noisy_measurements_is_no_delay(seed: int) -> None:
     assert (np.abs(found.theta - task.system.parameters.true) < 3.0 * found.std).all()
 
 
-def with_failing(failing: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Test a further candidate between the others."""
+def with_failing(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test a further candidate, a strange spring, between the others."""
+    number = Effect(path=path, unit="", value=-1e9, begin=-1e9, size=1.0)
+    failing = Candidate(description="a strange spring", tested=(number,))
     usual = term_tests.candidates_of
 
     def extended(system: System, speeds: Array) -> tuple[list[Candidate], list[str]]:
@@ -177,23 +179,8 @@ def test_a_candidate_that_diverges_or_is_invalid_is_named_and_hides_no_other(
     assert usual.data is not None and not usual.data.untested
     assert "joint/pivot:frictionloss" in {term.path for term in usual.terms}
 
-    number = Effect(path=path, unit="", value=-1e9, begin=-1e9, size=1.0)
-    with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
+    with_failing(path, monkeypatch)
     found = find_missing_terms(problem, task.recordings, at)
     assert found.data is not None and found.data.untested == ("a strange spring",)
     assert [term.path for term in found.terms] == [term.path for term in usual.terms]
     assert found.remark.endswith("cannot have it: a strange spring.")
-
-
-@pytest.mark.slow
-def test_a_selection_says_which_terms_it_could_not_test(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stated = experiment_of(tmp_path, "tilt", terms={}, parameters=DAMPED, fit={"bootstrap": 0})
-    log = rubbing_pendulum(tmp_path)
-    number = Effect(path="joint/pivot:nothing", unit="", value=0.0, begin=0.0, size=1.0)
-    with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
-    found = mjfim.select_terms(stated, [log])
-    assert found.selection is not None
-    assert found.selection.ending.endswith("cannot have it: a strange spring.")
-    assert any("a strange spring" in sentence for sentence in found.warnings)

@@ -12,7 +12,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.starts import SPREAD_STARTS, spread_starts
 from mjfim.records.trajectory import Recording
-from tests.identification.test_inverse_dynamics import CART, cart, cart_log
+from tests.identification.test_inverse_dynamics import cart, cart_log
 
 # The angle alone tells enough of the motion, but there is no equation of motion without the cart.
 ANGLE = ("qpos:hinge", "qvel:hinge")
@@ -34,9 +34,7 @@ def true_values(experiment: Experiment) -> Array:
 
 
 def test_starts_cover_factors_of_ten_within_bounds(experiment: Experiment) -> None:
-    tables = {name: dict(table) for name, table in CART.items()}
-    tables["c"]["bounds"] = [0.2, 0.9]
-    system = System.resolve(experiment.replace(parameters=tables))
+    system = System.resolve(experiment.replace(parameters={"c": {"bounds": [0.2, 0.9]}}))
     parameters, theta = system.parameters, system.parameters.guess
     rng = np.random.default_rng(1)
     starts = spread_starts(parameters, theta, ("d",), system.impossible, rng)
@@ -69,9 +67,7 @@ def test_a_start_that_diverges_is_left(experiment: Experiment, log: Recording) -
 def test_a_model_that_diverges_everywhere_is_an_error(
     experiment: Experiment, log: Recording
 ) -> None:
-    tables = {name: dict(table) for name, table in CART.items()}
-    tables["c"].update(guess=1e7, bounds=[1e6, 1e9])
-    stiff = experiment.replace(parameters=tables)
+    stiff = experiment.replace(parameters={"c": {"guess": 1e7, "bounds": [1e6, 1e9]}})
     with pytest.raises(SimulationDivergedError, match="diverges at the start"):
         mjfim.identify(stiff, [log], progress=False)
 

@@ -14,7 +14,6 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.assessment import term_tests
-from mjfim.identification.assessment.term_candidates import Candidate, Effect
 from mjfim.identification.assessment.term_tests import equivalent_sigmas, find_missing_terms
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segments import KnownActivations
@@ -220,16 +219,3 @@ def test_many_candidates_are_tested_in_groups(
     assert [term.path for term in in_groups[:-1]] == [term.path for term in whole[:-1]]
     for part, complete in zip(in_groups, whole, strict=True):
         assert part.sigmas == pytest.approx(complete.sigmas, rel=0.02)
-
-
-@pytest.mark.parametrize("counts", [[], [1], [3] * 40, [1] * 100, [1] * 101, [1, 3, 1] * 41])
-def test_groups_hold_all_candidates_in_their_order(counts: list[int]) -> None:
-    number = Effect(path="p", unit="", value=0.0, begin=0.0, size=1.0)
-    candidates = [
-        Candidate(description=str(i), tested=(number,) * count) for i, count in enumerate(counts)
-    ]
-    groups = term_tests.in_groups(candidates)
-    sizes = [sum(len(each.tested) for each in group) for group in groups]
-    assert [each for group in groups for each in group] == candidates
-    assert max(sizes, default=0) <= term_tests.MAX_TESTED
-    assert len(groups) <= sum(counts) // term_tests.MAX_TESTED + 1
