@@ -29,18 +29,6 @@ def swung(experiment: mjfim.Experiment, seed: int = 1) -> Recording:
     return mjfim.simulate(experiment, ((1.0 + t / 4.0) * np.sin(2.0 * t))[:, None], seed)
 
 
-def begun_late(log: Recording) -> Recording:
-    """The log without its first second."""
-    return replace(log, t=log.t[100:] - log.t[100], ctrl=log.ctrl[100:], y=log.y[100:])
-
-
-def hung_elsewhere(experiment: mjfim.Experiment) -> Recording:
-    """The log of a pendulum that is held aside at first."""
-    begin = [0.0, np.pi + 1.0]
-    initial = experiment.initial.model_copy(update={"keyframe": None, "qpos": begin})
-    return swung(experiment.model_copy(update={"initial": initial}))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "said", "widest"),
@@ -50,7 +38,13 @@ def test_a_log_that_begins_elsewhere_is_fitted_and_said(
     experiment: mjfim.Experiment, kind: str, said: str, widest: float
 ) -> None:
     """The intervals are nearly those of a log that begins as stated, and hold the true values."""
-    log = begun_late(swung(experiment)) if kind == "late" else hung_elsewhere(experiment)
+    if kind == "late":
+        log = swung(experiment)
+        log = replace(log, t=log.t[100:] - log.t[100], ctrl=log.ctrl[100:], y=log.y[100:])
+    else:
+        aside = {"keyframe": None, "qpos": [0.0, np.pi + 1.0]}
+        initial = experiment.initial.model_copy(update=aside)
+        log = swung(experiment.model_copy(update={"initial": initial}))
     estimate = mjfim.identify(experiment, [log], progress=False)
     assert not estimate.misfit and estimate.success
     assert any("does not begin where [initial] says" in each for each in estimate.warnings)

@@ -126,32 +126,13 @@ class StoppingThreads(ThreadPoolExecutor):
         return super().submit(fn, *args, **kwargs)
 
 
-@pytest.fixture
-def in_small_batches(
+def test_a_request_to_stop_takes_effect_after_the_pass_that_runs(
     experiment: mjfim.Experiment,
     recordings: list[mjfim.Recording],
     monkeypatch: pytest.MonkeyPatch,
-) -> FitProblem:
-    """A problem with many batches, each of which is a task."""
-    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
-    return problem_of(experiment, recordings, SEGMENTS)
-
-
-def stopped_fit(
-    experiment: mjfim.Experiment, recordings: list[mjfim.Recording], after: int
-) -> mjfim.Estimate:
-    """Estimate of a fit that is asked to stop when some number of tasks was submitted."""
-    stop = StopToken()
-    with StoppingThreads(stop, after) as threads:
-        return mjfim.identify(
-            experiment.replace(fit=SEGMENTS), recordings, threads=1, executor=threads, stop=stop
-        )
-
-
-def test_a_request_to_stop_takes_effect_after_the_pass_that_runs(
-    in_small_batches: FitProblem,
 ) -> None:
-    problem = in_small_batches
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
+    problem = problem_of(experiment, recordings, SEGMENTS)
     begin = problem.begin(1.05 * problem.system.parameters.guess)
     stop = StopToken()
     # The first pass for the cost and the first linearisation are complete by then.
@@ -173,7 +154,11 @@ def test_a_request_to_stop_in_any_pass_leaves_an_estimate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(search, "QUICK_SAMPLES", 60)
-    found = stopped_fit(experiment, recordings, after)
+    stop = StopToken()
+    with StoppingThreads(stop, after) as threads:
+        found = mjfim.identify(
+            experiment.replace(fit=SEGMENTS), recordings, threads=1, executor=threads, stop=stop
+        )
 
     assert np.isfinite(found.theta).all()
     assert found.interrupted

@@ -65,6 +65,11 @@ def cart_log(
     return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
 
 
+def true_of(experiment: Experiment) -> Array:
+    """(p,) values of the parameters at which logs are made."""
+    return System.resolve(experiment).parameters.guess
+
+
 def errors(fit: InverseDynamicsFit, true: Array) -> Array:
     """(p,) errors over the sizes of the parameters."""
     return np.abs(fit.theta - true) / np.where(true != 0.0, np.abs(true), 1.0)
@@ -73,7 +78,7 @@ def errors(fit: InverseDynamicsFit, true: Array) -> Array:
 @pytest.mark.slow
 def test_cart_pendulum_is_found_from_starts_wrong_by_ten(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     log = cart_log(experiment, 1e-6)
     signs = np.random.default_rng(5).choice([-1.0, 1.0], (3, len(true)))
     for start in (true, *(true * 10.0**signs)):
@@ -91,7 +96,7 @@ def test_cart_pendulum_is_found_from_starts_wrong_by_ten(tmp_path: Path) -> None
 )
 def test_positions_or_velocities_are_enough(measured: tuple[str, ...], tmp_path: Path) -> None:
     experiment = cart(tmp_path, noise=dict.fromkeys(measured, 1e-3))
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     fit = inverse_dynamics(experiment, [cart_log(experiment, 1e-3, measured=measured)])
     assert errors(fit, true).max() < 0.03
 
@@ -99,7 +104,7 @@ def test_positions_or_velocities_are_enough(measured: tuple[str, ...], tmp_path:
 @pytest.mark.slow
 def test_errors_are_those_of_the_stated_accuracy(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     fits = [
         inverse_dynamics(experiment, [cart_log(experiment, 0.01, seed)], start=2.0 * true)
         for seed in range(8)
@@ -114,7 +119,7 @@ def test_errors_are_those_of_the_stated_accuracy(tmp_path: Path) -> None:
 
 def test_irregular_rows_missing_values_and_several_recordings(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     logs = []
     for seed in range(2):
         log = cart_log(experiment, 0.005, seed)
@@ -142,7 +147,7 @@ def test_dry_friction_needs_no_start(tmp_path: Path) -> None:
     text = CART_PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.6"')
     tables = {**CART, "f": {"target": "joint/slide:frictionloss", "scale": 1.0}}
     experiment = cart(tmp_path, text, parameters=tables)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     log = cart_log(experiment, 0.002, seconds=12.0)
     for start in (0.1 * true, 10.0 * true):
         fit = inverse_dynamics(experiment, [log], start=start)
@@ -191,7 +196,7 @@ def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_p
         if spec.inertial
     }
     experiment = experiment.replace(parameters=tables)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
 
     # The start is a heavier arm with other friction.
     start = np.array(true)

@@ -45,13 +45,6 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
     return times, [rng.standard_normal((len(t), 3)) for t in times]
 
 
-def place(times: list[Array], z: list[Array]) -> WorstResidual:
-    """The worst residual of the three recordings a, b, c."""
-    found = worst_of("abc", times, z)
-    assert found is not None
-    return found
-
-
 @pytest.mark.parametrize(("recording", "output"), [(0, 2), (1, 0), (2, 1)])
 def test_a_planted_burst_is_found(recording: int, output: int) -> None:
     """Output, recording and time agree within two windows; size and share are the interval's."""
@@ -60,7 +53,7 @@ def test_a_planted_burst_is_found(recording: int, output: int) -> None:
     begin, end = 0.55 * t[-1], 0.67 * t[-1]
     burst = (t >= begin) & (t < end)
     z[recording][burst, output] += 8.0 * np.sin(40.0 * t[burst] + 1.0)
-    worst = place(times, z)
+    worst = worst_of("abc", times, z)
     assert (worst.output, worst.recording) == (NAMES[output], "abc"[recording])
     window = t[-1] / 25
     assert worst.begin == pytest.approx(begin, abs=1.5 * window)
@@ -75,7 +68,7 @@ def test_an_output_with_uniformly_large_residuals_is_named_as_a_whole() -> None:
     """The interval is the whole recording, not the window in which noise is largest by chance."""
     times, z = white()
     z[1][:, 2] *= 3.0
-    worst = place(times, z)
+    worst = worst_of("abc", times, z)
     assert (worst.output, worst.recording) == ("force", "b")
     assert worst.begin == times[1][0]
     assert worst.end == pytest.approx(times[1][-1])
@@ -88,7 +81,7 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
     z[0][:, 1] = np.nan
     z[0][200:700, 0] = np.nan
     z[0][720:780, 0] += 7.0
-    worst = place(times, z)
+    worst = worst_of("abc", times, z)
     assert (worst.output, worst.recording) == ("angle", "a")
     assert worst.begin <= 7.2 + 0.4
     assert worst.end >= 7.8 - 0.4
@@ -109,7 +102,7 @@ def test_a_single_value_is_not_an_interval() -> None:
         sparse[700] = 3.6
         z[0][:, 1] = sparse
         z[0][500:600, 0] += 2.5
-        assert place(times, z).output == "angle"
+        assert worst_of("abc", times, z).output == "angle"
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 9])

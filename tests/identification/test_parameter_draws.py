@@ -23,6 +23,7 @@ from mjfim.identification.assessment.parameter_draws import (
 )
 from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unknown_bodies
 from mjfim.model.inertia import barycentric_of, logcholesky_derivatives
+from mjfim.records.estimate import ParameterDraws
 from mjfim.records.events import stages_observed_by
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.hinged_arm import arm_experiment
@@ -59,6 +60,11 @@ def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimat
         "recordings": (),
     }
     return mjfim.Estimate(**{**values, **fields})
+
+
+def drawn(system: System, estimate: mjfim.Estimate, count: int, seed: int = 0) -> ParameterDraws:
+    """Robots drawn from an estimate."""
+    return draw_parameters_system(system, estimate, count, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +111,7 @@ def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
     )
     found = honest_covariance(system.parameters, bounded)
     np.testing.assert_allclose(np.sqrt(found[2, 2]), 0.4 / 1.959964, rtol=1e-5)
-    draws = draw_parameters_system(system, bounded, 1000, np.random.default_rng(2))
+    draws = drawn(system, bounded, 1000, 2)
     half_normal = truncnorm(0.0, np.inf, scale=0.4 / 1.959964)
     assert kstest(draws.values[:, 2], half_normal.cdf).pvalue > 1e-3
 
@@ -114,7 +120,7 @@ def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
     cut = replace(bounded, theta=np.array([2.0, 1.0, 1.0]), std=np.array([0.1, 0.1, 2.0]))
     cut = replace(cut, interval=np.array([[1.9, 2.1], [0.9, 1.1], [0.9, 1.5]]))
     assert np.sqrt(honest_covariance(narrow.parameters, cut)[2, 2]) == 2.0
-    damping = draw_parameters_system(narrow, cut, 500, np.random.default_rng(2)).values[:, 2]
+    damping = drawn(narrow, cut, 500, 2).values[:, 2]
     assert 0.9 <= damping.min() < 0.92 and 1.48 < damping.max() <= 1.5
 
 
@@ -127,7 +133,7 @@ def test_deviations_between_recordings_count(system: System) -> None:
 
     # A parameter with a value for each recording is centred at their mean, and scatters as they do.
     differing = estimated(system, COVARIANCE, per_recording={"c": (1.0, 2.0)})
-    draws = draw_parameters_system(system, differing, 10, np.random.default_rng(0))
+    draws = drawn(system, differing, 10)
     assert draws.centre[2] == 1.5
     np.testing.assert_allclose(draws.std[2], np.hypot(0.1, np.sqrt(0.5)), rtol=1e-3)
 
@@ -136,24 +142,22 @@ def test_undetermined_parameters_are_named(system: System) -> None:
     infinite = np.array([0.02, np.inf, 0.1])
     covariance = np.diag(infinite**2)
     with pytest.raises(ExperimentError, match=r"do not determine l, so that .*prior"):
-        draw_parameters_system(system, estimated(system, covariance), 5, np.random.default_rng(0))
+        drawn(system, estimated(system, covariance), 5)
 
 
 @pytest.mark.parametrize("count", [0, -3, 10_001])
 def test_counts_out_of_range(system: System, count: int) -> None:
     with pytest.raises(ExperimentError, match=rf"robots is {count}; it must be from 1 to 10000"):
-        draw_parameters_system(
-            system, estimated(system, COVARIANCE), count, np.random.default_rng(0)
-        )
+        drawn(system, estimated(system, COVARIANCE), count)
 
 
 def test_an_estimate_of_another_experiment(system: System) -> None:
     other = replace(estimated(system, COVARIANCE), parameters=("m", "l", "d"))
     with pytest.raises(ExperimentError, match=r"other parameters \(m, l, d\)"):
-        draw_parameters_system(system, other, 5, np.random.default_rng(0))
+        drawn(system, other, 5)
     outside = replace(estimated(system, COVARIANCE), theta=np.array([2.0, 1.0, -1.0]))
     with pytest.raises(ExperimentError, match="c lies outside of its bounds"):
-        draw_parameters_system(system, outside, 5, np.random.default_rng(0))
+        drawn(system, outside, 5)
 
 
 def test_initial_states_are_no_properties_of_a_robot() -> None:
@@ -164,7 +168,7 @@ def test_initial_states_are_no_properties_of_a_robot() -> None:
     covariance[3, 3] = np.inf
     assert names[3].startswith("initial")
     estimate = estimated(system, covariance)
-    draws = draw_parameters_system(system, estimate, 4, np.random.default_rng(0))
+    draws = drawn(system, estimate, 4)
     assert draws.parameters == ("m", "l", "c", "delay")
     theta = complete_theta(system, estimate, draws, 2)
     np.testing.assert_array_equal(theta[3:-1], estimate.theta[3:-1])
@@ -183,7 +187,7 @@ def test_unphysical_inertias_are_replaced() -> None:
     system = System.resolve(mjfim.Experiment(**{**values, "parameters": central}))
     assert system.parameters.names == ("Ixx", "Iyy", "Izz")
     estimate = estimated(system, np.diag(np.full(3, 0.006**2)))
-    draws = draw_parameters_system(system, estimate, 200, np.random.default_rng(3))
+    draws = drawn(system, estimate, 200, 3)
     assert draws.replaced > 20
     assert "replaced" in str(draws)
     moments = np.sort(draws.values, axis=1)
@@ -192,14 +196,12 @@ def test_unphysical_inertias_are_replaced() -> None:
 
     hopeless = estimated(system, np.diag([0.006**2, 0.006**2, 1e12]))
     with pytest.raises(ExperimentError, match=r"1 of 1 drawn robots still .*cad_prior"):
-        draw_parameters_system(system, hopeless, 1, np.random.default_rng(3))
+        drawn(system, hopeless, 1, 3)
 
     whole = {"cart": {"inertial": "cart"}}
     system = System.resolve(mjfim.Experiment(**{**values, "parameters": whole}))
     covariance: Array = np.diag((0.1 * system.parameters.magnitude) ** 2)
-    draws = draw_parameters_system(
-        system, estimated(system, covariance), 50, np.random.default_rng(3)
-    )
+    draws = drawn(system, estimated(system, covariance), 50, 3)
     assert draws.replaced < 10
     for values_of_robot in draws.values:
         model = system.model_at(values_of_robot)
@@ -275,7 +277,7 @@ def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
         np.testing.assert_allclose(
             np.sqrt(row @ estimate.honest_covariance @ row), KNOWN, rtol=1e-3
         )
-    draws = draw_parameters_system(system, estimate, 400, np.random.default_rng(7))
+    draws = drawn(system, estimate, 400, 7)
     assert draws.held_combinations == 9
     assert "9 combinations of inertias that the recordings do not determine" in str(draws)
 
@@ -302,7 +304,7 @@ def test_a_wide_prior_on_a_whole_inertia_gives_physical_robots(
     system = known.system
     stages: list[str] = []
     with stages_observed_by(lambda name, *_: stages.append(name)):
-        draws = draw_parameters_system(system, known.estimate, 50, np.random.default_rng(7))
+        draws = drawn(system, known.estimate, 50, 7)
     assert set(stages) == {"drawing robots inside the physical inertias"}
     linear, *combinations = known.relative(draws.values)
     assert all(known.body.is_physical(each) for each in linear)

@@ -18,7 +18,6 @@ from mjfim.identification.assessment.term_tests import equivalent_sigmas, find_m
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segments import KnownActivations
 from mjfim.model.terms.library import KINDS
-from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.studies.selected_models import selected_term
 from mjfim.studies.selection import SIMILAR_SHARE
 from tests.support.terms import (
@@ -26,6 +25,8 @@ from tests.support.terms import (
     experiment_of,
     motor_torque,
     recorded,
+    small_logs,
+    solution_near,
     write_pendulum,
 )
 
@@ -134,18 +135,11 @@ def without_term(folder: Path, kind: str) -> tuple[mjfim.Experiment, Any]:
     return stated, System.resolve(robot)
 
 
-def solution_near(problem: FitProblem, theta: Any) -> Any:
-    """Nearly the best unknowns, which a few steps give."""
-    found = minimise(problem, problem.begin(np.array(theta)), SearchSettings(max_iterations=6))
-    assert found is not None
-    return found.unknowns
-
-
 @pytest.mark.parametrize("kind", MISSED)
 @pytest.mark.slow
 def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind: str) -> None:
     stated, robot = without_term(tmp_path, kind)
-    logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
+    logs = small_logs(robot, 0, 1)
     system = System.resolve(stated)
     problem = FitProblem.of(system, logs)
     at = solution_near(problem, system.parameters.guess)
@@ -175,7 +169,7 @@ def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
         terms={"lag": table},
         parameters={"tau": {"target": "term/lag:time_constant", "guess": 0.02}},
     )
-    logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
+    logs = small_logs(robot, 0, 1)
     problem = FitProblem.of(System.resolve(whole), logs)
     at = solution_near(problem, [0.01, 0.0105, 0.02, 0.03])
     assert find_missing_terms(problem, logs, at).terms == ()
@@ -206,7 +200,7 @@ def test_many_candidates_are_tested_in_groups(
 ) -> None:
     """A delay is the last candidate; it was left out where others used all tested numbers."""
     stated, robot = without_term(tmp_path, "actuator_lag")
-    logs = [recorded(robot, motor_torque(1.5, RATE, 0, size=0.08), 0)]
+    logs = small_logs(robot, 0)
     problem = FitProblem.of(System.resolve(stated), logs)
     at = solution_near(problem, problem.system.parameters.guess)
     whole = find_missing_terms(problem, logs, at).terms

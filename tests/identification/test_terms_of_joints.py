@@ -18,12 +18,11 @@ from mjfim.identification.assessment.term_tests import (
     first_terms,
 )
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import selected_term
 from tests.support.numerics import Array
-from tests.support.terms import recorded
+from tests.support.terms import recorded, solution_near
 
 JOINTS = ("pan", "lift", "roll")
 EXCESS = (0.5, 0.4, 0.1)
@@ -95,10 +94,7 @@ def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
     """Tests of the terms that the stated model lacks."""
     system = System.resolve(experiment, threads=1)
     problem = FitProblem.of(system, [log])
-    begin = problem.begin(np.array(system.parameters.guess))
-    at = minimise(problem, begin, SearchSettings(max_iterations=6))
-    assert at is not None
-    return find_missing_terms(problem, [log], at.unknowns)
+    return find_missing_terms(problem, [log], solution_near(problem, system.parameters.guess))
 
 
 @pytest.mark.slow
