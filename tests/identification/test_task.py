@@ -13,9 +13,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.identify import identify_system
 from mjfim.identification.search import FitTask
-from mjfim.parallel.budget import StopToken
 from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS
 from tests.support.terms import recorded
@@ -99,18 +97,6 @@ def test_the_start_is_moved_inside_the_bounds_of_a_bounded_method(
     np.testing.assert_array_equal(bounded.start, [10.0, 0.0])
     unbounded = FitTask.of(System.resolve(experiment), [recording], start=start, method="newton")
     np.testing.assert_array_equal(unbounded.start, start)
-
-
-def test_a_stop_token_ends_the_search_with_the_best_result_so_far(
-    experiment: mjfim.Experiment, recording: Recording
-) -> None:
-    stop = StopToken()
-    stop.request()
-    task = FitTask.of(System.resolve(experiment), [recording])
-    estimate = identify_system(task.system, [recording], stop=stop)
-    assert estimate.interrupted and not estimate.success
-    assert estimate.predictions == ()
-    np.testing.assert_array_equal(estimate.theta, task.start)
 
 
 def test_variants_of_a_problem_leave_the_problem_unchanged(
