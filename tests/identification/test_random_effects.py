@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.stats import chi2, kstest
+from scipy.stats import chi2, f, kstest
 
 from mjfim.identification.assessment.recording_comparison import (
     between_variance,
     difference,
+    f_tail,
     random_effects,
+    satterthwaite,
     with_scatter,
 )
 from tests.support.numerics import Array
@@ -109,3 +111,11 @@ def test_scatter_adds_to_the_covariance_also_of_singular_information() -> None:
     np.testing.assert_allclose(both[0], rank_one / variance, atol=1e-12)
     np.testing.assert_allclose(both[1], found, rtol=1e-12)
     np.testing.assert_array_equal(with_scatter(rank_one, np.zeros((3, 3))), rank_one)
+
+
+def test_distributions() -> None:
+    assert f_tail(6.0, 3, 10.0) == pytest.approx(f(3, 10).sf(2.0))
+    assert f_tail(6.0, 0, 10.0) == 1.0
+    np.testing.assert_allclose(
+        satterthwaite(np.array([0.0, 1.0, 0.5]), 50.0, 2), [50.0, 2.0, 1.0 / (0.25 / 50 + 0.125)]
+    )
