@@ -341,7 +341,7 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
     )
     system = System.resolve(experiment)
     true = system.parameters.true
-    trajectory = system.plant.simulate(true, references(250, 11))
+    trajectory = system.plant.simulate(true, references(400, 11))
 
     study = mjfim.monte_carlo(experiment, trajectory, trials=20, seed=1, progress=False)
 
@@ -355,7 +355,7 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
 
     inside = []
     for seed in range(3):
-        log = recorded(experiment, 250, 100 + seed)
+        log = recorded(experiment, 400, 100 + seed)
         settings = {"segments": 0.2, "bootstrap": 100}
         estimate = mjfim.identify(experiment.replace(fit=settings), [log], progress=False)
         low, high = estimate.interval.T
@@ -435,7 +435,7 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
 def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Path) -> None:
     experiment = arm_with_torques(
         tmp_path, {"shoulder": SHOULDER, "elbow": ELBOW}, TORQUE1 + TORQUE2
-    ).replace(fit={"start": "inverse_dynamics", "bootstrap": 0, "segments": "whole"})
+    ).replace(fit={"start": "inverse_dynamics", "bootstrap": 0})
     true = System.resolve(experiment).parameters.true
 
     found = mjfim.identify(experiment, [recorded(experiment, 500, 5)], progress=False)

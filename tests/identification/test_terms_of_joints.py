@@ -22,7 +22,7 @@ from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import selected_term
 from tests.support.numerics import Array
-from tests.support.terms import recorded, solution_near
+from tests.support.terms import solution_near
 
 JOINTS = ("pan", "lift", "roll")
 EXCESS = (0.5, 0.4, 0.1)
@@ -87,7 +87,10 @@ def log_of(experiment: mjfim.Experiment, seed: int, seconds: float = 3.0) -> Rec
     rng = np.random.default_rng(seed)
     t = np.arange(round(RATE * seconds)) / RATE
     control: Array = 0.4 * multisine(t, 3, 0.3, 4, rng)
-    return recorded(system, control, seed)
+    y = system.plant.measure(system.parameters.guess[None], control)[0][0]
+    y = y + rng.standard_normal(y.shape) * system.noise.sigma
+    times = np.arange(len(y)) / RATE
+    return Recording(t=times, ctrl=control, y=y, outputs=system.outputs.names)
 
 
 def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
