@@ -20,7 +20,6 @@ from mjfim.identification.aligned_recording import (
     measured_trajectory,
     resample_control,
 )
-from mjfim.plant.outputs import OutputDelay
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
 
@@ -116,6 +115,8 @@ def test_a_recording_on_the_grid_is_unchanged(task: DesignTask) -> None:
         np.testing.assert_allclose(aligned.t, plain.t, rtol=0, atol=1e-15)
         np.testing.assert_array_equal(aligned.ctrl, plain.ctrl)
         np.testing.assert_array_equal(aligned.y, plain.y)
+    with pytest.raises(ValueError, match="read-only"):
+        aligned.y[0, 0] = 1.0
     swapped = log(task, y=plain.y[:, [3, 0]], outputs=("qvel:hinge", "qpos:slide"))
     aligned = align(task.system, swapped)
     np.testing.assert_array_equal(aligned.y[:, [3, 0]], swapped.y)
@@ -188,37 +189,33 @@ def test_faults_are_named(task: DesignTask, changes: dict[str, Any], words: str)
         align(task.system, log(task, **changes))
 
 
+def aligned_prediction(task: DesignTask, flipped: Array | None = None) -> tuple[Array, Array]:
+    """What the model predicts, and the aligned values of a log of it, or of its other signs."""
+    y = task.plant.measure(task.parameters.guess[None], task.control)[0][0]
+    shown = y if flipped is None else y * flipped
+    recording = log(task, t=np.arange(len(y)) * task.dt, ctrl=task.control, y=shown)
+    return y, align(task.system, recording).y
+
+
 def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
     """Random signs and gaps are replaced by the continuous curve that the model predicts."""
-    ctrl = body.control
-    y = body.plant.measure(body.parameters.guess[None], ctrl)[0][0]
-    names, flipped = body.system.outputs.names, np.array(y)
+    names = body.system.outputs.names
+    signs = np.ones((len(body.control) + 1, len(names)))
     rng = np.random.default_rng(0)
     for joint in ("float", "ball"):
         columns = [names.index(f"qpos:{joint}.q{a}") for a in "wxyz"]
-        flipped[:, columns] *= rng.choice([-1.0, 1.0], (len(y), 1))
-        flipped[10:20, columns] = np.nan
-    aligned = align(
-        body.system,
-        Recording(t=np.arange(len(y)) * body.dt, ctrl=ctrl, y=flipped, outputs=names, name="x.csv"),
-    )
-    seen = np.isfinite(flipped)
-    np.testing.assert_array_equal(aligned.y[seen], y[seen])
-    assert np.isnan(aligned.y[~seen]).all()
+        signs[:, columns] *= rng.choice([-1.0, 1.0], (len(signs), 1))
+        signs[10:20, columns] = np.nan
+    y, aligned = aligned_prediction(body, signs)
+    np.testing.assert_array_equal(aligned, y * np.abs(signs))
 
 
 def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
     """A single component may cross zero; it does not show whether q or -q was recorded."""
     some = body_task(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
-    y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
+    y, aligned = aligned_prediction(some)
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
-    aligned = align(
-        some.system,
-        Recording(
-            t=np.arange(len(y)) * some.dt, ctrl=some.control, y=y, outputs=some.system.outputs.names
-        ),
-    )
-    np.testing.assert_array_equal(aligned.y, y)
+    np.testing.assert_array_equal(aligned, y)
 
 
 def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) -> None:
@@ -247,64 +244,6 @@ def test_the_measured_trajectory_has_measured_velocities_or_none(tmp_path: Path)
     column = recorded.outputs.index("qvel:hinge")
     np.testing.assert_array_equal(shown.qvel[:, 1], recorded.y[:, column])
     assert np.isnan(shown.qvel[:, 0]).all()
-
-
-def test_interpolation_between_samples_is_exact_for_cubics() -> None:
-    """Values and slopes are exact at any times, in any order, also several at one sample.
-
-    They are not exact for a quartic, which shows that the test can fail.
-    """
-    rng = np.random.default_rng(0)
-    wanted = rng.uniform(0.0, 29.0, 200)
-    wanted[:3] = 0.0, 29.0, 14.0
-    output_delay, grid = OutputDelay.at(wanted, 30, DT), np.arange(30.0)
-    for degree in range(5):
-        curve = np.polynomial.Polynomial(rng.standard_normal(degree + 1), domain=[0, 29])
-        values, size = curve(grid), np.abs(curve(grid)).max()
-        error = np.abs(output_delay.apply(values) - curve(wanted)).max() / size
-        slope = (
-            np.abs(output_delay.derivative(values) + curve.deriv()(wanted) / DT)[2:].max()
-            * DT
-            / size
-        )
-        assert (max(error, slope) < 1e-11) == (degree <= 3)
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.4 * DT, 3.7 * DT, -1.2 * DT])
-def test_interpolation_at_the_samples_is_the_delay_on_the_grid(delay: float) -> None:
-    """The delay on the grid equals the interpolation at every sample, for any rows.
-
-    Before the first sample, its value is held.
-    """
-    all_of_them, y = (
-        OutputDelay.on_grid(40, delay, DT),
-        np.random.default_rng(0).standard_normal((40, 2)),
-    )
-    some = np.array([0, 3, 4, 17, 38, 39])
-    output_delay = OutputDelay.at(some - delay / DT, 40, DT)
-    np.testing.assert_allclose(
-        output_delay.apply(y), all_of_them.apply(y)[some], rtol=0, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        output_delay.derivative(y), all_of_them.derivative(y)[some], rtol=0, atol=1e-9
-    )
-    early = OutputDelay.at(np.array([-7.0, -0.01]), 40, DT)
-    np.testing.assert_array_equal(early.apply(y), y[[0, 0]])
-    assert not early.derivative(y).any()
-    v = np.random.default_rng(1).standard_normal((6, 2))
-    assert np.sum(v * output_delay.apply(y)) == pytest.approx(
-        np.sum(output_delay.apply_transposed(v) * y), rel=1e-12
-    )
-
-
-def test_an_aligned_recording_does_not_change(task: DesignTask) -> None:
-    """Its arrays are read-only, and those of the recording stay unchanged."""
-    plain = log(task)
-    before = np.array(plain.y)
-    aligned: AlignedRecording = align(task.system, plain)
-    with pytest.raises(ValueError, match="read-only"):
-        aligned.y[0, 0] = 1.0
-    np.testing.assert_array_equal(plain.y, before)
 
 
 def test_a_long_measured_motion_ends_with_the_fitted_one(task: DesignTask) -> None:

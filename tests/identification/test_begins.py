@@ -11,6 +11,7 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import MODELS
 
 CLEAN = ("cart_pendulum", "quadrotor", "servo_arm", "four_bar")
@@ -19,25 +20,13 @@ CLEAN = ("cart_pendulum", "quadrotor", "servo_arm", "four_bar")
 @pytest.fixture(scope="module")
 def experiment() -> mjfim.Experiment:
     """The cart-pendulum, which hangs at rest at first."""
-    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return cart_pendulum()
 
 
 def swung(experiment: mjfim.Experiment, seed: int = 1) -> Recording:
     """Six seconds of the motion of the paper."""
     t = 0.01 * np.arange(600)
     return mjfim.simulate(experiment, ((1.0 + t / 4.0) * np.sin(2.0 * t))[:, None], seed)
-
-
-def begun_late(log: Recording) -> Recording:
-    """The log without its first second."""
-    return replace(log, t=log.t[100:] - log.t[100], ctrl=log.ctrl[100:], y=log.y[100:])
-
-
-def hung_elsewhere(experiment: mjfim.Experiment) -> Recording:
-    """The log of a pendulum that is held aside at first."""
-    begin = [0.0, np.pi + 1.0]
-    initial = experiment.initial.model_copy(update={"keyframe": None, "qpos": begin})
-    return swung(experiment.model_copy(update={"initial": initial}))
 
 
 @pytest.mark.slow
@@ -49,7 +38,13 @@ def test_a_log_that_begins_elsewhere_is_fitted_and_said(
     experiment: mjfim.Experiment, kind: str, said: str, widest: float
 ) -> None:
     """The intervals are nearly those of a log that begins as stated, and hold the true values."""
-    log = begun_late(swung(experiment)) if kind == "late" else hung_elsewhere(experiment)
+    if kind == "late":
+        log = swung(experiment)
+        log = replace(log, t=log.t[100:] - log.t[100], ctrl=log.ctrl[100:], y=log.y[100:])
+    else:
+        aside = {"keyframe": None, "qpos": [0.0, np.pi + 1.0]}
+        initial = experiment.initial.model_copy(update=aside)
+        log = swung(experiment.model_copy(update={"initial": initial}))
     estimate = mjfim.identify(experiment, [log], progress=False)
     assert not estimate.misfit and estimate.success
     assert any("does not begin where [initial] says" in each for each in estimate.warnings)

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification import segment_simulation
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import least_squares
 from mjfim.output.export.mjcf import write_identified
 from mjfim.recordings.read import read_recording
 from mjfim.records.trajectory import Recording
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
-from tests.support.executors import LosingThreads
-from tests.support.paths import MODELS, SHARED_DATA, SHARED_MODELS
-from tests.support.shared_models import PANDA
+from tests.support.paths import MODELS, SHARED_DATA
 
 # Whole jobs: these tests run in `.ci/run` only.
 pytestmark = pytest.mark.slow
@@ -80,14 +74,17 @@ def exact(system: System, inputs: np.ndarray) -> Recording:
     return Recording(t=t, ctrl=inputs, y=y[0], outputs=system.outputs.names, name="exact")
 
 
-def test_plant_gains_and_latency_are_found_from_references_alone() -> None:
-    laws = {"shoulder": SHOULDER, "elbow": ELBOW}
+def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> None:
+    laws = {"shoulder": {**SHOULDER, "feedforward": True}, "elbow": ELBOW}
     experiment = arm_experiment(
-        laws, parameters={**PLANT, **GAINS}, noise=NOISE, fit={"bootstrap": 0}
+        laws,
+        parameters={**PLANT, **GAINS},
+        noise=NOISE,
+        fit={"bootstrap": 0, "segments": "whole"},
     )
     true = System.resolve(experiment).parameters.true
 
-    found = mjfim.identify(experiment, [recorded(experiment, 700, 1)], progress=False)
+    found = mjfim.identify(experiment, [recorded(experiment, 400, 1)], progress=False)
 
     assert found.success
     assert not found.misfit
@@ -99,6 +96,7 @@ def test_plant_gains_and_latency_are_found_from_references_alone() -> None:
     assert shoulder.rate == 250.0
     assert shoulder.numbers["kp"] == found.theta[2]
     assert shoulder.estimated == ("kp", "latency")
+    assert shoulder.columns == ("reference:shoulder", "feedforward:shoulder")
     assert elbow.columns == ("reference:elbow",)
     assert "latency" in shoulder.toml
     assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
@@ -108,7 +106,7 @@ def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
     """The rate matters: a slow law brakes less, and the plant would be blamed for it."""
     laws = {"shoulder": {**SHOULDER, "rate": 50.0}, "elbow": ELBOW}
     experiment = arm_experiment(laws, parameters=PLANT, noise=NOISE)
-    log = recorded(experiment, 500, 2)
+    log = recorded(experiment, 300, 2)
     wrong = experiment.replace(controllers={"shoulder": {**SHOULDER, "rate": 500.0}})
 
     costs = []
@@ -121,8 +119,7 @@ def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
     assert 2.0 * costs[1] > 1.5 * count
 
 
-@pytest.mark.parametrize("of_a_fit", [False, True])
-def test_derivatives_agree_with_differences_of_a_plain_loop(of_a_fit: bool) -> None:
+def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:
     """By gains and all times of the law, of a simulation and of a fit."""
     law = {
         "kp": 60.0,
@@ -158,18 +155,16 @@ def test_derivatives_agree_with_differences_of_a_plain_loop(of_a_fit: bool) -> N
         step[j] = 1e-4 * guess[j]
         expected[..., j] = (plain(guess + step) - plain(guess - step)) / (2 * step[j])
 
-    if not of_a_fit:
-        predicted = system.plant.derivatives.predict(guess, inputs)
-        assert predicted is not None
-        found = predicted[1]
-    else:
-        problem = FitProblem.of(system, [exact(system, inputs)])
-        batch = next(problem.batches(derivatives=True))
-        (rows,) = problem.rows_of_batch(problem.begin(guess), batch)
-        found = rows.jacobians[0]
     size = np.abs(expected).max(axis=(0, 1))
     assert (size * guess > 1e-4).all()
-    np.testing.assert_allclose(found / size, expected / size, atol=2e-4)
+
+    predicted = system.plant.derivatives.predict(guess, inputs)
+    assert predicted is not None
+    problem = FitProblem.of(system, [exact(system, inputs)])
+    batch = next(problem.batches(derivatives=True))
+    (rows,) = problem.rows_of_batch(problem.begin(guess), batch)
+    for found in (predicted[1], rows.jacobians[0]):
+        np.testing.assert_allclose(found / size, expected / size, atol=2e-4)
 
 
 @pytest.mark.parametrize(("off", "tolerance"), [(0, 4e-4), (50, 2e-3)])
@@ -217,29 +212,6 @@ def test_segments_know_the_integral_of_the_law(off: int, tolerance: float) -> No
     forgotten = np.array(recording.ctrl)
     forgotten[:, 3:] = 0.0
     assert error(replace(recording, ctrl=forgotten)) > 0.02
-
-
-@pytest.mark.parametrize("fit", [{}, {"segments": 0.25}], ids=["whole", "segments"])
-def test_a_fit_on_workers_is_the_same_to_the_last_digit(
-    fit: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 20_000)
-    laws = {"shoulder": {**SHOULDER, "ki": 20.0, "time_constant": 0.01}, "elbow": ELBOW}
-    experiment = arm_experiment(laws, parameters={**PLANT, **GAINS}, noise=NOISE, fit=fit)
-    logs = [recorded(experiment, 300, seed) for seed in range(3)]
-    problem = FitProblem.of(System.resolve(experiment, threads=1), logs)
-    at = problem.begin(problem.system.parameters.guess)
-    cost, condensed = problem.cost(at), problem.condense(at)
-
-    with LosingThreads() as threads:
-        divided = replace(problem, workers=FitWorkers(threads))
-        divided_cost, found = divided.cost(at), divided.condense(at)
-
-    assert threads.submitted > 4
-    assert divided_cost == cost
-    assert condensed is not None
-    assert found is not None
-    assert np.array_equal(found.blocks, condensed.blocks)
 
 
 def test_a_check_of_a_log_knows_the_law() -> None:
@@ -333,37 +305,31 @@ def servo_log(folder: Path, enabled: slice) -> Path:
     return path
 
 
+def predictions(log: Path, **tables: Any) -> list[np.ndarray]:
+    """Predictions of a log with three controls and with the law; tables change both experiments."""
+    outputs = []
+    for stated in servo_experiments():
+        system = System.resolve(stated.replace(**tables))
+        problem = FitProblem.of(system, [read_recording(log, system.channels)])
+        predicted = problem.predict(problem.begin(system.parameters.guess))
+        assert predicted is not None
+        outputs.append(predicted[0])
+    return outputs
+
+
 @pytest.mark.parametrize("enabled", [slice(0, None), slice(0, 120)], ids=["on", "switched off"])
 def test_a_duty_law_equals_the_same_law_as_three_controls(tmp_path: Path, enabled: slice) -> None:
     """The firmware's law on volts, and affine actuators of MJCF whose controls a log yields."""
-    path = servo_log(tmp_path, enabled)
-    outputs = []
-    for stated in servo_experiments():
-        stated = stated.replace(recording={"records": None})
-        system = System.resolve(stated)
-        problem = FitProblem.of(system, [read_recording(path, system.channels)])
-        predicted = problem.predict(problem.begin(system.parameters.guess))
-        assert predicted is not None
-        outputs.append(predicted[0][:, 0])
-
-    np.testing.assert_allclose(outputs[1], outputs[0], atol=1e-12)
-    assert np.ptp(outputs[0]) > 0.1
+    controls, law = predictions(servo_log(tmp_path, enabled), recording={"records": None})
+    np.testing.assert_allclose(law[:, 0], controls[:, 0], atol=1e-12)
+    assert np.ptp(controls[:, 0]) > 0.1
 
 
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="measured recordings are not here")
 def test_a_duty_law_predicts_measured_logs_as_three_controls() -> None:
     """Where the torque is switched off inside an engine step, both differ by this step."""
     logs = sorted((SHARED_DATA / "bam_xl330" / "raw").glob("*.json"))[:3]
-    differences = []
-    for log in logs:
-        outputs = []
-        for stated in servo_experiments():
-            system = System.resolve(stated)
-            problem = FitProblem.of(system, [read_recording(log, system.channels)])
-            predicted = problem.predict(problem.begin(system.parameters.guess))
-            assert predicted is not None
-            outputs.append(predicted[0])
-        differences.append(np.abs(outputs[1] - outputs[0]).max())
+    differences = [np.abs(np.subtract(*predictions(log))).max() for log in logs]
     assert sorted(differences)[1] < 1e-10
     assert max(differences) < 2e-3
 
@@ -395,76 +361,6 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
         low, high = estimate.interval.T
         inside.append((low < true) & (true < high))
     assert np.mean(inside) > 0.8
-
-
-def panda_with_motors(folder: Path) -> Path:
-    """The Panda with motors in place of servos, rotors and viscous friction, at 1 kHz."""
-    text = (SHARED_MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml").read_text()
-    ranges = [87] * 4 + [12] * 3
-    motors = [
-        f'<motor name="{joint}" joint="{joint}" ctrlrange="{-force} {force}"/>'
-        for joint, force in zip(PANDA, ranges, strict=True)
-    ]
-    block = f"<actuator>{''.join(motors)}</actuator>"
-    text = re.sub(r"<actuator>.*?</actuator>", block, text, flags=re.DOTALL)
-    text = re.sub(r"<keyframe>.*?</keyframe>", "", text, flags=re.DOTALL)
-    text = text.replace("<option ", '<option timestep="0.001" ')
-    joint = '<joint range="-2.8973 2.8973"'
-    text = text.replace(joint, f'{joint} armature="0.1" damping="1"', 1)
-    path = folder / "panda.xml"
-    path.write_text(text)
-    return path
-
-
-@pytest.mark.skipif(not SHARED_MODELS.is_dir(), reason="the models of others are not here")
-def test_a_seven_joint_arm_with_feedforward(tmp_path: Path) -> None:
-    """Payload, friction, all gains and the latency of the Panda's drivers, from references."""
-    path = panda_with_motors(tmp_path)
-    model = mujoco.MjModel.from_xml_path(str(path))
-    home = np.array([0.0, -0.4, 0.0, -1.9, 0.0, 1.57, -0.785])
-    kp, kd = (600, 600, 600, 600, 250, 150, 50), (50, 50, 50, 30, 30, 25, 15)
-    mass = float(model.body("link7").mass[0])
-
-    parameters: dict[str, Any] = {"mass": {"target": "body/link7:mass", "true": 1.4 * mass}}
-    controllers, noise = {}, {}
-    for i, joint in enumerate(PANDA):
-        law = {"kp": 0.85 * kp[i], "kd": float(kd[i]), "feedforward": True, "rate": 1000.0}
-        controllers[joint] = law
-        noise[f"qpos:{joint}"] = 2e-4
-        damping = {"target": f"joint/{joint}:damping", "true": 1.0 + 0.1 * i}
-        gain = {"target": f"controller/{joint}:kp", "true": float(kp[i]), "nuisance": True}
-        parameters |= {f"damping{i}": damping, f"kp{i}": gain}
-    times = tuple({"path": f"controller/{joint}:latency"} for joint in PANDA)
-    parameters["latency"] = {"targets": times, "guess": 0.002, "true": 0.0047, "nuisance": True}
-    experiment = mjfim.Experiment(
-        model=str(path),
-        rate=250.0,
-        initial={"qpos": tuple(home)},
-        parameters=parameters,
-        noise=noise,
-        controllers=controllers,
-    )
-
-    # Commands of a robot: smooth references, and the torque of gravity along them.
-    t = np.arange(150)[:, None] / 250.0
-    phases = np.random.default_rng(0).uniform(0, 6, (5, 7))
-    waves = [(np.sin(np.pi * k * t + p) - np.sin(p)) / k for k, p in enumerate(phases, 1)]
-    reference = home + 0.25 * sum(waves)
-    data = mujoco.MjData(model)
-    inputs = np.zeros((len(t), 14))
-    for row, position in zip(inputs, reference, strict=True):
-        data.qpos[:], data.qvel[:] = position, 0.0
-        mujoco.mj_forward(model, data)
-        row[0::2], row[1::2] = position, data.qfrc_bias
-
-    log = mjfim.simulate(experiment, inputs, seed=1)
-    found = mjfim.identify(experiment, [log], progress=False)
-
-    true = System.resolve(experiment).parameters.true
-    assert not found.misfit
-    assert np.abs((found.theta - true) / found.std).max() < 4.0
-    assert found.std[0] < 0.01 * true[0]
-    assert len(found.controllers) == 7
 
 
 def test_a_law_acts_on_a_motor_with_a_lag() -> None:

@@ -19,9 +19,16 @@ from mjfim.identification.assessment.term_tests import (
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import of_subset
-from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import TermTestData
-from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
+from tests.identification.test_missing_terms import with_failing
+from tests.support.terms import (
+    experiment_of,
+    motor_torque,
+    recorded,
+    small_logs,
+    solution_near,
+    write_pendulum,
+)
 
 RATE = 100.0
 
@@ -130,13 +137,9 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
         directory=tmp_path,
     )
     system = System.resolve(stated)
-    moved = [recorded(robot, motor_torque(1.5, RATE, i, size=0.08), i + 1) for i in (0, 1, 2)]
-    logs = [recorded(system, np.zeros((150, 1)), 0), *moved]
+    logs = [recorded(system, np.zeros((150, 1)), 0), *small_logs(robot, 1, 2, 3)]
     problem = FitProblem.of(system, logs)
-    begin = problem.begin(problem.system.parameters.guess)
-    solution = minimise(problem, begin, SearchSettings(max_iterations=6))
-    assert solution is not None
-    at = solution.unknowns
+    at = solution_near(problem, system.parameters.guess)
 
     first = np.zeros(1, dtype=int)
     assert not find_missing_terms(problem.of_segments(first), logs, of_subset(at, first)).terms
@@ -157,12 +160,17 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     system = System.resolve(experiment)
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in (0, 1)]
     monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 100))
+    with_failing("joint/pivot:nothing", monkeypatch)
     found = mjfim.select_terms(experiment, logs)
     assert not found.misfit
     words = "Terms that the model may lack were tested on 25 % of the data, from all 2 recordings."
     assert found.selection is not None
-    assert found.selection.ending == f"No further term that was tested is significant. {words}"
-    assert str(found.tested_data) == words
+    assert found.selection.ending.startswith(
+        f"No further term that was tested is significant. {words}"
+    )
+    assert found.selection.ending.endswith("cannot have it: a strange spring.")
+    assert any("a strange spring" in sentence for sentence in found.warnings)
+    assert str(found.tested_data).startswith(words)
 
     found.save(tmp_path / "out")
     assert mjfim.Estimate.load(tmp_path / "out").tested_data == found.tested_data

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,10 @@ import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
-from mjfim.experiment.system import System
 from mjfim.output.pages import page_of
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording
-from tests.identification.test_inverse_dynamics import STATE, cart, cart_log
+from tests.identification.test_inverse_dynamics import STATE, cart, cart_log, true_of
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +29,14 @@ def log(folder: Path) -> Recording:
 @pytest.fixture(scope="module")
 def estimate(folder: Path, log: Recording) -> Estimate:
     experiment = cart(folder, fit={"start": "inverse_dynamics", "bootstrap": 0})
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     wrong = true * np.array([8.0, 3.0, 9.0, 0.1])
     return mjfim.identify(experiment, [log], start=wrong, progress=False)
 
 
 @pytest.mark.slow
 def test_the_estimate_starts_from_the_equation_of_motion(folder: Path, estimate: Estimate) -> None:
-    true = System.resolve(cart(folder)).parameters.guess
+    true = true_of(cart(folder))
     assert estimate.success and not estimate.misfit
     assert (np.abs(estimate.theta - true) < 5.0 * estimate.std).all()
     assert estimate.restart is None
@@ -68,7 +68,7 @@ def test_it_is_saved_shown_and_drawn(estimate: Estimate, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_a_local_minimum_is_left_by_the_equation_of_motion(folder: Path, log: Recording) -> None:
     experiment = cart(folder, fit={"bootstrap": 0})
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     found = mjfim.identify(experiment, [log], start=0.1 * true, progress=False)
     assert (np.abs(found.theta - true) < 5.0 * found.std).all()
     assert found.restart is not None
@@ -83,7 +83,7 @@ def test_a_model_that_diverges_at_the_start_begins_at_the_equation_of_motion(
     folder: Path, log: Recording
 ) -> None:
     experiment = cart(folder, fit={"bootstrap": 0})
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     wrong = true * np.array([10.0, 0.1, 10.0, 0.1])
     found = mjfim.identify(experiment, [log], start=wrong, progress=False)
     assert found.success and not found.misfit
@@ -101,13 +101,8 @@ def test_a_model_that_diverges_at_the_start_begins_at_the_equation_of_motion(
 def test_what_it_needs_is_said(folder: Path, log: Recording) -> None:
     experiment = cart(folder, fit={"start": "inverse_dynamics"})
     kept = [i for i, name in enumerate(STATE) if not name.endswith("hinge")]
-    part = Recording(
-        t=log.t,
-        ctrl=log.ctrl,
-        y=log.y[:, kept],
-        outputs=tuple(STATE[i] for i in kept),
-        name="part.csv",
-    )
+    outputs = tuple(STATE[i] for i in kept)
+    part = replace(log, y=log.y[:, kept], outputs=outputs, name="part.csv")
     with pytest.raises(RecordingError, match=r"part\.csv: no measured position or velocity of h"):
         mjfim.identify(experiment, [part], progress=False)
 

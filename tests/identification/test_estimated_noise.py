@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch, FitTask
-from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
+from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.plant.outputs import Noise
 from mjfim.records.events import FitEvent
-from tests.support.paths import MODELS
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 
 # Error of the readings that the model cannot explain, so that the outputs contradict each other.
 DRIFT = 0.1
@@ -27,24 +24,16 @@ DRIFT = 0.1
 @pytest.fixture(scope="module")
 def task() -> FitTask:
     """A fit with estimated noise; the outputs contradict each other, because one reading drifts."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    experiment = experiment.replace(horizon=2.0, fit={"noise": "estimated"})
-    design = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(design.system, design.initial, 0)
+    made = fit_of(cart_pendulum(horizon=2.0, fit={"noise": "estimated"}), 0)
+    recording = made.recordings[0]
     y = np.array(recording.y)
     y[:, 0] += DRIFT * recording.t
-    return FitTask.of(System.resolve(experiment, threads=1), [replace(recording, y=y)])
+    return FitTask.of(made.system, [replace(recording, y=y)])
 
 
 @pytest.fixture(scope="module")
 def problem(task: FitTask) -> FitProblem:
     return task.problem()
-
-
-def minimum(problem: Any, begin: UnknownValues) -> UnknownValues:
-    found = minimise(problem, begin, SearchSettings(tolerance=1e-5), Budget())
-    assert found is not None and found.success
-    return found.unknowns
 
 
 def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, FitProblem, Array]:
@@ -63,7 +52,9 @@ def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, FitProblem, Array
         variances = [float(np.mean(e**2)) * correction for e in errors]
         noise = Noise(covariance=np.diag(variances), strides=problem.noise.strides)
         weighted = problem.with_noise(noise)
-        found = minimum(weighted, found)
+        solved = minimise(weighted, found, SearchSettings(tolerance=1e-5), Budget())
+        assert solved is not None and solved.success
+        found = solved.unknowns
 
     condensed = weighted.condense(found)
     assert condensed is not None

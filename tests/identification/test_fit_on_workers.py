@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import System, simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification import (
     left_out,
     search,
@@ -25,8 +24,9 @@ from mjfim.identification.identify import least_squares
 from mjfim.identification.search import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel.budget import Budget, StopToken
+from tests.support.cart_pendulum import cart_pendulum, logs_of
+from tests.support.closed_loop import arm_experiment
 from tests.support.executors import LosingThreads
-from tests.support.paths import MODELS
 
 # Settings of fits: whole recordings, and segments whose initial states are unknown.
 WHOLE: dict[str, Any] = {"starts": 2}
@@ -36,14 +36,13 @@ SEGMENTS: dict[str, Any] = {"starts": 2, "segments": 0.25, "start": "measured"}
 @pytest.fixture(scope="module")
 def experiment() -> mjfim.Experiment:
     """The cart-pendulum for a short time."""
-    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
+    return cart_pendulum(horizon=0.5)
 
 
 @pytest.fixture(scope="module")
 def recordings(experiment: mjfim.Experiment) -> list[mjfim.Recording]:
     """Three recordings that differ by their noise."""
-    task = DesignTask.resolve(experiment, threads=1)
-    return [simulate_system(task.system, task.initial, seed) for seed in range(3)]
+    return logs_of(experiment, 0, 1, 2)
 
 
 @pytest.fixture(autouse=True)
@@ -59,11 +58,25 @@ def problem_of(
     return FitTask.of(System.resolve(experiment.replace(fit=fit), threads=1), recordings).problem()
 
 
+def closed_loop(fit: dict[str, Any]) -> FitProblem:
+    """A fit to logs of the two-joint arm, whose laws have an integral and a late command."""
+    law = {"kp": 50.0, "kd": 3.0, "ki": 20.0, "rate": 250.0}
+    late = {"target": "controller/elbow:latency", "true": 0.006, "guess": 0.003}
+    laws = {"shoulder": {**law, "time_constant": 0.01}, "elbow": {"kp": 25.0, "kd": 1.0}}
+    arm = arm_experiment(laws, parameters={"latency": late}, noise={"state": 1e-3})
+    references = 0.3 * np.sin(0.02 * np.arange(200))[:, None] * [1.0, -1.0]
+    return problem_of(arm, [mjfim.simulate(arm, references, seed) for seed in range(3)], fit)
+
+
+@pytest.mark.parametrize("in_closed_loop", [False, True])
 @pytest.mark.parametrize("fit", [WHOLE, SEGMENTS], ids=["whole", "segments"])
 def test_cost_and_linearisation_are_the_same_although_tasks_are_lost(
-    experiment: mjfim.Experiment, recordings: list[mjfim.Recording], fit: dict[str, Any]
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    fit: dict[str, Any],
+    in_closed_loop: bool,
 ) -> None:
-    problem = problem_of(experiment, recordings, fit)
+    problem = closed_loop(fit) if in_closed_loop else problem_of(experiment, recordings, fit)
     plant = problem.system.plant
     at = problem.begin(problem.system.parameters.guess)
     begin = plant.engine_steps
@@ -113,32 +126,13 @@ class StoppingThreads(ThreadPoolExecutor):
         return super().submit(fn, *args, **kwargs)
 
 
-@pytest.fixture
-def in_small_batches(
+def test_a_request_to_stop_takes_effect_after_the_pass_that_runs(
     experiment: mjfim.Experiment,
     recordings: list[mjfim.Recording],
     monkeypatch: pytest.MonkeyPatch,
-) -> FitProblem:
-    """A problem with many batches, each of which is a task."""
-    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
-    return problem_of(experiment, recordings, SEGMENTS)
-
-
-def stopped_fit(
-    experiment: mjfim.Experiment, recordings: list[mjfim.Recording], after: int
-) -> mjfim.Estimate:
-    """Estimate of a fit that is asked to stop when some number of tasks was submitted."""
-    stop = StopToken()
-    with StoppingThreads(stop, after) as threads:
-        return mjfim.identify(
-            experiment.replace(fit=SEGMENTS), recordings, threads=1, executor=threads, stop=stop
-        )
-
-
-def test_a_request_to_stop_takes_effect_after_the_pass_that_runs(
-    in_small_batches: FitProblem,
 ) -> None:
-    problem = in_small_batches
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
+    problem = problem_of(experiment, recordings, SEGMENTS)
     begin = problem.begin(1.05 * problem.system.parameters.guess)
     stop = StopToken()
     # The first pass for the cost and the first linearisation are complete by then.
@@ -160,7 +154,11 @@ def test_a_request_to_stop_in_any_pass_leaves_an_estimate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(search, "QUICK_SAMPLES", 60)
-    found = stopped_fit(experiment, recordings, after)
+    stop = StopToken()
+    with StoppingThreads(stop, after) as threads:
+        found = mjfim.identify(
+            experiment.replace(fit=SEGMENTS), recordings, threads=1, executor=threads, stop=stop
+        )
 
     assert np.isfinite(found.theta).all()
     assert found.interrupted

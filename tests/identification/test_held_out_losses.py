@@ -5,14 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import mjfim
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
-from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.identification.left_out import HeldOutLosses, held_out_losses
 from mjfim.parallel.budget import Budget
-from tests.support.paths import ROOT
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 
 
 def losses(
@@ -82,16 +78,6 @@ def test_a_reduction_in_one_recording_only_is_not_clear() -> None:
     assert before.reduction(both_better).is_clear
 
 
-def test_the_jackknife_gives_the_standard_error_of_a_mean() -> None:
-    rng = np.random.default_rng(2)
-    data = rng.normal(3.0, 2.0, 25)
-    left_out = np.array([[np.delete(data, i).mean()] for i in range(25)])
-    found = HeldOutLosses(
-        losses=np.ones(1), counts=np.ones(1), parts=np.zeros(1, dtype=int), estimates=left_out
-    )
-    assert found.jackknife[0] == pytest.approx(data.std(ddof=1) / 5.0)
-
-
 @pytest.mark.parametrize(
     ("segments", "parts"),
     [
@@ -102,11 +88,7 @@ def test_the_jackknife_gives_the_standard_error_of_a_mean() -> None:
 )
 def test_a_single_recording_is_predicted_in_parts(segments: float | str, parts: int) -> None:
     """Each part is a stretch of the recording, also of a whole one or of two segments."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    experiment = base.replace(horizon=1.5, fit={"segments": segments})
-    task = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(task.system, task.initial, 1)
-    problem = FitProblem.of(task.system, [recording])
+    problem = fit_of(cart_pendulum(horizon=1.5, fit={"segments": segments}), 1).problem()
     solution = least_squares(problem, np.array([2.0, 1.0, 1.0]))
     found = held_out_losses(problem, solution, problem.noise.sigma, Budget())
     assert found is not None

@@ -8,27 +8,21 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
-from mjfim.identification.identify import identify_system
 from mjfim.output.pages import page_of
-from tests.support.paths import ROOT
+from tests.support.cart_pendulum import cart_pendulum, logs_of
 
 
 def stated(hold: tuple[str, ...]) -> mjfim.Experiment:
     """The cart-pendulum, one parameter of which is held at its true value."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    return base.replace(
-        horizon=1.0, parameters={"c": {"guess": 1.0}}, fit={"bootstrap": 0, "hold": hold}
-    )
+    fit = {"bootstrap": 0, "hold": hold}
+    return cart_pendulum(horizon=1.0, parameters={"c": {"guess": 1.0}}, fit=fit)
 
 
 @pytest.mark.slow
 def test_a_held_parameter_keeps_its_guess_and_the_others_are_fitted(tmp_path: Path) -> None:
-    task = DesignTask.resolve(stated(("c",)), threads=1)
-    recording = simulate_system(task.system, task.initial, 0)
-    found = identify_system(task.system, [recording])
-    free = mjfim.identify(stated(()), [recording], threads=1)
+    logs = logs_of(stated(()), 0)
+    found = mjfim.identify(stated(("c",)), logs, threads=1)
+    free = mjfim.identify(stated(()), logs, threads=1)
     assert found.success
     assert found.held == ("c",)
     j = found.parameters.index("c")
@@ -39,7 +33,7 @@ def test_a_held_parameter_keeps_its_guess_and_the_others_are_fitted(tmp_path: Pa
     # What is known about one parameter makes the others more accurate, and does not bias them.
     others = [k for k in range(3) if k != j]
     assert (found.std[others] < free.std[others]).all()
-    true = task.parameters.true
+    true = np.array([2.0, 1.0, 1.0])
     assert (np.abs(found.theta - true)[others] < 4.0 * found.std[others]).all()
 
     # The summary and the report say so, and the record is saved.
@@ -56,7 +50,5 @@ def test_a_held_parameter_keeps_its_guess_and_the_others_are_fitted(tmp_path: Pa
     ],
 )
 def test_what_cannot_be_held_is_refused(hold: tuple[str, ...], message: str) -> None:
-    task = DesignTask.resolve(stated(()), threads=1)
-    recording = simulate_system(task.system, task.initial, 0)
     with pytest.raises(mjfim.MjfimError, match=message):
-        mjfim.identify(stated(hold), [recording], threads=1)
+        mjfim.identify(stated(hold), logs_of(stated(()), 0), threads=1)

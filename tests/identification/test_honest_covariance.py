@@ -22,7 +22,8 @@ from mjfim.identification.assessment.honest_covariance import (
     with_honest_covariance,
 )
 from mjfim.records.estimate import HorizonStudy, Uncertainty
-from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated, stated
+from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
 
 # Mass and lever, known to 10 % each, and their product to 0.1 %.
@@ -38,7 +39,7 @@ def size(covariance: Array, weights: Array) -> float:
 
 @pytest.fixture(scope="module")
 def system() -> System:
-    return System.resolve(stated())
+    return System.resolve(cart_pendulum())
 
 
 # ---- agreement with intervals
@@ -203,7 +204,7 @@ def test_it_is_saved_and_earlier_estimates_have_none(system: System, tmp_path: P
 @pytest.mark.slow
 def test_noise_that_is_larger_than_stated_counts_in_all_combinations() -> None:
     factor = 1.8
-    experiment = stated(fit={"bootstrap": 100, "segments": "whole"})
+    experiment = cart_pendulum(fit={"bootstrap": 100, "segments": "whole"})
     motion = DesignTask.resolve(experiment).initial
     logs = []
     for seed in (1, 2):

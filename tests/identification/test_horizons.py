@@ -11,33 +11,30 @@ import pytest
 
 import mjfim
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
 from mjfim.identification.identify import DIVERGED
-from mjfim.identification.left_out import HeldOutLosses
 from mjfim.identification.search import FitSearch
 from mjfim.identification.starts import _chosen
 from mjfim.output.pages.estimate import horizon_parts
 from mjfim.records.estimate import HorizonStudy
 from mjfim.records.trajectory import Recording
-from tests.support.paths import ROOT
+from tests.identification.test_held_out_losses import losses
+from tests.support.cart_pendulum import cart_pendulum, logs_of
+from tests.support.numerics import Array
 
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
 
 
 def stated(**tables: object) -> mjfim.Experiment:
     """The cart-pendulum under a multisine."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     fit = {"bootstrap": 0, **tables}
-    return base.replace(horizon=2.5, initial={"control": CONTROL}, fit=fit)
+    return cart_pendulum(horizon=2.5, initial={"control": CONTROL}, fit=fit)
 
 
 def recorded(friction: float, count: int) -> list[Recording]:
     """Recordings of a robot whose cart has dry friction, which the model lacks."""
     parameters = {"f": {"target": "joint/slide:frictionloss", "guess": friction, "scale": 1.0}}
     experiment = stated() if friction == 0.0 else stated().replace(parameters=parameters)
-    task = DesignTask.resolve(experiment, threads=1)
-    return [simulate_system(task.system, task.initial, seed) for seed in range(count)]
+    return logs_of(experiment, *range(count))
 
 
 def made_study(**changes: object) -> HorizonStudy:
@@ -60,7 +57,7 @@ def made_study(**changes: object) -> HorizonStudy:
 @pytest.mark.slow
 def test_nothing_is_compared_where_the_model_explains_the_recordings() -> None:
     found = mjfim.identify(stated(), recorded(0.0, 2))
-    assert not found.misfit
+    assert not found.misfit and found.missing_terms == ()
     assert found.horizons is None
     assert all(len(begins) == 1 for begins in found.segments)
 
@@ -97,26 +94,22 @@ def test_lengths_are_compared_where_the_model_lacks_a_term(tmp_path: Path) -> No
     assert str(loaded) == str(study)
 
 
-def losses(values: list[float]) -> HeldOutLosses:
-    """Losses of twenty blocks of one value each."""
-    return HeldOutLosses(
-        losses=np.array(values),
-        counts=np.ones(len(values)),
-        parts=np.arange(len(values)),
-        estimates=np.zeros((1, 1)),
-    )
+def chosen(*losses_of_lengths: Array) -> int:
+    """Index of the length that is chosen by the losses of twenty blocks of one value."""
+    blocks = list(range(20))
+    return _chosen([[losses(each.tolist(), parts=blocks)] for each in losses_of_lengths])
 
 
 def test_the_longest_length_is_chosen_unless_it_predicts_clearly_worse() -> None:
     rng = np.random.default_rng(0)
     noise = rng.random(20)
     best, same, worse = noise + 1.0, noise + 1.0 + rng.normal(0.0, 0.05, 20), noise + 1.5
-    assert _chosen([[losses(each.tolist())] for each in (best, same, best)]) == 2
-    assert _chosen([[losses(each.tolist())] for each in (best, same, worse)]) == 1
-    assert _chosen([[losses(each.tolist())] for each in (best, worse, worse)]) == 0
+    assert chosen(best, same, best) == 2
+    assert chosen(best, same, worse) == 1
+    assert chosen(best, worse, worse) == 0
 
     # A difference of half a percent is clear here, but not relevant.
-    assert _chosen([[losses(each.tolist())] for each in (best, 1.005 * best)]) == 1
+    assert chosen(best, 1.005 * best) == 1
 
 
 def test_a_dependence_on_the_length_is_a_finding_that_the_interval_covers() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,11 @@ def cart_log(
     return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
 
 
+def true_of(experiment: Experiment) -> Array:
+    """(p,) values of the parameters at which logs are made."""
+    return System.resolve(experiment).parameters.guess
+
+
 def errors(fit: InverseDynamicsFit, true: Array) -> Array:
     """(p,) errors over the sizes of the parameters."""
     return np.abs(fit.theta - true) / np.where(true != 0.0, np.abs(true), 1.0)
@@ -72,7 +78,7 @@ def errors(fit: InverseDynamicsFit, true: Array) -> Array:
 @pytest.mark.slow
 def test_cart_pendulum_is_found_from_starts_wrong_by_ten(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     log = cart_log(experiment, 1e-6)
     signs = np.random.default_rng(5).choice([-1.0, 1.0], (3, len(true)))
     for start in (true, *(true * 10.0**signs)):
@@ -90,7 +96,7 @@ def test_cart_pendulum_is_found_from_starts_wrong_by_ten(tmp_path: Path) -> None
 )
 def test_positions_or_velocities_are_enough(measured: tuple[str, ...], tmp_path: Path) -> None:
     experiment = cart(tmp_path, noise=dict.fromkeys(measured, 1e-3))
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     fit = inverse_dynamics(experiment, [cart_log(experiment, 1e-3, measured=measured)])
     assert errors(fit, true).max() < 0.03
 
@@ -98,7 +104,7 @@ def test_positions_or_velocities_are_enough(measured: tuple[str, ...], tmp_path:
 @pytest.mark.slow
 def test_errors_are_those_of_the_stated_accuracy(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     fits = [
         inverse_dynamics(experiment, [cart_log(experiment, 0.01, seed)], start=2.0 * true)
         for seed in range(8)
@@ -113,7 +119,7 @@ def test_errors_are_those_of_the_stated_accuracy(tmp_path: Path) -> None:
 
 def test_irregular_rows_missing_values_and_several_recordings(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     logs = []
     for seed in range(2):
         log = cart_log(experiment, 0.005, seed)
@@ -130,9 +136,7 @@ def test_irregular_rows_missing_values_and_several_recordings(tmp_path: Path) ->
         places = np.flatnonzero(kept)
         means = [log.ctrl[a:b].mean(axis=0) for a, b in pairwise(places)]
         logs.append(
-            Recording(
-                t=log.t[kept], ctrl=np.array(means), y=y[kept], outputs=STATE, name=f"{seed}.csv"
-            )
+            replace(log, t=log.t[kept], ctrl=np.array(means), y=y[kept], name=f"{seed}.csv")
         )
     fit = inverse_dynamics(experiment, logs, start=3.0 * true)
     assert errors(fit, true).max() < 0.05
@@ -143,7 +147,7 @@ def test_dry_friction_needs_no_start(tmp_path: Path) -> None:
     text = CART_PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.6"')
     tables = {**CART, "f": {"target": "joint/slide:frictionloss", "scale": 1.0}}
     experiment = cart(tmp_path, text, parameters=tables)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
     log = cart_log(experiment, 0.002, seconds=12.0)
     for start in (0.1 * true, 10.0 * true):
         fit = inverse_dynamics(experiment, [log], start=start)
@@ -192,7 +196,7 @@ def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_p
         if spec.inertial
     }
     experiment = experiment.replace(parameters=tables)
-    true = System.resolve(experiment).parameters.guess
+    true = true_of(experiment)
 
     # The start is a heavier arm with other friction.
     start = np.array(true)
@@ -228,46 +232,11 @@ def test_measured_torques_take_the_place_of_unknown_motors(tmp_path: Path) -> No
 
     # The log holds currents, of which the gains are unknown.
     true[-2:] = 0.25, 4.0
-    log = Recording(
-        t=log.t, ctrl=log.ctrl / true[-2:], y=log.y, outputs=log.outputs, name="currents"
-    )
-    fit = inverse_dynamics(experiment, [log])
+    fit = inverse_dynamics(experiment, [replace(log, ctrl=log.ctrl / true[-2:])])
     assert [each.name for each in fit.equations][2:] == ["law of joint1", "law of joint2"]
     assert errors(fit, true)[-2:].max() < 0.01
     damping = [fit.parameters.index(f"damping{i}") for i in (1, 2)]
     assert errors(fit, true)[damping].max() < 0.02
-
-
-def test_servo_laws_with_recorded_references(tmp_path: Path) -> None:
-    text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
-      <body><joint name="j" axis="0 1 0" damping="0.3"/>
-        <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
-      <actuator><position name="s" joint="j" kp="30" kv="2"/></actuator></mujoco>"""
-    tmp_path.mkdir(exist_ok=True)
-    (tmp_path / "servo.xml").write_text(text, encoding="utf-8")
-    experiment = Experiment(
-        model="servo.xml",
-        directory=tmp_path,
-        source="servo",
-        rate=500.0,
-        parameters={
-            "kp": {"target": "actuator/s:kp"},
-            "damping": {"target": "joint/j:damping"},
-            "armature": {"target": "joint/j:armature", "scale": 0.01},
-        },
-        noise={"qpos:j": 1e-4},
-    )
-    system = System.resolve(experiment, threads=1)
-    rng = np.random.default_rng(0)
-    t = np.arange(5001) / 500.0
-    reference = 0.6 * multisine(t[:-1], 1, 0.3, 8, rng)
-    y = system.plant.measure(system.parameters.guess[None], reference)[0][0]
-    y = y + 1e-4 * rng.standard_normal(y.shape)
-    log = Recording(t=t, ctrl=reference, y=y, outputs=system.outputs.names, name="servo")
-    fit = inverse_dynamics(experiment, [log], start=np.array([5.0, 2.0, 0.1]))
-    assert fit.theta[0] == pytest.approx(30.0, rel=0.02)
-    assert fit.theta[1] == pytest.approx(0.3, rel=0.2)
-    assert fit.theta[2] == pytest.approx(0.0, abs=2e-3)
 
 
 # ---- units and misuse
@@ -295,8 +264,6 @@ def test_misuse_is_explained(tmp_path: Path) -> None:
         inverse_dynamics(experiment, [])
     with pytest.raises(ExperimentError, match=r"start: \(2,\) numbers; expected one per parameter"):
         inverse_dynamics(experiment, [log], start=np.ones(2))
-    with pytest.raises(RecordingError, match="no measured position or velocity of hinge"):
-        inverse_dynamics(experiment, [_without(log, "hinge")])
     with pytest.raises(RecordingError, match=r"part: a degree of freedom has only 6 measured"):
         inverse_dynamics(experiment, [_first(log, 6)])
     arm = arm_experiment(tmp_path, 2)
@@ -307,35 +274,30 @@ def test_misuse_is_explained(tmp_path: Path) -> None:
 
 def _first(log: Recording, rows: int) -> Recording:
     """The first rows of a log."""
-    return Recording(
-        t=log.t[:rows], ctrl=log.ctrl[: rows - 1], y=log.y[:rows], outputs=log.outputs, name="part"
-    )
+    return replace(log, t=log.t[:rows], ctrl=log.ctrl[: rows - 1], y=log.y[:rows], name="part")
 
 
-def _without(log: Recording, joint: str) -> Recording:
-    """A log without the columns of a joint."""
-    kept = [i for i, name in enumerate(log.outputs) if not name.endswith(joint)]
-    return Recording(
-        t=log.t,
-        ctrl=log.ctrl,
-        y=log.y[:, kept],
-        outputs=tuple(log.outputs[i] for i in kept),
-        name="part",
-    )
-
-
-def slow_servo(folder: Path, kind: str, parameters: dict[str, Any]) -> Experiment:
-    """A servo with friction that has a bristle of some kind.
+def servo(
+    folder: Path,
+    parameters: dict[str, Any],
+    *,
+    stiffness: int = 300,
+    friction: float = 0.5,
+    **tables: Any,
+) -> Experiment:
+    """A servo at 500 Hz with dry friction.
 
     Args:
         folder: Where its model is written.
-        kind: Kind of the friction in the library of terms.
         parameters: Tables of the unknowns.
+        stiffness: Gain of the servo [N m/rad].
+        friction: Dry friction [N m].
+        **tables: Further tables of the experiment.
     """
-    text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
-      <body><joint name="j" axis="0 1 0" damping="0.3" frictionloss="0.5"/>
+    text = f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+      <body><joint name="j" axis="0 1 0" damping="0.3" frictionloss="{friction}"/>
         <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
-      <actuator><position name="s" joint="j" kp="300" kv="10"/></actuator>
+      <actuator><position name="s" joint="j" kp="{stiffness}" kv="{stiffness / 30}"/></actuator>
       <sensor><actuatorfrc name="torque" actuator="s"/></sensor></mujoco>"""
     (folder / "servo.xml").write_text(text, encoding="utf-8")
     return Experiment(
@@ -344,19 +306,41 @@ def slow_servo(folder: Path, kind: str, parameters: dict[str, Any]) -> Experimen
         source="servo",
         rate=500.0,
         parameters=parameters,
-        noise={"qpos:j": 1e-5, "torque": 1e-3},
-        terms={"bristle": {"kind": kind, "joint": "j"}},
+        **{"noise": {"qpos:j": 1e-5, "torque": 1e-3}, **tables},
     )
 
 
-def slow_log(system: System, theta: Array, seconds: float) -> Recording:
-    """A log of the servo at theta under a slow multisine."""
+def bristle(kind: str) -> dict[str, Any]:
+    """Friction of the joint of some kind in the library of terms."""
+    return {"bristle": {"kind": kind, "joint": "j"}}
+
+
+def servo_log(
+    experiment: Experiment, theta: Array, seconds: float, slowest: float = 0.1, waves: int = 4
+) -> Recording:
+    """A log of the servo at theta under a multisine."""
+    system = System.resolve(experiment, threads=1)
     rng = np.random.default_rng(0)
     t = np.arange(round(500.0 * seconds) + 1) / 500.0
-    ctrl = 0.6 * multisine(t[:-1], 1, 0.1, 4, rng)
+    ctrl = 0.6 * multisine(t[:-1], 1, slowest, waves, rng)
     y = system.plant.measure(theta[None], ctrl)[0][0]
     y = y + rng.standard_normal(y.shape) * system.noise.sigma
     return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
+
+
+def test_servo_laws_with_recorded_references(tmp_path: Path) -> None:
+    parameters = {
+        "kp": {"target": "actuator/s:kp"},
+        "damping": {"target": "joint/j:damping"},
+        "armature": {"target": "joint/j:armature", "scale": 0.01},
+    }
+    noise = {"qpos:j": 1e-4}
+    experiment = servo(tmp_path, parameters, stiffness=30, friction=0.0, noise=noise)
+    log = servo_log(experiment, np.array([30.0, 0.3, 0.0]), 10.0, 0.3, 8)
+    fit = inverse_dynamics(experiment, [log], start=np.array([5.0, 2.0, 0.1]))
+    assert fit.theta[0] == pytest.approx(30.0, rel=0.02)
+    assert fit.theta[1] == pytest.approx(0.3, rel=0.2)
+    assert fit.theta[2] == pytest.approx(0.0, abs=2e-3)
 
 
 @pytest.mark.slow
@@ -369,37 +353,14 @@ def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: P
         "excess": {"target": "term/bristle:excess"},
         "speed": {"target": "term/bristle:speed"},
     }
-    experiment = slow_servo(tmp_path, kind, parameters)
-    system = System.resolve(experiment, threads=1)
+    experiment = servo(tmp_path, parameters, terms=bristle(kind))
     true = np.array([0.3, 0.5, 0.4, 0.15])
 
-    log = slow_log(system, true, 12.0)
-
     # The guess has no excess, so that the rows do not depend on the Stribeck speed there.
-    assert system.parameters.guess[2] == 0.0
-    fit = inverse_dynamics(experiment, [log])
+    assert System.resolve(experiment).parameters.guess[2] == 0.0
+    fit = inverse_dynamics(experiment, [servo_log(experiment, true, 12.0)])
     np.testing.assert_allclose(fit.theta, true, rtol=0.02)
     assert (np.abs(fit.theta - true) < 5.0 * fit.std).all()
-
-
-def stribeck_servo(folder: Path, **of_friction: dict[str, Any]) -> tuple[Experiment, Recording]:
-    """A servo with Stribeck friction of unknown size and a log of it.
-
-    Args:
-        folder: Where its model is written.
-        of_friction: Tables of the excess and the speed that differ from the usual ones.
-    """
-    parameters = {
-        "excess": of_friction.get("excess", {"target": "term/bristle:excess"}),
-        "speed": of_friction.get("speed", {"target": "term/bristle:speed"}),
-    }
-    experiment = slow_servo(folder, "stribeck", parameters)
-    true = {"kind": "stribeck", "joint": "j", "values": {"excess": 0.4, "speed": 0.15}}
-    damping = {"damping": {"target": "joint/j:damping"}}
-    stated = experiment.model_dump(exclude_unset=True)
-    robot = experiment.restated({**stated, "parameters": damping, "terms": {"bristle": true}})
-    system = System.resolve(robot, threads=1)
-    return experiment, slow_log(system, system.parameters.guess, 8.0)
 
 
 EXCESS, SPEED = {"target": "term/bristle:excess"}, {"target": "term/bristle:speed"}
@@ -425,11 +386,11 @@ EXCESS, SPEED = {"target": "term/bristle:excess"}, {"target": "term/bristle:spee
 def test_stated_bounds_priors_and_factors_of_stribeck_friction_hold(
     of_friction: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
-    experiment, log = stribeck_servo(tmp_path, **of_friction)
-    fit = inverse_dynamics(experiment, [log])
-    factor = 0.01 if "targets" in of_friction.get("speed", {}) else 1.0
-    assert fit.theta[0] == pytest.approx(0.4, rel=0.2)
-    assert factor * fit.theta[1] == pytest.approx(0.15, rel=0.2)
+    parameters = {"excess": EXCESS, "speed": SPEED} | of_friction
+    experiment = servo(tmp_path, parameters, terms=bristle("stribeck"))
+    true = np.array([0.4, 15.0 if "targets" in parameters["speed"] else 0.15])
+    fit = inverse_dynamics(experiment, [servo_log(experiment, true, 8.0)])
+    np.testing.assert_allclose(fit.theta, true, rtol=0.2)
     assert np.isfinite(fit.std).all()
     assert fit.std[1] > 0.0
 

@@ -7,29 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.arrays import Array
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.identification.left_out import LeftOutPart, fit_without, left_out_parts
 from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution
 from mjfim.parallel.budget import Budget
-from tests.support.paths import ROOT
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 
 TIGHT = SearchSettings(tolerance=1e-6)
 
 
 def fitted(fit: dict[str, object]) -> tuple[FitProblem, Solution]:
     """A fit to three recordings of the cart-pendulum."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    experiment = base.replace(horizon=2.0, fit={"bootstrap": 0, **fit})
-    task = DesignTask.resolve(experiment, threads=1)
-    problem = FitProblem.of(
-        task.system, [simulate_system(task.system, task.initial, i) for i in range(3)]
-    )
-    return problem, least_squares(problem, task.parameters.true, TIGHT)
+    task = fit_of(cart_pendulum(horizon=2.0, fit={"bootstrap": 0, **fit}), 0, 1, 2)
+    problem = task.problem()
+    return problem, least_squares(problem, task.system.parameters.true, TIGHT)
 
 
 def exact_fit(problem: FitProblem, solution: Solution, part: LeftOutPart) -> Array:
@@ -37,14 +30,6 @@ def exact_fit(problem: FitProblem, solution: Solution, part: LeftOutPart) -> Arr
     others = problem.masked([~mask for mask in part.masks(problem)])
     others = others.of_segments(others.segments_with_values)
     return least_squares(others, problem.theta(solution.unknowns), TIGHT).unknowns.theta
-
-
-def spoilt(problem: FitProblem, solution: Solution, factors: Array) -> Solution:
-    """The solution at other parameters, with the linearisation there."""
-    unknowns = replace(solution.unknowns, theta=solution.unknowns.theta * factors)
-    condensed = problem.condense(unknowns)
-    assert condensed is not None
-    return replace(solution, unknowns=unknowns, condensed=condensed)
 
 
 @pytest.mark.parametrize("fit", [{}, pytest.param({"segments": 0.5}, marks=pytest.mark.slow)])
@@ -68,7 +53,10 @@ def test_a_search_follows_where_the_linearisation_does_not_lead_there() -> None:
     problem, solution = fitted({})
     sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     part = next(left_out_parts(problem))
-    away = spoilt(problem, solution, np.array([3.0, 1.5, 0.2]))
+    unknowns = replace(solution.unknowns, theta=solution.unknowns.theta * [3.0, 1.5, 0.2])
+    condensed = problem.condense(unknowns)
+    assert condensed is not None
+    away = replace(solution, unknowns=unknowns, condensed=condensed)
     found = fit_without(problem, Budget(), solution=away, part=part)
     assert found is not None
     missed = found.theta - exact_fit(problem, solution, part)

@@ -100,22 +100,7 @@ def test_points_in_gaps_do_not_count(tmp_path: Path) -> None:
     assert motion.usable[(motion.t > 0.1) & (motion.t < 1.4)].all()
 
 
-def test_the_control_is_averaged_and_a_delay_shifts_it(tmp_path: Path) -> None:
-    task = cart_task(tmp_path, horizon=4.0)
-    motion, _, _ = motion_of(task)
-    t = task.dt * (np.arange(len(task.control)) + 0.5)
-    expected = np.interp(motion.t, t, task.control[:, 0])
-    inside = (motion.t > 0.1) & (motion.t < 3.8)
-    size = np.abs(task.control).max()
-    assert np.abs(motion.control(0.0)[inside, 0] - expected[inside]).max() < 0.01 * size
-    late = np.interp(motion.t - 0.05, t, task.control[:, 0])
-    assert np.abs(motion.control(0.05)[inside, 0] - late[inside]).max() < 0.01 * size
-
-
 def test_unmeasured_degrees_of_freedom_are_named(tmp_path: Path) -> None:
-    task = cart_task(tmp_path, horizon=4.0)
-    with pytest.raises(RecordingError, match=r"x\.csv: no measured position or velocity of hinge;"):
-        motion_of(task, hidden=("qpos:hinge", "qvel:hinge"))
     body = body_task(tmp_path, noise={"state": 0.01}, horizon=1.0)
-    with pytest.raises(RecordingError, match=r"velocity of ball\.rx, ball\.ry, ball\.rz;"):
+    with pytest.raises(RecordingError, match=r"x\.csv: .* of ball\.rx, ball\.ry, ball\.rz;"):
         motion_of(body, hidden=("qpos:ball.qx",))

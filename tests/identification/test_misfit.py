@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +21,8 @@ from mjfim.identification.assessment.residual_tests import (
 from mjfim.output.page import Level
 from mjfim.output.pages.estimate import estimate_page
 from mjfim.records.estimate import Whiteness, WorstResidual
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
-from tests.support.paths import MODELS
 
 NAMES = ("angle", "speed", "force")
 
@@ -44,13 +45,6 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
     return times, [rng.standard_normal((len(t), 3)) for t in times]
 
 
-def place(times: list[Array], z: list[Array]) -> WorstResidual:
-    """The worst residual of the three recordings a, b, c."""
-    found = worst_of("abc", times, z)
-    assert found is not None
-    return found
-
-
 @pytest.mark.parametrize(("recording", "output"), [(0, 2), (1, 0), (2, 1)])
 def test_a_planted_burst_is_found(recording: int, output: int) -> None:
     """Output, recording and time agree within two windows; size and share are the interval's."""
@@ -59,7 +53,7 @@ def test_a_planted_burst_is_found(recording: int, output: int) -> None:
     begin, end = 0.55 * t[-1], 0.67 * t[-1]
     burst = (t >= begin) & (t < end)
     z[recording][burst, output] += 8.0 * np.sin(40.0 * t[burst] + 1.0)
-    worst = place(times, z)
+    worst = worst_of("abc", times, z)
     assert (worst.output, worst.recording) == (NAMES[output], "abc"[recording])
     window = t[-1] / 25
     assert worst.begin == pytest.approx(begin, abs=1.5 * window)
@@ -74,7 +68,7 @@ def test_an_output_with_uniformly_large_residuals_is_named_as_a_whole() -> None:
     """The interval is the whole recording, not the window in which noise is largest by chance."""
     times, z = white()
     z[1][:, 2] *= 3.0
-    worst = place(times, z)
+    worst = worst_of("abc", times, z)
     assert (worst.output, worst.recording) == ("force", "b")
     assert worst.begin == times[1][0]
     assert worst.end == pytest.approx(times[1][-1])
@@ -87,7 +81,7 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
     z[0][:, 1] = np.nan
     z[0][200:700, 0] = np.nan
     z[0][720:780, 0] += 7.0
-    worst = place(times, z)
+    worst = worst_of("abc", times, z)
     assert (worst.output, worst.recording) == ("angle", "a")
     assert worst.begin <= 7.2 + 0.4
     assert worst.end >= 7.8 - 0.4
@@ -108,7 +102,7 @@ def test_a_single_value_is_not_an_interval() -> None:
         sparse[700] = 3.6
         z[0][:, 1] = sparse
         z[0][500:600, 0] += 2.5
-        assert place(times, z).output == "angle"
+        assert worst_of("abc", times, z).output == "angle"
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 9])
@@ -134,23 +128,10 @@ def test_a_worst_residual_in_words() -> None:
     )
 
 
-def seen(
-    output: str = "y",
-    p: float = 1.0,
-    inflation: float = 1.0,
-    variance: float = 1.0,
-    time: float = 1.0,
-    correlation: float = 0.3,
-) -> Whiteness:
-    return Whiteness(
-        output=output,
-        count=1000,
-        variance=variance,
-        correlation=correlation,
-        p=p,
-        inflation=inflation,
-        time=time,
-    )
+def seen(output: str = "y", p: float = 1.0, inflation: float = 1.0, **fields: Any) -> Whiteness:
+    """A test of whiteness, by default of white noise of the stated size."""
+    white = {"count": 1000, "variance": 1.0, "correlation": 0.3, "time": 1.0, **fields}
+    return Whiteness(output=output, p=p, inflation=inflation, **white)
 
 
 def test_larger_and_smaller_need_probability_and_size() -> None:
@@ -196,7 +177,7 @@ def test_reasons_in_sentences() -> None:
     assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
     assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (), "white: larger noise"
     burst = WorstResidual(output="y", recording="log", begin=0.0, end=0.1, size=9.0, share=0.5)
-    few = replace(seen(), count=20)
+    few = seen(count=20)
     larger = ("residuals are 2.00 times the stated noise",)
     assert misfit_reasons(4000.0, 1000, True, [seen()], (), burst) == larger
     assert misfit_reasons(4000.0, 1000, True, [few], ()) == larger
@@ -228,8 +209,7 @@ def test_reasons_in_sentences() -> None:
 )
 def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, said: str) -> None:
     """The verdict says the size; coloured residuals remain a misfit."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    experiment = experiment.replace(noise={"state": 0.01}, fit={"bootstrap": 0})
+    experiment = cart_pendulum(noise={"state": 0.01}, fit={"bootstrap": 0})
     control = 5.0 * np.sin(0.04 * np.arange(400))[:, None]
     log, clean = (
         mjfim.simulate(experiment.replace(noise={"state": size}), control) for size in (0.01, 1e-9)

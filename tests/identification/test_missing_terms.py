@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,14 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import System, simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification.assessment import term_tests
 from mjfim.identification.assessment.term_candidates import Candidate, Effect
 from mjfim.identification.assessment.term_tests import TermTests, find_missing_terms
 from mjfim.identification.identify import identify_system
 from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
+from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.numerics import Array
 from tests.support.paths import ROOT
 from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
@@ -26,11 +28,10 @@ DAMPED = {"d": {"target": "joint/pivot:damping"}}
 
 def stated(**tables: object) -> mjfim.Experiment:
     """The cart-pendulum under a multisine."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    return base.replace(initial={"control": CONTROL}, fit={"bootstrap": 0}, **tables)
+    return cart_pendulum(initial={"control": CONTROL}, fit={"bootstrap": 0}, **tables)
 
 
-def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> Recording:
+def robot(folder: Path, old: str, new: str, **tables: object) -> Recording:
     """A recording of a robot whose model differs in one place."""
     text = (ROOT / "models" / "cart_pendulum.xml").read_text(encoding="utf-8")
     assert text.count(old) == 1
@@ -38,8 +39,7 @@ def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> 
     other = mjfim.Experiment(
         **{**stated(**tables).model_dump(exclude_unset=True), "directory": folder}
     )
-    task = DesignTask.resolve(other)
-    return simulate_system(task.system, task.initial, seed)
+    return logs_of(other, 0)[0]
 
 
 def rubbing_pendulum(folder: Path) -> Recording:
@@ -109,20 +109,14 @@ def test_a_small_term_that_matters_is_found_in_much_data() -> None:
 
 
 @pytest.mark.slow
-def test_a_bias_and_a_delay_are_found(tmp_path: Path) -> None:
-    task = DesignTask.resolve(stated(horizon=2.0))
-    clean = simulate_system(task.system, task.initial, seed=1)
-    off = np.array(clean.y)
-    off[:, 3] += 0.03
-    biased = identify_system(
-        task.system, [Recording(t=clean.t, ctrl=clean.ctrl, y=off, outputs=clean.outputs)]
-    )
+def test_a_bias_and_a_delay_are_found() -> None:
+    experiment = stated(horizon=2.0)
+    (clean,) = logs_of(experiment, 1)
+    biased = mjfim.identify(experiment, [replace(clean, y=clean.y + 0.03 * np.eye(4)[3])])
     assert biased.missing_terms[0].path == "output/qvel:hinge:bias"
     assert biased.missing_terms[0].main.value == pytest.approx(0.03, rel=0.4)
-    late = Recording(
-        t=clean.t[2:] - clean.t[2], ctrl=clean.ctrl[2:], y=clean.y[:-2], outputs=clean.outputs
-    )
-    lagging = identify_system(task.system, [late])
+    late = replace(clean, t=clean.t[2:] - clean.t[2], ctrl=clean.ctrl[2:], y=clean.y[:-2])
+    lagging = mjfim.identify(experiment, [late])
     assert "output:delay" in [s.path for s in lagging.missing_terms]
 
 
@@ -158,18 +152,10 @@ def test_feedback_on_noisy_measurements_is_no_delay(seed: int) -> None:
     assert (np.abs(found.theta - task.system.parameters.true) < 3.0 * found.std).all()
 
 
-@pytest.mark.slow
-def test_a_complete_model_has_no_missing_terms() -> None:
-    task = DesignTask.resolve(stated(horizon=2.0))
-    found = [
-        identify_system(task.system, [simulate_system(task.system, task.initial, seed)])
-        for seed in range(4)
-    ]
-    assert not any(e.missing_terms or e.misfit for e in found)
-
-
-def with_failing(failing: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Test a further candidate between the others."""
+def with_failing(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test a further candidate, a strange spring, between the others."""
+    number = Effect(path=path, unit="", value=-1e9, begin=-1e9, size=1.0)
+    failing = Candidate(description="a strange spring", tested=(number,))
     usual = term_tests.candidates_of
 
     def extended(system: System, speeds: Array) -> tuple[list[Candidate], list[str]]:
@@ -193,23 +179,8 @@ def test_a_candidate_that_diverges_or_is_invalid_is_named_and_hides_no_other(
     assert usual.data is not None and not usual.data.untested
     assert "joint/pivot:frictionloss" in {term.path for term in usual.terms}
 
-    number = Effect(path=path, unit="", value=-1e9, begin=-1e9, size=1.0)
-    with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
+    with_failing(path, monkeypatch)
     found = find_missing_terms(problem, task.recordings, at)
     assert found.data is not None and found.data.untested == ("a strange spring",)
     assert [term.path for term in found.terms] == [term.path for term in usual.terms]
     assert found.remark.endswith("cannot have it: a strange spring.")
-
-
-@pytest.mark.slow
-def test_a_selection_says_which_terms_it_could_not_test(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stated = experiment_of(tmp_path, "tilt", terms={}, parameters=DAMPED, fit={"bootstrap": 0})
-    log = rubbing_pendulum(tmp_path)
-    number = Effect(path="joint/pivot:nothing", unit="", value=0.0, begin=0.0, size=1.0)
-    with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
-    found = mjfim.select_terms(stated, [log])
-    assert found.selection is not None
-    assert found.selection.ending.endswith("cannot have it: a strange spring.")
-    assert any("a strange spring" in sentence for sentence in found.warnings)

@@ -23,7 +23,9 @@ from mjfim.identification.assessment.parameter_draws import (
 )
 from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unknown_bodies
 from mjfim.model.inertia import barycentric_of, logcholesky_derivatives
+from mjfim.records.estimate import ParameterDraws
 from mjfim.records.events import stages_observed_by
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.hinged_arm import arm_experiment
 from tests.support.numerics import Array
 from tests.support.paths import MODELS
@@ -35,11 +37,6 @@ KNOWN = 1e-3
 STD = np.array([0.02, 0.03, 0.1])
 COVARIANCE = np.diag(STD**2)
 COVARIANCE[0, 1] = COVARIANCE[1, 0] = -0.8 * STD[0] * STD[1]
-
-
-def stated(**tables: Any) -> mjfim.Experiment:
-    """The cart-pendulum."""
-    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**tables)
 
 
 def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimate:
@@ -65,15 +62,20 @@ def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimat
     return mjfim.Estimate(**{**values, **fields})
 
 
+def drawn(system: System, estimate: mjfim.Estimate, count: int, seed: int = 0) -> ParameterDraws:
+    """Robots drawn from an estimate."""
+    return draw_parameters_system(system, estimate, count, np.random.default_rng(seed))
+
+
 @pytest.fixture(scope="module")
 def system() -> System:
-    return System.resolve(stated())
+    return System.resolve(cart_pendulum())
 
 
 @pytest.mark.slow
 def test_the_moments_are_those_of_the_formal_covariance(system: System) -> None:
     estimate = estimated(system, COVARIANCE)
-    draws = draw_parameters(stated(), estimate, 2000, np.random.default_rng(1))
+    draws = draw_parameters(cart_pendulum(), estimate, 2000, np.random.default_rng(1))
     assert draws.parameters == ("m", "l", "c")
     assert draws.units == ("kg", "m", "N m s/rad")
     assert len(draws) == 2000
@@ -109,16 +111,16 @@ def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
     )
     found = honest_covariance(system.parameters, bounded)
     np.testing.assert_allclose(np.sqrt(found[2, 2]), 0.4 / 1.959964, rtol=1e-5)
-    draws = draw_parameters_system(system, bounded, 1000, np.random.default_rng(2))
+    draws = drawn(system, bounded, 1000, 2)
     half_normal = truncnorm(0.0, np.inf, scale=0.4 / 1.959964)
     assert kstest(draws.values[:, 2], half_normal.cdf).pvalue > 1e-3
 
     # Both sides cut off: the deviations that led to the interval remain.
-    narrow = System.resolve(stated(parameters={"c": {"bounds": [0.9, 1.5]}}))
+    narrow = System.resolve(cart_pendulum(parameters={"c": {"bounds": [0.9, 1.5]}}))
     cut = replace(bounded, theta=np.array([2.0, 1.0, 1.0]), std=np.array([0.1, 0.1, 2.0]))
     cut = replace(cut, interval=np.array([[1.9, 2.1], [0.9, 1.1], [0.9, 1.5]]))
     assert np.sqrt(honest_covariance(narrow.parameters, cut)[2, 2]) == 2.0
-    damping = draw_parameters_system(narrow, cut, 500, np.random.default_rng(2)).values[:, 2]
+    damping = drawn(narrow, cut, 500, 2).values[:, 2]
     assert 0.9 <= damping.min() < 0.92 and 1.48 < damping.max() <= 1.5
 
 
@@ -131,7 +133,7 @@ def test_deviations_between_recordings_count(system: System) -> None:
 
     # A parameter with a value for each recording is centred at their mean, and scatters as they do.
     differing = estimated(system, COVARIANCE, per_recording={"c": (1.0, 2.0)})
-    draws = draw_parameters_system(system, differing, 10, np.random.default_rng(0))
+    draws = drawn(system, differing, 10)
     assert draws.centre[2] == 1.5
     np.testing.assert_allclose(draws.std[2], np.hypot(0.1, np.sqrt(0.5)), rtol=1e-3)
 
@@ -140,35 +142,33 @@ def test_undetermined_parameters_are_named(system: System) -> None:
     infinite = np.array([0.02, np.inf, 0.1])
     covariance = np.diag(infinite**2)
     with pytest.raises(ExperimentError, match=r"do not determine l, so that .*prior"):
-        draw_parameters_system(system, estimated(system, covariance), 5, np.random.default_rng(0))
+        drawn(system, estimated(system, covariance), 5)
 
 
 @pytest.mark.parametrize("count", [0, -3, 10_001])
 def test_counts_out_of_range(system: System, count: int) -> None:
     with pytest.raises(ExperimentError, match=rf"robots is {count}; it must be from 1 to 10000"):
-        draw_parameters_system(
-            system, estimated(system, COVARIANCE), count, np.random.default_rng(0)
-        )
+        drawn(system, estimated(system, COVARIANCE), count)
 
 
 def test_an_estimate_of_another_experiment(system: System) -> None:
     other = replace(estimated(system, COVARIANCE), parameters=("m", "l", "d"))
     with pytest.raises(ExperimentError, match=r"other parameters \(m, l, d\)"):
-        draw_parameters_system(system, other, 5, np.random.default_rng(0))
+        drawn(system, other, 5)
     outside = replace(estimated(system, COVARIANCE), theta=np.array([2.0, 1.0, -1.0]))
     with pytest.raises(ExperimentError, match="c lies outside of its bounds"):
-        draw_parameters_system(system, outside, 5, np.random.default_rng(0))
+        drawn(system, outside, 5)
 
 
 def test_initial_states_are_no_properties_of_a_robot() -> None:
-    system = System.resolve(stated(nuisance={"initial": 0.1, "delay": 0.01}))
+    system = System.resolve(cart_pendulum(nuisance={"initial": 0.1, "delay": 0.01}))
     names = system.parameters.names
     covariance = np.diag(np.full(len(names), 1e-4))
     # Nobody asks how well an initial state is known.
     covariance[3, 3] = np.inf
     assert names[3].startswith("initial")
     estimate = estimated(system, covariance)
-    draws = draw_parameters_system(system, estimate, 4, np.random.default_rng(0))
+    draws = drawn(system, estimate, 4)
     assert draws.parameters == ("m", "l", "c", "delay")
     theta = complete_theta(system, estimate, draws, 2)
     np.testing.assert_array_equal(theta[3:-1], estimate.theta[3:-1])
@@ -182,12 +182,12 @@ def test_unphysical_inertias_are_replaced() -> None:
         "Iyy": {"target": "body/cart:inertia[1]", "guess": 0.01},
         "Izz": {"target": "body/cart:inertia[2]", "guess": 0.01},
     }
-    base = stated()
+    base = cart_pendulum()
     values = {**base.model_dump(exclude_unset=True), "directory": MODELS}
     system = System.resolve(mjfim.Experiment(**{**values, "parameters": central}))
     assert system.parameters.names == ("Ixx", "Iyy", "Izz")
     estimate = estimated(system, np.diag(np.full(3, 0.006**2)))
-    draws = draw_parameters_system(system, estimate, 200, np.random.default_rng(3))
+    draws = drawn(system, estimate, 200, 3)
     assert draws.replaced > 20
     assert "replaced" in str(draws)
     moments = np.sort(draws.values, axis=1)
@@ -196,14 +196,12 @@ def test_unphysical_inertias_are_replaced() -> None:
 
     hopeless = estimated(system, np.diag([0.006**2, 0.006**2, 1e12]))
     with pytest.raises(ExperimentError, match=r"1 of 1 drawn robots still .*cad_prior"):
-        draw_parameters_system(system, hopeless, 1, np.random.default_rng(3))
+        drawn(system, hopeless, 1, 3)
 
     whole = {"cart": {"inertial": "cart"}}
     system = System.resolve(mjfim.Experiment(**{**values, "parameters": whole}))
     covariance: Array = np.diag((0.1 * system.parameters.magnitude) ** 2)
-    draws = draw_parameters_system(
-        system, estimated(system, covariance), 50, np.random.default_rng(3)
-    )
+    draws = drawn(system, estimated(system, covariance), 50, 3)
     assert draws.replaced < 10
     for values_of_robot in draws.values:
         model = system.model_at(values_of_robot)
@@ -263,34 +261,38 @@ class KnownMoment:
             system=system, estimate=estimate, body=body, moment=moment, inertia=inertia
         )
 
+    def relative(self, robots: Array) -> tuple[Array, Array, Array]:
+        """(n, 10) linear coordinates of robots, and both known combinations over the estimate's."""
+        linear = np.array([self.body.linear(robot[self.body.columns]) for robot in robots])
+        theta = self.estimate.theta
+        begin = self.body.linear(theta[self.body.columns])
+        inertia = (linear[:, 9] + robots[:, 10]) / (begin[9] + theta[10])
+        return linear, linear[:, 1] / begin[1], inertia
+
 
 def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
     known = KnownMoment.of(tmp_path)
-    system, estimate, body = known.system, known.estimate, known.body
+    system, estimate = known.system, known.estimate
     for row in (known.moment, known.inertia):
         np.testing.assert_allclose(
             np.sqrt(row @ estimate.honest_covariance @ row), KNOWN, rtol=1e-3
         )
-    draws = draw_parameters_system(system, estimate, 400, np.random.default_rng(7))
+    draws = drawn(system, estimate, 400, 7)
     assert draws.held_combinations == 9
     assert "9 combinations of inertias that the recordings do not determine" in str(draws)
 
     # Standard deviations of 400 draws scatter by 3.5 %.
-    linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
-    begin = body.linear(estimate.theta[body.columns])
-    moment = linear[:, 1] / begin[1]
-    inertia = (linear[:, 9] + draws.values[:, 10]) / (begin[9] + estimate.theta[10])
-    for values in (moment, inertia):
+    linear, *combinations = known.relative(draws.values)
+    for values in combinations:
         assert np.std(values) == pytest.approx(KNOWN, rel=0.12)
         assert np.mean(values) == pytest.approx(1.0, abs=4 * KNOWN / 20)
-    assert all(body.is_physical(each) for each in linear)
+    assert all(known.body.is_physical(each) for each in linear)
 
     # Along straight lines of log-Cholesky coordinates, they are lost.
     curved = np.random.default_rng(7).multivariate_normal(
         estimate.theta, estimate.honest_covariance, 400, method="eigh"
     )
-    lost = [body.linear(robot[body.columns])[1] / begin[1] for robot in curved]
-    assert np.std(lost) > 50 * KNOWN
+    assert np.std(known.relative(curved)[1]) > 50 * KNOWN
 
 
 @pytest.mark.parametrize("prior", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
@@ -299,21 +301,18 @@ def test_a_wide_prior_on_a_whole_inertia_gives_physical_robots(
 ) -> None:
     """Nearly all draws of the normal distribution are no bodies, so that replacing them failed."""
     known = KnownMoment.of(tmp_path, cad_prior=False, prior=prior)
-    system, estimate, body = known.system, known.estimate, known.body
+    system = known.system
     stages: list[str] = []
     with stages_observed_by(lambda name, *_: stages.append(name)):
-        draws = draw_parameters_system(system, estimate, 50, np.random.default_rng(7))
+        draws = drawn(system, known.estimate, 50, 7)
     assert set(stages) == {"drawing robots inside the physical inertias"}
-    linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
-    assert all(body.is_physical(each) for each in linear)
+    linear, *combinations = known.relative(draws.values)
+    assert all(known.body.is_physical(each) for each in linear)
     for values_of_robot in draws.values[:5]:
         assert system.model_at(values_of_robot).body("link1").mass[0] > 0.0
 
     # The combinations that the recordings determine stay known, and the mass is not.
-    begin = body.linear(estimate.theta[body.columns])
-    moment = linear[:, 1] / begin[1]
-    inertia = (linear[:, 9] + draws.values[:, 10]) / (begin[9] + estimate.theta[10])
-    for values in (moment, inertia):
+    for values in combinations:
         assert 0.65 * KNOWN < np.std(values) < 1.4 * KNOWN
         assert np.mean(values) == pytest.approx(1.0, abs=KNOWN)
-    assert np.std(linear[:, 0]) > 0.1 * begin[0]
+    assert np.std(linear[:, 0]) > 0.1 * np.mean(linear[:, 0])

@@ -75,9 +75,17 @@ def axes(candidate: Candidate) -> str:
     return "".join(each.path[-1] for each in candidate.further)
 
 
-def test_a_planar_robot_does_not_show_the_place_along_its_hinges() -> None:
+# Friction that grows with the torque of a motor is a contact with a ball.
+WORM = {
+    "terms": {"worm": {"kind": "load_dependent_friction", "actuator": "elbow"}},
+    "parameters": {**DAMPINGS, "worm": {"target": "term/worm:coefficient", "guess": 0.05}},
+}
+
+
+@pytest.mark.parametrize("tables", [{}, WORM], ids=["arm", "body of a term"])
+def test_a_planar_robot_does_not_show_the_place_along_its_hinges(tables: dict[str, Any]) -> None:
     """Two places are tested at the last body: its centre of mass, and twice as far."""
-    found = payloads(planar_arm())
+    found = payloads(planar_arm(**tables))
     assert [each.description for each in found] == ["a payload at fore"] * 2
     assert [axes(each) for each in found] == ["xz", "xz"]
     assert [each.further[-1].value for each in found] == pytest.approx([-0.15, -0.3])
@@ -95,14 +103,6 @@ def test_a_planar_robot_whose_frame_is_turned_has_two_places_to_find(tmp_path: P
     mujoco.mju_rotVecQuat(axis, np.array([0.0, 1.0, 0.0]), turned)
     found = candidates(tmp_path, text.format(axis=" ".join(map(str, axis))), "joint/b:damping")
     assert {len(axes(each)) for each in found} == {2}
-
-
-def test_bodies_of_terms_carry_no_payload() -> None:
-    """Friction that grows with the torque of a motor is a contact with a ball."""
-    terms = {"worm": {"kind": "load_dependent_friction", "actuator": "elbow"}}
-    parameters = {**DAMPINGS, "worm": {"target": "term/worm:coefficient", "guess": 0.05}}
-    found = payloads(planar_arm(terms=terms, parameters=parameters))
-    assert [each.description for each in found] == ["a payload at fore"] * 2
 
 
 def test_payloads_are_tested_at_every_last_body(tmp_path: Path) -> None:

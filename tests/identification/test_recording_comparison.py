@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
 from mjfim.identification.assessment.recording_comparison import compare_evidence
 from mjfim.identification.assessment.robust_covariance import (
     block_length,
@@ -19,8 +18,8 @@ from mjfim.identification.assessment.robust_covariance import (
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
+from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.numerics import Array
-from tests.support.paths import MODELS
 
 
 def compared(model: Linear, y: Array, length: float = 1.0) -> RecordingComparison:
@@ -41,13 +40,17 @@ def compared(model: Linear, y: Array, length: float = 1.0) -> RecordingCompariso
     )
 
 
+def simulated(seed: int, K: int, truth: tuple[float, ...], N: int = 400) -> tuple[Array, Array]:
+    """Regressors of K recordings, and measured values with white noise."""
+    X = waves(K, N, len(truth))
+    return X, X @ np.array(truth) + noise(0.0, (K, N), np.random.default_rng(seed))
+
+
 @pytest.mark.parametrize("with_offsets", [False, True])
 def test_values_are_those_of_separate_fits(with_offsets: bool) -> None:
-    rng = np.random.default_rng(0)
     K, N, c = 4, 160, 3
-    X = waves(K, N, c)
+    X, y = simulated(0, K, (1.0, -2.0, 0.5), N)
     model = Linear(X=X, with_offsets=with_offsets)
-    y = X @ np.array([1.0, -2.0, 0.5]) + noise(0.0, (K, N), rng)
     y[1] += 1.0 * X[1, :, 0]
     found = compared(model, y)
     for k in range(K):
@@ -63,10 +66,7 @@ def test_values_are_those_of_separate_fits(with_offsets: bool) -> None:
 
 
 def test_an_odd_recording_is_named_with_its_parameter() -> None:
-    rng = np.random.default_rng(1)
-    K, N = 5, 400
-    X = waves(K, N, 3)
-    y = X @ np.array([1.0, -2.0, 0.5]) + noise(0.0, (K, N), rng)
+    X, y = simulated(1, 5, (1.0, -2.0, 0.5))
     y[2] += 1.0 * X[2, :, 0]
     found = compared(Linear(X=X), y)
     (odd,) = found.odd
@@ -84,9 +84,7 @@ def test_an_odd_recording_is_named_with_its_parameter() -> None:
 
 
 def test_two_odd_recordings_of_seven() -> None:
-    rng = np.random.default_rng(2)
-    X = waves(7, 400, 2)
-    y = X @ np.array([1.0, -2.0]) + noise(0.0, (7, 400), rng)
+    X, y = simulated(2, 7, (1.0, -2.0))
     y[1] -= 2.0 * X[1, :, 1]
     y[5] += 1.0 * X[5, :, 0]
     found = compared(Linear(X=X), y)
@@ -94,9 +92,7 @@ def test_two_odd_recordings_of_seven() -> None:
 
 
 def test_two_recordings_disagree_without_an_odd_one() -> None:
-    rng = np.random.default_rng(3)
-    X = waves(2, 400, 2)
-    y = X @ np.array([1.0, -2.0]) + noise(0.0, (2, 400), rng)
+    X, y = simulated(3, 2, (1.0, -2.0))
     y[1] += 1.0 * X[1, :, 0]
     found = compared(Linear(X=X), y)
     assert found.odd == ()
@@ -147,52 +143,44 @@ def test_a_combination_that_no_recording_determines() -> None:
 # ---- rates
 
 
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """Simulated sets of recordings.
+def rates(
+    sets: int, *, K: int, phi: float = 0.0, c: int = 3, noisy: float = 1.0, odd: float = 0.0
+) -> tuple[float, float, float]:
+    """Shares of sets with an odd recording, with the right one, and with a small joint p.
 
-    Attributes:
+    Args:
+        sets: Number of simulated sets of recordings.
         K: Number of recordings.
         phi: Correlation of successive noise values.
         c: Number of parameters.
         noisy: Factor of the noise of the first recording.
         odd: Difference of the first parameter of the last recording [standard deviations].
     """
-
-    K: int
-    phi: float = 0.0
-    c: int = 3
-    noisy: float = 1.0
-    odd: float = 0.0
-
-    def rates(self, sets: int) -> tuple[float, float, float]:
-        """Shares of sets with an odd recording, with the right one, and with a small joint p."""
-        N = 400
-        rng = np.random.default_rng(0)
-        X = waves(self.K, N, self.c)
-        growth = (1.0 + self.phi) / (1.0 - self.phi)
-        std = np.sqrt(2.0 / N * growth)
-        alarms, hits, joint = 0, 0, 0
-        for _ in range(sets):
-            y = noise(self.phi, (self.K, N), rng)
-            y[0] *= self.noisy
-            y[-1] += self.odd * std * X[-1, :, 0]
-            found = compared(Linear(X=X), y, block_length([growth], self.K * N))
-            alarms += bool(found.odd)
-            joint += found.joint_p < 1e-3
-            hits += bool(found.odd) and found.odd[0].index == self.K - 1
-        return alarms / sets, hits / sets, joint / sets
+    N = 400
+    rng = np.random.default_rng(0)
+    X = waves(K, N, c)
+    growth = (1.0 + phi) / (1.0 - phi)
+    std = np.sqrt(2.0 / N * growth)
+    alarms, hits, joint = 0, 0, 0
+    for _ in range(sets):
+        y = noise(phi, (K, N), rng)
+        y[0] *= noisy
+        y[-1] += odd * std * X[-1, :, 0]
+        found = compared(Linear(X=X), y, block_length([growth], K * N))
+        alarms += bool(found.odd)
+        joint += found.joint_p < 1e-3
+        hits += bool(found.odd) and found.odd[0].index == K - 1
+    return alarms / sets, hits / sets, joint / sets
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "setting",
-    [Setting(K=4), Setting(K=3, phi=0.9), Setting(K=5, phi=0.9, c=10), Setting(K=5, noisy=5.0)],
-    ids=str,
+    [{"K": 4}, {"K": 3, "phi": 0.9}, {"K": 5, "phi": 0.9, "c": 10}, {"K": 5, "noisy": 5.0}],
 )
-def test_rate_of_false_alarms(setting: Setting) -> None:
+def test_rate_of_false_alarms(setting: dict[str, Any]) -> None:
     """The stated level is 1 %; 80 sets give more than 3 with a probability of 0.9 %."""
-    alarms, _, joint = setting.rates(80)
+    alarms, _, joint = rates(80, **setting)
     assert alarms <= 3 / 80
     assert joint <= 0.02
 
@@ -201,7 +189,7 @@ def test_rate_of_false_alarms(setting: Setting) -> None:
 @pytest.mark.parametrize(("K", "least"), [(3, 0.75), (8, 0.95)])
 def test_rate_of_true_alarms(K: int, least: float) -> None:
     """A difference of eight standard deviations of one recording."""
-    alarms, hits, _ = Setting(K=K, phi=0.3, odd=8.0).rates(60)
+    alarms, hits, _ = rates(60, K=K, phi=0.3, odd=8.0)
     assert hits >= least
     assert alarms - hits <= 0.02
 
@@ -212,23 +200,18 @@ def test_rate_of_true_alarms(K: int, least: float) -> None:
 @pytest.fixture(scope="module")
 def recordings() -> list[Recording]:
     """Five recordings of the cart-pendulum; the friction of the third is 70 % larger."""
-    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
-    stated = stated.replace(initial={"control": control}, horizon=2.0)
     found = []
     for k in range(5):
-        friction = 1.7 if k == 2 else 1.0
-        task = DesignTask.resolve(stated.replace(parameters={"c": {"true": friction}}))
-        recording = simulate_system(task.system, task.initial, k)
-        found.append(Recording(**{**vars(recording), "name": f"logs/run_{k + 1}.csv"}))
+        rubbing = {"c": {"true": 1.7 if k == 2 else 1.0}}
+        stated = cart_pendulum(initial={"control": control}, horizon=2.0, parameters=rubbing)
+        found.append(replace(logs_of(stated, k)[0], name=f"logs/run_{k + 1}.csv"))
     return found
 
 
 @pytest.mark.slow
 def test_a_fit_names_the_odd_recording(recordings: list[Recording]) -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
-        fit={"bootstrap": 0}
-    )
+    experiment = cart_pendulum(fit={"bootstrap": 0})
     estimate = mjfim.identify(experiment, recordings)
     comparison = estimate.recording_comparison
     assert comparison is not None

@@ -8,17 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import mjfim
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import System, simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification.assessment.report import FitResult, estimate_from
 from mjfim.identification.assessment.term_tests import TermTests
 from mjfim.identification.identify import fit_task, refit_task
 from mjfim.identification.search import FitSearch, FitTask
 from mjfim.parallel.budget import Budget
 from mjfim.records.events import FitEvent
-from mjfim.records.trajectory import Recording
-from tests.support.paths import ROOT
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 from tests.support.terms import experiment_of, motor_torque, recorded
 
 # Zeros of the angle in two recordings [rad], which are 20 standard deviations of its noise apart.
@@ -28,20 +25,16 @@ BIASES = (0.5, -0.5)
 @pytest.fixture(scope="module")
 def fitted() -> FitResult:
     """A fit to two short recordings whose zeros of the angle differ."""
-    experiment = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(
+    experiment = cart_pendulum(
         horizon=1.0,
         fit={"bootstrap": 0, "segments": "whole"},
         nuisance={"bias": {"qpos:hinge": True}, "per_recording": True},
     )
-    task = DesignTask.resolve(experiment, threads=1)
-    recordings = []
-    for seed, bias in enumerate(BIASES):
-        clean = simulate_system(task.system, task.initial, seed)
-        shift = bias * (np.arange(len(clean.outputs)) == clean.outputs.index("qpos:hinge"))
-        recordings.append(
-            Recording(t=clean.t, ctrl=clean.ctrl, y=clean.y + shift, outputs=clean.outputs)
-        )
-    return fit_task(searched(FitTask.of(task.system, recordings)))
+    made = fit_of(experiment, 0, 1)
+    shift = np.array([name == "qpos:hinge" for name in made.system.outputs.names])
+    pairs = zip(made.recordings, BIASES, strict=True)
+    logs = [replace(log, y=log.y + bias * shift) for log, bias in pairs]
+    return fit_task(searched(FitTask.of(made.system, logs)))
 
 
 def searched(task: FitTask, events: list[FitEvent] | None = None) -> FitSearch:

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mjfim
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import System, simulate_system
 from mjfim.identification import search as search_module
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.search import FitSearch, FitTask, first_subset
+from mjfim.identification.search import FitSearch, first_subset
 from mjfim.identification.segment_simulation import SegmentBatch
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
@@ -25,8 +22,8 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.parallel.budget import Budget
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 from tests.support.numerics import Array
-from tests.support.paths import MODELS
 
 # Slope of the residuals: the standard deviation of the parameter is 0.01.
 SLOPE = 10.0
@@ -130,10 +127,7 @@ def test_longer_differences_lead_over_waves_to_the_minimum(begin: float) -> None
 def test_longer_differences_are_two_sided_also_with_much_data(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.2)
-    design = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(design.system, design.initial, 0)
-    problem = FitTask.of(System.resolve(experiment, threads=1), [recording]).problem()
+    problem = fit_of(cart_pendulum(horizon=0.2), 0).problem()
     linearised = []
 
     def recorded(self: FitProblem, at: UnknownValues, batch: SegmentBatch) -> None:

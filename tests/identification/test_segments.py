@@ -48,25 +48,18 @@ def aligned_log(
     hidden: tuple[str, ...] = (),
 ) -> AlignedRecording:
     """A noise-free recording of some rows, without the hidden columns."""
-    y = np.array(truth(task) if y is None else y)
+    y = truth(task) if y is None else y
     rows = np.arange(len(y)) if rows is None else rows
-    kept = (
-        [i for i, name in enumerate(task.system.outputs.names) if not name.startswith(hidden)]
-        if hidden
-        else slice(None)
+    names = task.system.outputs.names
+    kept = [i for i, name in enumerate(names) if not name.startswith(hidden)]
+    recording = Recording(
+        t=rows * task.dt,
+        ctrl=task.control[rows[:-1]],
+        y=y[rows][:, kept],
+        outputs=tuple(names[i] for i in kept),
+        name="x.csv",
     )
-    names = tuple(np.array(task.system.outputs.names)[kept].tolist())
-    ctrl = task.control[rows[:-1]]
-    return align(
-        task.system,
-        Recording(
-            t=rows * task.dt,
-            ctrl=ctrl,
-            y=y[np.ix_(rows, np.arange(y.shape[1])[kept])],
-            outputs=names,
-            name="x.csv",
-        ),
-    )
+    return align(task.system, recording)
 
 
 def require_rows_covered_once(
@@ -262,17 +255,9 @@ def test_an_initial_position_that_no_output_shows_does_not_disturb_the_fit(
     unseen = cart_task(tmp_path, horizon=1.5, noise=noise, fit={**fit, "bootstrap": 0})
     theta, y = 1.1 * unseen.parameters.guess, truth(unseen)
     y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
+    t = np.arange(len(y)) * unseen.dt
     found = identify_system(
-        unseen.system,
-        [
-            Recording(
-                t=np.arange(len(y)) * unseen.dt,
-                ctrl=unseen.control,
-                y=y,
-                outputs=names,
-                name="x.csv",
-            )
-        ],
+        unseen.system, [Recording(t=t, ctrl=unseen.control, y=y, outputs=names)]
     )
     assert found.success, found.status
     assert not found.misfit, found.reasons

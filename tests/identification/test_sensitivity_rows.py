@@ -9,38 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import System, simulate_system
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem, sensitivity_rows
 from mjfim.identification.identify import _unseen_directions
 from mjfim.identification.search import FitTask
 from mjfim.identification.segment_simulation import SegmentBatch
-from tests.support.paths import MODELS
-
-
-def cart_pendulum(horizon: float) -> FitTask:
-    """The fit to one recording of the cart-pendulum over a horizon [s]."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=horizon)
-    design = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(design.system, design.initial, 0)
-    return FitTask.of(System.resolve(experiment, threads=1), [recording])
+from tests.support.cart_pendulum import cart_pendulum, fit_of
 
 
 def test_the_recordings_of_the_batch_that_diverges_are_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 2000)
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
-    design = DesignTask.resolve(experiment, threads=1)
-    recordings = [
-        replace(simulate_system(design.system, design.initial, seed), name=f"log{seed}")
-        for seed in range(3)
-    ]
-    problem = FitTask.of(System.resolve(experiment, threads=1), recordings).problem()
+    task = fit_of(cart_pendulum(horizon=0.5), 0, 1, 2)
+    logs = [replace(log, name=f"log{seed}") for seed, log in enumerate(task.recordings)]
+    problem = FitTask.of(task.system, logs).problem()
     last: list[str] = []
 
     def diverging(_: FitProblem, work: Any, batches: Sequence[SegmentBatch], at: Any) -> Iterator:
@@ -59,10 +44,7 @@ def test_the_recordings_of_the_batch_that_diverges_are_named(
 
 
 def test_rows_without_error_are_those_of_one_sided_differences() -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
-    design = DesignTask.resolve(experiment, threads=1)
-    recordings = [simulate_system(design.system, design.initial, seed) for seed in range(2)]
-    problem = FitTask.of(System.resolve(experiment, threads=1), recordings).problem()
+    problem = fit_of(cart_pendulum(horizon=0.5), 0, 1).problem()
     at = problem.begin(problem.system.parameters.guess)
     steps = problem.system.plant.engine_steps
     full = sensitivity_rows(problem, at)
@@ -81,7 +63,7 @@ def test_rows_without_error_are_those_of_one_sided_differences() -> None:
 
 
 def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> None:
-    task = cart_pendulum(2.0)
+    task = fit_of(cart_pendulum(horizon=2.0), 0)
     problem = task.problem()
     before = problem.system.plant.engine_steps
     sensitivity_rows(problem, problem.begin(task.start))
@@ -92,7 +74,7 @@ def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> N
 
 def test_what_all_recordings_determine_only_together_takes_one_difference_step() -> None:
     """The first halves of the recordings do not determine the last parameter, all of them do."""
-    task = cart_pendulum(0.5)
+    task = fit_of(cart_pendulum(horizon=0.5), 0)
     whole = task.problem()
     samples_of_all = whole.sample_count
     count = len(task.start)
@@ -117,7 +99,7 @@ def test_what_all_recordings_determine_only_together_takes_one_difference_step()
 def test_an_effect_that_may_be_round_off_is_tested_with_its_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    task = cart_pendulum(0.5)
+    task = fit_of(cart_pendulum(horizon=0.5), 0)
     count = len(task.start)
 
     def rows(

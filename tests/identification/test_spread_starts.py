@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.starts import SPREAD_STARTS, spread_starts
 from mjfim.records.trajectory import Recording
-from tests.identification.test_inverse_dynamics import CART, cart, cart_log
+from tests.identification.test_inverse_dynamics import cart, cart_log, true_of
 
 # The angle alone tells enough of the motion, but there is no equation of motion without the cart.
 ANGLE = ("qpos:hinge", "qvel:hinge")
@@ -29,14 +28,8 @@ def log(experiment: Experiment) -> Recording:
     return cart_log(experiment, 0.01, seconds=4.0, measured=ANGLE)
 
 
-def true_values(experiment: Experiment) -> Array:
-    return System.resolve(experiment).parameters.guess
-
-
 def test_starts_cover_factors_of_ten_within_bounds(experiment: Experiment) -> None:
-    tables = {name: dict(table) for name, table in CART.items()}
-    tables["c"]["bounds"] = [0.2, 0.9]
-    system = System.resolve(experiment.replace(parameters=tables))
+    system = System.resolve(experiment.replace(parameters={"c": {"bounds": [0.2, 0.9]}}))
     parameters, theta = system.parameters, system.parameters.guess
     rng = np.random.default_rng(1)
     starts = spread_starts(parameters, theta, ("d",), system.impossible, rng)
@@ -55,7 +48,7 @@ def test_starts_cover_factors_of_ten_within_bounds(experiment: Experiment) -> No
 
 @pytest.mark.slow
 def test_a_start_that_diverges_is_left(experiment: Experiment, log: Recording) -> None:
-    true = true_values(experiment)
+    true = true_of(experiment)
     wrong = true * np.array([10.0, 0.1, 10.0, 0.1])
     found = mjfim.identify(experiment, [log], start=wrong, progress=False)
     assert found.success and not found.misfit
@@ -69,9 +62,7 @@ def test_a_start_that_diverges_is_left(experiment: Experiment, log: Recording) -
 def test_a_model_that_diverges_everywhere_is_an_error(
     experiment: Experiment, log: Recording
 ) -> None:
-    tables = {name: dict(table) for name, table in CART.items()}
-    tables["c"].update(guess=1e7, bounds=[1e6, 1e9])
-    stiff = experiment.replace(parameters=tables)
+    stiff = experiment.replace(parameters={"c": {"guess": 1e7, "bounds": [1e6, 1e9]}})
     with pytest.raises(SimulationDivergedError, match="diverges at the start"):
         mjfim.identify(stiff, [log], progress=False)
 
@@ -80,7 +71,7 @@ def test_a_model_that_diverges_everywhere_is_an_error(
 def test_starts_are_spread_where_the_restart_explains_no_motion(
     experiment: Experiment, log: Recording
 ) -> None:
-    true = true_values(experiment)
+    true = true_of(experiment)
     rng = np.random.default_rng([7, 2])
     factors = np.exp(rng.uniform(np.log(10.0), np.log(30.0), 4)) ** rng.choice([-1.0, 1.0], 4)
     found = mjfim.identify(experiment, [log], start=true * factors, progress=False)

@@ -13,11 +13,10 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.identify import identify_system
 from mjfim.identification.search import FitTask
-from mjfim.parallel.budget import StopToken
 from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS
+from tests.support.terms import recorded
 
 MINIMAL = f"""
 model = "{(MODELS / "cart_pendulum.xml").as_posix()}"
@@ -52,11 +51,8 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> mjfim.Experiment:
 def recording(experiment: mjfim.Experiment) -> Recording:
     """A noisy recording at the true parameters."""
     system = System.resolve(experiment)
-    t = np.arange(301) * system.dt
-    ctrl = 10.0 * np.sin(2.0 * np.pi * 0.7 * t[:-1])[:, None]
-    y, _ = system.plant.measure(system.parameters.true[None], ctrl)
-    noise = 0.05 * np.random.default_rng(0).standard_normal(y[0].shape)
-    return Recording(t=t, ctrl=ctrl, y=y[0] + noise, outputs=system.outputs.names, name="log")
+    ctrl = 10.0 * np.sin(2.0 * np.pi * 0.7 * np.arange(300) * system.dt)[:, None]
+    return dataclasses.replace(recorded(system, ctrl, 0), name="log")
 
 
 def test_a_minimal_experiment_identifies_its_parameters(
@@ -101,18 +97,6 @@ def test_the_start_is_moved_inside_the_bounds_of_a_bounded_method(
     np.testing.assert_array_equal(bounded.start, [10.0, 0.0])
     unbounded = FitTask.of(System.resolve(experiment), [recording], start=start, method="newton")
     np.testing.assert_array_equal(unbounded.start, start)
-
-
-def test_a_stop_token_ends_the_search_with_the_best_result_so_far(
-    experiment: mjfim.Experiment, recording: Recording
-) -> None:
-    stop = StopToken()
-    stop.request()
-    task = FitTask.of(System.resolve(experiment), [recording])
-    estimate = identify_system(task.system, [recording], stop=stop)
-    assert estimate.interrupted and not estimate.success
-    assert estimate.predictions == ()
-    np.testing.assert_array_equal(estimate.theta, task.start)
 
 
 def test_variants_of_a_problem_leave_the_problem_unchanged(

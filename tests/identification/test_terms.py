@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,10 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.assessment import term_tests
-from mjfim.identification.assessment.term_candidates import Candidate, Effect
 from mjfim.identification.assessment.term_tests import equivalent_sigmas, find_missing_terms
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segments import KnownActivations
 from mjfim.model.terms.library import KINDS
-from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.studies.selected_models import selected_term
 from mjfim.studies.selection import SIMILAR_SHARE
 from tests.support.terms import (
@@ -28,6 +25,8 @@ from tests.support.terms import (
     experiment_of,
     motor_torque,
     recorded,
+    small_logs,
+    solution_near,
     write_pendulum,
 )
 
@@ -47,13 +46,8 @@ def log_of(system: System, seed: int, duration: float = 2.0) -> Any:
     return recorded(system, motor_torque(duration, RATE, seed), seed)
 
 
-def some_fast(kinds: Iterable[str], fast: Collection[str]) -> list[Any]:
-    """Parameters of a test of which some are fast, and the others are marked slow."""
-    return [pytest.param(k, marks=[] if k in fast else pytest.mark.slow) for k in kinds]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", some_fast(KINDS, {"actuator_lag", "tilt"}))
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_term_is_identified_from_a_log(tmp_path: Path, kind: str) -> None:
     guesses = GUESSES.get(kind, {})
     parameters = {field: {"guess": value} for field, value in guesses.items()}
@@ -141,18 +135,11 @@ def without_term(folder: Path, kind: str) -> tuple[mjfim.Experiment, Any]:
     return stated, System.resolve(robot)
 
 
-def solution_near(problem: FitProblem, theta: Any) -> Any:
-    """Nearly the best unknowns, which a few steps give."""
-    found = minimise(problem, problem.begin(np.array(theta)), SearchSettings(max_iterations=6))
-    assert found is not None
-    return found.unknowns
-
-
-@pytest.mark.parametrize("kind", some_fast(MISSED, {"stribeck"}))
+@pytest.mark.parametrize("kind", MISSED)
 @pytest.mark.slow
 def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind: str) -> None:
     stated, robot = without_term(tmp_path, kind)
-    logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
+    logs = small_logs(robot, 0, 1)
     system = System.resolve(stated)
     problem = FitProblem.of(system, logs)
     at = solution_near(problem, system.parameters.guess)
@@ -182,7 +169,7 @@ def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
         terms={"lag": table},
         parameters={"tau": {"target": "term/lag:time_constant", "guess": 0.02}},
     )
-    logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
+    logs = small_logs(robot, 0, 1)
     problem = FitProblem.of(System.resolve(whole), logs)
     at = solution_near(problem, [0.01, 0.0105, 0.02, 0.03])
     assert find_missing_terms(problem, logs, at).terms == ()
@@ -213,7 +200,7 @@ def test_many_candidates_are_tested_in_groups(
 ) -> None:
     """A delay is the last candidate; it was left out where others used all tested numbers."""
     stated, robot = without_term(tmp_path, "actuator_lag")
-    logs = [recorded(robot, motor_torque(1.5, RATE, 0, size=0.08), 0)]
+    logs = small_logs(robot, 0)
     problem = FitProblem.of(System.resolve(stated), logs)
     at = solution_near(problem, problem.system.parameters.guess)
     whole = find_missing_terms(problem, logs, at).terms
@@ -226,16 +213,3 @@ def test_many_candidates_are_tested_in_groups(
     assert [term.path for term in in_groups[:-1]] == [term.path for term in whole[:-1]]
     for part, complete in zip(in_groups, whole, strict=True):
         assert part.sigmas == pytest.approx(complete.sigmas, rel=0.02)
-
-
-@pytest.mark.parametrize("counts", [[], [1], [3] * 40, [1] * 100, [1] * 101, [1, 3, 1] * 41])
-def test_groups_hold_all_candidates_in_their_order(counts: list[int]) -> None:
-    number = Effect(path="p", unit="", value=0.0, begin=0.0, size=1.0)
-    candidates = [
-        Candidate(description=str(i), tested=(number,) * count) for i, count in enumerate(counts)
-    ]
-    groups = term_tests.in_groups(candidates)
-    sizes = [sum(len(each.tested) for each in group) for group in groups]
-    assert [each for group in groups for each in group] == candidates
-    assert max(sizes, default=0) <= term_tests.MAX_TESTED
-    assert len(groups) <= sum(counts) // term_tests.MAX_TESTED + 1

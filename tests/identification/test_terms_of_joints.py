@@ -18,11 +18,11 @@ from mjfim.identification.assessment.term_tests import (
     first_terms,
 )
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import selected_term
 from tests.support.numerics import Array
+from tests.support.terms import solution_near
 
 JOINTS = ("pan", "lift", "roll")
 EXCESS = (0.5, 0.4, 0.1)
@@ -87,21 +87,17 @@ def log_of(experiment: mjfim.Experiment, seed: int, seconds: float = 3.0) -> Rec
     rng = np.random.default_rng(seed)
     t = np.arange(round(RATE * seconds)) / RATE
     control: Array = 0.4 * multisine(t, 3, 0.3, 4, rng)
-    theta = np.array(system.parameters.guess)
-    y = system.plant.measure(theta[None], control)[0][0]
+    y = system.plant.measure(system.parameters.guess[None], control)[0][0]
     y = y + rng.standard_normal(y.shape) * system.noise.sigma
     times = np.arange(len(y)) / RATE
-    return Recording(t=times, ctrl=control, y=y, outputs=system.outputs.names, name=f"log {seed}")
+    return Recording(t=times, ctrl=control, y=y, outputs=system.outputs.names)
 
 
 def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
     """Tests of the terms that the stated model lacks."""
     system = System.resolve(experiment, threads=1)
     problem = FitProblem.of(system, [log])
-    begin = problem.begin(np.array(system.parameters.guess))
-    at = minimise(problem, begin, SearchSettings(max_iterations=6))
-    assert at is not None
-    return find_missing_terms(problem, [log], at.unknowns)
+    return find_missing_terms(problem, [log], solution_near(problem, system.parameters.guess))
 
 
 @pytest.mark.slow

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.records.trajectory import Recording
 
 Array = NDArray[np.float64]
@@ -112,3 +114,15 @@ def recorded(system: System, ctrl: Array, seed: int) -> Recording:
     noise = rng.normal(size=y[0].shape) * system.noise.sigma
     t = np.arange(len(ctrl) + 1) * system.dt
     return Recording(t=t, y=y[0] + noise, ctrl=ctrl, outputs=system.outputs.names)
+
+
+def small_logs(system: System, *seeds: int) -> list[Recording]:
+    """Logs of small slow motions, in which friction matters."""
+    return [recorded(system, motor_torque(1.5, 100.0, i, size=0.08), i) for i in seeds]
+
+
+def solution_near(problem: FitProblem, theta: Array) -> UnknownValues:
+    """Nearly the best unknowns, which a few steps give."""
+    found = minimise(problem, problem.begin(np.array(theta)), SearchSettings(max_iterations=6))
+    assert found is not None
+    return found.unknowns

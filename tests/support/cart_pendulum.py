@@ -1,0 +1,28 @@
+"""The cart-pendulum of the paper, logs of it under its initial control, and fits to them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System, simulate_system
+from mjfim.identification.search import FitTask
+from mjfim.records.trajectory import Recording
+from tests.support.paths import MODELS
+
+
+def cart_pendulum(**tables: Any) -> Experiment:
+    """The cart-pendulum with some tables changed."""
+    return Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**tables)
+
+
+def logs_of(experiment: Experiment, *seeds: int) -> list[Recording]:
+    """Logs under the initial control, which differ by their noise."""
+    task = DesignTask.resolve(experiment, threads=1)
+    return [simulate_system(task.system, task.initial, seed) for seed in seeds]
+
+
+def fit_of(experiment: Experiment, *seeds: int) -> FitTask:
+    """The fit to such logs."""
+    return FitTask.of(System.resolve(experiment, threads=1), logs_of(experiment, *seeds))
