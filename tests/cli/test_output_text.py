@@ -107,14 +107,10 @@ def test_a_full_stream_costs_its_text_alone(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("verb", "streams"), [("check", ">&-"), ("check", "<&- >&- 2>&-"), ("identify", "| true")]
-)
-def test_streams_that_are_closed_or_full(
-    verb: str, streams: str, study: Path, recorded: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-", "| true"])
+def test_streams_that_are_closed_or_full(streams: str, study: Path, tmp_path: Path) -> None:
     """The exit code is that of the result, its files are there, and stdout is named."""
-    words = [*PROCESS, verb, study, *([recorded] if verb == "identify" else []), "-o", "out"]
+    words = [*PROCESS, "check", study, "-o", "out"]
     call = f'"$@" {streams} ; exit "${{PIPESTATUS[0]}}"'
     done = subprocess.run(
         ["bash", "-c", call, "bash", *words],
@@ -126,7 +122,6 @@ def test_streams_that_are_closed_or_full(
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
-    found = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"check": "check.json", "identify": "identified.xml"}[verb] in found
+    assert (tmp_path / "out" / "check.json").is_file()
     assert "Traceback" not in done.stdout + done.stderr
     assert ("mjfim: stdout: " in done.stderr) is ("2>&-" not in streams)

@@ -77,6 +77,8 @@ def test_a_foreign_recording_beside_the_design_stays(
     (tmp_path / "recording.csv").write_text("t\n", encoding="utf-8")
     misused(run("simulate", study, tmp_path), "recording.csv", "--force")
     assert (tmp_path / "recording.csv").read_text(encoding="utf-8") == "t\n"
+    assert run("simulate", study, tmp_path, "--force").exit_code == 0
+    assert (tmp_path / "recording.csv").read_text(encoding="utf-8") != "t\n"
 
 
 def test_another_ending_of_a_video_is_refused_before_the_work(study: Path, tmp_path: Path) -> None:

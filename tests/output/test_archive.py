@@ -22,11 +22,11 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
 from mjfim.files import PREFIX, as_json, replacing
-from mjfim.identification.identify import identify_system
 from mjfim.output import archive
 from mjfim.recordings import read as logs
 from mjfim.records.design import MAX_MOTIONS, MOTION_SAMPLES, Design
 from mjfim.records.trajectory import Recording
+from tests.support import results
 from tests.support.paths import MODELS
 
 Array = NDArray[np.float64]
@@ -39,7 +39,12 @@ def task() -> DesignTask:
     """The cart-pendulum for 0.4 s, measured at every second sample."""
     e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     return DesignTask.resolve(
-        e.replace(horizon=0.4, measure_rate=50.0, descent={"max_iterations": 2})
+        e.replace(
+            horizon=0.4,
+            measure_rate=50.0,
+            descent={"max_iterations": 2},
+            rehearsal={"robots": 4},
+        )
     )
 
 
@@ -109,8 +114,8 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         **{"theta": (P,), "sizes": (P,), "prior": (P, P), "data": (P, P)},
         "record": (),
     }
-    assert robots["rehearsal.theta"] == (61, P) and robots["rehearsal.steps.std"] == (P,)
-    assert robots["rehearsal.speed"] == (61, NV)
+    assert robots["rehearsal.theta"] == (5, P) and robots["rehearsal.steps.std"] == (P,)
+    assert robots["rehearsal.speed"] == (5, NV)
     assert kinds == {np.dtype("float64")}
     assert kinds_of_motions == {np.dtype("float64")}
     assert np.array_equal(psi, design.initial.sensitivity)
@@ -177,6 +182,7 @@ def test_json_names_nuisance_parameters_and_priors(tmp_path: Path) -> None:
             parameters=table,
             nuisance={"delay": 0.1, "initial": 0.2},
             descent={"max_iterations": 0},
+            rehearsal={"robots": 0},
         )
     )
     archive.write_design(tmp_path, design_task(known), known.system)
@@ -496,9 +502,9 @@ def test_recording_round_trip(recording: Recording, task: DesignTask, tmp_path: 
 # ---- estimates and studies
 
 
-def test_estimate_summary(task: DesignTask, recording: Recording) -> None:
+def test_estimate_summary() -> None:
     """estimate.json has the documented keys and is standard JSON."""
-    estimate = identify_system(task.system, [recording])
+    estimate = results.estimate()
     data = strict_json(as_json(estimate.summary()))
     assert {"theta", "std", "covariance", "chi2", "dof", "status", "residual_rms", "misfit"} <= set(
         data
@@ -506,7 +512,10 @@ def test_estimate_summary(task: DesignTask, recording: Recording) -> None:
     assert np.array_equal(data["theta"], estimate.theta)
     assert np.array(data["covariance"]).shape == (P, P)
     assert np.sqrt(np.diag(data["covariance"])) == pytest.approx(data["std"], rel=1e-6)
-    assert set(data["residual_rms"]) == set(task.system.outputs.names)
+    assert data["residual_rms"] == estimate.residual_rms
     assert data["misfit"] is False
-    assert (data["parameters"], data["units"]) == (["m", "l", "c"], list(task.system.units))
+    assert (data["parameters"], data["units"]) == (
+        list(results.PARAMETERS),
+        list(results.UNITS),
+    )
     assert data["prior"] == np.zeros((P, P)).tolist()

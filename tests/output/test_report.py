@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.errors import RecordingError
 from mjfim.files import write_json
 from mjfim.output.page import REPORT
 from mjfim.output.pages import page_of
@@ -334,14 +333,6 @@ def test_a_report_has_the_name_of_its_experiment_wherever_it_is(tmp_path: Path) 
     assert "<h1><small>Check of an experiment</small>arm</h1>" in pages[0]
     assert "<dt>experiment</dt><dd>arm.toml</dd>" in pages[0]
     assert "<dt>model</dt><dd>arm.xml</dd>" in pages[0]
-
-
-def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"holds no result; .*design\.npz"):
-        write_report(tmp_path)
-    with pytest.raises(RecordingError, match="no such folder"):
-        write_report(tmp_path / "nowhere")
-    assert not (tmp_path / REPORT).exists()
 
 
 def test_a_report_draws_every_length_of_segments_that_was_compared() -> None:
