@@ -12,6 +12,7 @@ import pytest
 
 from mjfim.output.export.mjcf import identified_files, write_identified
 from tests.output.test_mjcf import assert_is_identified_model, changes, task_of
+from tests.support.contents import contents
 
 # A robot of five files: settings with defaults, an arm in the tree, and inside it a hand, all in
 # folders of their own. The mesh of the arm lies in the folder of the compiler, that of the hand in
@@ -91,15 +92,6 @@ def robot(tmp_path: Path) -> Path:
         (home / name).parent.mkdir(parents=True, exist_ok=True)
         (home / name).write_text(text, encoding="utf-8")
     return home / "robot.xml"
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Texts of all files of a folder, by their names in it."""
-    return {
-        file.relative_to(folder).as_posix(): file.read_text(encoding="utf-8")
-        for file in sorted(folder.rglob("*"))
-        if file.is_file()
-    }
 
 
 # Changed numbers by parameter path, and the copies that a change needs.

@@ -39,8 +39,12 @@ def experiment() -> mjfim.Experiment:
     return stated.replace(horizon=0.5, descent={"max_iterations": 4}, rehearsal={"robots": 0})
 
 
+# A design and its events.
+Searched = tuple[Design, list[DesignEvent]]
+
+
 @pytest.fixture(scope="module")
-def searched(experiment: mjfim.Experiment) -> tuple[Design, list[DesignEvent]]:
+def searched(experiment: mjfim.Experiment) -> Searched:
     """A design without a viewer, and its events."""
     events: list[DesignEvent] = []
     return mjfim.design(experiment, callback=events.append), events
@@ -146,7 +150,7 @@ def watched(
 
 @pytest.fixture(scope="module")
 def received(
-    searched: tuple[Design, list[DesignEvent]],
+    searched: Searched,
     experiment: mjfim.Experiment,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Received:
@@ -158,7 +162,7 @@ def received(
 class TestShown:
     def test_every_iterate_of_a_design_changes_curves_robot_and_path(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         received: Received,
     ) -> None:
         design, events = searched
@@ -182,7 +186,7 @@ class TestShown:
 
     def test_curves_over_time_show_the_positions_and_the_controls(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         received: Received,
     ) -> None:
         design, events = searched
@@ -206,7 +210,7 @@ class TestShown:
 
     def test_the_best_iterate_of_several_starts_is_shown(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         experiment: mjfim.Experiment,
         tmp_path: Path,
     ) -> None:
@@ -239,7 +243,7 @@ class TestShown:
 
     def test_the_end_of_a_burst_is_transmitted_without_a_further_event(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         experiment: mjfim.Experiment,
         tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch,
@@ -263,7 +267,7 @@ class TestShown:
 
     def test_transmissions_are_rare_and_lose_no_point(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         experiment: mjfim.Experiment,
         tmp_path: Path,
     ) -> None:
@@ -305,7 +309,7 @@ class TestIndependence:
     def test_with_and_without_a_viewer_the_result_is_the_same(
         self,
         listens: bool,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         experiment: mjfim.Experiment,
     ) -> None:
         """The same in every bit."""

@@ -87,17 +87,15 @@ def test_a_notebook_shows_the_progress_of_each_verb_once(
     assert places == []
 
 
-def test_a_callback_replaces_the_bar(experiment: mjfim.Experiment, places: list[Shown]) -> None:
-    events: list[Event] = []
-    mjfim.design(experiment, callback=events.append)
-    assert places == [] and len(events) >= 2
-
-
-def test_a_program_that_is_no_notebook_shows_nothing(
+def test_a_callback_replaces_the_bar_and_programs_show_nothing(
     experiment: mjfim.Experiment, places: list[Shown], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    told: list[Event] = []
+    mjfim.design(experiment, callback=told.append)
+    assert places == [] and len(told) >= 2
+
     monkeypatch.setattr(events, "in_notebook", lambda: False)
-    mjfim.design(experiment)
+    mjfim.check(experiment)
     assert places == []
 
 
