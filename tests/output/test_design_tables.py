@@ -104,12 +104,12 @@ def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: P
     assert np.isnan(starting(rows, "gain:")[-1]).all()
 
     task = BUILD[kind](tmp_path)
-    path, played = written(task, tmp_path)
+    path, _ = written(task, tmp_path)
     push = 0.02 * np.random.default_rng(1).standard_normal(nx)
     states, used, _ = closed_loop(path, tmp_path, push)
     model = task.plant.model(task.theta)
     reference = np.array(task.initial.state)
-    expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, played.gain)
+    expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, gains(task))
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
     assert np.abs(used - task.initial.ctrl).max() > 1e-3
 
