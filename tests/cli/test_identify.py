@@ -80,7 +80,7 @@ def test_identify_several_recordings(
 def test_misfit(study: Path, recorded: Path, tmp_path: Path) -> None:
     """The model cannot explain the recording: the exit code and the text say so."""
     header, *rows = recorded.read_text(encoding="utf-8").splitlines()
-    cells = [row.split(",") for row in rows]
+    cells = [row.split(",") for row in rows[:61]]
     bent = [[t, u, str(float(s) + 0.5 * float(t)), *rest] for t, u, s, *rest in cells]
     odd = tmp_path / "odd.csv"
     odd.write_text("\n".join([header, *(",".join(row) for row in bent)]) + "\n", encoding="utf-8")
@@ -140,11 +140,9 @@ def test_drawn_robots(study: Path, recorded: Path, tmp_path: Path) -> None:
     # The seed alone decides. A file that was edited is the user's.
     (out / "samples" / "robot_0002.xml").write_text("edited", encoding="utf-8")
     misused(run(*words, "--samples", 2), "robot_0002.xml: changed after mjfim wrote it")
-    assert run(*words, "--samples", 3, "--seed", 7, "--force").exit_code == 0
-    assert (out / "samples.csv").read_text(encoding="utf-8") == first
-    assert run(*words, "--samples", 2, "--seed", 8).exit_code == 0
+    assert run(*words, "--samples", 2, "--seed", 7, "--force").exit_code == 0
     assert names(out / "samples") - {MANIFEST} == {"robot_0001.xml", "robot_0002.xml"}
-    assert (out / "samples.csv").read_text(encoding="utf-8") != first
+    assert (out / "samples.csv").read_text(encoding="utf-8").splitlines() == first.splitlines()[:3]
 
     # Without the option, nothing of them remains.
     assert run(*words).exit_code == 0

@@ -88,5 +88,6 @@ def test_a_press_while_pictures_are_drawn_keeps_those_that_are_written(
 
 
 def test_report_of_a_folder_without_results(tmp_path: Path) -> None:
-    misused(run("report", tmp_path), f"{tmp_path}: holds no result")
+    misused(run("report", tmp_path), f"{tmp_path}: holds no result; ", "design.npz")
     misused(run("report", tmp_path / "nowhere"), "no such folder")
+    assert list(tmp_path.iterdir()) == []

@@ -16,7 +16,9 @@ Designed = tuple[mjfim.Experiment, mjfim.Design]
 def designed(name: str, **tables: Any) -> Designed:
     """An example and its design after two iterations."""
     stated = mjfim.Experiment.from_file(MODELS / f"{name}.toml")
-    stated = stated.replace(**{"descent": {"max_iterations": 2}, **tables})
+    stated = stated.replace(
+        **{"descent": {"max_iterations": 2}, "rehearsal": {"robots": 4}, **tables}
+    )
     return stated, mjfim.design(stated)
 
 

@@ -53,32 +53,6 @@ def starting(rows: dict[str, Array], prefix: str) -> Array:
     return np.column_stack([values for name, values in rows.items() if name.startswith(prefix)])
 
 
-@pytest.mark.parametrize("kind", BUILD)
-def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
-    """A bare mj_step loop on the model file, fed from the CSV, walks through its positions,
-    velocities and activations.
-    """
-    task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    path, _ = written(task, tmp_path)
-    rows = table(path)
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
-    data = mujoco.MjData(model)
-    steps = round(1.0 / FINE[kind] / model.opt.timestep)
-    qpos, qvel, ctrl = (starting(rows, prefix) for prefix in ("qpos:", "qvel:", "ctrl:"))
-    data.qpos[:], data.qvel[:] = qpos[0], qvel[0]
-    if model.na:
-        data.act[:] = starting(rows, "act:")[0]
-    assert len(qpos) == round(task.experiment.horizon * FINE[kind]) + 1
-    for k in range(len(ctrl) - 1):
-        np.testing.assert_allclose(data.qpos, qpos[k], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(data.qvel, qvel[k], rtol=0, atol=1e-9)
-        data.ctrl[:] = ctrl[k]
-        mujoco.mj_step(model, data, steps)
-    np.testing.assert_allclose(data.qpos, qpos[-1], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(rows["t"], np.arange(len(qpos)) / FINE[kind], rtol=0, atol=1e-12)
-    assert np.isnan(ctrl[-1]).all() and np.isnan(starting(rows, "gain:")[-1]).all()
-
-
 def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Array]:
     """States and controls of a loop that knows only the CSV and the model file, and the planned
     ones. push: (nx,) of the start
@@ -113,20 +87,29 @@ def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Ar
 
 @pytest.mark.parametrize("kind", BUILD)
 def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: Path) -> None:
-    """On the plan it changes nothing; pushed off it, it is the engine's own loop with the arrays of
-    design.npz.
+    """On the plan, at the rate of the controller, it changes nothing: a bare mj_step loop on the
+    model file walks through the positions, velocities and activations of the table. Pushed off it,
+    it is the engine's own loop with the arrays of design.npz.
     """
-    task = BUILD[kind](tmp_path)
-    path, played = written(task, tmp_path)
-    nx = task.space.nx
+    task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
+    path, _ = written(task, tmp_path)
+    nx, rows = task.space.nx, table(path)
     states, used, plan = closed_loop(path, tmp_path, np.zeros(nx))
     np.testing.assert_allclose(states, plan, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(used, task.initial.ctrl, rtol=0, atol=1e-9)
+    assert len(plan) == round(task.experiment.horizon * FINE[kind]) + 1
+    times = len(used) // len(task.initial.ctrl)
+    np.testing.assert_allclose(used, np.repeat(task.initial.ctrl, times, axis=0), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rows["t"], np.arange(len(plan)) / FINE[kind], rtol=0, atol=1e-12)
+    assert np.isnan(starting(rows, "ctrl:")[-1]).all()
+    assert np.isnan(starting(rows, "gain:")[-1]).all()
+
+    task = BUILD[kind](tmp_path)
+    path, _ = written(task, tmp_path)
     push = 0.02 * np.random.default_rng(1).standard_normal(nx)
     states, used, _ = closed_loop(path, tmp_path, push)
     model = task.plant.model(task.theta)
     reference = np.array(task.initial.state)
-    expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, played.gain)
+    expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, gains(task))
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
     assert np.abs(used - task.initial.ctrl).max() > 1e-3
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from mjfim.output.export.mjcf import identified_files, write_identified
-from tests.output.test_mjcf import assert_is_identified_model, changes, task_of
+from tests.output.test_mjcf import assert_is_identified_model, changes, system_of
+from tests.support.contents import contents
 
 # A robot of five files: settings with defaults, an arm in the tree, and inside it a hand, all in
 # folders of their own. The mesh of the arm lies in the folder of the compiler, that of the hand in
@@ -93,15 +94,6 @@ def robot(tmp_path: Path) -> Path:
     return home / "robot.xml"
 
 
-def contents(folder: Path) -> dict[str, str]:
-    """Texts of all files of a folder, by their names in it."""
-    return {
-        file.relative_to(folder).as_posix(): file.read_text(encoding="utf-8")
-        for file in sorted(folder.rglob("*"))
-        if file.is_file()
-    }
-
-
 # Changed numbers by parameter path, and the copies that a change needs.
 CHANGES: dict[str, tuple[float, set[str]]] = {
     "joint/base:damping": (0.7, set()),
@@ -126,10 +118,10 @@ def test_the_file_that_holds_the_number_is_copied(
         both = [{"path": path}, {"path": "actuator/elbow:biasprm[1]", "scale": -1.0}]
         targets = [{"targets": both, "scale": 1.0}]
 
-    task = task_of(robot, tmp_path, *targets)
+    system = system_of(robot, tmp_path, *targets)
     new = tmp_path / place / "identified.xml"
-    assert write_identified(new, task.system, np.array([value])) == []
-    assert_is_identified_model(new, task, [value])
+    assert write_identified(new, system, np.array([value])) == []
+    assert_is_identified_model(new, system, [value])
 
     # In another folder, every file that names others relative to the main file is copied, too.
     written = {file.name for file in new.parent.glob("identified*")}
@@ -142,9 +134,9 @@ def test_the_file_that_holds_the_number_is_copied(
 
 
 def test_the_text_stays_as_it_is(robot: Path, tmp_path: Path) -> None:
-    task = task_of(robot, tmp_path, "joint/elbow:armature", "joint/finger:damping")
+    system = system_of(robot, tmp_path, "joint/elbow:armature", "joint/finger:damping")
     new = tmp_path / "out" / "identified.xml"
-    assert write_identified(new, task.system, np.array([0.02, 0.05])) == []
+    assert write_identified(new, system, np.array([0.02, 0.05])) == []
 
     home = robot.parent
     lost, gained = changes(home / "parts" / "arm.xml", new.parent / "identified_arm.xml")
@@ -163,19 +155,19 @@ def test_the_text_stays_as_it_is(robot: Path, tmp_path: Path) -> None:
 
 
 def test_a_copy_can_be_identified_again(robot: Path, tmp_path: Path) -> None:
-    task = task_of(robot, tmp_path, "joint/finger:damping")
+    system = system_of(robot, tmp_path, "joint/finger:damping")
     first = tmp_path / "first" / "identified.xml"
-    write_identified(first, task.system, np.array([0.05]))
+    write_identified(first, system, np.array([0.05]))
 
-    again = task_of(first, tmp_path, "joint/finger:damping")
+    again = system_of(first, tmp_path, "joint/finger:damping")
     second = tmp_path / "second" / "identified.xml"
-    assert write_identified(second, again.system, np.array([0.06])) == []
+    assert write_identified(second, again, np.array([0.06])) == []
     assert_is_identified_model(second, again, [0.06])
     assert (second.parent / "identified_hand.xml").is_file()
 
     # In the folder of its own model, the copy takes another name.
     beside = first.with_name("other.xml")
-    assert write_identified(beside, again.system, np.array([0.06])) == []
+    assert write_identified(beside, again, np.array([0.06])) == []
     assert (first.parent / "other_identified_hand.xml").is_file()
     assert mujoco.MjModel.from_xml_path(str(first)).joint("finger").damping[0] == 0.05
 
@@ -196,12 +188,12 @@ def test_names_do_not_collide(tmp_path: Path) -> None:
     )
     (tmp_path / "model.xml").write_text(xml, encoding="utf-8")
     paths = ["joint/j0:damping", "joint/j1:damping", "joint/j2:damping"]
-    task = task_of(tmp_path / "model.xml", tmp_path, *paths)
+    system = system_of(tmp_path / "model.xml", tmp_path, *paths)
 
     before = contents(tmp_path)
     new = tmp_path / "identified.xml"
-    assert write_identified(new, task.system, np.array([2.0, 3.0, 4.0])) == []
-    assert_is_identified_model(new, task, [2.0, 3.0, 4.0])
+    assert write_identified(new, system, np.array([2.0, 3.0, 4.0])) == []
+    assert_is_identified_model(new, system, [2.0, 3.0, 4.0])
     after = contents(tmp_path)
     assert {name: after[name] for name in before} == before
     assert len(after) == len(before) + 4
@@ -215,9 +207,9 @@ def test_nothing_is_left_where_the_text_cannot_express_the_value(
     """MuJoCo prints the pose of a body in a turned frame; no copy stays."""
     arm = robot.parent / "parts" / "arm.xml"
     arm.write_text(ARM.replace('pos="0.1 0 0">', 'euler="0 0 9">'), encoding="utf-8")
-    task = task_of(robot, tmp_path, "body/hand:pos[0]", "joint/elbow:armature")
+    system = system_of(robot, tmp_path, "body/hand:pos[0]", "joint/elbow:armature")
     new = tmp_path / "out" / "identified.xml"
-    (said,) = write_identified(new, task.system, np.array([0.25, 0.02]))
+    (said,) = write_identified(new, system, np.array([0.25, 0.02]))
     assert "printed by MuJoCo" in said
     assert os.listdir(new.parent) == ["identified.xml"]
     model = mujoco.MjModel.from_xml_path(str(new))
@@ -229,11 +221,11 @@ def test_a_model_that_is_edited_meanwhile_is_written_as_it_was_loaded(
     edited: str, robot: Path, tmp_path: Path
 ) -> None:
     """Its parameters belong to the text that was loaded, also where it is resolved again."""
-    task = task_of(robot, tmp_path, "joint/elbow:armature")
+    system = system_of(robot, tmp_path, "joint/elbow:armature")
     whole, new = tmp_path / "whole" / "identified.xml", tmp_path / "out" / "identified.xml"
-    assert write_identified(whole, task.system, np.array([0.02])) == []
+    assert write_identified(whole, system, np.array([0.02])) == []
     with (robot.parent / edited).open("a", encoding="utf-8") as file:
         file.write("<!-- edited -->")
-    assert write_identified(new, task.system, np.array([0.02])) == []
+    assert write_identified(new, system, np.array([0.02])) == []
     written = {path.name: path.read_bytes() for path in new.parent.iterdir()}
     assert written == {path.name: path.read_bytes() for path in whole.parent.iterdir()}

@@ -36,11 +36,15 @@ from tests.support.paths import MODELS
 def experiment() -> mjfim.Experiment:
     """A short cart-pendulum experiment with few iterations."""
     stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    return stated.replace(horizon=0.5, descent={"max_iterations": 4})
+    return stated.replace(horizon=0.5, descent={"max_iterations": 4}, rehearsal={"robots": 0})
+
+
+# A design and its events.
+Searched = tuple[Design, list[DesignEvent]]
 
 
 @pytest.fixture(scope="module")
-def searched(experiment: mjfim.Experiment) -> tuple[Design, list[DesignEvent]]:
+def searched(experiment: mjfim.Experiment) -> Searched:
     """A design without a viewer, and its events."""
     events: list[DesignEvent] = []
     return mjfim.design(experiment, callback=events.append), events
@@ -146,7 +150,7 @@ def watched(
 
 @pytest.fixture(scope="module")
 def received(
-    searched: tuple[Design, list[DesignEvent]],
+    searched: Searched,
     experiment: mjfim.Experiment,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Received:
@@ -158,7 +162,7 @@ def received(
 class TestShown:
     def test_every_iterate_of_a_design_changes_curves_robot_and_path(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         received: Received,
     ) -> None:
         design, events = searched
@@ -182,7 +186,7 @@ class TestShown:
 
     def test_curves_over_time_show_the_positions_and_the_controls(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         received: Received,
     ) -> None:
         design, events = searched
@@ -206,7 +210,7 @@ class TestShown:
 
     def test_the_best_iterate_of_several_starts_is_shown(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         experiment: mjfim.Experiment,
         tmp_path: Path,
     ) -> None:
@@ -239,7 +243,7 @@ class TestShown:
 
     def test_the_end_of_a_burst_is_transmitted_without_a_further_event(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         experiment: mjfim.Experiment,
         tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch,
@@ -263,7 +267,7 @@ class TestShown:
 
     def test_transmissions_are_rare_and_lose_no_point(
         self,
-        searched: tuple[Design, list[DesignEvent]],
+        searched: Searched,
         experiment: mjfim.Experiment,
         tmp_path: Path,
     ) -> None:
@@ -293,22 +297,37 @@ class TestShown:
         assert received.series("/share/monte_carlo") == pytest.approx([25.0, 75.0])
 
 
+def free_port() -> int:
+    """A port at which nobody listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 class TestIndependence:
-    def test_without_a_viewer_the_result_is_the_same(
-        self, searched: tuple[Design, list[DesignEvent]], experiment: mjfim.Experiment
+    @pytest.mark.parametrize("listens", [False, pytest.param(True, marks=pytest.mark.slow)])
+    def test_with_and_without_a_viewer_the_result_is_the_same(
+        self,
+        listens: bool,
+        searched: Searched,
+        experiment: mjfim.Experiment,
     ) -> None:
-        """Nobody listens at the port."""
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+        """The same in every bit."""
+        port = free_port()
+        with rr.RecordingStream("server") as server:
+            if listens:
+                server.serve_grpc(grpc_port=port)
+            said: list[str] = []
+            with live(experiment, f"127.0.0.1:{port}", say=said.append) as show:
+                design = mjfim.design(experiment, callback=show)
+            server.disconnect()
 
-        said: list[str] = []
-        with live(experiment, f"127.0.0.1:{port}", say=said.append) as show:
-            design = mjfim.design(experiment, callback=show)
-
-        (sentence,) = said
-        assert "there is no live view: nothing listens at" in sentence
-        assert_equal(design, searched[0])
+        assert len(said) == (0 if listens else 1)
+        assert listens or "there is no live view: nothing listens at" in said[0]
+        expected = searched[0]
+        assert np.array_equal(design.trajectory.ctrl, expected.trajectory.ctrl)
+        assert np.array_equal(design.final.information, expected.final.information)
+        assert [row.cost for row in design.history] == [row.cost for row in expected.history]
 
     def test_without_a_display_a_sentence_says_so(
         self, experiment: mjfim.Experiment, monkeypatch: pytest.MonkeyPatch
@@ -355,30 +374,6 @@ class TestIndependence:
         assert said == ["the live view ended: lost"]
         assert calls == [event]
 
-    @pytest.mark.slow
-    def test_with_a_server_the_result_is_the_same(
-        self, searched: tuple[Design, list[DesignEvent]], experiment: mjfim.Experiment
-    ) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-        with rr.RecordingStream("server") as server:
-            server.serve_grpc(grpc_port=port)
-            said: list[str] = []
-            with live(experiment, f"127.0.0.1:{port}", say=said.append) as show:
-                design = mjfim.design(experiment, callback=show)
-            server.disconnect()
-
-        assert said == []
-        assert_equal(design, searched[0])
-
-
-def assert_equal(design: Design, expected: Design) -> None:
-    """Two designs are the same in every bit."""
-    assert np.array_equal(design.trajectory.ctrl, expected.trajectory.ctrl)
-    assert np.array_equal(design.final.information, expected.final.information)
-    assert [row.cost for row in design.history] == [row.cost for row in expected.history]
-
 
 class TestAddress:
     def test_forms(self) -> None:
@@ -410,9 +405,7 @@ def test_a_viewer_listens_on_this_computer_alone_and_stores_no_statistics(
     """What listens at all addresses answers at 127.0.0.2 as well, on Linux."""
     for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     nowhere = subprocess.DEVNULL
     viewer = live_module.start_viewer(
         "--serve-grpc", "--port", str(port), stdout=nowhere, stderr=nowhere

@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 
 import mjfim
 from mjfim.errors import MjfimError
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.export.mjcf import same_dynamics, write_identified
 from tests.support.examples import design_file
-from tests.support.numerics import make_task, shared_model
+from tests.support.numerics import shared_model
 from tests.support.paths import MODELS, SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
 
@@ -173,20 +172,18 @@ OUTSIDE = (
 )
 
 
-def task_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> DesignTask:
-    """Experiment whose parameters p0, p1 ... have the given targets: paths or tables."""
+def system_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> System:
+    """System whose parameters p0, p1 ... have the given targets: paths or tables."""
     given = {
         f"p{i}": {"target": t, "scale": 1.0} if isinstance(t, str) else t
         for i, t in enumerate(targets)
     }
-    return make_task(
-        xml,
-        folder,
-        rate=500.0,
-        horizon=0.1,
-        parameters=given,
-        **{"noise": {"state": 0.1}, **tables},
-    )
+    path = xml
+    if isinstance(xml, str):
+        path = folder / "model.xml"
+        path.write_text(xml, encoding="utf-8")
+    tables = {"noise": {"state": 0.1}, **tables}
+    return System.resolve(mjfim.Experiment(model=str(path), rate=500.0, parameters=given, **tables))
 
 
 def elements(path: Path) -> list[str]:
@@ -202,18 +199,18 @@ def changes(old: Path, new: Path) -> tuple[list[str], list[str]]:
     return lost, [each for each in after if each not in before]
 
 
-def written(task: DesignTask, *theta: float, said: str = "") -> Path:
+def written(system: System, *theta: float, said: str = "") -> Path:
     """The identified model beside the user's, which was checked, and whose remark holds words."""
-    path = task.system.model_path.parent / "identified.xml"
-    remarks = write_identified(path, task.system, np.array(theta))
+    path = system.model_path.parent / "identified.xml"
+    remarks = write_identified(path, system, np.array(theta))
     assert (said in " ".join(remarks)) if said else not remarks, remarks
     return path
 
 
-def assert_is_identified_model(path: Path, task: DesignTask, theta: Any) -> None:
+def assert_is_identified_model(path: Path, system: System, theta: Any) -> None:
     """Assert that the file is the identified model, to 1e-12 of each array's largest number."""
     found = mujoco.MjModel.from_xml_path(str(path))
-    wanted = task.system.model_at(np.asarray(theta, float), at_keyframe=False)
+    wanted = system.model_at(np.asarray(theta, float), at_keyframe=False)
     for name in dir(found):
         if not name.startswith(DYNAMICS) or name.startswith(NO_DYNAMICS):
             continue
@@ -239,12 +236,12 @@ def inertias(model: Any) -> Any:
 def test_one_value_changes_one_element(path: str, tmp_path: Path) -> None:
     value, words = STATED[path]
     target: Any = {"target": path, "guess": 1.0, "scale": 1.0}
-    task = task_of(RICH, tmp_path, target if path.endswith(("mass", "density")) else path)
-    new = written(task, value)
+    system = system_of(RICH, tmp_path, target if path.endswith(("mass", "density")) else path)
+    new = written(system, value)
     lost, gained = changes(tmp_path / "model.xml", new)
     assert len(gained) == 1 and words in gained[0], gained
     assert len(lost) == (0 if path.startswith("body/b ") else 1)
-    assert_is_identified_model(new, task, [value])
+    assert_is_identified_model(new, system, [value])
 
 
 def test_every_field_is_tested() -> None:
@@ -258,13 +255,13 @@ def test_every_field_is_tested() -> None:
 
 
 def test_parameters_outside_the_model_are_a_comment(tmp_path: Path) -> None:
-    task = task_of(RICH, tmp_path, *OUTSIDE, noise={"seen": 0.1, "qpos:j": 0.1})
+    system = system_of(RICH, tmp_path, *OUTSIDE, noise={"seen": 0.1, "qpos:j": 0.1})
     said = "<!-- not part of an MJCF: output/seen[0]:bias = 0.01, output/seen[0]:scale = 0.01, "
-    new = written(task, *np.full(len(OUTSIDE), 0.01))
+    new = written(system, *np.full(len(OUTSIDE), 0.01))
     assert changes(tmp_path / "model.xml", new) == ([], [f"{said}output:delay = 0.01 s -->"])
 
     # Errors of zero need no comment.
-    new = written(task, *np.zeros(len(OUTSIDE)))
+    new = written(system, *np.zeros(len(OUTSIDE)))
     assert changes(tmp_path / "model.xml", new) == ([], [])
 
 
@@ -292,31 +289,31 @@ UNCHANGED = [
 def test_without_a_change_every_number_keeps_its_spelling(
     more: tuple[str, ...], tmp_path: Path
 ) -> None:
-    task = task_of(RICH, tmp_path, *(p for p in UNCHANGED if p != 'body/b "2":mass'), *more)
-    assert changes(tmp_path / "model.xml", written(task, *task.parameters.guess)) == ([], [])
+    system = system_of(RICH, tmp_path, *(p for p in UNCHANGED if p != 'body/b "2":mass'), *more)
+    assert changes(tmp_path / "model.xml", written(system, *system.parameters.guess)) == ([], [])
 
 
 def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
     """A written file has the identified values; identified again, it does not change."""
     paths = [p for p in UNCHANGED if p != 'body/b "2":mass']
     paths += ["body/a:firstmoment[0]", "body/c:fullinertia[3]"]
-    first = task_of(RICH, tmp_path, *paths)
+    first = system_of(RICH, tmp_path, *paths)
     theta = first.parameters.guess * 1.013 + 1e-3 / 3
     new = written(first, *theta)
     (tmp_path / "again").mkdir()
-    second = task_of(new, tmp_path / "again", *paths)
+    second = system_of(new, tmp_path / "again", *paths)
     straight = np.array([":rot" not in p for p in paths])
     found = second.parameters.guess
     np.testing.assert_allclose(found[straight], theta[straight], rtol=1e-12, atol=1e-13)
-    assert write_identified(tmp_path / "again.xml", second.system, found) == []
+    assert write_identified(tmp_path / "again.xml", second, found) == []
     assert (tmp_path / "again.xml").read_bytes() == new.read_bytes()
 
 
 def test_scale_and_offset_reach_every_target(tmp_path: Path) -> None:
     other = {"path": "joint/k:damping", "scale": 2.0, "offset": 0.25}
     both = {"targets": [{"path": "joint/j:damping"}, other], "guess": 0.3}
-    task = task_of(RICH, tmp_path, both)
-    _, gained = changes(tmp_path / "model.xml", written(task, 0.125))
+    system = system_of(RICH, tmp_path, both)
+    _, gained = changes(tmp_path / "model.xml", written(system, 0.125))
     assert len(gained) == 2
     assert 'damping="0.125"' in gained[0] and 'damping="0.5 0.020"' in gained[1]
 
@@ -327,7 +324,7 @@ def test_texts_of_other_systems(ending: str, tmp_path: Path) -> None:
     text = "\ufeff" + RICH.replace("?>\n", "?>\n<!DOCTYPE mujoco>\n", 1).replace("\n", ending)
     source = tmp_path / "arm.xml"
     source.write_bytes(text.encode() + b"<!-- the end -->")
-    new = written(task_of(source, tmp_path, 'body/b "2":mass'), 2.0)
+    new = written(system_of(source, tmp_path, 'body/b "2":mass'), 2.0)
     text = new.read_text(encoding="utf-8")
     assert text.startswith('<?xml version="1.0" encoding="utf-8"?>\n<!-- größer als ASCII')
     assert text.endswith("</mujoco>\n<!-- the end -->\n")
@@ -366,11 +363,11 @@ def test_mujoco_prints_values_that_the_text_cannot_express(
     asset = '<asset><model name="leg" file="leg.xml"/></asset>'
     xml = RICH.replace("  <worldbody>", f"{asset}  <worldbody>")
     xml = xml.replace("  </worldbody>", f"{place}</worldbody>")
-    task = task_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
+    system = system_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
     value = 0.6 + 1e-9
-    new = written(task, value, said="it is printed by MuJoCo, without comments")
+    new = written(system, value, said="it is printed by MuJoCo, without comments")
     found = mujoco.MjModel.from_xml_path(str(new))
-    wanted = task.system.model_at(np.array([value]))
+    wanted = system.model_at(np.array([value]))
     for name in ("dof_damping", "body_pos", "body_mass", "body_inertia", "actuator_gainprm"):
         np.testing.assert_allclose(
             getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12
@@ -390,11 +387,11 @@ def soften(spec: Any, value: float) -> None:
 @pytest.mark.parametrize("function", [stiffen, soften])
 def test_functions_of_the_spec(function: Any, tmp_path: Path) -> None:
     """A text states the numbers that a function changes; MuJoCo prints other changes."""
-    task = task_of(RICH, tmp_path, {"function": function, "guess": 0.1, "scale": 1.0})
+    system = system_of(RICH, tmp_path, {"function": function, "guess": 0.1, "scale": 1.0})
     said = "jnt_margin" if function is soften else ""
-    new = written(task, 0.25, said=said)
+    new = written(system, 0.25, said=said)
     found = mujoco.MjModel.from_xml_path(str(new))
-    assert same_dynamics(found, task.system.model_at(np.array([0.25])), 1e-6 if said else 1e-9)
+    assert same_dynamics(found, system.model_at(np.array([0.25])), 1e-6 if said else 1e-9)
 
 
 @pytest.mark.parametrize("path", ["body/c:pos[0]", "body/c:rot[1]", "site/u:pos[2]"])
@@ -402,9 +399,9 @@ def test_poses_inside_frames(path: str, tmp_path: Path) -> None:
     frames = '<frame pos="1 2 3" quat="0.6 0.8 0 0"><frame quat="0.8 0 0.6 0"><body name="c" '
     xml = RICH.replace('<body name="c" ', frames)
     xml = xml.replace("</body>\n  </worldbody>", "</body></frame></frame>\n  </worldbody>")
-    task = task_of(xml, tmp_path, path)
-    new = written(task, 0.3)
-    assert_is_identified_model(new, task, [0.3])
+    system = system_of(xml, tmp_path, path)
+    new = written(system, 0.3)
+    assert_is_identified_model(new, system, [0.3])
     assert len(changes(tmp_path / "model.xml", new)[1]) == 1
 
 
@@ -439,14 +436,14 @@ def test_meshes_are_found_from_another_folder(
     xml = RICH.replace("  <default>\n", f"  {compiler}\n  {assets}\n  <default>\n", 1)
     sphere = 'type="sphere" size="0.10" density="300"'
     xml = xml.replace(sphere, 'type="mesh" mesh="t" density="300"')
-    task = task_of(xml, tmp_path / "model", "geom/i:pos[1]")
-    theta = task.parameters.guess + 0.01
+    system = system_of(xml, tmp_path / "model", "geom/i:pos[1]")
+    theta = system.parameters.guess + 0.01
     for folder in ("model", "out"):
         path = tmp_path / folder / "identified.xml"
-        assert write_identified(path, task.system, theta) == []
+        assert write_identified(path, system, theta) == []
         _, gained = changes(tmp_path / "model" / "model.xml", path)
         assert (stated in gained) == (folder == "out"), gained
-        assert_is_identified_model(path, task, theta)
+        assert_is_identified_model(path, system, theta)
 
 
 # Numbers that the compiler would derive: (old, new) text, path, value, and what is stated.
@@ -488,29 +485,29 @@ DERIVED = {
 def test_numbers_that_the_compiler_would_derive_are_stated(case: str, tmp_path: Path) -> None:
     (old, new), (path, value), words = DERIVED[case]
     assert old in RICH
-    task = task_of(RICH.replace(old, new, 1), tmp_path, path)
-    file = written(task, value, said="" if words else "printed by MuJoCo")
+    system = system_of(RICH.replace(old, new, 1), tmp_path, path)
+    file = written(system, value, said="" if words else "printed by MuJoCo")
     if words:
         assert words in " ".join(changes(tmp_path / "model.xml", file)[1])
-        assert_is_identified_model(file, task, [value])
+        assert_is_identified_model(file, system, [value])
 
 
 def test_an_option_is_made_where_there_is_none(tmp_path: Path) -> None:
     xml = re.sub(r"\n +<option[^>]*/>[^\n]*", "", RICH)
-    task = task_of(xml, tmp_path, "option:gravity[0]", "option:density")
-    new = written(task, 0.1, 1.2)
+    system = system_of(xml, tmp_path, "option:gravity[0]", "option:density")
+    new = written(system, 0.1, 1.2)
     stated = '<option gravity="0.1 0 -9.81" density="1.2"/>'
     assert changes(tmp_path / "model.xml", new) == ([], [stated])
-    assert_is_identified_model(new, task, [0.1, 1.2])
+    assert_is_identified_model(new, system, [0.1, 1.2])
 
 
 @pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
 def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: Path) -> None:
     """`objtype="body"` reads the principal axes, whose order the matrix does not determine."""
     xml = RICH.replace('mass="1.50"', f'mass="1.50"{turned}')
-    task = task_of(xml, tmp_path, "body/a:fullinertia[3]")
-    found = mujoco.MjModel.from_xml_path(str(written(task, 0.004)))
-    wanted = task.system.model_at(np.array([0.004]))
+    system = system_of(xml, tmp_path, "body/a:fullinertia[3]")
+    found = mujoco.MjModel.from_xml_path(str(written(system, 0.004)))
+    wanted = system.model_at(np.array([0.004]))
     np.testing.assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
     np.testing.assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
 
@@ -535,9 +532,11 @@ def test_actuators(element: str, field: str, words: str, tmp_path: Path) -> None
     xml = RICH.replace('name="l" type="slide"', 'name="l" type="slide" range="-2 2"')
     xml = xml.replace("</actuator>", f'<{tag} name="x" joint="l" {attributes}/></actuator>')
     value = -0.7 if tag in ("damper", "pid") else 0.7
-    task = task_of(xml, tmp_path, {"target": f"actuator/x:{field}", "guess": value, "scale": 1.0})
-    new = written(task, value)
-    assert_is_identified_model(new, task, [value])
+    system = system_of(
+        xml, tmp_path, {"target": f"actuator/x:{field}", "guess": value, "scale": 1.0}
+    )
+    new = written(system, value)
+    assert_is_identified_model(new, system, [value])
     lost, gained = changes(tmp_path / "model.xml", new)
     assert len(lost) == len(gained) == 1
     assert words in gained[0]
@@ -580,12 +579,12 @@ def test_models_of_this_and_other_projects(name: str, tmp_path: Path) -> None:
         experiment = mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name)
     else:
         experiment = mjfim.Experiment.from_file(design_file(name, tmp_path))
-    task = DesignTask.resolve(experiment)
-    change = 0.004 * np.random.default_rng(1).uniform(-1.0, 1.0, len(task.parameters))
-    theta = task.parameters.guess * (1.0 + change)
+    system = System.resolve(experiment)
+    change = 0.004 * np.random.default_rng(1).uniform(-1.0, 1.0, len(system.parameters))
+    theta = system.parameters.guess * (1.0 + change)
     new = tmp_path / "identified.xml"
-    assert write_identified(new, task.system, theta) == []
-    assert_is_identified_model(new, task, theta)
+    assert write_identified(new, system, theta) == []
+    assert_is_identified_model(new, system, theta)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import pytest
 
 import mjfim
+from mjfim.excitation.task import DesignTask
 from mjfim.output import progress_text
 from mjfim.output.progress_text import NotebookProgress
 from mjfim.records import events
@@ -48,27 +49,24 @@ def places(monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
 def experiment() -> mjfim.Experiment:
     """The cart-pendulum for 0.4 s."""
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    return experiment.replace(horizon=0.4, descent={"max_iterations": 2})
+    return experiment.replace(horizon=0.4, descent={"max_iterations": 2}, rehearsal={"robots": 2})
 
 
 def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
-    """Yield short calls of verbs."""
+    """Short calls of verbs."""
     yield "designing: iteration   1", mjfim.design
     yield "checking", mjfim.check
     yield "comparing", lambda e, **o: mjfim.compare(e, seconds=0.5, methods=["multisine"], **o)
 
     def repeat(e: mjfim.Experiment, **options: Any) -> object:
         """Repeat the initial trajectory."""
-        curve = mjfim.design(e.replace(descent={"max_iterations": 0}), progress=False).trajectory
-        return mjfim.monte_carlo(e, curve, trials=3, **options)
-
-    yield "repeating the experiment", repeat
+        return mjfim.monte_carlo(e, DesignTask.resolve(e).initial, trials=3, **options)
 
     def identify(e: mjfim.Experiment, **options: Any) -> object:
         """Identify from the initial trajectory."""
-        curve = mjfim.design(e.replace(descent={"max_iterations": 0}), progress=False).trajectory
-        return mjfim.identify(e, [mjfim.simulate(e, curve)], **options)
+        return mjfim.identify(e, [mjfim.simulate(e, DesignTask.resolve(e).initial)], **options)
 
+    yield "repeating the experiment", repeat
     yield "identifying: all data", identify
 
 
@@ -89,17 +87,15 @@ def test_a_notebook_shows_the_progress_of_each_verb_once(
     assert places == []
 
 
-def test_a_callback_replaces_the_bar(experiment: mjfim.Experiment, places: list[Shown]) -> None:
-    events: list[Event] = []
-    mjfim.design(experiment, callback=events.append)
-    assert places == [] and len(events) >= 2
-
-
-def test_a_program_that_is_no_notebook_shows_nothing(
+def test_a_callback_replaces_the_bar_and_programs_show_nothing(
     experiment: mjfim.Experiment, places: list[Shown], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    told: list[Event] = []
+    mjfim.design(experiment, callback=told.append)
+    assert places == [] and len(told) >= 2
+
     monkeypatch.setattr(events, "in_notebook", lambda: False)
-    mjfim.design(experiment)
+    mjfim.check(experiment)
     assert places == []
 
 

@@ -30,10 +30,11 @@ from mjfim.output.plots.draw import figure_of, log_ticks, plain_number, save
 from mjfim.output.plots.estimate import fit, parameter_intervals
 from mjfim.output.plots.estimate_studies import selection
 from mjfim.output.plots.pictures import draw, picture_names
-from mjfim.output.plots.studies import histogram
-from mjfim.records.design import Design, LimitUsage
+from mjfim.output.plots.studies import check, histogram
+from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import Decision, Selection, SelectionStep
+from tests.support import results
 from tests.support.made_records import (
     make_design,
     make_estimate,
@@ -300,6 +301,27 @@ def test_outliers_and_endless_bounds_do_not_widen_a_histogram() -> None:
         assert remark in panel.remark
 
 
+# ---- checks
+
+
+def test_parameters_that_are_not_known_alone_are_hatched_and_without_correlation() -> None:
+    combined = (CombinationAccuracy(expression="a + b", value=1.0, std_initial=1.0, std_final=0.5),)
+    made = results.check()
+    rows = tuple(dataclasses.replace(row, std=np.inf, relative=np.inf) for row in made.rows[:2])
+    correlation = np.full((3, 3), np.nan)
+    correlation[2, 2] = 1.0
+    found = dataclasses.replace(
+        made, rows=(*rows, made.rows[2]), combined=combined, correlation=correlation
+    )
+    bars, heat = check(found).panels
+    assert bars.y.names == [*found.wanted, "a + b"]
+    (hatched,) = (mark for mark in bars.marks if mark.hollow)
+    assert len(hatched.x) == 2
+    assert heat.cells is not None
+    assert heat.cells.values.shape == (3, 3)
+    assert np.isnan(heat.cells.values[:2]).all()
+
+
 # ---- names and words
 
 
@@ -308,6 +330,8 @@ def test_wrong_names_labels_and_endings_are_refused(tmp_path: Path) -> None:
     assert picture_names(design)[0] == "trajectories"
     with pytest.raises(MjfimError, match=r"picture of a Design .*valid: convergence, "):
         draw(design, "portrait")
+    with pytest.raises(MjfimError, match=r"trajectorys.*did you mean 'trajectories'"):
+        design.plot("trajectorys")
     with pytest.raises(MjfimError, match=r"labels.qpos has 5 entries, the data has 2"):
         draw(dataclasses.replace(design, labels=make_labels(5, 3)))
     with pytest.raises(MjfimError, match=r"valid: .png, .svg, .pdf"):

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plotly.graph_objects import Figure
 
-from mjfim.errors import RecordingError
 from mjfim.files import write_json
 from mjfim.output.page import REPORT
 from mjfim.output.pages import page_of
@@ -82,9 +82,11 @@ def numbers(array: dict[str, str]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("verb", results.MAKERS)
-def test_a_report_needs_no_other_file(verb: str) -> None:
-    """The part around the plotting library names no address, and scripts and styles are inline."""
-    html = html_of(verb)
+def test_a_report_needs_no_other_file_and_shows_everything(verb: str) -> None:
+    html, page = html_of(verb), page_of(record_of(verb))
+    data = data_of(html)
+
+    # The part around the plotting library names no address, and scripts and styles are inline.
     assert len(html.encode()) < MAX_SIZE
     assert html.lstrip().startswith("<!DOCTYPE html>")
     assert re.findall(r"https?://", own_part(html)) == []
@@ -92,53 +94,30 @@ def test_a_report_needs_no_other_file(verb: str) -> None:
     assert re.findall(r'<link[^>]*href="(?!data:)', html) == []
     assert "default-src 'none'" in html
 
-
-@pytest.mark.parametrize("verb", results.MAKERS)
-def test_the_verdict_stands_above_the_sections(verb: str) -> None:
-    """The first thing is the verdict; every section has an entry in the navigation."""
-    html, page = html_of(verb), page_of(record_of(verb))
+    # The first thing is the verdict; every section has an entry in the navigation.
     places = [html.index(f'<div class="verdict {page.verdict.level}'), html.index("<nav")]
     for i, section in enumerate(page.sections):
         assert f'<a href="#section-1-{i + 1}">{section.title}</a>' in html
         places.append(html.index(f"<h2>{section.title}</h2>"))
     assert places == sorted(places)
 
-
-@pytest.mark.parametrize("verb", results.MAKERS)
-def test_every_plot_has_a_place_and_every_picture_a_heading(verb: str) -> None:
-    """The pictures of a folder stand in the report, too; joint uncertainties only in their file."""
-    html = html_of(verb)
-    places = [int(number) for number in re.findall(r'data-panel="(\d+)"', html)]
-    assert places == list(range(len(data_of(html)["panels"])))
+    # The pictures of a folder stand in the report, too; joint uncertainties only in their file.
+    panels = [int(number) for number in re.findall(r'data-panel="(\d+)"', html)]
+    assert panels == list(range(len(data["panels"])))
     shown = html.replace("\xa0", " ")
     for name, make in pictures_of(record_of(verb)).items():
         assert name == "pairs" or f">{escape(make().title)}</" in shown, name
 
-
-@pytest.mark.parametrize("verb", results.MAKERS)
-def test_plotly_knows_all_that_a_plot_states(verb: str) -> None:
-    """Its classes refuse unknown names and values."""
-    from plotly.graph_objects import Figure
-
-    data = data_of(html_of(verb))
-    colours = data["palettes"]["light"]
-    for panel in data["panels"]:
-        text = re.sub(
-            r'"role:([^"]+)"', lambda role: json.dumps(colours[role[1]]), json.dumps(panel)
-        )
-        stated = json.loads(text)
-        Figure(data=stated["traces"], layout=stated["layout"])
-
-
-@pytest.mark.parametrize("verb", results.MAKERS)
-def test_every_colour_has_a_value_in_both_themes(verb: str) -> None:
-    """A role without a colour would be drawn in black on a dark page."""
-    html = html_of(verb)
-    data = data_of(html)
-    roles = set(re.findall(r'"role:([^"]+)"', json.dumps(data["panels"])))
+    # A role without a colour would be drawn in black on a dark page.
+    text, colours = json.dumps(data["panels"]), data["palettes"]["light"]
+    roles = set(re.findall(r'"role:([^"]+)"', text))
     roles |= set(re.findall(r"color: var\(--([\w-]+)\)", html)) - {"level"}
-    assert roles <= set(data["palettes"]["light"])
-    assert set(data["palettes"]["light"]) == set(data["palettes"]["dark"])
+    assert roles <= set(colours) == set(data["palettes"]["dark"])
+
+    # The classes of plotly refuse unknown names and values.
+    stated = re.sub(r'"role:([^"]+)"', lambda role: json.dumps(colours[role[1]]), text)
+    for panel in json.loads(stated):
+        Figure(data=panel["traces"], layout=panel["layout"])
 
 
 @pytest.mark.parametrize("verb", results.MAKERS)
@@ -334,14 +313,6 @@ def test_a_report_has_the_name_of_its_experiment_wherever_it_is(tmp_path: Path) 
     assert "<h1><small>Check of an experiment</small>arm</h1>" in pages[0]
     assert "<dt>experiment</dt><dd>arm.toml</dd>" in pages[0]
     assert "<dt>model</dt><dd>arm.xml</dd>" in pages[0]
-
-
-def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"holds no result; .*design\.npz"):
-        write_report(tmp_path)
-    with pytest.raises(RecordingError, match="no such folder"):
-        write_report(tmp_path / "nowhere")
-    assert not (tmp_path / REPORT).exists()
 
 
 def test_a_report_draws_every_length_of_segments_that_was_compared() -> None:

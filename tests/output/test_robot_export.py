@@ -124,7 +124,7 @@ def test_servos_get_their_commands(arm: Designed, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_bag_is_read_by_rosbags_and_by_identify(
+def test_a_bag_is_read_by_rosbags_and_as_a_recording(
     storage: str, cart: Designed, tmp_path: Path
 ) -> None:
     """The message is the trajectory; joint states and controls are a recording of the design."""
@@ -149,8 +149,6 @@ def test_a_bag_is_read_by_rosbags_and_by_identify(
         np.testing.assert_array_equal(
             recording.y[:, columns.index(name)], design.trajectory.qpos[:, i]
         )
-    estimate = mjfim.identify(experiment, [recording])
-    np.testing.assert_allclose(list(estimate.theta), [2.0, 1.0, 1.0], rtol=1e-6)
 
 
 def test_the_verb_writes_and_replaces_its_own_files_only(folder: Path, tmp_path: Path) -> None:

@@ -121,10 +121,10 @@ def test_cells_are_folded_and_aligned_by_their_width_on_the_screen() -> None:
 
 @pytest.mark.slow
 def test_tables_of_large_models_are_printed_in_seconds() -> None:
-    """A model with 20 000 tendons has 120 000 parameters."""
+    """A model with 10 000 tendons has 60 000 parameters."""
     begin = time.process_time()
-    assert "p119999" in printed(page_with(rows_table(120_000)), 80, verbose=True)
-    assert time.process_time() - begin < 20.0
+    assert "p59999" in printed(page_with(rows_table(60_000)), 80, verbose=True)
+    assert time.process_time() - begin < 5.0
 
 
 def test_lines_to_be_copied_are_printed_as_they_are() -> None:

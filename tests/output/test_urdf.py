@@ -97,14 +97,13 @@ def system_of(
     """The system of a model in a folder, with further parameters."""
     (folder / "two.urdf").write_text(URDF, encoding="utf-8")
     (folder / "driven.xml").write_text(MOTORS.format(prefix=prefix), encoding="utf-8")
-    tables: dict[str, Any] = {
-        "model": model,
-        "directory": folder,
-        "rate": 100.0,
-        "noise": {"state": 0.01},
-        "parameters": {**PARAMETERS, **further},
-    }
-    return System.resolve(mjfim.Experiment(**tables))
+    return resolved(folder, model, {**PARAMETERS, **further})
+
+
+def resolved(folder: Path, model: str, parameters: dict[str, dict[str, Any]]) -> System:
+    """The system of a model in a folder."""
+    tables: dict[str, Any] = {"rate": 100.0, "noise": {"state": 0.01}, "parameters": parameters}
+    return System.resolve(mjfim.Experiment(model=model, directory=folder, **tables))
 
 
 def other_values(system: System) -> Array:
@@ -224,20 +223,14 @@ def test_values_that_a_urdf_cannot_hold_are_named(tmp_path: Path) -> None:
 
 def test_a_urdf_that_is_attached_twice_is_not_written(tmp_path: Path) -> None:
     """The MJCF, which MuJoCo prints, holds the values of the first one."""
-    system = system_of(tmp_path)
+    system_of(tmp_path)
     twice = MOTORS.format(prefix="a_").replace(
         '<attach model="robot" prefix="a_"/>',
         '<attach model="robot" prefix="a_"/><body name="b" pos="1 0 0">'
         '<attach model="robot" prefix="b_"/></body>',
     )
     (tmp_path / "driven.xml").write_text(twice, encoding="utf-8")
-    tables = {
-        **system.experiment.model_dump(exclude_unset=True),
-        "model": "driven.xml",
-        "directory": tmp_path,
-        "parameters": {"m": {"target": "body/a_upper:mass"}},
-    }
-    both = System.resolve(mjfim.Experiment(**tables))
+    both = resolved(tmp_path, "driven.xml", {"m": {"target": "body/a_upper:mass"}})
     (source,) = urdf_sources(both.model_path)
     assert source.prefixes == ("a_", "b_")
     (remark,) = written(tmp_path / "out", both, np.array([1.6]))
@@ -281,17 +274,8 @@ def test_links_whose_inertia_comes_from_their_geometry(tmp_path: Path) -> None:
 </robot>
 """
     (tmp_path / "one.urdf").write_text(text, encoding="utf-8")
-    tables: dict[str, Any] = {
-        "model": "one.urdf",
-        "directory": tmp_path,
-        "rate": 100.0,
-        "noise": {"state": 0.01},
-        "parameters": {
-            "arm": {"target": "body/arm:mass"},
-            "hand": {"target": "body/hand:ipos[2]", "scale": 0.1},
-        },
-    }
-    system = System.resolve(mjfim.Experiment(**tables))
+    hand = {"target": "body/hand:ipos[2]", "scale": 0.1}
+    system = resolved(tmp_path, "one.urdf", {"arm": {"target": "body/arm:mass"}, "hand": hand})
     theta = np.array([5.0, -0.05])
     assert written(tmp_path / "out", system, theta) == []
     file = tmp_path / "out" / "identified.urdf"
@@ -322,14 +306,7 @@ def test_meshes_are_found_from_another_folder(
     text = URDF.replace("</visual>\n  </link>\n", f"</visual>\n    {mesh}")
     text = text.replace("<robot name='two'>", f"<robot name='two'>\n  {extension}")
     (tmp_path / "two.urdf").write_text(text, encoding="utf-8")
-    tables: dict[str, Any] = {
-        "model": "two.urdf",
-        "directory": tmp_path,
-        "rate": 100.0,
-        "noise": {"state": 0.01},
-        "parameters": {"mass": {"target": "body/upper:mass"}},
-    }
-    system = System.resolve(mjfim.Experiment(**tables))
+    system = resolved(tmp_path, "two.urdf", {"mass": {"target": "body/upper:mass"}})
     out = tmp_path / "far" / "away"
     assert written(out, system, np.array([2.0])) == []
     assert said in (out / "identified.urdf").read_text(encoding="utf-8")
