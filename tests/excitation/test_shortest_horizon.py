@@ -231,7 +231,7 @@ def test_the_command_line(tmp_path: Path) -> None:
     text = f"rehearsal.robots = 1\n{text}"
     for old, new in (
         ("horizon = 4.0", "horizon = 1.0"),
-        ("max_iterations = 200", "max_iterations = 4"),
+        ("max_iterations = 200", "max_iterations = 10"),
         ("tolerance = 1e-7", "tolerance = 1e-2"),
         ("[parameters.m] ", "[parameters.m]\nwanted = 0.03\n#"),
     ):
@@ -249,6 +249,8 @@ def test_the_command_line(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     kept = json.loads((folder / "shortest.json").read_text(encoding="utf-8"))
     assert kept["closed"] and kept["horizon"] < 1.0
+    told = json.loads((folder / "design.json").read_text(encoding="utf-8"))
+    assert told["shortest"]["horizon"] == kept["horizon"]
     assert f"shortest horizon: {kept['horizon']:g} s" in done.output
     with np.load(folder / "design.npz", allow_pickle=False) as arrays:
         assert arrays["t"][-1] == pytest.approx(kept["horizon"])

@@ -79,6 +79,8 @@ def test_the_moments_are_those_of_the_formal_covariance(system: System) -> None:
     assert draws.parameters == ("m", "l", "c")
     assert draws.units == ("kg", "m", "N m s/rad")
     assert len(draws) == 2000
+    first, again, other = (drawn(system, estimate, 3, seed).values for seed in (0, 0, 1))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
     np.testing.assert_allclose(draws.std, STD, rtol=1e-3)
 
     deviation = draws.values - estimate.theta

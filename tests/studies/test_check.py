@@ -78,6 +78,8 @@ def test_factors_of_a_product_are_named_with_their_combination(tmp_path) -> None
     assert set(ratio) == {"gear", "gain"}
     alone = {row.name: row.std for row in found.rows}
     assert np.isinf(alone["gear"]) and np.isinf(alone["gain"])
+    unknown = [row.name in ("gear", "gain") for row in found.rows]
+    assert np.isnan(found.correlation[unknown]).all()
     assert np.isfinite([alone["m"], alone["l"], alone["c"]]).all()
     assert any("gear" in sentence and "gain" in sentence for sentence in found.verdict)
 
