@@ -598,7 +598,12 @@ class FitSearch:
             return []
         # The first sample is the stated start, which was searched before.
         samples = sample_parameters(
-            system.parameters, self.task.start, settings.starts, settings.seed, system.impossible
+            system.parameters,
+            self.task.start,
+            settings.starts,
+            settings.seed,
+            system.impossible,
+            "fit.starts",
         )
         works = [partial(_from_start, begin=problem.begin(theta)) for theta in samples[1:]]
         searched = []

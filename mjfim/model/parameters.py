@@ -561,6 +561,7 @@ def sample_parameters(
     count: int,
     seed: int,
     unphysical: Callable[[Array], Sequence[int]] | None = None,
+    key: str = "robust",
 ) -> Array:
     """Sample the parameters from their priors or bounds.
 
@@ -578,6 +579,7 @@ def sample_parameters(
         seed: Seed of the random numbers.
         unphysical: Gives for a sample (p,) the indices of the parameters that determine unphysical
             bodies; None for no check.
+        key: What of the experiment asks for samples, for messages.
 
     Returns:
         (count, p) samples.
@@ -593,8 +595,7 @@ def sample_parameters(
     ]
     if not free:
         raise ExperimentError(
-            "no parameter has a prior or bounds to sample from; state `prior` or `bounds` in "
-            "[parameters]"
+            f"{key}: no parameter has a prior or bounds to sample from; state `prior` or `bounds`"
         )
 
     samples = np.tile(theta, (count, 1))

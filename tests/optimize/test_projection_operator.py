@@ -434,7 +434,7 @@ def test_lbfgs_needs_fewer_iterations_than_metric_descent_for_the_same_digits() 
     metric = MetricDescent(
         np.zeros((2, 2)), R * DT, np.zeros((2, 2))
     )  # the same metric as the L-BFGS here starts from
-    counts = [len(run(Pendulum(), d, max_iterations=60)) for d in (metric, LBFGS(R * DT))]
+    counts = [len(run(Pendulum(), d, max_iterations=120)) for d in (metric, LBFGS(R * DT))]
     assert counts[1] < 0.5 * counts[0]
 
 
