@@ -93,7 +93,7 @@ def far_outside(folder: Path, descent: dict[str, Any]) -> DesignTask:
 @pytest.mark.parametrize(
     ("make", "seconds"),
     [
-        (weights, 0.3),
+        (weights, 0.4),
         pytest.param(limits, 0.6, marks=pytest.mark.slow),
         pytest.param(starts, 0.4, marks=pytest.mark.slow),
         pytest.param(far_outside, 2.0, marks=pytest.mark.slow),
