@@ -508,8 +508,11 @@ class GeomDistances:
             if k != posed:
                 self._set_pose(positions[k], frames[k])
                 posed = k
-            found[i] = min(self._distance(p, self.reach, segments[i]), self.reach)
-        return found, segments
+            model, first, second, offset = self._calls[p]
+            found[i] = mujoco.mj_geomDistance(
+                model, self._posed, first, second, self.reach + offset, segments[i]
+            )
+        return np.minimum(found - self._axis_offset[pairs], self.reach), segments
 
     def _normals(
         self,

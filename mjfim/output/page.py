@@ -78,6 +78,10 @@ class Term(str):
         term.colour, term.colour_on_dark, term.colour_name = colour, colour_on_dark, colour_name
         return term
 
+    def __getnewargs__(self) -> tuple[str, str, str, str]:
+        """What a copy is made of."""
+        return str(self), self.colour, self.colour_on_dark, self.colour_name
+
     @property
     def rgb(self) -> tuple[int, int, int]:
         """Its colour as red, green and blue from 0 to 255."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import pickle
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,6 +87,12 @@ def test_shown_sentences_use_the_words_of_the_page() -> None:
         if (match := re.search(pattern, text, re.IGNORECASE))
     ]
     assert found == []
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_a_copied_word_keeps_its_colours(term: Term) -> None:
+    copied = pickle.loads(pickle.dumps(term))
+    assert (copied, copied.rgb, copied.colour_name) == (term, term.rgb, term.colour_name)
 
 
 def test_the_page_is_part_of_the_documentation() -> None:
