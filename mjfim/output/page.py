@@ -78,9 +78,9 @@ class Term(str):
         term.colour, term.colour_on_dark, term.colour_name = colour, colour_on_dark, colour_name
         return term
 
-    def __getnewargs__(self) -> tuple[str, str, str, str]:
+    def __reduce__(self) -> tuple[type[Term], tuple[str, ...]]:
         """What a copy is made of."""
-        return str(self), self.colour, self.colour_on_dark, self.colour_name
+        return Term, (str(self), self.colour, self.colour_on_dark, self.colour_name)
 
     @property
     def rgb(self) -> tuple[int, int, int]:
