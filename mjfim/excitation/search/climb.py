@@ -195,7 +195,7 @@ class Grounds:
         """The level of a variant of the plant."""
         if variant not in self._levels:
             task = self.stated.task.with_variant(variant)
-            self._levels[variant] = DescentLevel(task, self.stated.basis)
+            self.keep(DescentLevel(task, self.stated.basis))
         return self._levels[variant]
 
     def ground(self, variant: ModelVariant, candidate: Candidate) -> Ground:
@@ -205,7 +205,10 @@ class Grounds:
             return Ground.of(level, candidate.curves, candidate.repeats)
         key = variant, candidate.repeats
         if key not in self._grounds:
+            # What a process makes once is no work of a move, which any process may do.
+            before = self.steps
             self._grounds[key] = Ground.of(level, None, candidate.repeats)
+            self._steps_before += self.steps - before
         return self._grounds[key]
 
     @property
