@@ -209,7 +209,7 @@ class Search:
         waiting = list(candidates)
         begins_as_stated = waiting[0].control is self.stage.task.control
         if self._is_bounded_by_weights and not self._is_determinant:
-            if not self._has_time() and waiting[0].control is self.stage.task.control:
+            if begins_as_stated and not self._has_time():
                 waiting[0] = self._enlarged(waiting[0])
             free = [each for each in waiting if each.curves is None and each.repeats == 1]
             climbed = yield from self._moved(free, self._free_rungs, is_last=True)
@@ -230,12 +230,11 @@ class Search:
                 waiting[0] = replace(waiting[0], curves=series.curves)
             # Where derivatives mislead and time is short, random changes come first.
             is_rough = begins_as_stated and self._is_rough
-            shortest = LADDER_EVALUATIONS * self.evaluation_seconds
-            is_short = is_rough and self.budget.seconds_left < shortest
+            is_short = is_rough and not self._has_time(evaluations=LADDER_EVALUATIONS)
             ladder = () if is_short else self._ladder(waiting)
-            rung = ladder[0] if ladder else None
-            waiting[0] = yield from self._prepared(waiting[0], rung, is_rough=is_rough)
-            if is_rough and not self._has_time(rung):
+            level = self.grounds.level(ladder[0].variant) if ladder else None
+            waiting[0] = yield from self._prepared(waiting[0], level, is_rough=is_rough)
+            if is_rough and not self._has_time(level):
                 return [*done, replace(waiting[0], status=Status.MAX_ITERATIONS)]
             done += yield from self._run_inside(waiting, ladder)
         return (yield from self._followed(done, further))
@@ -272,7 +271,7 @@ class Search:
         return first
 
     def _prepared(
-        self, first: Candidate, rung: Rung | None, *, is_rough: bool
+        self, first: Candidate, level: DescentLevel | None, *, is_rough: bool
     ) -> Generator[DesignEvent, None, Candidate]:
         """The first candidate with a control within the limits, where one is found.
 
@@ -287,8 +286,8 @@ class Search:
         is_outside = not ground.is_near(first.control)
         share = 0.0
         if is_rough:
-            share = PROBE_SHARE if self._has_time(rung) else CLOSING_SHARE
-        elif is_outside and self._has_time(rung):
+            share = PROBE_SHARE if self._has_time(level) else CLOSING_SHARE
+        elif is_outside and self._has_time(level):
             share = OUTSIDE_SHARE
         if share:
             first, best = yield from self._by_chance(first, best, share)
@@ -347,9 +346,11 @@ class Search:
         results = {}
         for number, rung in enumerate(ladder):
             is_last = number == len(ladder) - 1
-            if number and not self._has_time_for(batch, rung):
-                break
             if number:
+                if any(each.best is not None for each in batch):
+                    level = self.grounds.ground(rung.variant, batch[0]).level
+                    if not self._has_time(level, FEWEST_ITERATIONS):
+                        break
                 rung = self._in_time(rung, ladder[number - 1], batch)
             batch = yield from self._moved(batch, (rung,), is_last=is_last)
             results.update({each.name: each for each in batch})
@@ -361,14 +362,6 @@ class Search:
                 if each.best is not None:
                     results[each.name] = replace(each, status=Status.LEFT)
         return list(results.values())
-
-    def _has_time_for(self, batch: list[Candidate], rung: Rung) -> bool:
-        """Whether there is time for some iterations of a rung; True if nothing was found yet."""
-        if not any(each.best is not None for each in batch):
-            return True
-        level = self.grounds.ground(rung.variant, batch[0]).level
-        ratio = level.engine_steps / self.grounds.stated.engine_steps
-        return self.budget.seconds_left > FEWEST_ITERATIONS * ratio * self.evaluation_seconds
 
     def _in_time(self, rung: Rung, before: Rung, batch: list[Candidate]) -> Rung:
         """A rung with as many stages of the barrier as there is time for.
@@ -426,12 +419,14 @@ class Search:
             is_useful = is_progress(before, best.cost)
         return done
 
-    def _has_time(self, rung: Rung | None = None) -> bool:
-        """Whether the time that is left allows a descent on a rung, or on the stated level."""
+    def _has_time(
+        self, level: DescentLevel | None = None, evaluations: float = FEWEST_EVALUATIONS
+    ) -> bool:
+        """Whether there is time for so many evaluations on a level, or on the stated one."""
         stated = self.grounds.stated
-        level = stated if rung is None else self.grounds.level(rung.variant)
-        seconds = self.evaluation_seconds * level.engine_steps / stated.engine_steps
-        return self.budget.seconds_left > FEWEST_EVALUATIONS * seconds
+        steps = stated.engine_steps if level is None else level.engine_steps
+        seconds = self.evaluation_seconds * steps / stated.engine_steps
+        return self.budget.seconds_left > evaluations * seconds
 
     def _by_chance(
         self, candidate: Candidate, inside: InsideControl, share: float
@@ -552,11 +547,10 @@ class Search:
         if len(candidates) == 1 or np.isinf(seconds):
             return candidates
         # Measure an iteration without its line search. The first one builds models.
-        problem = self.grounds.ground(rung.variant, candidates[0]).level.problem
-        task = self.grounds.ground(rung.variant, candidates[0]).task
-        problem.expand(problem.point(task.initial))
+        level = self.grounds.ground(rung.variant, candidates[0]).level
+        level.problem.expand(level.problem.point(level.task.initial))
         begun = self.budget.seconds_used
-        problem.expand(problem.point(task.initial))
+        level.problem.expand(level.problem.point(level.task.initial))
         each = ITERATIONS_OF_A_START * (self.budget.seconds_used - begun)
         return candidates[: max(int(self._worker_count * seconds / max(each, 1e-9)), 1)]
 
