@@ -294,6 +294,8 @@ class Weights:
         a[..., :-1, :] += products_at_samples(self.S.swapaxes(1, 2), v)
         b = products_at_samples(self.S, z[..., :-1, :])
         b += products_at_samples(self.R, v)
+        if not self.W.any():
+            return a, b
 
         # A change of the control between two samples involves both of them.
         changes = np.diff(v, axis=-2, prepend=0.0, append=0.0)

@@ -436,11 +436,17 @@ class OutputDelay:
     Attributes:
         weights: (M, N+1) sparse interpolation weights; M = N+1 if values are wanted at the samples
             themselves.
-        weight_slopes: (M, N+1) sparse derivative of the weights by d [1/s].
+        node_slopes: (M n,) derivative of the stored weights by d [1/s].
     """
 
     weights: Any
-    weight_slopes: Any
+    node_slopes: Array
+
+    @cached_property
+    def weight_slopes(self) -> Any:
+        """(M, N+1) sparse derivative of the weights by d [1/s]."""
+        places = self.weights.indices, self.weights.indptr
+        return scipy.sparse.csr_array((self.node_slopes, *places), shape=self.weights.shape)
 
     @staticmethod
     def on_grid(samples: int, delay: float, dt: float) -> OutputDelay:
@@ -485,13 +491,10 @@ class OutputDelay:
 
         # All rows have the same number of nodes, so that the operators need no sorting.
         row_starts = np.arange(len(place) + 1) * count
-        weights, slopes = (
-            scipy.sparse.csr_array(
-                (of_nodes.ravel(), nodes.ravel(), row_starts), shape=(len(place), samples)
-            )
-            for of_nodes in (value, slope)
+        weights = scipy.sparse.csr_array(
+            (value.ravel(), nodes.ravel(), row_starts), shape=(len(place), samples)
         )
-        return OutputDelay(weights=weights, weight_slopes=slopes)
+        return OutputDelay(weights=weights, node_slopes=slope.ravel())
 
     def apply(self, values: Array) -> Array:
         """Delayed values.

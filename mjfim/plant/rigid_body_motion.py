@@ -362,8 +362,11 @@ def _moved_motion(v: Array, motion: Array) -> Array:
 
 def _moved_force(v: Array, force: Array) -> Array:
     """Change per time of a force (..., 6) that is fixed to a body with the motion v: (..., 6)."""
-    # The rule is that of motions, with the moment and the force exchanged.
-    return np.roll(_moved_motion(v, np.roll(force, 3, axis=-1)), 3, axis=-1)
+    moment, linear = force[..., :3], force[..., 3:]
+    return np.concatenate(
+        [_cross(v[..., :3], moment) + _cross(v[..., 3:], linear), _cross(v[..., :3], linear)],
+        axis=-1,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
