@@ -364,11 +364,11 @@ def _causes(result: FitResult, tests: TermTests, *, is_selected: bool) -> Iterat
     if not solution.interrupted and (advice := unpredictable_motion(problem, solution.unknowns)):
         yield advice
     # A term that explains a good part of the residuals comes before what may not matter.
-    decide = "" if is_selected else f", or let `{SELECT}` decide"
-    terms = [(f"the model may lack {term}{decide}", term.share) for term in tests.named[:1]]
-    yield from (text for text, share in terms if share > TELLING_SHARE)
+    likely = list(_likely_terms(tests, is_selected=is_selected))
+    is_telling = bool(likely) and tests.likely[0].share > TELLING_SHARE
+    yield from likely if is_telling else ()
     yield from _remarks_on_rate(result)
-    yield from (text for text, share in terms if share <= TELLING_SHARE)
+    yield from () if is_telling else likely
     yield from _remarks_on_data(result)
     if quality.unexplained:
         yield (
@@ -378,14 +378,27 @@ def _causes(result: FitResult, tests: TermTests, *, is_selected: bool) -> Iterat
         )
 
 
+def _likely_terms(tests: TermTests, *, is_selected: bool) -> Iterator[str]:
+    """The term that the model most probably lacks, or some that are alike, and their cure."""
+    if not tests.likely:
+        return
+    terms = " or ".join(map(str, tests.likely))
+    alike = ", which the log hardly tells apart" if len(tests.likely) > 1 else ""
+    advice = "Add" if is_selected else f"Let `{SELECT}` decide, or add"
+    yield (
+        f"the model may lack {terms}{alike}. {advice} at the end of the experiment file:\n"
+        f"{tests.likely[0].recipe}"
+    )
+
+
 def _where_it_fails(result: FitResult, reasons: Sequence[str], tests: TermTests) -> Iterator[str]:
     """What a misfit is and where, and further terms that the model may lack."""
     if reasons:
         yield f"misfit: {'; '.join(reasons)}; the formal standard deviations are not the accuracy"
     if reasons and result.quality.worst_residual is not None:
         yield str(result.quality.worst_residual)
-    for term in tests.named[bool(reasons) :]:
-        yield f"the model may lack {term}"
+    for term in tests.named[len(tests.likely) if reasons else 0 :]:
+        yield f"the model may lack {term}; to estimate it, add:\n{term.recipe}"
     if tests.data is not None:
         found = (tests.data.untested_sentence, tests.data.impossible_sentence if reasons else "")
         yield from (f"terms that the model may lack: {each}" for each in found if each)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import Any
 
 import numpy as np
-import tomlkit
 
 from mjfim.arrays import NORMAL_95
 from mjfim.errors import first_ones, listed
@@ -39,7 +37,7 @@ from mjfim.output.pages.studies import equation_parts
 from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
-from mjfim.records.terms import Decision, Selection, SelectionStep
+from mjfim.records.terms import Decision, Selection, SelectionStep, as_toml
 
 # Largest number of digits of an estimate.
 MAX_DIGITS = 9
@@ -403,41 +401,14 @@ def _row(step: SelectionStep) -> Row:
 def _tables_to_keep(selection: Selection) -> Iterator[str]:
     """Yield the tables of the experiment file that state the selected model, as TOML."""
     for name, table in selection.library_terms.items():
-        yield _as_toml(table, "terms", name)
+        yield as_toml(table, "terms", name)
     for name, table in selection.parameters.items():
-        yield _as_toml(table, "parameters", name)
+        yield as_toml(table, "parameters", name)
     for pool in selection.pooled:
         members = listed([f"[parameters.{member}]" for member in pool.members])
-        yield _as_toml(pool.table, "parameters", pool.name, remark=f"in place of {members}")
+        yield as_toml(pool.table, "parameters", pool.name, remark=f"in place of {members}")
     if selection.fit_table:
-        yield _as_toml(selection.fit_table, "fit", remark="beside the other keys of this table")
-
-
-def _as_toml(table: Mapping[str, object], *name: str, remark: str = "") -> str:
-    """Write a table of an experiment file, with a line for each key."""
-    written = tomlkit.table()
-    if remark:
-        written.add(tomlkit.comment(remark))
-    for key, value in table.items():
-        written.add(key, _value(value))
-    for part in reversed(name[1:]):
-        outer = tomlkit.table(is_super_table=True)
-        outer.add(part, written)
-        written = outer
-    return tomlkit.dumps({name[0]: written}).strip()
-
-
-def _value(value: object) -> Any:
-    """A value; tables in it are written in one line, and lists of them with a line for each."""
-    if isinstance(value, Mapping):
-        inline = tomlkit.inline_table()
-        inline.update({key: _value(each) for key, each in value.items()})
-        return inline
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
-        array = tomlkit.array()
-        array.extend(_value(entry) for entry in value)
-        return array.multiline(True)
-    return value
+        yield as_toml(selection.fit_table, "fit", remark="beside the other keys of this table")
 
 
 # Largest number of rows of the table with the values of single recordings.
