@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import UNDETERMINED_SHARE, Array
 from mjfim.errors import first_ones, listed
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification.aligned_recording import changes_within_samples
-from mjfim.identification.assessment.accuracy import UNDETERMINED_SHARE, FitResult
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import with_honest_covariance
 from mjfim.identification.assessment.poor_fit import unpredictable_motion
 from mjfim.identification.assessment.recording_comparison import compare_recordings
@@ -463,11 +463,8 @@ def _limits_of_search(
         yield f"at a bound: {listed(at_bound)}; formal standard deviations are not valid there"
     chi2, dof = result.quality.chi2, result.quality.dof
     ratio = np.sqrt(chi2 / dof)
-    is_judged = result.task.noise_is_stated and not reasons
-    if is_judged and is_smaller_than_noise(chi2, dof):
+    if result.task.noise_is_stated and not reasons and is_smaller_than_noise(chi2, dof):
         yield f"residuals are only {ratio:.2f} times the stated noise: the stated σ is too large"
-    if is_judged and is_larger_than_noise(chi2, dof):
-        yield f"the noise is {ratio:.2f} times what you stated; the intervals use it"
 
 
 def _contradictions(result: FitResult, comparison: RecordingComparison | None) -> Iterator[str]:

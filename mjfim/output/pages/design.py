@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
 from mjfim.errors import first_ones, listed
 from mjfim.output.page import (
     Emphasis,
@@ -193,10 +194,14 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
         yield "It ends at rest."
 
 
-def _undetermined(design: Design) -> list[int]:
-    """Numbers of the wanted parameters whose standard deviation exceeds their size."""
-    std, sizes = design.stated_std, design.sizes
-    return [j for j in design.wanted if not np.isfinite(std[j]) or 0.0 < sizes[j] < std[j]]
+def _with_interval(design: Design, share: float) -> list[int]:
+    """Numbers of the wanted parameters whose predicted 95 % interval is wide.
+
+    Half its width is at least a share of their size.
+    """
+    widths, least = NORMAL_95 * design.stated_std, share * design.sizes
+    is_wide = ~np.isfinite(widths) | ((least > 0.0) & (widths >= least))
+    return [j for j in design.wanted if is_wide[j]]
 
 
 def _reservation(design: Design) -> str:
@@ -204,30 +209,35 @@ def _reservation(design: Design) -> str:
 
     A start outside the limits may tell more.
     """
-    found = _undetermined(design)
-    if not found and _tells_less(design):
+    undetermined = _with_interval(design, UNDETERMINED_SHARE)
+    if undetermined:
+        return f"it does not determine {_with_widest(design, undetermined)}"
+    if _tells_less(design):
         before, after = _least_eigenvalues(design)
         return (
             f"it tells less than its start (λ_min {before:.3g} → {after:.3g}), because the cost "
             "weighs the control or the tracking more than the information"
         )
     rehearsal = design.rehearsal
-    if not found:
-        if rehearsal is None or rehearsal.at_clamp < max(MAX_BROKEN * rehearsal.robots, 1.0):
-            return ""
+    if rehearsal is not None and rehearsal.at_clamp >= max(MAX_BROKEN * rehearsal.robots, 1.0):
         reached = np.flatnonzero(~rehearsal.kept.all(axis=0) & rehearsal.is_clamped).tolist()
         limits = [rehearsal.limits[i] for i in reached]
         names = first_ones([f"{_kind(limit)} of {limit.name}" for limit in limits])
         who = f"{rehearsal.at_clamp} of {_robots(rehearsal)}"
         return f"{who} reach the clamp on {names}, where σ does not hold"
+    poorly = _with_interval(design, POORLY_KNOWN_SHARE)
+    return f"it hardly determines {_with_widest(design, poorly)}" if poorly else ""
+
+
+def _with_widest(design: Design, found: list[int]) -> str:
+    """Names of parameters, and the accuracy of that which is known worst."""
     std, sizes = design.stated_std, design.sizes
+    names = first_ones([design.parameters[j] for j in found])
     worst = max(found, key=lambda j: float(std[j] / sizes[j]) if np.isfinite(std[j]) else np.inf)
-    text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
     if not np.isfinite(std[worst]):
-        return text
-    share = relative(std[worst], sizes[worst])
-    of_one = f": σ is {share} of its size"
-    return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
+        return names
+    of_one = f": σ is {relative(std[worst], sizes[worst])} of its size"
+    return names + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
 
 
 def _tells_less(design: Design) -> bool:
@@ -269,9 +279,9 @@ def _next_steps(design: Design) -> Iterator[str]:
             f"Remove or fix one parameter of each group, give it a prior, or measure another "
             f"output: {groups}."
         )
-    undetermined = _undetermined(design) if design.separable else []
-    if undetermined:
-        names = first_ones([design.parameters[j] for j in undetermined])
+    wide = _with_interval(design, POORLY_KNOWN_SHARE) if design.separable else []
+    if wide:
+        names = first_ones([design.parameters[j] for j in wide])
         yield (
             f"Determine {names} with a longer or larger motion, by measuring another output, or "
             "state what is known with `prior`."

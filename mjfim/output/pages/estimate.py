@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
 from mjfim.errors import first_ones, listed
-from mjfim.identification.assessment.accuracy import POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
 from mjfim.identification.assessment.residual_tests import is_larger_than_noise
 from mjfim.output.page import (
     IDENTIFIED,
@@ -80,8 +80,8 @@ def estimate_page(estimate: Estimate) -> Page:
     return Page(
         kind="Identification from recordings",
         verdict=_verdict(estimate),
-        next_steps=tuple(_next_steps(estimate)),
-        causes=tuple(cause.replace(" RECORDING ", f" {_files(estimate)} ") for cause in causes),
+        next_steps=tuple(_with_files(step, estimate) for step in _next_steps(estimate)),
+        causes=tuple(_with_files(cause, estimate) for cause in causes),
         warnings=tuple(each for each in estimate.warnings if each not in (*causes, *details)),
         details=details,
         facts={
@@ -95,10 +95,11 @@ def estimate_page(estimate: Estimate) -> Page:
     )
 
 
-def _files(estimate: Estimate) -> str:
-    """The fitted and the held-out recordings as arguments of a command."""
+def _with_files(sentence: str, estimate: Estimate) -> str:
+    """A sentence with the fitted and the held-out recordings as arguments of its command."""
     held_out = [("--held-out", each.name) for each in estimate.predictions if each.held_out]
-    return shlex.join([*(each.name for each in estimate.recordings), *chain(*held_out)])
+    files = shlex.join([*(each.name for each in estimate.recordings), *chain(*held_out)])
+    return sentence.replace(" RECORDING ", f" {files} ")
 
 
 # ---- verdict
@@ -139,7 +140,10 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         return Verdict(text, Level.DOUBTFUL)
     text = f"{model} explains the recordings: the residuals are {ratio:.2f} times the noise"
     if is_larger_than_noise(estimate.chi2, estimate.dof):
-        text = f"{model} explains the recordings: the noise is {ratio:.2f} times what you stated"
+        text = (
+            f"{model} explains the recordings: the noise is {ratio:.2f} times what you stated, "
+            "which the intervals use"
+        )
     return Verdict(f"{text}{_worst_estimate(estimate)}.", Level.GOOD)
 
 
@@ -164,7 +168,11 @@ def _worst_estimate(estimate: Estimate) -> str:
 
 
 def _next_steps(estimate: Estimate) -> Iterator[str]:
-    if estimate.sloppy:
+    # More data do not help a model that lacks something.
+    commands = re.findall(r"`mjfim [^`]*`", "".join(estimate.causes[:1]))
+    if estimate.misfit and commands:
+        yield f"Decide what the model lacks: {commands[0]}."
+    elif estimate.sloppy and not estimate.misfit:
         names = first_ones(estimate.sloppy)
         yield (
             f"Design an experiment that tells more about {names}: "
