@@ -155,7 +155,7 @@ def template(file: str) -> Template:
 
 
 def _prose(text: str) -> Markup:
-    """A text as HTML: words in backquotes are code, numbers stay with their units, and lines stay."""
+    """A text as HTML: words in backquotes are code, and numbers stay with their units."""
     from markupsafe import Markup, escape
 
     spaced = UNIT_SPACE.sub("\u00a0", str(escape(text)))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mjfim
+from mjfim.errors import WrongLogError
 from mjfim.experiment.system import System
 from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
@@ -53,6 +56,38 @@ def test_a_log_that_begins_elsewhere_is_fitted_and_said(
     true = np.array([2.0, 1.0, 1.0])
     assert np.all((low < true) & (true < high))
     assert 0.5 * (high[0] - low[0]) < widest * true[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("zero", [0.35, -0.2])
+def test_another_zero_of_an_encoder_is_named_with_the_line_that_cures_it(
+    experiment: mjfim.Experiment, zero: float
+) -> None:
+    """The log begins at rest, elsewhere by the zero; the equation of motion is too noisy for it."""
+    log = swung(experiment)
+    shifted = replace(log, y=log.y + zero * (np.array(log.outputs) == "qpos:hinge"))
+    with pytest.raises(WrongLogError, match="another zero of qpos:hinge") as error:
+        mjfim.identify(experiment, [shifted], progress=False)
+    line = str(error.value).partition("State in [recording.columns]: ")[2]
+    (column,) = tomllib.loads(line).items()
+    assert column[0] == "qpos:hinge"
+    assert column[1]["offset"] == pytest.approx(-zero, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_log_that_begins_elsewhere_and_misfits_is_fitted(
+    experiment: mjfim.Experiment, tmp_path: Path
+) -> None:
+    """A rail that rubs explains the residuals, and no zero does."""
+    text = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
+    robot = tmp_path / "robot.xml"
+    robot.write_text(text.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>'))
+    aside = {"keyframe": None, "qpos": [0.0, np.pi + 1.0]}
+    initial = experiment.initial.model_copy(update=aside)
+    made = experiment.model_copy(update={"initial": initial}).replace(model=str(robot))
+    estimate = mjfim.identify(experiment, [swung(made)], progress=False)
+    assert any("does not begin where [initial] says" in each for each in estimate.warnings)
+    assert "dry friction of slide" in estimate.causes[0]
 
 
 def test_more_noise_than_stated_is_no_other_begin(experiment: mjfim.Experiment) -> None:

@@ -444,7 +444,7 @@ def _limits_of_search(
     result: FitResult, at_bound: Sequence[str], reasons: Sequence[str], *, interrupted: bool
 ) -> Iterator[str]:
     """Warnings about the start, the end, and what the recordings do not determine."""
-    yield from result.task.elsewhere
+    yield from map(str, result.task.elsewhere)
     if result.begun_instead:
         yield (
             f"the model diverges at the start ({values_of_start(result.task)}): the search began "
