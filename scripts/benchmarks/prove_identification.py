@@ -13,8 +13,8 @@ the cart that the model does not have.
 `--study power` measures how often the tests of missing terms find a tilt of the base that the model
 does not have. It is 4, 6 and 8 of its standard deviations, and theory says how often that is.
 
-`--study clean` counts false alarms: simulated logs of ten robots, those of `models/` and of a folder
-of MJCF files, which the models explain. `--runs` is the number of all logs.
+`--study clean` counts false alarms in logs that the models explain. The ten robots are those of
+`models/` and of a folder of MJCF files. `--runs` is the number of all logs.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ from mjfim.parallel.budget import Budget
 from mjfim.records.trajectory import Recording
 from mjfim.studies.first_experiment import experiment_text, propose_experiment
 
-Job, Found = TypeVar("Job"), TypeVar("Found")
+Job = TypeVar("Job")
+Found = TypeVar("Found")
 
 # Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
@@ -369,7 +370,7 @@ def power_study(runs: int, seed: int) -> dict[str, dict[str, float]]:
 # ---- false alarms
 
 # Experiments of `models/`, and models of the folder for which `mjfim init` writes one.
-SHIPPED = ("cart_pendulum", "double_pendulum", "servo_arm", "two_joint_arm", "four_bar")
+SHIPPED = ("cart_pendulum", "filtered_drive", "servo_arm", "two_joint_arm", "four_bar")
 OTHERS = ("dmc_cartpole", "dmc_reacher", "dmc_finger", "arx_l5", "allegro")
 
 # Largest error of the parameters of a robot, as a share of their values.
@@ -434,9 +435,10 @@ def identified(job: tuple[int, int, Path]) -> CleanLog:
         system, rng = task.system, np.random.default_rng([seed, number])
         parameters = system.parameters
         moved = parameters.guess * rng.uniform(1.0 - WRONG, 1.0 + WRONG, len(parameters))
-        true = dict(zip(parameters.names, np.clip(moved, parameters.lower, parameters.upper)))
+        moved = np.clip(moved, parameters.lower, parameters.upper).tolist()
+        true = dict(zip(parameters.names, moved, strict=True))
         stated = system.experiment
-        tables = {key: {"true": float(true[key])} for key in stated.parameters if key in true}
+        tables = {key: {"true": true[key]} for key in stated.parameters if key in true}
         made = System.resolve(stated.replace(parameters=tables), threads=1)
         log = simulate_system(made, task.initial, seed=number)
         found = identify_system(system, [log])
@@ -525,9 +527,10 @@ def power(args: argparse.Namespace, console: Console) -> tuple[dict[str, Any], b
     """Run the study of the power, and print it."""
     found = power_study(args.runs, args.seed)
     for distance, shares in found.items():
+        of_found, of_first, of_theory = (f"{100 * share:.0f} %" for share in shares.values())
         console.print(
-            f"a tilt of {distance} σ: found in {100 * shares['found']:.0f} %, named first in "
-            f"{100 * shares['first']:.0f} % of {args.runs} logs; theory {100 * shares['theory']:.0f} %"
+            f"a tilt of {distance} σ: found in {of_found} of {args.runs} logs (theory: "
+            f"{of_theory}), named first in {of_first}"
         )
     errors = [abs(shares["found"] - shares["theory"]) for shares in found.values()]
     return {"runs": args.runs, "power": found}, max(errors) <= MAX_POWER_ERROR
