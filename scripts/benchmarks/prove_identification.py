@@ -319,7 +319,7 @@ class Tilted:
         theta = np.append(self.task.parameters.true, tilt)
         y = self.robot.plant.measure(theta[None], control)[0][0]
         y = y + self.robot.noise.sample(len(y), np.random.default_rng(seed))
-        times = self.task.dt * np.arange(len(y))
+        times: Array = self.task.dt * np.arange(len(y))
         log = Recording(t=times, ctrl=control, y=y, outputs=self.robot.outputs.names)
 
         # A fit to the whole log, which begins at the true values.

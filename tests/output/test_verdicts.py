@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from html import unescape
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mjfim.output.page import Level
+from mjfim.output.page import Level, as_sentence
 from mjfim.output.pages import page_of
 from mjfim.output.plots.pictures import pictures_of
+from mjfim.output.report import as_html
 from mjfim.output.words import relative
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.check import verdict_of_check
@@ -226,6 +228,17 @@ def test_the_cause_stands_under_the_verdict_with_the_command_that_cures_it(tmp_p
         "logs/new.csv --select -o FOLDER`."
     )
     assert "tells more" not in " ".join(page_of(cause(sloppy=("length",))).next_steps)
+
+
+def test_the_lines_of_a_cure_stay_lines_everywhere() -> None:
+    """They are copied from a terminal, a notebook or a report into the experiment file."""
+    lines = '[parameters.slide_frictionloss]\ntarget = "joint/slide:frictionloss"\nscale = 0.33'
+    text = f"the model may lack friction. Add at the end of the experiment file:\n{lines}"
+    estimate = cause(causes=(text,), warnings=(text,), details=())
+    assert lines in printed(page_of(estimate), 200)
+    assert as_sentence(text).endswith(lines)
+    html = unescape(as_html(estimate)).replace("<br>", "\n")
+    assert f"{lines}</p>" in html
 
 
 def test_at_most_three_remarks_are_shown_before_verbose() -> None:
