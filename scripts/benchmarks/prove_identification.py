@@ -319,7 +319,7 @@ class Tilted:
         theta = np.append(self.task.parameters.true, tilt)
         y = self.robot.plant.measure(theta[None], control)[0][0]
         y = y + self.robot.noise.sample(len(y), np.random.default_rng(seed))
-        times: Array = self.task.dt * np.arange(len(y))
+        times = np.arange(len(y), dtype=np.float64) * self.task.dt
         log = Recording(t=times, ctrl=control, y=y, outputs=self.robot.outputs.names)
 
         # A fit to the whole log, which begins at the true values.
@@ -370,7 +370,7 @@ def power_study(runs: int, seed: int) -> dict[str, dict[str, float]]:
 # ---- false alarms
 
 # Experiments of `models/`, and models of the folder for which `mjfim init` writes one.
-SHIPPED = ("cart_pendulum", "filtered_drive", "servo_arm", "two_joint_arm", "four_bar")
+SHIPPED = ("cart_pendulum", "filtered_drive", "servo_arm", "muscle_arm", "four_bar")
 OTHERS = ("dmc_cartpole", "dmc_reacher", "dmc_finger", "arx_l5", "allegro")
 
 # Largest error of the parameters of a robot, as a share of their values.
