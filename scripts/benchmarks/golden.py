@@ -2,6 +2,7 @@
 
     python -m scripts.benchmarks golden run OUT.json                # about 20 minutes
     python -m scripts.benchmarks golden run OUT.json --tree PATH    # of the mjfim in PATH
+    python -m scripts.benchmarks golden run OUT.json --models PATH  # with these experiment files
     python -m scripts.benchmarks golden compare A.json B.json
 
 `run` stores for each case of `golden_cases` the exit codes, the error, the names of the files, the
@@ -128,11 +129,11 @@ def run_line(words: list[str], folder: Path, tree: Path) -> dict[str, Any]:
     }
 
 
-def run_case(text: str, tree: Path, shared: Path) -> dict[str, Any]:
+def run_case(text: str, tree: Path, models: Path, shared: Path) -> dict[str, Any]:
     """Run the command lines of a case in a new folder, and return what a user gets."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        shutil.copytree(ROOT / "models", folder, dirs_exist_ok=True)
+        shutil.copytree(models, folder, dirs_exist_ok=True)
         (folder / "shared").symlink_to(shared)
 
         lines = [run_line(shlex.split(line), folder, tree) for line in text.split(" ; ")]
@@ -188,6 +189,7 @@ def main() -> int:
     run = verbs.add_parser("run")
     run.add_argument("out", type=Path)
     run.add_argument("--tree", type=Path, default=ROOT, help="folder that holds the package")
+    run.add_argument("--models", type=Path, default=ROOT / "models")
     run.add_argument("--shared", type=Path, default=ROOT.parent / "shared")
     run.add_argument("--only", default="", help="cases whose names hold this text")
     compare = verbs.add_parser("compare")
@@ -199,7 +201,8 @@ def main() -> int:
     if args.verb == "run":
         results = json.loads(args.out.read_text()) if args.out.exists() else {}
         for name in (name for name in CASES if args.only in name):
-            results[name] = run_case(CASES[name], args.tree.resolve(), args.shared.resolve())
+            places = (args.tree.resolve(), args.models.resolve(), args.shared.resolve())
+            results[name] = run_case(CASES[name], *places)
             print(f"{name:20s} {results[name]['codes']} {results[name]['cpu']:.1f} s", flush=True)
             args.out.write_text(json.dumps(results, indent=1))
         return 0
