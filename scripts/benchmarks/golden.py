@@ -94,8 +94,10 @@ def numbers(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def processor_seconds(pid: int) -> float:
-    """Processor time of a running process, from Linux."""
+    """Processor time of a running process, from Linux; infinite once it has ended."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    if fields[0] == "Z":
+        return float("inf")
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
