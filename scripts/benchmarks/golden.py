@@ -94,11 +94,16 @@ def numbers(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def processor_seconds(pid: int) -> float:
-    """Processor time of a running process, from Linux; infinite once it has ended."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    if fields[0] == "Z":
+    """Processor time of a running process and its children, from Linux; infinite at its end."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except FileNotFoundError:
+        return 0.0
+    if fields[0] == "Z" and not children:
         return float("inf")
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    own = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return own + sum(t for t in map(processor_seconds, map(int, children)) if t < float("inf"))
 
 
 def run_line(words: list[str], folder: Path, tree: Path) -> dict[str, Any]:
