@@ -432,11 +432,18 @@ def test_pictures_need_no_matplotlib_and_figures_no_pyplot() -> None:
     assert importers == ["draw.py"]
 
 
-def test_a_fixed_parameter_is_no_pair() -> None:
-    """A parameter at its guess without a standard deviation has no ellipse, and warns of nothing."""
+def test_a_fixed_parameter_is_in_no_pair() -> None:
+    """A parameter at its guess without a standard deviation has no ellipse and warns of nothing."""
     covariance = np.diag([0.0, 1e-4, 4e-4])
     values = np.array([1.0, 2.0, 3.0])
     picture = pairs(
-        ["a", "b", "c"], ["", "", ""], values, covariance, "estimate", guess=values, title="", note=""
+        ["a", "b", "c"],
+        ["", "", ""],
+        values,
+        covariance,
+        "estimate",
+        guess=values,
+        title="",
+        note="",
     )
     assert len(picture.panels) == 3  # b, c, and both
