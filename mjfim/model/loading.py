@@ -438,7 +438,7 @@ def packed_model(files: PackedFiles, path: Path) -> ModelSource:
     key = files.digest, name_of(path)
 
     def load() -> ModelSource:
-        """Parse the model, from the disk where these files are there, and compile what is packed."""
+        """Parse the model, from the disk where it is the same there; compile the packed files."""
         contents = {Path(name): content for name, content in files.contents.items()}
         are_here = all(file.is_file() and file.read_bytes() == contents[file] for file in contents)
         system = mujoco.MjVfs()

@@ -233,7 +233,7 @@ def test_a_mesh_that_is_edited_meanwhile_is_told(robot: Path, tmp_path: Path) ->
     mesh.write_text(tetrahedron(0.3))
     compiled = system.source.edited(None, b"after", lambda spec: None)
     assert compiled.body_mass.tolist() == loaded.body_mass.tolist()
-    with pytest.raises(ModelError, match="block.obj changed while this ran"):
+    with pytest.raises(ModelError, match=r"block\.obj changed while this ran"):
         write_identified(path, system, theta)
     assert not path.exists()
 
