@@ -264,14 +264,13 @@ class Interruption:
         self._announce = announce
         self._requests: list[StopToken] = []
         self._has_result = False
-        self._has_work_to_finish = False
         self._is_optional = False
         self._is_postponed = False
         self._first_press = math.inf
         self._before: dict[int, Any] = {}
 
-        # A queue of this kind may be used in a signal handler.
-        self._answered: SimpleQueue[None] = SimpleQueue()
+        # Whether there is work to finish, from the handler. It may use a queue of this kind.
+        self._answered: SimpleQueue[bool] = SimpleQueue()
         self._watcher = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> Interruption:
@@ -301,7 +300,7 @@ class Interruption:
 
         # What the other thread still says belongs to this context, and not to what follows.
         signal.set_wakeup_fd(-1)
-        self._answered.put(None)
+        self._answered.put(False)
         self._sender.close()
         self._watcher.join(timeout=1.0)
         if kind is None:
@@ -318,20 +317,16 @@ class Interruption:
         if self.presses and number not in SIGNALS[:2]:
             return
         self.presses += 1
-
-        # The thread that announces the first press must not see what this function changes later.
-        if self.presses == 1:
-            self._first_press = time.monotonic()
-            self._has_work_to_finish = bool(self._requests) or self._has_result
+        self._first_press = min(self._first_press, time.monotonic())
         for request in self._requests:
             request.request()
 
         # An import that ends halfway would leave modules behind that cannot be imported again.
-        has_work = self._requests or self._has_result
+        has_work = bool(self._requests) or self._has_result
         if not has_work and _is_importing(frame):
             self._is_postponed = True
             return
-        self._answered.put(None)
+        self._answered.put(has_work)
         if has_work:
             if self._is_optional and self.hurried and not _is_importing(frame):
                 raise UnfinishedError
@@ -398,7 +393,7 @@ class Interruption:
         """End a program that goes on after an import in which the press came."""
         if self._is_postponed:
             self._is_postponed = False
-            self._answered.put(None)
+            self._answered.put(False)
             raise InterruptedByUserError
 
     def _watch(self) -> None:
@@ -406,12 +401,12 @@ class Interruption:
         if not self._has_come(SIGNALS):
             return
         try:
-            self._answered.get(timeout=LAST_SECONDS)
+            has_work = self._answered.get(timeout=LAST_SECONDS)
         except Empty:
-            self._has_work_to_finish = bool(self._requests) or self._has_result
-            if not self._has_work_to_finish:
+            has_work = bool(self._requests) or self._has_result
+            if not has_work:
                 self._end(NOTHING_SENTENCE)
-        if self._has_work_to_finish:
+        if has_work:
             self._announce(FIRST_SENTENCE)
         if not self._has_come(SIGNALS[:2]):
             return

@@ -22,7 +22,7 @@ from mjfim.model.control_laws import remove_numbers
 from mjfim.model.elements import element_count, element_name
 from mjfim.model.inertia import body_inertia
 from mjfim.model.loading import ModelSource, compile_spec
-from mjfim.model.model_files import elements_of
+from mjfim.model.model_files import changed_files, elements_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS, POLYNOMIAL_ARRAYS
 from mjfim.model.targets import OutputBiasField, OutputDelayField, OutputScaleField, SpecField
@@ -349,10 +349,13 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
     """
     wanted = system.model_at(theta, at_keyframe=False)
     urdfs, remarks = write_identified_urdfs(path, system, theta)
-    changed = _changed_files(system)
-    cause = f"{first_ones(changed)} changed while this ran; {path.name} reads what is there now"
+    texts = {file.resolve() for file, _ in elements_of(system.model_path)}
+    changed = [x for x in changed_files(system.source.stated.contents) if x.resolve() not in texts]
     if changed:
-        remarks.append(f"{cause}, but the parameters belong to what was loaded")
+        remarks.append(
+            f"{first_ones([file.name for file in changed])} changed while this ran; {path.name} "
+            "reads what is there now, but the parameters belong to what was loaded"
+        )
     try:
         xml = _edited(system, theta, wanted, urdfs)
         _save(xml, path, wanted, TOLERANCE)
@@ -360,8 +363,8 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
         try:
             _save(_printed(system, theta, wanted), path, wanted, PRINTED_TOLERANCE)
         except ModelError as reason:
-            cause = f" ({cause})" if changed else ""
-            raise ModelError(f"{path}: not written: {reason}{cause}") from None
+            why = "; ".join([str(reason), *remarks])
+            raise ModelError(f"{path}: not written: {why}") from None
         remarks.append(
             f"{path.name}: it is printed by MuJoCo, without comments and, where elements have no "
             f"name, with six digits: {error}"
@@ -373,14 +376,6 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
             "has no laws with a rate; estimate.json holds their numbers"
         )
     return remarks
-
-
-def _changed_files(system: System) -> list[str]:
-    """Names of the meshes and other files beside the text that are not as they were loaded."""
-    texts = {file.resolve() for file, _ in elements_of(system.model_path)}
-    held = system.source.stated.contents
-    others = [file for file in held if file.resolve() not in texts]
-    return [x.name for x in others if not x.is_file() or x.read_bytes() != held[x]]
 
 
 def identified_files(path: Path, model: Path) -> tuple[str, ...]:
