@@ -24,6 +24,7 @@ from mjfim.output.pages import page_of
 from mjfim.records.design import Design
 from mjfim.records.rehearsal import FiniteSteps
 from tests.support.cli import run
+from tests.support.paths import MODELS
 
 CART = """
 <mujoco model="cart_pendulum">
@@ -552,3 +553,47 @@ def test_a_model_alone_is_enough(plain: Played) -> None:
     assert alone.robots == 0 and alone.is_safe
     lost = replace(alone, margins=-alone.margins)
     assert not lost.is_safe
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "iterations"), [("cart_pendulum_limits.toml", 40), ("quadrotor.toml", 10)]
+)
+def test_shipped_designs_are_safe_because_of_what_their_files_state(
+    file: str, iterations: int
+) -> None:
+    """Without the reserve, the box and the end at rest nobody would play them."""
+    experiment = mjfim.Experiment.from_file(MODELS / file).replace(
+        descent={"starts": 1, "max_iterations": iterations}
+    )
+    design = mjfim.design(experiment, progress=False)
+    assert design.rehearsal is not None and design.rehearsal.is_safe and design.within_limits
+    stated = experiment.model_dump(exclude_unset=True)
+    del stated["boundary"]
+    stated["limits"].pop("reserve")
+    stated["limits"].pop("tilt", None)
+    if file == "quadrotor.toml":
+        del stated["limits"]
+    bare = mjfim.design(experiment.restated(stated), progress=False)
+    assert bare.rehearsal is not None and not bare.rehearsal.is_safe
+    assert page_of(bare).verdict.level is Level.BAD
+
+
+@pytest.mark.slow
+def test_a_closed_chain_is_designed_and_never_worse_than_its_start() -> None:
+    """The four-bar linkage, whose loop is an equality constraint."""
+    experiment = mjfim.Experiment.from_file(MODELS / "four_bar.toml").replace(
+        descent={"starts": 1, "max_iterations": 5}
+    )
+    design = mjfim.design(experiment, progress=False)
+    assert design.rehearsal is not None and design.rehearsal.diverged == 0
+    assert design.final.cost <= design.initial.cost
+    # The design in plain MuJoCo, whose loop stays closed.
+    model = mujoco.MjModel.from_xml_path(str(MODELS / "four_bar.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = design.trajectory.qpos[0], design.trajectory.qvel[0]
+    substeps = round(design.trajectory.dt / model.opt.timestep)
+    for u, qpos in zip(design.trajectory.ctrl, design.trajectory.qpos[1:], strict=True):
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data, substeps)
+        assert_allclose(data.qpos, qpos, atol=1e-9)
