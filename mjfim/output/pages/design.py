@@ -189,7 +189,8 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
     if str(rehearsal.steps):
         yield as_sentence(str(rehearsal.steps))
     if not rehearsal.limits:
-        yield "No limits were stated."
+        others = f"; {_robots(rehearsal)} were tried" if rehearsal.robots else ""
+        yield f"No limits were stated{others}."
     elif rehearsal.robots:
         yield f"{rehearsal.all_kept} of {_robots(rehearsal)} keep all limits."
     else:
@@ -354,11 +355,10 @@ def _cures(rehearsal: Rehearsal, *, is_designed: bool = True) -> Iterator[str]:
             "`[limits]`, or state `[rehearsal] floor` where it may go lower."
         )
     if rehearsal.is_unstable:
-        feedback = ", or play it with feedback" if is_designed else ""
         yield (
             f"Small differences grow {rehearsal.growth:.2g}-fold along this motion. Begin in a "
-            "stable rest, such as hanging down (`[initial] qpos` or `keyframe`), shorten "
-            f"`horizon`{feedback}."
+            "stable rest, such as hanging down (`[initial] qpos` or `keyframe`), or shorten "
+            "`horizon`."
         )
     if rehearsal.unbraked and not rehearsal.at_rest:
         yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
@@ -620,7 +620,8 @@ def _check_verdict(check: Check) -> Verdict:
             f"All parameters can be identified with {check.source}; the least accurate is {worst} "
             f"with a σ of {sigma}."
         )
-        return Verdict(text, Level.GOOD)
+        is_doubtful = rehearsal is not None and rehearsal.is_unstable
+        return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD)
     first = check.verdict[0] if check.verdict else "the check found a fault"
     return Verdict(as_sentence(first), Level.DOUBTFUL)
 
@@ -648,7 +649,7 @@ def _check_next(check: Check) -> Iterator[str]:
     elif not (check.ok and check.reaches_all):
         yield "Design a motion that tells more: `mjfim design EXPERIMENT -o FOLDER`."
     elif check.is_start:
-        yield "Make of it a motion for the robot: `mjfim design EXPERIMENT -o FOLDER`."
+        yield "Design a motion that a robot can play: `mjfim design EXPERIMENT -o FOLDER`."
     elif check.rehearsal is None:
         yield "Estimate the parameters: `mjfim identify EXPERIMENT RECORDING -o FOLDER`."
     else:
