@@ -422,6 +422,7 @@ def test_robots_that_were_not_asked_for_are_not_counted() -> None:
         ({"repetitions": 4}, "Design a motion that tells more: `mjfim design my.toml -o"),
         ({"is_start": False, "rehearsal": results.rehearsal()}, "`mjfim export made --to player"),
         ({"is_start": False}, "Estimate the parameters: `mjfim identify my.toml RECORDING -o"),
+        ({"rehearsal": results.rehearsal()}, "Design a motion that a robot can play"),
         ({"rehearsal": results.rehearsal(**FALLEN)}, "Keep the robot above the floor"),
     ],
 )
@@ -440,6 +441,9 @@ def test_the_step_after_a_check_agrees_with_its_findings(
     text = printed(page, verbose=True)
     assert not ("nothing more is needed" in text and "tells more" in text)
     assert "--design" not in text
+    if check.is_start:
+        margins = "Margins of the limits" in printed(page)
+        assert margins is check.is_dangerous
 
 
 def test_the_level_of_a_verdict_has_a_colour() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -399,10 +400,10 @@ def rehearsal_page(rehearsal: Rehearsal) -> Page:
     )
 
 
-def _rehearsal_parts(rehearsal: Rehearsal) -> Iterator[Part]:
+def _rehearsal_parts(rehearsal: Rehearsal, *, is_detail: bool = False) -> Iterator[Part]:
     yield Plot("rehearsal")
     if rehearsal.limits:
-        yield _margin_table(rehearsal)
+        yield replace(_margin_table(rehearsal), detail=is_detail)
     yield tabulated(
         "Largest speeds and accelerations of the model and of all robots",
         {
@@ -582,7 +583,10 @@ def check_page(check: Check) -> Page:
     """Describe predicted standard deviations, and inseparable parameters."""
     sections = [Section("Accuracy", list(_check_parts(check)))]
     if check.rehearsal is not None:
-        sections.append(Section("Rehearsal", list(_rehearsal_parts(check.rehearsal))))
+        # Nobody plays a start; its margins matter where it is dangerous.
+        is_detail = check.is_start and not check.is_dangerous
+        parts = list(_rehearsal_parts(check.rehearsal, is_detail=is_detail))
+        sections.append(Section("Rehearsal", parts))
     if check.violations:
         title = "The motion of the initial control violates limits; a design looks for one inside:"
         items = tuple(str(violation) for violation in check.violations)
