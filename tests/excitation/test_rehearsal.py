@@ -557,7 +557,7 @@ def test_a_model_alone_is_enough(plain: Played) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("file", "iterations"), [("cart_pendulum_limits.toml", 40), ("quadrotor.toml", 10)]
+    ("file", "iterations"), [("cart_pendulum_limits.toml", 15), ("quadrotor.toml", 3)]
 )
 def test_shipped_designs_are_safe_because_of_what_their_files_state(
     file: str, iterations: int

@@ -611,7 +611,7 @@ def _check_verdict(check: Check) -> Verdict:
     if rehearsal is not None and check.is_dangerous:
         if not check.is_start:
             return _danger(rehearsal)
-        text = f"No limit keeps a design from what the start does. {_faults_of(rehearsal)}."
+        text = f"The start falls, and no limit keeps a design from it. {_faults_of(rehearsal)}."
         return Verdict(text, Level.BAD)
     if check.ok:
         shares = {row.name: row.relative for row in check.rows if not row.nuisance}
