@@ -133,11 +133,19 @@ def pendulum_time(model: Any, data: Any) -> float | None:
         model: The compiled model.
         data: Its data in the initial state, after `mj_forward`.
     """
-    gravity = np.linalg.norm(model.opt.gravity)
-    is_off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-    if gravity == 0.0 or is_off:
+    if not has_gravity(model):
         return None
-    return float(np.sqrt(reach(model, data) / gravity))
+    return float(np.sqrt(reach(model, data) / np.linalg.norm(model.opt.gravity)))
+
+
+def has_gravity(model: Any) -> bool:
+    """Whether gravity acts.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    is_off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    return bool(model.opt.gravity.any()) and not is_off
 
 
 def free_time(model: Any) -> float:
