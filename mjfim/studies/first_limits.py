@@ -23,8 +23,8 @@ from mjfim.studies.first_motion import Start, TimeScale, has_gravity
 # larger than the natural speed: a robot that sinks or falls keeps its limits.
 SPEED_ROOM = 2.0
 
-# Half of the width of the box of a free body or of a slide without a range, over the robot's length,
-# and largest tilt of a free body [rad].
+# Half of the width of the box of a free body or of a slide without a range, relative to the robot's
+# length, and largest tilt of a free body [rad].
 BOX = 2.0
 TILT = 0.8
 

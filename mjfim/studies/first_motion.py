@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -11,8 +12,9 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, first_ones
 from mjfim.model.coordinates import joint_dofs, tangent_components
-from mjfim.model.elements import control_sizes, is_rk4, translations
+from mjfim.model.elements import control_sizes, is_rk4, translations, unique_names
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.records.base import record
 from mjfim.studies.first_candidates import require_keyframe, resting_keyframes, rounded
@@ -225,6 +227,7 @@ class Start:
 
     Attributes:
         keyframe: Name of the keyframe, or None.
+        near: Name of the keyframe that the state is or was moved away from; empty without one.
         qpos: (nq,) positions.
         act: (na,) activations.
         control: (nu,) control that holds the state, or that comes near to it.
@@ -239,6 +242,7 @@ class Start:
     control: Array
     drift: float
     reason: str
+    near: str = ""
 
     @property
     def held(self) -> bool:
@@ -250,8 +254,9 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
     """Choose a state at rest in which an experiment can begin.
 
     Named keyframes that a control holds come first, then the reference positions, then the state in
-    which the model settles while its driven joints are locked, or by itself. Where nothing holds,
-    the one that drifts least is taken: a robot with legs begins on its feet.
+    which the model settles while its driven joints are locked, or by itself. A stable state comes
+    before reference positions that are not: a pendulum begins hanging. Where nothing holds, the one
+    that drifts least is taken: a robot with legs begins on its feet.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
@@ -265,10 +270,51 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
 
     candidates = []
     for start in _candidates(model):
-        if start.held:
-            return start
         candidates.append(start)
-    return min(candidates, key=lambda start: start.drift)
+        if start.held and (start.near or _is_stable(model, start)):
+            return start
+    held = [start for start in candidates if start.held]
+    return held[0] if held else min(candidates, key=lambda start: start.drift)
+
+
+def falling_bodies(model: Any) -> list[str]:
+    """Names of the free bodies that fall by their weight where nothing is below them.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    if not has_gravity(model):
+        return []
+    is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    names = unique_names(model, "body")
+    return [names[body] for body in model.jnt_bodyid[is_free].tolist()]
+
+
+def require_support(model: Any, path: Path) -> None:
+    """Require something on which a free body can stand.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`), which no control holds.
+        path: Its file, for the message.
+
+    Raises:
+        ExperimentError: Nothing that does not move can be touched.
+    """
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    touchable = (model.geom_contype | model.geom_conaffinity) != 0
+    falling = falling_bodies(model)
+    if falling and not (fixed & touchable).any() and not model.npair:
+        raise ExperimentError(
+            f"{path}: nothing is below {first_ones(falling)}, which falls; give the file of the "
+            'scene with the floor, or add <geom type="plane" size="0 0 1"/> to the <worldbody>'
+        )
+
+
+def _is_stable(model: Any, start: Start) -> bool:
+    """Whether a state that a control holds stays where it is after a small disturbance."""
+    data = mujoco.MjData(model)
+    _signed_acceleration(model, data, start.qpos, start.control)
+    return not time_scale(model, data).unstable
 
 
 def _candidates(model: Any) -> Iterator[Start]:
@@ -308,7 +354,7 @@ def _start(
 
     A joint that rests on the end of its range has no room to move, so it is moved away from there.
     """
-    inside = _inside_ranges(model, qpos) if moves_inside else qpos
+    near, inside = keyframe or "", _inside_ranges(model, qpos) if moves_inside else qpos
     if not np.array_equal(inside, qpos):
         qpos, keyframe, reason = inside, None, reason + MOVED_INSIDE
     data = mujoco.MjData(model)
@@ -317,12 +363,10 @@ def _start(
 
     # The control of a keyframe is kept where it holds its state. Others have six significant
     # digits; those that hardly differ from zero are zero.
-    shown = control
-    if keyframe is None:
-        _, _, width = _ranges(model, data, control)
-        values = np.array([rounded(value, 6) for value in control])
-        shown = np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0)
-    elif (by_guess := _drift(model, data, qpos, guess)) <= 1.0:
+    _, _, width = _ranges(model, data, control)
+    values = np.array([rounded(value, 6) for value in control])
+    shown = np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0)
+    if keyframe is not None and (by_guess := _drift(model, data, qpos, guess)) <= 1.0:
         control = shown = np.array(guess)
         drift = by_guess
     return Start(
@@ -332,6 +376,7 @@ def _start(
         control=shown,
         drift=drift,
         reason=reason,
+        near=near,
     )
 
 

@@ -14,7 +14,13 @@ from mjfim.experiment.time_grid import TimeGrid
 
 def experiment(rate: float, **keys: Any) -> Experiment:
     """An experiment with some rates."""
-    return Experiment(model="m.xml", rate=rate, parameters={"m": {"target": "body/b:mass"}}, noise={"b": 0.1}, **keys)
+    return Experiment(
+        model="m.xml",
+        rate=rate,
+        parameters={"m": {"target": "body/b:mass"}},
+        noise={"b": 0.1},
+        **keys,
+    )
 
 
 @pytest.mark.parametrize("timestep", [0.002, 0.003, 0.007, 0.01])

@@ -561,7 +561,10 @@ def test_wishes_are_fulfilled(tmp_path: Path) -> None:
     ("wished", "message"),
     [
         ({"keyframe": "up"}, "unknown keyframe at rest 'up'; valid: hanging"),
-        ({"rate": 33.0}, "33 Hz is no whole number of timesteps of 0.01 s; rates nearby: 25, 50, 33.3"),
+        (
+            {"rate": 33.0},
+            "33 Hz is no whole number of timesteps of 0.01 s; rates nearby: 25, 50, 33.3",
+        ),
         ({"rate": 333.0}, "rates nearby: 50, 100$"),
         ({"horizon": 0.01, "rate": 100.0}, "less than two samples at 100 Hz.* at least 0.02 s"),
     ],
