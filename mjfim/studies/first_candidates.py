@@ -25,12 +25,13 @@ from mjfim.model.elements import (
     identifier,
     names_of,
     position_sizes,
+    translations,
 )
 from mjfim.model.inertia import body_inertia
 from mjfim.model.loading import NO_PACKAGES, load_spec
 from mjfim.model.model_files import PACKAGE
 from mjfim.model.paths import unit_of
-from mjfim.model.units import acts_at_joint, actuator_gear, servo_kind
+from mjfim.model.units import servo_kind
 from mjfim.records.base import record
 from mjfim.studies import GROUPS, Group
 
@@ -378,8 +379,8 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
     scale = max(PAYLOAD_SHARE * mass, STRENGTH_SHARE * moving)
     gravity = np.linalg.norm(model.opt.gravity)
     if gravity > 0.0 and model.nu:
-        forces = np.abs(model.actuator_gear[:, 0]) * actuator_force_sizes(model, period)
-        scale = max(scale, STRENGTH_SHARE * forces.max() / (gravity * length))
+        torques = _strengths(model, period) * np.where(translations(model), length, 1.0)
+        scale = max(scale, STRENGTH_SHARE * torques.max() / (gravity * length))
     yield Candidate(
         name="payload",
         group="payload",
@@ -511,17 +512,22 @@ def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate
 
 def _strengths(model: Any, period: float) -> Array:
     """(nv,) force of the actuators at each joint; without any, that of a natural motion."""
-    strengths = force_sizes(model, period)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
     forces, controls = actuator_force_sizes(model, period), control_sizes(model, period)
     for i in range(model.nactuator):
-        if not acts_at_joint(model, i) or not model.actuator_ctrlnum[i]:
-            continue
-        force, dof = forces[model.actuator_outadr[i]], model.jnt_dofadr[model.actuator_trnid[i, 0]]
         # The control of a motor is its force.
-        if not model.actuator_forcelimited[i] and not model.actuator_biastype[i]:
-            force = abs(model.actuator_gainprm[i, 0]) * controls[model.actuator_ctrladr[i]]
-        strengths[dof] = max(strengths[dof], abs(actuator_gear(model, i)) * force)
-    return strengths
+        is_motor = model.actuator_ctrlnum[i] == 1 and not model.actuator_biastype[i]
+        if is_motor and not model.actuator_forcelimited[i]:
+            gain = abs(model.actuator_gainprm[i, 0])
+            forces[model.actuator_outadr[i]] = gain * controls[model.actuator_ctrladr[i]]
+
+    # The moments hold gears, and the ways of tendons.
+    moments = np.zeros((len(forces), model.nv))
+    places = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    mujoco.mju_sparse2dense(moments, data.actuator_moment, *places)
+    strongest = (np.abs(moments) * forces[:, None]).max(axis=0, initial=0.0)
+    return np.maximum(strongest, force_sizes(model, period))
 
 
 def _servos(model: Any) -> Iterator[Candidate]:

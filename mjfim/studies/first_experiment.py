@@ -302,9 +302,12 @@ def propose_experiment(
         flies=flies,
     )
     refinement = _Refinement(source=source, folder=folder, wishes=wishes)
-    if release is not None:
-        return refinement.released(draft, length)
-    return refinement.refined(draft)
+    try:
+        if release is not None:
+            return refinement.released(draft, length)
+        return refinement.refined(draft)
+    except SimulationDivergedError as error:
+        raise ModelError(f"{path}: {error}") from None
 
 
 def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
@@ -495,8 +498,8 @@ class _Refinement:
         remarks = list(remarks)
         if idle:
             remarks.append(
-                f"Warning: {first_ones(idle)} held at the end of the range, so that the first "
-                "motion cannot move it; start where the control is inside its range."
+                f"Warning: the start holds {first_ones(idle)} at the end of the range, where the "
+                "first motion does not use it; choose another start."
             )
 
         # Parameters of bodies and joints without a name cannot be proposed; a free joint has none.

@@ -14,7 +14,13 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, first_ones
 from mjfim.model.coordinates import joint_dofs, tangent_components
-from mjfim.model.elements import control_sizes, is_rk4, translations, unique_names
+from mjfim.model.elements import (
+    control_sizes,
+    is_rk4,
+    position_sizes,
+    translations,
+    unique_names,
+)
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.records.base import record
 from mjfim.studies.first_candidates import require_keyframe, resting_keyframes, rounded
@@ -219,6 +225,11 @@ MOVED_INSIDE = ", with joints moved away from the ends of their ranges"
 # left after each of them.
 SETTLING_PERIODS = 60.0
 VELOCITY_LEFT = 1e-3
+
+# Push of a state that is held but not stable, relative to the sizes of the positions, and the share
+# of the velocity that is left after each period while it falls.
+PUSH = 1e-2
+FALLING_LEFT = 0.1
 
 
 @record
@@ -533,9 +544,12 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
     kept = [int(model.jnt_qposadr[model.dof_jntid[v]]) for v in locked]
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
+    if start.held:
+        # A pendulum that stands upright falls only if something pushes it.
+        mujoco.mj_integratePos(model, data.qpos, PUSH * position_sizes(model), 1.0)
     time = _time(model, data)
     step = model.opt.timestep
-    decay = VELOCITY_LEFT ** (step / time)
+    decay = (FALLING_LEFT if start.held else VELOCITY_LEFT) ** (step / time)
 
     for _ in range(int(SETTLING_PERIODS * time / step)):
         mujoco.mj_step(model, data)
