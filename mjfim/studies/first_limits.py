@@ -11,9 +11,9 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.limits import SOFT_KINDS, SOFT_SHARE, limits_of_model
-from mjfim.model.clearance import GeomDistances, find_geom_pairs, with_floor
+from mjfim.model.clearance import FLOOR, GeomDistances, find_geom_pairs, with_floor
 from mjfim.model.coordinates import joint_dofs, joint_names
-from mjfim.model.elements import translations, unique_names
+from mjfim.model.elements import identifier, translations, unique_names
 from mjfim.model.limited_elements import tilt_weights
 from mjfim.model.loading import ModelSource
 from mjfim.studies.first_candidates import rounded
@@ -173,7 +173,9 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
     return {**found}
 
 
-def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:
+def _clearance(
+    source: ModelSource, positions: Array, least: float, *, may_add_floor: bool = True
+) -> dict[str, Any]:
     """The least distance [m], a floor, and the pairs of bodies that are nearer at rest.
 
     A robot above its base, without anything around it, gets a floor at the height of its base, and
@@ -183,6 +185,7 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
         source: The model.
         positions: (n, nq) positions at rest.
         least: The least distance [m].
+        may_add_floor: Whether a floor may be stated that the MJCF does not have.
     """
     data, model = mujoco.MjData(source.model), source.model
     data.qpos[:] = positions[0]
@@ -195,7 +198,7 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
     is_fixed = not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
     has_below = is_fixed or has_gravity(model)
     lowest = data.geom_xpos[moves[model.geom_bodyid], 2].min(initial=np.inf)
-    if has_below and not around and lowest > height:
+    if may_add_floor and has_below and not around and lowest > height:
         stated["floor"] = rounded(height, 6)
         model = with_floor(source, stated["floor"]).model
     try:
@@ -206,6 +209,11 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
 
     nearest = distances(positions, slopes=False)[0].min(axis=0)
     near = {name for name, d in zip(distances.columns, nearest, strict=True) if d < 2.0 * least}
+    # A hand that lies at the height of its base has no floor there.
+    floor = identifier(model, "geom", FLOOR)
+    above = {pair.bodies for pair in pairs if pair.second == floor}
+    if 2 * len(above & near) > len(above):
+        return _clearance(source, positions, least, may_add_floor=False)
     if len(near) == len(nearest):
         return {}
     names = np.array(unique_names(model, "body"))[model.geom_bodyid]

@@ -264,6 +264,28 @@ def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
     assert 0.01 < found.chosen[0].scale < 1.0
 
 
+def test_a_hand_that_lies_at_the_height_of_its_base_has_no_floor(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        """
+    <mujoco>
+      <worldbody>
+        <body name="palm"><geom type="box" size="0.05 0.05 0.02"/>
+          <body name="finger" pos="0.1 0 0.02"><joint name="knuckle" axis="0 0 1" damping="0.1"/>
+            <geom type="capsule" fromto="0.02 0 0 0.1 0 0" size="0.02" mass="0.1"/>
+            <body name="tip" pos="0.15 0 0"><joint name="end" axis="0 0 1" damping="0.1"/>
+              <geom type="capsule" fromto="0.02 0 0 0.1 0 0" size="0.02" mass="0.1"/>
+      </body></body></body></worldbody>
+      <actuator><motor name="a" joint="knuckle" ctrlrange="-1 1"/>
+        <motor name="b" joint="end" ctrlrange="-1 1"/></actuator>
+    </mujoco>
+    """,
+    )
+    _, experiment = proposed(path, tmp_path)
+    assert experiment.limits.floor is None
+    assert experiment.limits.clearance is not None
+
+
 # Four equal servos, the last of which turns a light wrist; no joint has a damping.
 SERVO_ARM = """
 <mujoco>
