@@ -382,13 +382,13 @@ class _Refinement:
         at_rest = replace(draft, boundary=AT_REST)
         if draft.start.held and self._can_begin(system, at_rest):
             draft = at_rest
-        # Each joint of an arm is driven, so that the controls can stop it.
-        is_arm = len(driven_dofs(self.source.model)) == self.source.model.nv
+        # Each joint of an arm is driven, so that the controls can stop it; who flies, hovers.
+        can_stop = len(driven_dofs(self.source.model)) == self.source.model.nv or draft.flies
 
         remarks = []
         amplitudes = np.array(list(draft.amplitudes.values()))
         kept = self._kept_amplitudes(system, draft, amplitudes)
-        if draft.boundary and kept is not None and is_arm:
+        if draft.boundary and kept is not None and can_stop:
             # Servos stop a motion that fades; under torques, the design has to find the end.
             draft = replace(draft, boundary=AT_REST | {"end": "rest"})
             ended = self._kept_amplitudes(system, draft, kept)
