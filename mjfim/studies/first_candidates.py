@@ -527,7 +527,7 @@ def _strengths(model: Any, period: float) -> Array:
     places = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
     mujoco.mju_sparse2dense(moments, data.actuator_moment, *places)
     strongest = (np.abs(moments) * forces[:, None]).max(axis=0, initial=0.0)
-    return np.maximum(strongest, force_sizes(model, period))
+    return np.asarray(np.maximum(strongest, force_sizes(model, period)))
 
 
 def _servos(model: Any) -> Iterator[Candidate]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from copy import copy
 from pathlib import Path
 from typing import Any
@@ -226,6 +226,9 @@ MOVED_INSIDE = ", with joints moved away from the ends of their ranges"
 SETTLING_PERIODS = 60.0
 VELOCITY_LEFT = 1e-3
 
+# Inertia of a locked joint, relative to its own.
+LOCKING = 1e9
+
 # Push of a state that is held but not stable, relative to the sizes of the positions, and the share
 # of the velocity that is left after each period while it falls.
 PUSH = 1e-2
@@ -264,10 +267,11 @@ class Start:
 def choose_start(model: Any, keyframe: str | None = None) -> Start:
     """Choose a state at rest in which an experiment can begin.
 
-    Named keyframes that a control holds come first, then the reference positions, then the state in
-    which the model settles while its driven joints are locked, or by itself. A stable state comes
-    before reference positions that are not: a pendulum begins hanging. Where nothing holds, the one
-    that drifts least is taken: a robot with legs begins on its feet.
+    Named keyframes that a control holds come first, or the reference positions where there are
+    none, then the state in which the model settles from there while its driven joints are locked,
+    or by itself. A stable state comes before reference positions that are not: a pendulum begins
+    hanging. Where nothing holds, the one that drifts least is taken: a robot with legs begins on
+    its feet.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
@@ -330,18 +334,17 @@ def _is_stable(model: Any, start: Start) -> bool:
 
 def _candidates(model: Any) -> Iterator[Start]:
     """Starts in the order of preference."""
-    for name in resting_keyframes(model):
-        yield _start_in_keyframe(model, model.key(name).id)
+    stated = [_start_in_keyframe(model, model.key(name).id) for name in resting_keyframes(model)]
+    if not stated:
+        resting = _resting_control(model, _inside_ranges(model, model.qpos0))
+        stated = [_start(model, model.qpos0, resting, "the reference positions of the MJCF")]
+    yield from stated
 
-    resting = _resting_control(model, _inside_ranges(model, model.qpos0))
-    first = _start(model, model.qpos0, resting, "the reference positions of the MJCF")
-    yield first
-
-    driven = driven_dofs(model)
-    for locked, how in ((driven, "while its driven joints are locked"), ((), "by itself")):
+    first, driven = stated[0], driven_dofs(model)
+    for locked, how in ((driven, "while its driven joints are locked"), ([], "by itself")):
         settled = _settled(model, first, locked)
         if settled is not None:
-            reason = f"the state in which the model comes to rest {how}"
+            reason = f"the state in which the model comes to rest {how}, from {first.reason}"
             # To move one joint of a closed chain would open it.
             yield _start(model, settled, first.control, reason, moves_inside=not model.neq)
 
@@ -533,7 +536,7 @@ def driven_dofs(model: Any) -> list[int]:
     return [model.jnt_dofadr[j] for j in sorted(joints) if joint_dofs(model, j) == 1]
 
 
-def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
+def _settled(model: Any, start: Start, locked: list[int]) -> Array | None:
     """(nq,) positions in which the model comes to rest with a strong artificial damping.
 
     Slides and hinges whose degrees of freedom are locked keep their position. None where the
@@ -541,12 +544,16 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
     """
     if len(locked) == model.nv:
         return None
-    kept = [int(model.jnt_qposadr[model.dof_jntid[v]]) for v in locked]
+    # A joint with a large inertia stays where it is, and does not push the others.
+    model = copy(model)
+    model.dof_armature[locked] = LOCKING * model.dof_M0[locked]
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
     if start.held:
         # A pendulum that stands upright falls only if something pushes it.
-        mujoco.mj_integratePos(model, data.qpos, PUSH * position_sizes(model), 1.0)
+        push = PUSH * position_sizes(model)
+        push[locked] = 0.0
+        mujoco.mj_integratePos(model, data.qpos, push, 1.0)
     time = _time(model, data)
     step = model.opt.timestep
     decay = (FALLING_LEFT if start.held else VELOCITY_LEFT) ** (step / time)
@@ -554,8 +561,7 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
     for _ in range(int(SETTLING_PERIODS * time / step)):
         mujoco.mj_step(model, data)
         data.qvel *= decay
-        data.qvel[list(locked)] = 0.0
-        data.qpos[kept] = start.qpos[kept]
+        data.qvel[locked] = 0.0
         if (
             not np.isfinite(data.qpos).all()
             or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number

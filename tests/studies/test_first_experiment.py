@@ -521,6 +521,27 @@ def test_a_pendulum_begins_hanging_where_the_file_shows_it_upright() -> None:
     assert start.keyframe == "up"
 
 
+def test_a_keyframe_that_no_control_holds_is_where_a_robot_settles() -> None:
+    """A passive finger falls, while the driven arm stays where the keyframe shows it."""
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <compiler angle="radian"/>
+      <worldbody><body name="arm"><joint name="arm" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
+        <body name="finger" pos="0 0 -0.3"><joint name="finger" axis="0 1 0" damping="0.01"/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.01" mass="0.1"/></body></body>
+      </worldbody>
+      <actuator><position joint="arm" kp="500" kv="20"/></actuator>
+      <keyframe><key name="home" qpos="0.8 0.5" ctrl="0.8"/></keyframe>
+    </mujoco>
+    """)
+    start = choose_start(model)
+    assert start.held
+    assert start.qpos[0] == pytest.approx(0.8, abs=1e-6)
+    assert start.qpos.sum() == pytest.approx(0.0, abs=1e-4)
+    assert start.reason.endswith("from the keyframe 'home' of the MJCF")
+
+
 def test_what_the_file_says_about_starts_and_names(tmp_path: Path) -> None:
     """A keyframe at a stop is no other keyframe; a weak motor at its end is named."""
     path = written(
