@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from functools import cache
@@ -428,12 +429,11 @@ class _Refinement:
         """(nu,) largest amplitudes that keep all limits, if possible with some room; or None."""
         task = self._task(system, _with_amplitudes(draft, amplitudes))
         room = cache(lambda share: self._room(task, share))
-        if room(SHRINKING**TRIALS) < 0.0:
-            return None
         for least in (ROOM, 0.0):
-            for trial in range(TRIALS + 1):
-                if room(SHRINKING**trial) >= least:
-                    return two_digits(amplitudes * SHRINKING**trial)
+            if room(SHRINKING**TRIALS) >= least:
+                # A smaller motion has more room.
+                trial = bisect_left(range(TRIALS), least, key=lambda k: room(SHRINKING**k))
+                return two_digits(amplitudes * SHRINKING**trial)
         return None
 
     def _within_limits(
