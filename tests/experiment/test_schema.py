@@ -404,7 +404,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     ),
     "rate": (
         edited("rate = 100.0", "rate = 30.0"),
-        "rate: at 30 Hz … 0.01 s … 25, 33.3333, 50 Hz … A log keeps its own rate",
+        "rate: at 30 Hz … 0.01 s … 25, 50, 33.3333333 Hz … A log keeps its own rate",
     ),
     "rate negative": (edited("rate = 100.0", "rate = -1.0"), "rate … greater than 0 … -1.0"),
     "measure rate": ("measure_rate = 30.0" + SHORT, "measure_rate: 30 Hz … 100 Hz … 50, 25"),
