@@ -718,7 +718,7 @@ def _accuracy_over_rounds(
             hline(wanted, dash="--", label="wanted"),
             hspan(low, wanted, "text", opacity=0.06),
         ]
-    return Panel(title=title, marks=marks, x=axis, y=Axis(log=True, limits=(low, 105.0)))
+    return Panel(title=title, marks=marks, x=axis, y=Axis(log=True, limits=(low, high)))
 
 
 def _estimate_over_rounds(
