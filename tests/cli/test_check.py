@@ -75,6 +75,7 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
         "check.npz",
         "check.png",
         "report.html",
+        "rehearsal.png",
         "pairs.png",
         MANIFEST,
     }

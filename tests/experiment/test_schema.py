@@ -362,7 +362,10 @@ FAULTS: dict[str, tuple[str, str]] = {
     "nested key": (edited("[cost]", "[cost]\ncontrl = 1"), "cost.contrl … 'control' … tracking"),
     "initial key": (edited("keyframe =", "keyfrme ="), "initial.keyfrme … 'keyframe' … qpos"),
     "signal key": (control('{ kind = "sine", amp = 1 }'), "initial.control.amp … amplitude, "),
-    "signal kind": (control("{ amplitude = 1 }"), "initial.control.kind: this key is required"),
+    "signal without kind": (
+        control("{ amplitude = 1 }"),
+        "initial.control.kind: this key is required",
+    ),
     "limits key": (
         SHORT + "[limits]\nspeed = 1\n",
         "limits.speed … acceleration, angular_velocity, bandwidth, clearance, control, "

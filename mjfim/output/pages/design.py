@@ -628,7 +628,7 @@ def _check_verdict(check: Check) -> Verdict:
         shares = {row.name: row.relative for row in check.rows if not row.nuisance}
         worst = max(shares, key=lambda name: shares[name])
         sigma = relative(shares[worst], 1.0)
-        if shares[worst] >= 1.0:
+        if NORMAL_95 * shares[worst] >= UNDETERMINED_SHARE:
             text = f"{check.source} does not determine {worst}: its σ is {sigma} of its size."
             return Verdict(text, Level.DOUBTFUL)
         text = (
