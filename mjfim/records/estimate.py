@@ -13,7 +13,11 @@ from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import first_ones
 from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.check import join_names
-from mjfim.records.estimate_parts import InverseDynamicsFit, PayloadEstimate
+from mjfim.records.estimate_parts import (
+    InverseDynamicsFit,
+    PayloadEstimate,
+    ResidualForce,
+)
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Selection, Term, TermTestData
 from mjfim.records.trajectory import Labels, Recording, Trajectory
@@ -454,6 +458,8 @@ class Estimate(ShownRecord):
             recordings; None where they were not.
         inverse_dynamics: The fit to the equation of motion from which the search started; None
             where there was none.
+        residual_forces: What the model does not explain at each joint, along the measured motions;
+            none where a motion or a force was not measured.
         draws: Robots that were drawn from the uncertainty, for simulations that vary the robot;
             None where that was not asked for.
         recording_comparison: What each recording suggests alone, the scatter between recordings,
@@ -520,6 +526,7 @@ class Estimate(ShownRecord):
     horizons: HorizonStudy | None = None
     held: tuple[str, ...] = ()
     inverse_dynamics: InverseDynamicsFit | None = None
+    residual_forces: tuple[ResidualForce, ...] = ()
     draws: ParameterDraws | None = None
     recording_comparison: RecordingComparison | None = None
     prior_directions: PriorDirections | None = None
@@ -574,6 +581,7 @@ class Estimate(ShownRecord):
         "held",
         "horizons",
         "inverse_dynamics",
+        "residual_forces",
         "draws",
         "payload",
         "recording_comparison",

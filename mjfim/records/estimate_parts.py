@@ -27,9 +27,7 @@ class EquationFit(Record):
         sigma: Standard deviation by which its residuals were divided; outliers hardly change it
             [unit].
         correlation: Integrated autocorrelation time of its residuals [rows].
-        t: (n,) times of the averages of the recording that is drawn [s].
-        measured: (n,) force of the actuators, measured or by the model from the control [unit].
-        explained: (n,) force that the measured motion needs by the fitted model [unit].
+        force: Root mean square of the force of the actuators [unit].
     """
 
     name: str
@@ -40,9 +38,7 @@ class EquationFit(Record):
     cutoff: float
     sigma: float
     correlation: float
-    t: Array
-    measured: Array
-    explained: Array
+    force: float
 
     in_json = (
         "name",
@@ -60,6 +56,96 @@ class EquationFit(Record):
     def share(self) -> float:
         """Residuals over the forces; NaN without any force."""
         return self.residual / self.size if self.size > 0.0 else float("nan")
+
+
+# Share of the points that count as slow.
+SLOW_SHARE = 0.25
+
+# Largest number of medians of one direction of motion, and fewest of a line.
+MOST_MEDIANS, FEWEST_OF_LINE = 25, 3
+
+
+@record
+class ResidualForce(Record):
+    """Force of a joint along measured motions that the model does not explain, at n points.
+
+    It is the force of the actuators, measured or by the model from the control, less the one that
+    the measured motion needs. Dry friction that the model lacks is a step at speed zero.
+
+    Attributes:
+        joint: Name of the joint.
+        unit: Unit of its force, N or N m.
+        position: (n,) positions [m or rad].
+        speed: (n,) velocities [m/s or rad/s].
+        force: (n,) residual forces [unit].
+        sigma: Standard deviation of the residual forces by noise of the measurements [unit].
+        size: Root mean square of the force of the actuators [unit].
+    """
+
+    joint: str
+    unit: str
+    position: Array
+    speed: Array
+    force: Array
+    sigma: float
+    size: float
+
+    in_json = ("joint", "unit", "rms", "friction", "sigma", "size")
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual forces [unit]."""
+        return float(np.sqrt(np.mean(self.force**2)))
+
+    @property
+    def share(self) -> float:
+        """Residual forces over the forces of the actuators; infinite without any force."""
+        return self.rms / self.size if self.size > 0.0 else float("inf")
+
+    @property
+    def noise_ratio(self) -> float:
+        """Root mean square over the standard deviation by noise; infinite without noise."""
+        return self.rms / self.sigma if self.sigma > 0.0 else float("inf")
+
+    @property
+    def friction(self) -> tuple[float, float]:
+        """Friction that the model lacks, or has too much of, by the medians over the speed.
+
+        The slowest points are left out: noise hides their direction.
+
+        Returns:
+            Half of the step between the directions [unit], and the slope [unit per m/s or rad/s];
+            NaN where too few points move in both directions.
+        """
+        slow = np.quantile(np.abs(self.speed), SLOW_SHARE)
+        both = [self.medians(self.speed, sign * self.speed > slow) for sign in (1.0, -1.0)]
+        if min(len(speed) for speed, _ in both) < FEWEST_OF_LINE:
+            return float("nan"), float("nan")
+        speed, force = np.concatenate(both, axis=1)
+        columns = np.column_stack([np.ones(len(speed)), np.sign(speed), speed])
+        _, step, slope = np.linalg.lstsq(columns, force, rcond=None)[0].tolist()
+        return step, slope
+
+    def medians(self, along: Array, is_counted: np.ndarray) -> tuple[Array, Array]:
+        """Medians of the residual forces in intervals with equally many points.
+
+        There are about as many intervals as points in each of them.
+
+        Args:
+            along: (n,) quantity along which the points are ordered, such as `speed`.
+            is_counted: (n,) True for the points that count, such as those of one direction.
+
+        Returns:
+            (k,) medians of the quantity, and (k,) those of the residual forces [unit].
+        """
+        points = np.flatnonzero(is_counted)
+        points = points[np.argsort(along[points], kind="stable")]
+        count = min(int(np.sqrt(len(points))), MOST_MEDIANS)
+        parts = np.array_split(points, count) if count else []
+        return (
+            np.array([np.median(along[part]) for part in parts]),
+            np.array([np.median(self.force[part]) for part in parts]),
+        )
 
 
 @record
@@ -85,7 +171,8 @@ class InverseDynamicsFit(ShownRecord):
         iterations: Number of linearisations.
         success: True where the last step changed nothing.
         status: How the fit ended, in words.
-        recording: Name of the recording that is drawn.
+        residual_forces: What the fitted model does not explain at each joint; none for a fit that
+            was the start of another one.
         seconds: Wall time [s].
         steps: MuJoCo steps taken.
     """
@@ -104,7 +191,7 @@ class InverseDynamicsFit(ShownRecord):
     iterations: int = 0
     success: bool = True
     status: str = ""
-    recording: str = ""
+    residual_forces: tuple[ResidualForce, ...] = ()
     seconds: float = 0.0
     steps: int = 0
     sizes: Array = no_array()
@@ -126,7 +213,7 @@ class InverseDynamicsFit(ShownRecord):
         "iterations",
         "success",
         "status",
-        "recording",
+        "residual_forces",
         "seconds",
         "steps",
     )

@@ -27,7 +27,7 @@ from mjfim.records.estimate import (
     PredictionErrors,
     Whiteness,
 )
-from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
+from mjfim.records.estimate_parts import ResidualForce
 from mjfim.records.rehearsal import Rehearsal, RehearsedLimit
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
@@ -335,44 +335,21 @@ def draws(size: Size) -> ParameterDraws:
     )
 
 
-def inverse_dynamics(size: Size) -> InverseDynamicsFit:
-    """The equations of as many joints, with a gap in the measured force."""
-    count = size.parameters
-    t = np.delete(np.linspace(0.0, 6.0, 60), slice(20, 30))
-    equations = tuple(
-        EquationFit(
-            name="n" * size.width + str(k),
+def residual_forces(size: Size) -> tuple[ResidualForce, ...]:
+    """Residual forces of as many joints."""
+    rng = np.random.default_rng(1)
+    speed = np.sin(np.linspace(0.0, 40.0, 300))
+    return tuple(
+        ResidualForce(
+            joint="n" * size.width + str(k),
             unit="N m",
-            residual=0.1 * (k + 1),
-            size=2.0,
-            rows=len(t),
-            cutoff=12.0,
+            position=np.cumsum(speed),
+            speed=speed,
+            force=np.sign(speed) + 0.1 * rng.normal(size=300),
             sigma=0.1,
-            correlation=3.0,
-            t=t,
-            measured=np.sin(t + k),
-            explained=1.1 * np.sin(t + k),
+            size=2.0,
         )
         for k in range(size.joints)
-    )
-    return InverseDynamicsFit(
-        parameters=size.labels.parameters,
-        units=size.labels.parameter_units,
-        theta=np.ones(count),
-        std=np.full(count, 0.1),
-        covariance=0.01 * np.eye(count),
-        start=np.ones(count),
-        equations=equations,
-        determined=count,
-        undetermined=(),
-        absent=(),
-        condition=10.0,
-        iterations=3,
-        success=True,
-        status="converged",
-        recording="n" * size.width + ".csv",
-        seconds=1.0,
-        steps=1000,
     )
 
 
@@ -389,7 +366,7 @@ def studied(size: Size) -> Estimate:
             labels.parameters, labels.parameter_units, names
         ),
         draws=draws(size),
-        inverse_dynamics=inverse_dynamics(size),
+        residual_forces=residual_forces(size),
         misfit=True,
     )
 

@@ -35,7 +35,7 @@ from mjfim.output.page import (
     tabulated,
     warned,
 )
-from mjfim.output.pages.studies import equation_parts
+from mjfim.output.pages.studies import residual_parts
 from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
@@ -64,19 +64,19 @@ ABOUT_STD = (
 
 def estimate_page(estimate: Estimate) -> Page:
     """Describe estimates with intervals, the fit of every output, and predictions."""
-    equation, rms = estimate.inverse_dynamics, estimate.residual_rms
+    rms = estimate.residual_rms
     residuals = {"output": [*rms], "residual rms": numbers(rms.values())}
     parts: dict[str, Sequence[Part]] = {
         "Parameters": [*_parameter_parts(estimate), *_correlation_tables(estimate)],
         "Added terms": [] if estimate.selection is None else selection_parts(estimate.selection),
         "Length of the segments": horizon_parts(estimate.horizons),
-        "Equation of motion": [] if equation is None else list(equation_parts(equation)),
         "Recordings": recording_parts(estimate),
         "Drawn robots": list(sample_parts(estimate)),
         "Predictions": _prediction_parts(estimate.predictions),
         "Signals": [Plot("fit")] if estimate.recordings else [],
         "Residuals": [tabulated("Fit of every output", residuals, detail=True), Plot("spectra")],
         "Search": [Plot("trace")] if len(estimate.trace) > 1 else [],
+        "Residual torque": residual_parts(estimate.residual_forces),
     }
     causes, details = estimate.causes, estimate.details
     return Page(

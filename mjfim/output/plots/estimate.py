@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ from mjfim.output.words import (
     without_zeros,
 )
 from mjfim.records.estimate import Estimate, Prediction
-from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
+from mjfim.records.estimate_parts import ResidualForce
 from mjfim.records.trajectory import Labels, Recording, with_unit
 
 # Number of segments that are transformed at once.
@@ -73,8 +74,8 @@ def power_density(x: Array, rate: float, length: int) -> tuple[Array, Array]:
 
 
 # Largest numbers of outputs over time, of outputs with a spectrum, of predicted recordings, of
-# parameters over the iterations, and of equations; of more, those that say most are drawn.
-MAX_OUTPUTS, MAX_SPECTRA, MAX_PREDICTIONS, MAX_PARAMETERS, MAX_EQUATIONS = 8, 12, 8, 12, 10
+# parameters over the iterations, and of joints; of more, those that say most are drawn.
+MAX_OUTPUTS, MAX_SPECTRA, MAX_PREDICTIONS, MAX_PARAMETERS, MAX_JOINTS = 8, 12, 8, 12, 6
 
 # Largest number of samples of a recording that are drawn, and of segments whose boundaries are.
 MAX_SAMPLES, MAX_BOUNDARIES = 4000, 40
@@ -97,8 +98,8 @@ INDEPENDENT_SHARE = 1.0 / (1.0 + 2.0 / 36.0)
 # Probability below which a p-value is not written as a number.
 SMALLEST_WRITTEN_P = 1e-6
 
-# Times between averages of forces above this multiple of the usual one are gaps.
-GAP = 2.5
+# Quantiles of residual forces between which a panel reaches.
+SHOWN_QUANTILES = (0.005, 0.995)
 
 
 # ---- parameters
@@ -565,52 +566,82 @@ def _prediction_name(prediction: Prediction) -> str:
     return name if prediction.held_out else f"{name} *"
 
 
-# ---- equation of motion
+# ---- residual forces
 
 
-def inverse_dynamics(fit: InverseDynamicsFit) -> Picture:
-    """Show the forces of the actuators and those that the measured motion needs."""
-    order = sorted(fit.equations, key=lambda each: -np.nan_to_num(each.share))
-    shown = [each for each in fit.equations if each in order[:MAX_EQUATIONS]]
+def residual_torque(found: Sequence[ResidualForce]) -> Picture:
+    """Show the force that the model does not explain at each joint, over speed and position."""
+    order = sorted(found, key=lambda each: -each.noise_ratio)
+    shown = [each for each in found if each in order[:MAX_JOINTS]]
     panels = []
-    for row, each in enumerate(shown):
-        t, measured, explained = _with_gaps(each)
-        share = f"{100.0 * each.share:.2g} %" if np.isfinite(each.share) else "no force"
-        marks = [
-            line(t, measured, MEASURED, width=1.8, label="measured, or by the model"),
-            line(t, explained, IDENTIFIED, width=0.9, label="needed by the measured motion"),
+    for each in shown:
+        length, noun = ("rad", "angle") if each.unit == "N m" else ("m", "position")
+        step, slope = each.friction
+        title = "too few points in both directions"
+        if np.isfinite(step):
+            viscous = _with_unit(slope, f"{each.unit} s/{length}")
+            title = f"missing friction {_with_unit(step, each.unit)}, viscous {viscous}"
+        rms = f"rms {_with_unit(each.rms, each.unit)}{_over_noise(each)}"
+        panels += [
+            _force_panel(each, each.speed, f"speed [{length}/s]", title),
+            _force_panel(each, each.position, f"{noun} [{length}]", rms),
         ]
-        panels.append(
-            Panel(
-                title=f"{with_unit(shorten(each.name, 30), each.unit)}: residual {share}",
-                marks=marks,
-                x=Axis(label="time [s]" if row == len(shown) - 1 else ""),
-                y=Axis(most=3),
-                place=(row, 0),
-            )
-        )
-    shares = [100.0 * each.share for each in fit.equations if np.isfinite(each.share)]
-    title = "Equation of motion: no equation has a force"
-    if shares:
-        span = f"{min(shares):.2g} to {max(shares):.2g}" if len(shares) > 1 else f"{shares[0]:.2g}"
-        title = f"Equation of motion: residuals are {span} % of the forces"
+    worst = order[0]
+    title = f"Residual torque: {_with_unit(worst.rms, worst.unit)} rms at {worst.joint}"
+    title += _over_noise(worst)
+    if np.isfinite(worst.share):
+        title += f", {_with_unit(100.0 * worst.share, '%')} of the force of its actuators"
     note = (
-        f"Forces in {shorten(fit.recording, NAME_WIDTH)}, averaged over short windows; the share "
-        "is the root mean square residual over the force. Gaps: too little was measured, or "
-        "unknown forces act. An equation without actuators has no measured force."
+        "Force of the actuators, measured or by the model, less the force that the measured "
+        "motion needs by the identified model. Over the speed, a step at 0 is dry friction that "
+        "the model lacks (negative: has too much of), a slope is viscous friction, and a peak near "
+        "0 is a Stribeck effect. "
+        "Over the position, a distance of both medians is friction or backlash, and a slope or a "
+        "wave is a cable, a spring, gravity or cogging. A few distant points are not drawn."
     )
-    if len(shown) < len(fit.equations):
-        note += f" {len(fit.equations) - len(shown)} equations with smaller residuals are left out."
-    return Picture(title=title, panels=panels, note=note, heights=[1.15] * len(shown))
+    note += share_note(shown, found, "joints, those with the largest residuals over the noise")
+    heights = [1.75] * len(shown)
+    return Picture(
+        title=title, panels=in_grid(panels, 2), note=note, heights=heights, widths=[1.0, 1.0]
+    )
 
 
-def _with_gaps(each: EquationFit) -> tuple[Array, Array, Array]:
-    """Return times and forces, with NaN where averages are missing."""
-    steps = np.diff(each.t)
-    usual = np.median(steps) if len(steps) else 0.0
-    gaps = np.flatnonzero(steps > GAP * usual) + 1
-    return (
-        np.insert(each.t, gaps, each.t[gaps]),
-        np.insert(each.measured, gaps, np.nan),
-        np.insert(each.explained, gaps, np.nan),
-    )
+def _over_noise(each: ResidualForce) -> str:
+    if not each.sigma > 0.0:
+        return ""
+    return f", {format_number(each.noise_ratio, 2)} times the noise"
+
+
+def _force_panel(each: ResidualForce, along: Array, label: str, title: str) -> Panel:
+    """Return the residual forces of a joint over a quantity, with medians by direction."""
+    low, high = np.quantile(each.force, SHOWN_QUANTILES)
+    low, high = min(low, -2.0 * each.sigma), max(high, 2.0 * each.sigma)
+    margin = MARGIN * (high - low)
+    limits = (low - margin, high + margin)
+    is_inside = (each.force >= limits[0]) & (each.force <= limits[1])
+
+    band = hspan(-2.0 * each.sigma, 2.0 * each.sigma, opacity=0.8, label="±2σ of the noise")
+    marks = [hline(0.0, width=0.8)] + ([band] if each.sigma > 0.0 else [])
+    look = {
+        "symbol": ".",
+        "size": float(np.clip(120.0 / np.sqrt(len(along)), 1.5, 4.0)),
+        "opacity": 0.35,
+    }
+    for sign, colour, words in ((1.0, "series0", "forwards"), (-1.0, "series1", "backwards")):
+        moves = np.sign(each.speed) == sign
+        shown = moves & is_inside
+        points = dots(along[shown], each.force[shown], colour, label=f"moves {words}", **look)
+        x, y = each.medians(along, moves)
+        marks += [
+            points,
+            line(x, y, "white", width=4.0, front=3.0),
+            line(x, y, colour, width=2.2, front=3.1, label=f"median, {words}"),
+        ]
+    up = Axis(label=with_unit(shorten(each.joint, 18), each.unit), most=4)
+    if margin > 0.0:
+        up = replace(up, limits=limits)
+    return Panel(title=title, marks=marks, x=Axis(label=label), y=up)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{format_number(value, 2)} {unit}"

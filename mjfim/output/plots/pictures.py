@@ -55,7 +55,7 @@ DESIGN_PICTURES = (
 ESTIMATE_PICTURES = (
     "parameters",
     "spectra",
-    "inverse_dynamics",
+    "residual_torque",
     "trace",
     "pairs",
     "predictions",
@@ -153,16 +153,15 @@ def _(estimate: Estimate) -> Pictures:
         name: partial(of_estimate.held_out, estimate, i, labels)
         for i, name in enumerate(numbered("held_out", held))
     }
-    forces = estimate.inverse_dynamics
     optional = {
         "selection": (
             estimate.selection is not None,
             partial(estimate_studies.selection, estimate),
         ),
         "horizons": (estimate.horizons is not None, partial(estimate_studies.horizons, estimate)),
-        "inverse_dynamics": (
-            forces is not None,
-            partial(of_estimate.inverse_dynamics, forces),  # type: ignore[arg-type]
+        "residual_torque": (
+            bool(estimate.residual_forces),
+            partial(of_estimate.residual_torque, estimate.residual_forces),
         ),
         "recordings": (
             estimate.recording_comparison is not None,
@@ -193,7 +192,9 @@ def _(estimate: Estimate) -> Pictures:
 
 @pictures_of.register
 def _(result: InverseDynamicsFit) -> Pictures:
-    return {"inverse_dynamics": partial(of_estimate.inverse_dynamics, result)}
+    if not result.residual_forces:
+        return {}
+    return {"residual_torque": partial(of_estimate.residual_torque, result.residual_forces)}
 
 
 @pictures_of.register
