@@ -14,6 +14,7 @@ from mjfim.errors import first_ones
 from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.check import join_names
 from mjfim.records.estimate_parts import (
+    InformationInTime,
     InverseDynamicsFit,
     PayloadEstimate,
     ResidualForce,
@@ -441,8 +442,6 @@ class Estimate(ShownRecord):
         prior: (p, p) information of the parameters' priors, at the estimate.
         labels: Names and units for figures and tables; None in records of earlier versions.
         restart: How the fit was repeated from fits over segments; None where it was not.
-        trace: (n, p) the initial guess, and the parameters at the begin and at each iteration of
-            the search over all data [theta-unit]; empty in records of earlier versions.
         nominal: Outputs of the model at the initial guess, with the fitted initial states, for each
             recording, (M, ny) [unit of the output]; empty where it diverges, and for recordings of
             more than 1 000 000 rows together.
@@ -467,6 +466,8 @@ class Estimate(ShownRecord):
         prior_directions: Combinations of inertias that the recordings do not determine, but the
             inertias of the model (`cad_prior`); None without any.
         payload: The payload that was looked for; None where none was.
+        in_time: Which seconds of the recordings decide each parameter; None where some direction of
+            the unknowns is not determined.
         honest_covariance: (p, p) covariance that agrees with the intervals, for combinations of
             parameters: with weights w, the standard deviation is `sqrt(w @ honest_covariance @ w)`.
             It contains the noise of the stated or estimated size, its autocorrelation, priors,
@@ -517,7 +518,6 @@ class Estimate(ShownRecord):
     prior: Array = no_array(0, 0)
     labels: Labels | None = None
     restart: Restart | None = None
-    trace: Array = no_array(0, 0)
     nominal: tuple[Array, ...] = ()
     segments: tuple[Array, ...] = ()
     sizes: Array = no_array()
@@ -531,6 +531,7 @@ class Estimate(ShownRecord):
     recording_comparison: RecordingComparison | None = None
     prior_directions: PriorDirections | None = None
     payload: PayloadEstimate | None = None
+    in_time: InformationInTime | None = None
     tested_data: TermTestData | None = None
     honest_covariance: Array = no_array(0, 0)
 
@@ -586,8 +587,10 @@ class Estimate(ShownRecord):
         "payload",
         "recording_comparison",
         "prior_directions",
+        "in_time",
     )
     json_names = {
+        "in_time": "information_in_time",
         "worst_residual": "worst",
         "missing_terms": "suspects",
         "tested_data": "suspects_tested",

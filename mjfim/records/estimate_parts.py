@@ -224,6 +224,74 @@ class InverseDynamicsFit(ShownRecord):
         return tuple(each for each in self.equations if not each.name.startswith("law of "))
 
 
+# Share of the information of the recordings that counts as most of it.
+MOST = 0.9
+
+
+@record
+class InformationInTime(Record):
+    """Which seconds of the recordings decide each of q parameters, by B blocks of rows.
+
+    Information about a parameter counts with all other unknowns unknown. That of all blocks and of
+    the priors adds to 1/σ².
+
+    Attributes:
+        parameters: Names of the q parameters.
+        recording: (B,) index of the recording of each block.
+        times: (B, 2) begin and end of each block [s].
+        shares: (B, q) share of each block in 1/σ², from 0 to 1.
+        pulls: (B, q) distance by which the residuals of each block draw the estimate [σ].
+        scatter: Size of the residuals over that of the noise, at least 1.
+    """
+
+    parameters: tuple[str, ...]
+    recording: Array
+    times: Array
+    shares: Array
+    pulls: Array
+    scatter: float
+
+    in_json = ("parameters", "prior", "seconds_of_most")
+
+    @property
+    def prior(self) -> Array:
+        """(q,) share of the priors in 1/σ², from 0 to 1."""
+        return np.asarray(np.clip(1.0 - self.shares.sum(axis=0), 0.0, 1.0))
+
+    @property
+    def seconds_of_most(self) -> Array:
+        """(q,) shortest time that holds 90 % of the information of the recordings [s]."""
+        duration = np.diff(self.times, axis=1)
+        order = np.argsort(-self.shares / duration, axis=0, kind="stable")
+        gathered = np.cumsum(np.take_along_axis(self.shares, order, axis=0), axis=0)
+        time = np.cumsum(duration[order, 0], axis=0)
+        return np.array(
+            [
+                np.interp(MOST * sum_[-1], sum_, t)
+                for sum_, t in zip(gathered.T, time.T, strict=True)
+            ]
+        )
+
+    def on_grid(self, recording: int, edges: Array) -> tuple[Array, Array]:
+        """Shares and pulls in intervals of a recording; what a block holds is spread evenly in it.
+
+        Args:
+            recording: Index of the recording.
+            edges: (m+1,) ascending ends of the intervals [s].
+
+        Returns:
+            (m, q) shares, from 0 to 1, and (m, q) pulls [σ].
+        """
+        own = self.recording == recording
+        found = np.zeros((2, len(edges) - 1, len(self.parameters)))
+        for (begin, end), *of_block in zip(
+            self.times[own], self.shares[own], self.pulls[own], strict=True
+        ):
+            part = np.diff(np.clip(edges, begin, end)) / (end - begin)
+            found += part[:, None] * np.array(of_block)[:, None]
+        return found[0], found[1]
+
+
 # Axes of the frame of a body.
 AXES = ("x", "y", "z")
 

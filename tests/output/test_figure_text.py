@@ -27,7 +27,7 @@ from mjfim.records.estimate import (
     PredictionErrors,
     Whiteness,
 )
-from mjfim.records.estimate_parts import ResidualForce
+from mjfim.records.estimate_parts import InformationInTime, ResidualForce
 from mjfim.records.rehearsal import Rehearsal, RehearsedLimit
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
@@ -107,7 +107,7 @@ def design(size: Size) -> Design:
 
 @cache
 def estimate(size: Size) -> Estimate:
-    """An estimate with predictions, segments, a trace and the nominal model."""
+    """An estimate with predictions, segments and the nominal model."""
     made = make_estimate(size.joints, size.parameters)
     recording = made.recordings[0]
     labels = size.labels
@@ -146,7 +146,6 @@ def estimate(size: Size) -> Estimate:
         sigma=dict.fromkeys(outputs, 0.05),
         predictions=(held, other, other) if size.joints > 1 else (held,),
         whiteness=whiteness,
-        trace=np.linspace(1.2, 1.0, 6)[:, None] * made.theta,
         nominal=(1.3 * made.predicted[0],),
         segments=(np.arange(0.0, 2.0, 0.25),),
     )
@@ -353,6 +352,23 @@ def residual_forces(size: Size) -> tuple[ResidualForce, ...]:
     )
 
 
+def information_in_time(size: Size) -> InformationInTime:
+    """Information of ten blocks of each recording."""
+    count, blocks = size.parameters, 10
+    recordings = len(estimate(size).recordings)
+    edges = np.linspace(0.0, float(estimate(size).recordings[0].t[-1]), blocks + 1)
+    times = np.column_stack([edges[:-1], edges[1:]])
+    shape = (recordings * blocks, count)
+    return InformationInTime(
+        parameters=size.labels.parameters,
+        recording=np.repeat(np.arange(recordings), blocks),
+        times=np.tile(times, (recordings, 1)),
+        shares=np.full(shape, 0.9 / shape[0]),
+        pulls=np.where(np.arange(count) % 2, 2.0, -2.0) * np.ones(shape),
+        scatter=1.0,
+    )
+
+
 @cache
 def studied(size: Size) -> Estimate:
     """An estimate with all studies."""
@@ -367,6 +383,7 @@ def studied(size: Size) -> Estimate:
         ),
         draws=draws(size),
         residual_forces=residual_forces(size),
+        in_time=information_in_time(size),
         misfit=True,
     )
 

@@ -45,8 +45,8 @@ ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
         "spectra",
         "predictions",
         "pairs",
+        "deciding_seconds",
         "residual_torque",
-        "trace",
     )
 }
 

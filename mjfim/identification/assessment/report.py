@@ -276,7 +276,6 @@ def estimate_from(
         motion=problem.motion(solution.unknowns, 0, MAX_MOTION_SAMPLES),
         interrupted=interrupted,
         labels=labels_of_system(system),
-        trace=np.array([task.start, *(problem.theta(each) for each in solution.iterates)]),
         nominal=_nominal_outputs(result),
         segments=tuple(
             np.array([each.t[s.rows.start] for s in problem.segments if s.recording == k])
@@ -291,6 +290,7 @@ def estimate_from(
         residual_forces=() if interrupted else _residual_forces(result),
         recording_comparison=comparison,
         prior_directions=accuracy.prior_directions,
+        in_time=accuracy.in_time,
     )
     return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from mjfim.model.coordinates import split_unit
 from mjfim.output.page import IDENTIFIED, MEASURED, NOMINAL
 from mjfim.output.panels import (
     Axis,
+    Cells,
     Mark,
     Panel,
     Picture,
@@ -41,7 +42,7 @@ from mjfim.output.words import (
     without_zeros,
 )
 from mjfim.records.estimate import Estimate, Prediction
-from mjfim.records.estimate_parts import ResidualForce
+from mjfim.records.estimate_parts import MOST, InformationInTime, ResidualForce
 from mjfim.records.trajectory import Labels, Recording, with_unit
 
 # Number of segments that are transformed at once.
@@ -97,6 +98,14 @@ INDEPENDENT_SHARE = 1.0 / (1.0 + 2.0 / 36.0)
 
 # Probability below which a p-value is not written as a number.
 SMALLEST_WRITTEN_P = 1e-6
+
+# Largest numbers of parameters and recordings with a ribbon of information, of its cells, and of
+# marked places of a parameter; height of a ribbon [inch].
+MAX_RIBBONS, MAX_RIBBON_LOGS, MAX_CELLS, MAX_MARKED, RIBBON_HEIGHT = 24, 3, 150, 3, 0.25
+
+# Quantile of the shares at which the colours end, share of priors from which they are written, and
+# size of a pull over that by noise from which it is marked.
+STRONGEST_COLOUR, RELEVANT_PRIOR, LARGE_PULL = 0.99, 0.01, 3.0
 
 # Quantiles of residual forces between which a panel reaches.
 SHOWN_QUANTILES = (0.005, 0.995)
@@ -192,49 +201,95 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
     return f"{text}   (at its bound)" if estimate.parameters[j] in estimate.at_bound else text
 
 
-def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
-    """Show the parameters over the iterations of the search over all data."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        change = np.ptp(estimate.trace, axis=0) / np.ptp(estimate.interval, axis=1)
-    order = np.argsort(-np.nan_to_num(change, posinf=0.0), kind="stable")
+# ---- information over time
+
+
+def deciding_seconds(estimate: Estimate, labels: Labels) -> Picture:
+    """Show the share of the information on each parameter per second of the recordings."""
+    found = estimate.in_time
+    assert found is not None
+    seconds = found.seconds_of_most
+    is_nuisance = np.isin(found.parameters, estimate.nuisance)
+    asked = np.flatnonzero(~is_nuisance | is_nuisance.all())
+    rows = np.sort(asked[np.argsort(seconds[asked], kind="stable")[:MAX_RIBBONS]]).tolist()
+    logs = np.unique(found.recording).astype(int)
+    gathered = [found.shares[found.recording == k].sum() for k in logs]
+    recordings = np.sort(logs[np.argsort(gathered)[::-1][:MAX_RIBBON_LOGS]]).tolist()
+    ribbons = {k: _ribbon(found, k) for k in recordings}
+    rates = np.concatenate([rate[:, rows].ravel() for _, rate, _ in ribbons.values()])
+    reach = float(np.quantile(rates, STRONGEST_COLOUR)) or 1.0
+
+    names = [labels.parameter(estimate.parameters.index(found.parameters[j])) for j in rows]
+    beside = [(f"{100.0 * MOST:.0f} % in", "text", [f"{seconds[j]:.2g} s" for j in rows])]
+    if (found.prior > RELEVANT_PRIOR).any():
+        beside.append(("priors", "muted", [f"{100.0 * found.prior[j]:.0f} %" for j in rows]))
+    remark = (
+        "share of the information per second: white for none, darkest for "
+        f"{format_number(reach, 2)} % per s or more"
+    )
     panels = []
-    for j in np.sort(order[:MAX_PARAMETERS]).tolist():
-        values = np.append(estimate.trace[1:, j], estimate.theta[j])
-        marks = [
-            hline(estimate.trace[0, j], NOMINAL, label=NOMINAL),
-            line(
-                np.arange(len(values)),
-                values,
-                IDENTIFIED,
-                symbol="o",
-                size=3.0,
-                label="estimate so far",
-            ),
-        ]
-        low, high = estimate.interval[j]
-        if np.isfinite(low) and np.isfinite(high):
-            label = "95 % interval of the result"
-            marks.append(hspan(low, high, IDENTIFIED, opacity=0.15, label=label))
+    for place, (k, (edges, rate, pull)) in enumerate(ribbons.items()):
         panels.append(
             Panel(
-                title=labels.parameter(j),
-                marks=marks,
-                x=Axis(label="iteration [–]", most=4, whole=True),
-                y=Axis(most=4),
+                title=_file_name(estimate.recordings[k].name),
+                remark=remark if place == 0 else "",
+                cells=Cells(values=rate.T[rows], reach=reach, edges=edges),
+                marks=[*_pulls(edges, pull[:, rows])],
+                x=Axis(label="time [s]" if place == len(ribbons) - 1 else ""),
+                y=row_axis(names),
+                beside=beside if place == 0 else (),
+                place=(place, 0),
             )
         )
+    first, last = min(rows, key=seconds.__getitem__), max(rows, key=seconds.__getitem__)
+    total = sum(float(recording.t[-1]) for recording in estimate.recordings)
     note = (
-        "0: begin of the search over all data, after short searches for a start. The last point is "
-        "the identified value."
+        "The information on a parameter, with all others unknown, adds over all seconds and priors "
+        "to 1/σ²."
     )
-    which = "parameters, those that changed most over the width of their interval"
-    return grid(
-        "Parameters over the iterations of the fit",
-        panels,
-        [1.5] * len(panels),
-        min(4, len(panels)),
-        note + share_note(panels, estimate.theta, which),
+    if any(panel.marks for panel in panels):
+        note += (
+            " Triangles: here, residuals that are larger than noise draw the estimate by more than "
+            "1 σ; at most three for each parameter and recording."
+        )
+    span = f"{seconds[first]:.2g} s ({found.parameters[first]})"
+    if first != last:
+        span += f" to {seconds[last]:.2g} s ({found.parameters[last]})"
+    title = (
+        f"Which seconds decide: {100.0 * MOST:.0f} % of the information comes from {span} "
+        f"of {total:.3g} s"
     )
+    which = "parameters, those with the fewest deciding seconds"
+    note += share_note(rows, asked, which)
+    note += share_note(recordings, logs, "recordings, those with most information")
+    heights = [0.4 + RIBBON_HEIGHT * len(rows)] * len(panels)
+    heights[-1] += 0.2
+    return Picture(title=title, panels=panels, note=note, heights=heights)
+
+
+def _ribbon(found: InformationInTime, recording: int) -> tuple[Array, Array, Array]:
+    """Return the (m+1,) edges of intervals [s], (m, q) shares [%/s] and marked pulls [σ].
+
+    Pulls that are not marked are 0.
+    """
+    times = found.times[found.recording == recording]
+    count, end = min(len(times), MAX_CELLS), float(times.max())
+    edges = np.linspace(0.0, end, count + 1)
+    share, pull = found.on_grid(recording, edges)
+    by_noise = LARGE_PULL * found.scatter * np.sqrt(share)
+    size = np.where(np.abs(pull) > np.maximum(by_noise, 1.0), np.abs(pull), 0.0)
+    least = np.sort(size, axis=0)[-MAX_MARKED:][:1]
+    return edges, 100.0 * share * count / end, np.where(size >= least, np.sign(pull) * size, 0.0)
+
+
+def _pulls(edges: Array, pull: Array) -> Iterator[Mark]:
+    """Yield triangles where residuals draw an estimate up or down."""
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    for sign, symbol, words in ((1.0, "^", "up"), (-1.0, "v", "down")):
+        place, row = np.nonzero(np.sign(pull) == sign)
+        label = f"residuals draw it {words}"
+        if len(place):
+            yield dots(middle[place], row, "text", symbol=symbol, size=5.0, front=3.0, label=label)
 
 
 # ---- recordings over time

@@ -56,7 +56,7 @@ ESTIMATE_PICTURES = (
     "parameters",
     "spectra",
     "residual_torque",
-    "trace",
+    "deciding_seconds",
     "pairs",
     "predictions",
     "horizons",
@@ -168,9 +168,9 @@ def _(estimate: Estimate) -> Pictures:
             partial(estimate_studies.recordings, estimate),
         ),
         "samples": (estimate.draws is not None, partial(estimate_studies.samples, estimate)),
-        "trace": (
-            len(estimate.trace) > 1,
-            partial(of_estimate.parameter_trace, estimate, labels),
+        "deciding_seconds": (
+            estimate.in_time is not None,
+            partial(of_estimate.deciding_seconds, estimate, labels),
         ),
         "pairs": (
             estimate_studies.has_pairs(estimate.std),
