@@ -130,6 +130,22 @@ def test_residuals_that_are_larger_than_noise_are_marked(
     assert [mark.x.tolist() for mark in panel.marks] == [[2.5]] * len(symbols)
 
 
+def test_the_title_leaves_out_what_a_prior_tells(estimate: Estimate) -> None:
+    edges = np.arange(3.0)
+    found = InformationInTime(
+        parameters=("m", "l"),
+        recording=np.zeros(2),
+        times=np.column_stack([edges[:-1], edges[1:]]),
+        shares=np.array([[0.1, 0.9], [0.0, 0.1]]),
+        pulls=np.zeros((2, 2)),
+        scatter=1.0,
+    )
+    shown = replace(estimate, in_time=found)
+    picture = deciding_seconds(shown, complete_labels(shown))
+    assert "comes from 1 s (l) of 2 s" in picture.title
+    assert picture.panels[0].beside[1] == ("priors", "muted", ["90 %", "0 %"])
+
+
 def test_picture_table_and_json_have_the_same_numbers(estimate: Estimate, tmp_path: Path) -> None:
     found = in_time(estimate)
     picture = deciding_seconds(estimate, complete_labels(estimate))

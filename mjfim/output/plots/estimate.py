@@ -103,9 +103,9 @@ SMALLEST_WRITTEN_P = 1e-6
 # marked places of a parameter; height of a ribbon [inch].
 MAX_RIBBONS, MAX_RIBBON_LOGS, MAX_CELLS, MAX_MARKED, RIBBON_HEIGHT = 24, 3, 150, 3, 0.25
 
-# Quantile of the shares at which the colours end, share of priors from which they are written, and
-# size of a pull over that by noise from which it is marked.
-STRONGEST_COLOUR, RELEVANT_PRIOR, LARGE_PULL = 0.99, 0.01, 3.0
+# Quantile of the shares at which the colours end, shares of priors from which they are written and
+# from which the title leaves a parameter out, and size of a marked pull over that by noise.
+STRONGEST_COLOUR, RELEVANT_PRIOR, MOSTLY_PRIOR, LARGE_PULL = 0.99, 0.01, 0.5, 3.0
 
 # Quantiles of residual forces between which a panel reaches.
 SHOWN_QUANTILES = (0.005, 0.995)
@@ -241,7 +241,8 @@ def deciding_seconds(estimate: Estimate, labels: Labels) -> Picture:
                 place=(place, 0),
             )
         )
-    first, last = min(rows, key=seconds.__getitem__), max(rows, key=seconds.__getitem__)
+    told = [j for j in rows if found.prior[j] < MOSTLY_PRIOR] or rows
+    first, last = min(told, key=seconds.__getitem__), max(told, key=seconds.__getitem__)
     total = sum(float(recording.t[-1]) for recording in estimate.recordings)
     note = (
         "The information on a parameter, with all others unknown, adds over all seconds and priors "
@@ -649,10 +650,10 @@ def residual_torque(found: Sequence[ResidualForce]) -> Picture:
     note = (
         "Force of the actuators, measured or by the model, less the force that the measured "
         "motion needs by the identified model. Over the speed, a step at 0 is dry friction that "
-        "the model lacks (negative: has too much of), a slope is viscous friction, and a peak near "
-        "0 is a Stribeck effect. "
-        "Over the position, a distance of both medians is friction or backlash, and a slope or a "
-        "wave is a cable, a spring, gravity or cogging. A few distant points are not drawn."
+        "the model lacks; a negative one is too much of it. A slope is viscous friction, and a "
+        "peak near 0 a Stribeck effect. Over the position, a distance of both medians is friction "
+        "or backlash. A slope or a wave is a cable, a spring, gravity or cogging. A few distant "
+        "points are not drawn."
     )
     note += share_note(shown, found, "joints, those with the largest residuals over the noise")
     heights = [1.75] * len(shown)
