@@ -7,7 +7,7 @@ because that would colour their noise. Predictions are interpolated instead.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import mujoco
@@ -137,6 +137,10 @@ class AlignedRecording:
     def size(self) -> int:
         """Memory that the recording takes [bytes]."""
         return self.t.nbytes + self.y.nbytes + self.ctrl.nbytes
+
+    def first_rows(self, count: int) -> AlignedRecording:
+        """The first `count` rows, with all controls; a shorter recording is unchanged."""
+        return replace(self, t=self.t[:count], y=self.y[:count])
 
     @cached_property
     def measured(self) -> np.ndarray:

@@ -638,9 +638,5 @@ class FitSearch:
 
 
 def _continued(first: Solution, found: Solution) -> Solution:
-    """The second of two searches, with the iterates of the first one, at whose end it began."""
-    return replace(
-        found,
-        iterates=(*first.iterates, *found.iterates[1:]),
-        iterations=first.iterations + found.iterations,
-    )
+    """The second of two searches, with the iterations of the first one, at whose end it began."""
+    return replace(found, iterations=first.iterations + found.iterations)

@@ -390,6 +390,19 @@ class SegmentSimulation(FitUnknowns):
         return np.repeat(recordings, np.diff(self._offsets))
 
     @property
+    def times_of_block(self) -> Array:
+        """(B, 2) times at which the rows of every block begin and end [s]."""
+        found = []
+        for index, segment in enumerate(self.segments):
+            t = self.recordings[segment.recording].t
+            t = np.append(t, 2.0 * t[-1] - t[-2])
+            rows = np.arange(segment.rows.start, segment.rows.stop)
+            first = rows[np.diff(self.blocks_of_rows(index, rows), prepend=-1) > 0]
+            edges = t[np.append(first, segment.rows.stop)]
+            found.append(np.column_stack([edges[:-1], edges[1:]]))
+        return np.concatenate(found)
+
+    @property
     def mean_block_rows(self) -> np.ndarray:
         """(B,) mean number of rows of every block."""
         counts = np.diff(self._offsets)

@@ -262,8 +262,6 @@ class Solution:
         success: True where the search converged.
         status: Sentence that says why the search ended.
         interrupted: True where the stop token ended the search.
-        iterates: The begin and all accepted values, with the private unknowns of the first segment
-            only.
         stuck: True where no step lowered the cost, although the linearisation predicts one.
         rough: True where the search ended near the minimum, by `SearchSettings.rough_share`, or
             where it was slow.
@@ -278,7 +276,6 @@ class Solution:
     success: bool
     status: str
     interrupted: bool = False
-    iterates: tuple[UnknownValues, ...] = ()
     stuck: bool = False
     rough: bool = False
     slow: bool = False
@@ -400,7 +397,6 @@ class _Search:
     slow_iterations: int = 0
     previous_length: float = ASSUMED_LENGTH
     unit: float = 1.0
-    iterates: list[UnknownValues] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         settings = self.settings
@@ -410,7 +406,6 @@ class _Search:
         self.unknowns_length = float(np.sqrt(max(self.condensed.common_count, 1)))
         self.unit_is_known = not settings.in_true_deviations
         self.scale = self.condensed.column_norms
-        self._keep(self.unknowns)
 
     def run(self) -> Solution:
         """Iterate until the search ends."""
@@ -454,7 +449,6 @@ class _Search:
         self.previous_length = trial.step.common_length
         self.unknowns = trial.unknowns
         self.cost = trial.cost
-        self._keep(trial.unknowns)
         if self.callback is not None:
             self.callback(self.iteration, self.cost, trial.fraction * trial.step.common_length)
 
@@ -673,10 +667,6 @@ class _Search:
         left = max(trial.cost - (self.cost - predicted.predicted_decrease), 0.0)
         return trial.cost - FUTILE_FACTOR * left > self.settings.cost_to_beat
 
-    def _keep(self, at: UnknownValues) -> None:
-        """Keep an iterate, with the private unknowns of the first segment only."""
-        self.iterates.append(replace(at, private=at.private[:1]))
-
     def _without_progress(self, predicted: Step) -> Solution:
         """Solution where no step lowers the cost: converged if the predicted step is short."""
         self._find_unit()
@@ -710,6 +700,5 @@ class _Search:
             iterations=self.iteration,
             success=success,
             status=status,
-            iterates=tuple(self.iterates),
             **more,
         )

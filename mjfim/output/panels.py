@@ -133,6 +133,7 @@ class Cells:
         texts: (n, m) words of the cells; empty for none.
         is_bold: (n, m) whether words are bold.
         scale: Values and names at a bar of colours beside the cells.
+        edges: (m+1,) ends of the columns along the axis across; None for columns that are counted.
     """
 
     values: Array
@@ -141,6 +142,7 @@ class Cells:
     texts: Sequence[Sequence[str]] = ()
     is_bold: NDArray[np.bool_] | None = None
     scale: tuple[Sequence[float], Sequence[str]] | None = None
+    edges: Array | None = None
 
 
 @record

@@ -13,7 +13,12 @@ from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import first_ones
 from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.check import join_names
-from mjfim.records.estimate_parts import InverseDynamicsFit, PayloadEstimate
+from mjfim.records.estimate_parts import (
+    InformationInTime,
+    InverseDynamicsFit,
+    PayloadEstimate,
+    ResidualForce,
+)
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Selection, Term, TermTestData
 from mjfim.records.trajectory import Labels, Recording, Trajectory
@@ -437,8 +442,6 @@ class Estimate(ShownRecord):
         prior: (p, p) information of the parameters' priors, at the estimate.
         labels: Names and units for figures and tables; None in records of earlier versions.
         restart: How the fit was repeated from fits over segments; None where it was not.
-        trace: (n, p) the initial guess, and the parameters at the begin and at each iteration of
-            the search over all data [theta-unit]; empty in records of earlier versions.
         nominal: Outputs of the model at the initial guess, with the fitted initial states, for each
             recording, (M, ny) [unit of the output]; empty where it diverges, and for recordings of
             more than 1 000 000 rows together.
@@ -454,6 +457,8 @@ class Estimate(ShownRecord):
             recordings; None where they were not.
         inverse_dynamics: The fit to the equation of motion from which the search started; None
             where there was none.
+        residual_forces: What the model does not explain at each joint, along the measured motions;
+            none where a motion or a force was not measured.
         draws: Robots that were drawn from the uncertainty, for simulations that vary the robot;
             None where that was not asked for.
         recording_comparison: What each recording suggests alone, the scatter between recordings,
@@ -461,6 +466,8 @@ class Estimate(ShownRecord):
         prior_directions: Combinations of inertias that the recordings do not determine, but the
             inertias of the model (`cad_prior`); None without any.
         payload: The payload that was looked for; None where none was.
+        in_time: Which seconds of the recordings decide each parameter; None where some direction of
+            the unknowns is not determined.
         honest_covariance: (p, p) covariance that agrees with the intervals, for combinations of
             parameters: with weights w, the standard deviation is `sqrt(w @ honest_covariance @ w)`.
             It contains the noise of the stated or estimated size, its autocorrelation, priors,
@@ -511,7 +518,6 @@ class Estimate(ShownRecord):
     prior: Array = no_array(0, 0)
     labels: Labels | None = None
     restart: Restart | None = None
-    trace: Array = no_array(0, 0)
     nominal: tuple[Array, ...] = ()
     segments: tuple[Array, ...] = ()
     sizes: Array = no_array()
@@ -520,10 +526,12 @@ class Estimate(ShownRecord):
     horizons: HorizonStudy | None = None
     held: tuple[str, ...] = ()
     inverse_dynamics: InverseDynamicsFit | None = None
+    residual_forces: tuple[ResidualForce, ...] = ()
     draws: ParameterDraws | None = None
     recording_comparison: RecordingComparison | None = None
     prior_directions: PriorDirections | None = None
     payload: PayloadEstimate | None = None
+    in_time: InformationInTime | None = None
     tested_data: TermTestData | None = None
     honest_covariance: Array = no_array(0, 0)
 
@@ -574,12 +582,15 @@ class Estimate(ShownRecord):
         "held",
         "horizons",
         "inverse_dynamics",
+        "residual_forces",
         "draws",
         "payload",
         "recording_comparison",
         "prior_directions",
+        "in_time",
     )
     json_names = {
+        "in_time": "information_in_time",
         "worst_residual": "worst",
         "missing_terms": "suspects",
         "tested_data": "suspects_tested",

@@ -27,9 +27,7 @@ class EquationFit(Record):
         sigma: Standard deviation by which its residuals were divided; outliers hardly change it
             [unit].
         correlation: Integrated autocorrelation time of its residuals [rows].
-        t: (n,) times of the averages of the recording that is drawn [s].
-        measured: (n,) force of the actuators, measured or by the model from the control [unit].
-        explained: (n,) force that the measured motion needs by the fitted model [unit].
+        force: Root mean square of the force of the actuators [unit].
     """
 
     name: str
@@ -40,9 +38,7 @@ class EquationFit(Record):
     cutoff: float
     sigma: float
     correlation: float
-    t: Array
-    measured: Array
-    explained: Array
+    force: float
 
     in_json = (
         "name",
@@ -60,6 +56,96 @@ class EquationFit(Record):
     def share(self) -> float:
         """Residuals over the forces; NaN without any force."""
         return self.residual / self.size if self.size > 0.0 else float("nan")
+
+
+# Share of the points that count as slow.
+SLOW_SHARE = 0.25
+
+# Largest number of medians of one direction of motion, and fewest of a line.
+MOST_MEDIANS, FEWEST_OF_LINE = 25, 3
+
+
+@record
+class ResidualForce(Record):
+    """Force of a joint along measured motions that the model does not explain, at n points.
+
+    It is the force of the actuators, measured or by the model from the control, less the one that
+    the measured motion needs. Dry friction that the model lacks is a step at speed zero.
+
+    Attributes:
+        joint: Name of the joint.
+        unit: Unit of its force, N or N m.
+        position: (n,) positions [m or rad].
+        speed: (n,) velocities [m/s or rad/s].
+        force: (n,) residual forces [unit].
+        sigma: Standard deviation of the residual forces by noise of the measurements [unit].
+        size: Root mean square of the force of the actuators [unit].
+    """
+
+    joint: str
+    unit: str
+    position: Array
+    speed: Array
+    force: Array
+    sigma: float
+    size: float
+
+    in_json = ("joint", "unit", "rms", "friction", "sigma", "size")
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual forces [unit]."""
+        return float(np.sqrt(np.mean(self.force**2)))
+
+    @property
+    def share(self) -> float:
+        """Residual forces over the forces of the actuators; infinite without any force."""
+        return self.rms / self.size if self.size > 0.0 else float("inf")
+
+    @property
+    def noise_ratio(self) -> float:
+        """Root mean square over the standard deviation by noise; infinite without noise."""
+        return self.rms / self.sigma if self.sigma > 0.0 else float("inf")
+
+    @property
+    def friction(self) -> tuple[float, float]:
+        """Friction that the model lacks, or has too much of, by the medians over the speed.
+
+        The slowest points are left out: noise hides their direction.
+
+        Returns:
+            Half of the step between the directions [unit], and the slope [unit per m/s or rad/s];
+            NaN where too few points move in both directions.
+        """
+        slow = np.quantile(np.abs(self.speed), SLOW_SHARE)
+        both = [self.medians(self.speed, sign * self.speed > slow) for sign in (1.0, -1.0)]
+        if min(len(speed) for speed, _ in both) < FEWEST_OF_LINE:
+            return float("nan"), float("nan")
+        speed, force = np.concatenate(both, axis=1)
+        columns = np.column_stack([np.ones(len(speed)), np.sign(speed), speed])
+        _, step, slope = np.linalg.lstsq(columns, force, rcond=None)[0].tolist()
+        return step, slope
+
+    def medians(self, along: Array, is_counted: np.ndarray) -> tuple[Array, Array]:
+        """Medians of the residual forces in intervals with equally many points.
+
+        There are about as many intervals as points in each of them.
+
+        Args:
+            along: (n,) quantity along which the points are ordered, such as `speed`.
+            is_counted: (n,) True for the points that count, such as those of one direction.
+
+        Returns:
+            (k,) medians of the quantity, and (k,) those of the residual forces [unit].
+        """
+        points = np.flatnonzero(is_counted)
+        points = points[np.argsort(along[points], kind="stable")]
+        count = min(int(np.sqrt(len(points))), MOST_MEDIANS)
+        parts = np.array_split(points, count) if count else []
+        return (
+            np.array([np.median(along[part]) for part in parts]),
+            np.array([np.median(self.force[part]) for part in parts]),
+        )
 
 
 @record
@@ -85,7 +171,8 @@ class InverseDynamicsFit(ShownRecord):
         iterations: Number of linearisations.
         success: True where the last step changed nothing.
         status: How the fit ended, in words.
-        recording: Name of the recording that is drawn.
+        residual_forces: What the fitted model does not explain at each joint; none for a fit that
+            was the start of another one.
         seconds: Wall time [s].
         steps: MuJoCo steps taken.
     """
@@ -104,7 +191,7 @@ class InverseDynamicsFit(ShownRecord):
     iterations: int = 0
     success: bool = True
     status: str = ""
-    recording: str = ""
+    residual_forces: tuple[ResidualForce, ...] = ()
     seconds: float = 0.0
     steps: int = 0
     sizes: Array = no_array()
@@ -126,7 +213,7 @@ class InverseDynamicsFit(ShownRecord):
         "iterations",
         "success",
         "status",
-        "recording",
+        "residual_forces",
         "seconds",
         "steps",
     )
@@ -135,6 +222,74 @@ class InverseDynamicsFit(ShownRecord):
     def degrees_of_freedom(self) -> tuple[EquationFit, ...]:
         """Equations of the degrees of freedom, without the laws of actuators."""
         return tuple(each for each in self.equations if not each.name.startswith("law of "))
+
+
+# Share of the information of the recordings that counts as most of it.
+MOST = 0.9
+
+
+@record
+class InformationInTime(Record):
+    """Which seconds of the recordings decide each of q parameters, by B blocks of rows.
+
+    Information about a parameter counts with all other unknowns unknown. That of all blocks and of
+    the priors adds to 1/σ².
+
+    Attributes:
+        parameters: Names of the q parameters.
+        recording: (B,) index of the recording of each block.
+        times: (B, 2) begin and end of each block [s].
+        shares: (B, q) share of each block in 1/σ², from 0 to 1.
+        pulls: (B, q) distance by which the residuals of each block draw the estimate [σ].
+        scatter: Size of the residuals over that of the noise, at least 1.
+    """
+
+    parameters: tuple[str, ...]
+    recording: Array
+    times: Array
+    shares: Array
+    pulls: Array
+    scatter: float
+
+    in_json = ("parameters", "prior", "seconds_of_most")
+
+    @property
+    def prior(self) -> Array:
+        """(q,) share of the priors in 1/σ², from 0 to 1."""
+        return np.asarray(np.clip(1.0 - self.shares.sum(axis=0), 0.0, 1.0))
+
+    @property
+    def seconds_of_most(self) -> Array:
+        """(q,) shortest time that holds 90 % of the information of the recordings [s]."""
+        duration = np.diff(self.times, axis=1)
+        order = np.argsort(-self.shares / duration, axis=0, kind="stable")
+        gathered = np.cumsum(np.take_along_axis(self.shares, order, axis=0), axis=0)
+        time = np.cumsum(duration[order, 0], axis=0)
+        return np.array(
+            [
+                np.interp(MOST * sum_[-1], sum_, t)
+                for sum_, t in zip(gathered.T, time.T, strict=True)
+            ]
+        )
+
+    def on_grid(self, recording: int, edges: Array) -> tuple[Array, Array]:
+        """Shares and pulls in intervals of a recording; what a block holds is spread evenly in it.
+
+        Args:
+            recording: Index of the recording.
+            edges: (m+1,) ascending ends of the intervals [s].
+
+        Returns:
+            (m, q) shares, from 0 to 1, and (m, q) pulls [σ].
+        """
+        own = self.recording == recording
+        found = np.zeros((2, len(edges) - 1, len(self.parameters)))
+        for (begin, end), *of_block in zip(
+            self.times[own], self.shares[own], self.pulls[own], strict=True
+        ):
+            part = np.diff(np.clip(edges, begin, end)) / (end - begin)
+            found += part[:, None] * np.array(of_block)[:, None]
+        return found[0], found[1]
 
 
 # Axes of the frame of a body.

@@ -38,21 +38,23 @@ def inner_error(spline: RegressionSpline, derivative: int) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
+@pytest.mark.parametrize("derivative", [0, 1, 2])
 @pytest.mark.parametrize("sigma", [1e-4, 1e-2])
-def test_noise_is_averaged_and_its_size_found(sigma: float) -> None:
+def test_noise_is_averaged_and_its_size_found(sigma: float, derivative: int) -> None:
     t = grid()
     inner = np.linspace(0.5, SECONDS - 0.5, 300)
     squares, splines = [], []
     for seed in range(8):
         noisy = fit_spline([readings(t, sigma, seed=seed)])
         exact = fit_spline([readings(t, 0.0)], spacing=noisy.spacing)
-        squares.append(np.mean((noisy.at(inner, 1) - exact.at(inner, 1)) ** 2))
+        change = noisy.at(inner, derivative) - exact.at(inner, derivative)
+        squares.append(np.mean(change**2))
         splines.append(noisy)
     assert inner_error(splines[0], 0) < 0.5 * sigma
     assert np.mean([spline.variance for spline in splines]) == pytest.approx(1.0, abs=0.1)
 
-    # The predicted noise of the slope is that of the fits.
-    predicted = np.mean([spline.slope_sigma for spline in splines])
+    # The predicted noise of a derivative is that of the fits.
+    predicted = np.mean([spline.sigma(derivative) for spline in splines])
     assert np.sqrt(np.mean(squares)) == pytest.approx(predicted, rel=0.35)
 
 

@@ -27,7 +27,7 @@ from mjfim.records.estimate import (
     PredictionErrors,
     Whiteness,
 )
-from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
+from mjfim.records.estimate_parts import InformationInTime, ResidualForce
 from mjfim.records.rehearsal import Rehearsal, RehearsedLimit
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
@@ -107,7 +107,7 @@ def design(size: Size) -> Design:
 
 @cache
 def estimate(size: Size) -> Estimate:
-    """An estimate with predictions, segments, a trace and the nominal model."""
+    """An estimate with predictions, segments and the nominal model."""
     made = make_estimate(size.joints, size.parameters)
     recording = made.recordings[0]
     labels = size.labels
@@ -146,7 +146,6 @@ def estimate(size: Size) -> Estimate:
         sigma=dict.fromkeys(outputs, 0.05),
         predictions=(held, other, other) if size.joints > 1 else (held,),
         whiteness=whiteness,
-        trace=np.linspace(1.2, 1.0, 6)[:, None] * made.theta,
         nominal=(1.3 * made.predicted[0],),
         segments=(np.arange(0.0, 2.0, 0.25),),
     )
@@ -335,44 +334,38 @@ def draws(size: Size) -> ParameterDraws:
     )
 
 
-def inverse_dynamics(size: Size) -> InverseDynamicsFit:
-    """The equations of as many joints, with a gap in the measured force."""
-    count = size.parameters
-    t = np.delete(np.linspace(0.0, 6.0, 60), slice(20, 30))
-    equations = tuple(
-        EquationFit(
-            name="n" * size.width + str(k),
+def residual_forces(size: Size) -> tuple[ResidualForce, ...]:
+    """Residual forces of as many joints."""
+    rng = np.random.default_rng(1)
+    speed = np.sin(np.linspace(0.0, 40.0, 300))
+    return tuple(
+        ResidualForce(
+            joint="n" * size.width + str(k),
             unit="N m",
-            residual=0.1 * (k + 1),
-            size=2.0,
-            rows=len(t),
-            cutoff=12.0,
+            position=np.cumsum(speed),
+            speed=speed,
+            force=np.sign(speed) + 0.1 * rng.normal(size=300),
             sigma=0.1,
-            correlation=3.0,
-            t=t,
-            measured=np.sin(t + k),
-            explained=1.1 * np.sin(t + k),
+            size=2.0,
         )
         for k in range(size.joints)
     )
-    return InverseDynamicsFit(
+
+
+def information_in_time(size: Size) -> InformationInTime:
+    """Information of ten blocks of each recording."""
+    count, blocks = size.parameters, 10
+    recordings = len(estimate(size).recordings)
+    edges = np.linspace(0.0, float(estimate(size).recordings[0].t[-1]), blocks + 1)
+    times = np.column_stack([edges[:-1], edges[1:]])
+    shape = (recordings * blocks, count)
+    return InformationInTime(
         parameters=size.labels.parameters,
-        units=size.labels.parameter_units,
-        theta=np.ones(count),
-        std=np.full(count, 0.1),
-        covariance=0.01 * np.eye(count),
-        start=np.ones(count),
-        equations=equations,
-        determined=count,
-        undetermined=(),
-        absent=(),
-        condition=10.0,
-        iterations=3,
-        success=True,
-        status="converged",
-        recording="n" * size.width + ".csv",
-        seconds=1.0,
-        steps=1000,
+        recording=np.repeat(np.arange(recordings), blocks),
+        times=np.tile(times, (recordings, 1)),
+        shares=np.full(shape, 0.9 / shape[0]),
+        pulls=np.where(np.arange(count) % 2, 2.0, -2.0) * np.ones(shape),
+        scatter=1.0,
     )
 
 
@@ -389,7 +382,8 @@ def studied(size: Size) -> Estimate:
             labels.parameters, labels.parameter_units, names
         ),
         draws=draws(size),
-        inverse_dynamics=inverse_dynamics(size),
+        residual_forces=residual_forces(size),
+        in_time=information_in_time(size),
         misfit=True,
     )
 

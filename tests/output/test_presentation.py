@@ -116,15 +116,11 @@ def test_every_part_of_a_page_is_escaped() -> None:
 # ---- what pictures of a fit need
 
 
-def test_a_fit_keeps_its_iterates_its_segments_and_the_nominal_model() -> None:
+def test_a_fit_keeps_its_segments_and_the_nominal_model() -> None:
     stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.4)
     estimate = mjfim.identify(
         stated, [mjfim.simulate(stated, DesignTask.resolve(stated).initial, seed=0)]
     )
-    np.testing.assert_array_equal(estimate.trace[0], estimate.initial_theta)
-    np.testing.assert_allclose(estimate.trace[-1], estimate.theta, rtol=1e-2)
-    assert 3 <= len(estimate.trace) <= estimate.iterations + 3
-
     recording = estimate.recordings[0]
     assert estimate.nominal[0].shape == recording.y.shape
     assert np.abs(estimate.nominal[0] - estimate.predicted[0]).max() > 0.0

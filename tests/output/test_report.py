@@ -152,7 +152,7 @@ def test_a_design_shows_its_tables_and_curves() -> None:
 
 def test_an_estimate_shows_predictions_and_residuals() -> None:
     html = html_of("identify")
-    for heading in ("Parameters", "Predictions", "Signals", "Residuals", "Search"):
+    for heading in ("Parameters", "Predictions", "Signals", "Residuals"):
         assert f"<h2>{heading}</h2>" in html
     for title in ("identified / nominal", "Prediction errors of every", "Correlation of the est"):
         assert title in html
@@ -206,6 +206,12 @@ def test_cells_and_words_beside_rows() -> None:
     layout = plot.data["layout"]
     assert [each["text"] for each in layout["annotations"]] == ["head", "one", "two", "m"]
     assert len(layout["yaxis"]["ticktext"][0]) < 30 and layout["margin"]["r"] > 30
+
+
+def test_cells_over_time_have_the_edges_of_their_columns() -> None:
+    panel = Panel(cells=Cells(values=np.ones((1, 2)), edges=np.array([0.0, 1.5, 3.0])))
+    (plot,) = group_of(Picture(title="", panels=[panel]), 9).plots
+    assert plot.data["traces"][0]["x"] == [0.0, 1.5, 3.0]
 
 
 # ---- long logs

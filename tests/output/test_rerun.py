@@ -29,6 +29,7 @@ from mjfim.output.rerun.plots import round_numbers
 from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses, entity_path
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
+from mjfim.records.estimate_parts import InformationInTime, ResidualForce
 from mjfim.records.trajectory import Trajectory
 from tests.support.made_motions import designed, estimated, load, simulated
 
@@ -375,6 +376,38 @@ def test_without_measured_positions_there_is_no_measured_robot(
     log_estimate(path, cart, estimate_of(cart, trajectory), None, trajectory, labels_of_model(cart))
     assert empty_views(path) == []
     assert not any(name.startswith("/robots/measured") for name in entities(path))
+
+
+def test_ribbons_are_curves_over_time_and_residual_torques_are_planes(
+    cart: mujoco.MjModel, tmp_path: Path
+) -> None:
+    trajectory = simulated(cart, 1.0)
+    made = estimate_of(cart, trajectory)
+    count, speed = len(made.parameters), np.sin(np.arange(100.0))
+    end = float(made.recordings[0].t[-1])
+    in_time = InformationInTime(
+        parameters=made.parameters,
+        recording=np.zeros(2),
+        times=0.5 * end * np.array([[0.0, 1.0], [1.0, 2.0]]),
+        shares=np.tile([[0.25], [0.75]], (1, count)),
+        pulls=np.zeros((2, count)),
+        scatter=1.0,
+    )
+    residual = ResidualForce(
+        joint="slide", unit="N", position=speed, speed=speed, force=speed, sigma=0.1, size=1.0
+    )
+    estimate = replace(made, in_time=in_time, residual_forces=(residual,))
+    path = tmp_path / "estimate.rrd"
+    log_estimate(path, cart, estimate, trajectory, trajectory, labels_of_model(cart))
+    assert empty_views(path) == []
+
+    first = entity_path(("information [% per s]", "run 0")) + "/0"
+    (curve,) = (name for name in entities(path) if name.startswith(first))
+    times, values = column(path, curve, "sim_time", "Scalars:scalars")
+    np.testing.assert_allclose(np.ravel(values), np.array([25.0, 75.0]) * 2.0 / end)
+    np.testing.assert_allclose(1e-9 * times, [0.0, 0.5 * end], atol=1e-6)
+    plane = entity_path(("residual torque", "slide [N] over speed [m/s]"))
+    assert any(name.startswith(plane) for name in entities(path))
 
 
 # ---- numbers and the viewer

@@ -38,7 +38,16 @@ DESIGN = {
 # Files that `mjfim identify` writes.
 ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml"}
 ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
-    f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions", "pairs", "trace")
+    f"{name}.png"
+    for name in (
+        "fit",
+        "parameters",
+        "spectra",
+        "predictions",
+        "pairs",
+        "deciding_seconds",
+        "residual_torque",
+    )
 }
 
 # Files that `mjfim montecarlo` writes for the cart-pendulum.

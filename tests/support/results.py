@@ -168,7 +168,6 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
         "recordings": (recording,),
         "nominal": (0.7 * predicted,),
         "segments": (np.array([0.0, 1.0]),),
-        "trace": np.outer(np.linspace(1.2, 1.0, 5), THETA),
         "whiteness": (
             Whiteness(
                 output=output,

@@ -35,7 +35,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.records.check import ParameterGroup
 from mjfim.records.estimate import HorizonStudy, PriorDirections, Restart, Uncertainty
-from mjfim.records.estimate_parts import InverseDynamicsFit
+from mjfim.records.estimate_parts import InformationInTime, InverseDynamicsFit
 
 # A combination is determined by the recordings where these leave at most this share of the standard
 # deviation of the prior.
@@ -142,6 +142,7 @@ class Accuracy:
         data_information: (p, p) information of the recordings alone, without priors.
         robust: Robust uncertainty of the common unknowns; None where one of them is not determined.
         prior_directions: Combinations of inertias that the CAD prior determines, or None.
+        in_time: Which seconds decide the parameters; None where one of them is not determined.
     """
 
     std: Array
@@ -157,6 +158,7 @@ class Accuracy:
     data_information: Array
     robust: Uncertainty | None
     prior_directions: PriorDirections | None
+    in_time: InformationInTime | None
 
 
 def _accuracy_of(fit: FitResult) -> Accuracy:
@@ -244,6 +246,32 @@ def _accuracy_of(fit: FitResult) -> Accuracy:
         data_information=data,
         robust=robust,
         prior_directions=prior_directions(parameters, theta, data, std),
+        in_time=_information_in_time(fit, common, std) if is_regular else None,
+    )
+
+
+def _information_in_time(fit: FitResult, covariance: Array, std: Array) -> InformationInTime | None:
+    """Which seconds decide the parameters that have a standard deviation: (p,); None without any.
+
+    When a parameter moves and all other unknowns follow at their optimum, they move along its
+    column of the covariance: (c, c).
+    """
+    problem, condensed = fit.problem, fit.solution.condensed
+    names = problem.system.parameters.names
+    known = np.isfinite(std[problem.parameter_of_column])
+    columns = problem.first_columns[known[problem.first_columns]]
+    if not len(columns):
+        return None
+    variance = np.diag(covariance)[columns]
+    along = covariance[:, columns]
+    information = np.sum(along * (condensed.block_information @ along), axis=1)
+    return InformationInTime(
+        parameters=tuple(names[j] for j in problem.parameter_of_column[columns]),
+        recording=problem.recording_of_block,
+        times=problem.times_of_block,
+        shares=information / variance,
+        pulls=-condensed.block_scores @ along / np.sqrt(variance),
+        scatter=float(np.sqrt(max(fit.quality.chi2 / fit.quality.dof, 1.0))),
     )
 
 

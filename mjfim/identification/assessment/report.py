@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import UNDETERMINED_SHARE, Array
-from mjfim.errors import first_ones, listed
+from mjfim.errors import MjfimError, first_ones, listed
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification.aligned_recording import changes_within_samples
@@ -27,6 +27,7 @@ from mjfim.identification.assessment.residual_tests import (
 )
 from mjfim.identification.assessment.term_tests import TermTests, find_missing_terms
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.inverse_dynamics import residual_forces
 from mjfim.identification.left_out import predict_unfitted
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import values_of_start
@@ -42,6 +43,7 @@ from mjfim.records.estimate import (
     Estimate,
     Prediction,
 )
+from mjfim.records.estimate_parts import ResidualForce
 from mjfim.records.events import begin_stage
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
@@ -117,6 +119,9 @@ BOUND_TOLERANCE = 1e-6
 # Distance from the last physical value, relative to the value, at which an inertia is at a bound.
 PHYSICAL_TOLERANCE = 1e-3
 
+
+# Largest number of values of all recordings by which forces are compared.
+MOST_FORCE_VALUES = 100_000
 
 # Longest list of remarks on poorly known parameters [characters].
 REMARKS_TEXT = 400
@@ -271,7 +276,6 @@ def estimate_from(
         motion=problem.motion(solution.unknowns, 0, MAX_MOTION_SAMPLES),
         interrupted=interrupted,
         labels=labels_of_system(system),
-        trace=np.array([task.start, *(problem.theta(each) for each in solution.iterates)]),
         nominal=_nominal_outputs(result),
         segments=tuple(
             np.array([each.t[s.rows.start] for s in problem.segments if s.recording == k])
@@ -283,8 +287,10 @@ def estimate_from(
         horizons=result.horizons,
         held=task.settings.hold,
         inverse_dynamics=result.inverse_dynamics,
+        residual_forces=() if interrupted else _residual_forces(result),
         recording_comparison=comparison,
         prior_directions=accuracy.prior_directions,
+        in_time=accuracy.in_time,
     )
     return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
 
@@ -305,6 +311,22 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
         replace(prediction, recording=recording)
         for prediction, recording in zip(complete, recordings, strict=False)
     )
+
+
+def _residual_forces(result: FitResult) -> tuple[ResidualForce, ...]:
+    """What the model does not explain at each joint; none where no log shows it.
+
+    Of much data, the first rows of every recording are enough for a picture.
+    """
+    problem, at = result.problem, result.solution.unknowns
+    count = len(problem.recordings)
+    rows = MOST_FORCE_VALUES // (count * len(problem.system.outputs))
+    parts = [each.first_rows(rows) for each in problem.recordings]
+    thetas = [problem.theta_of_recording(at, k) for k in range(count)]
+    try:
+        return residual_forces(problem.system, parts, thetas)
+    except (MjfimError, np.linalg.LinAlgError):
+        return ()
 
 
 def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:

@@ -92,15 +92,19 @@ class RecordedEquations:
     Attributes:
         motion: The measured motion.
         forces: (n, f) measured forces.
+        force_sigma: (f,) their standard deviations by noise.
         has_force: (f,) True for those that the recording holds.
         moments: (n, f, nv) forces on the degrees of freedom per measured force.
+        usable: (n, nv) True where all that acts on a degree of freedom is known.
         windows: Windows of each equation.
     """
 
     motion: MeasuredMotion
     forces: Array
+    force_sigma: Array
     has_force: np.ndarray
     moments: Array
+    usable: np.ndarray
     windows: tuple[Windows, ...]
 
 
@@ -155,7 +159,7 @@ class MotionEquations:
             measured_motion(system, recording, theta, max(int(share), 2))
             for recording, share in zip(recordings, shares, strict=True)
         ]
-        sigma = np.max([motion.speed_sigma for motion in motions], axis=0)
+        sigma = np.max([motion.sigma[1] for motion in motions], axis=0)
         fastest = np.max([np.abs(motion.qvel).max(axis=0) for motion in motions], axis=0)
         units = np.where(translations(system.model), "N", "N m").tolist()
         of_dofs = [
@@ -273,11 +277,6 @@ class MotionEquations:
         squares = np.bincount(of_row, values**2, minlength=count)
         return np.asarray(squares / np.maximum(np.bincount(of_row, minlength=count), 1))
 
-    @property
-    def times(self) -> Array:
-        """(R,) time of each row [s]."""
-        return np.concatenate([t for each in self.recorded for _, t, _ in each.windows])
-
     def rows(self, thetas: Array) -> Array:
         """Rows at several values of the parameters.
 
@@ -298,8 +297,18 @@ class MotionEquations:
         rows[~compiled] = np.nan
         return rows
 
-    def _averaged(self, each: RecordedEquations, terms: EquationTerms) -> Array:
-        """(3, r) explained, measured and inertial forces along one recording."""
+    def forces_along(self, each: RecordedEquations, terms: EquationTerms) -> tuple[Array, Array]:
+        """Forces of the actuators along one recording.
+
+        Args:
+            each: The equations along the recording.
+            terms: The terms of the equation of motion there.
+
+        Returns:
+            (n, nv) forces on the degrees of freedom, measured where the recording holds them and by
+            the model elsewhere, and (n, f) the forces by the model in place of measured ones
+            [N or N m].
+        """
         measured = np.array(terms.actuation)
         modelled = np.zeros_like(each.forces)
         for place, force in enumerate(self.forces):
@@ -313,7 +322,11 @@ class MotionEquations:
             elif each.has_force[place]:
                 error = values - modelled[:, place]
                 measured += error[:, None] * each.moments[:, place]
+        return measured, modelled
 
+    def _averaged(self, each: RecordedEquations, terms: EquationTerms) -> Array:
+        """(3, r) explained, measured and inertial forces along one recording."""
+        measured, modelled = self.forces_along(each, terms)
         parts = []
         nothing = np.zeros(len(measured))
         for equation, (weights, _, _) in zip(self.equations, each.windows, strict=True):
@@ -341,7 +354,7 @@ def _recorded(
     matters = coupling >= LEAST_CONTRIBUTION * coupling.max(axis=1, keepdims=True)
     spacing = np.where(matters, motion.spacing, 0.0).max(axis=1)
     count = len(motion.t)
-    measured = np.zeros((count, len(forces)))
+    measured, sigma = np.zeros((count, len(forces))), np.zeros(len(forces))
     near = np.zeros((count, len(forces)), dtype=bool)
     moments = np.zeros((count, len(forces), model.nv))
     touched = np.zeros((len(forces), model.nv), dtype=bool)
@@ -353,7 +366,7 @@ def _recorded(
             touched[place] = moments[:, place].any(axis=0)
         values = motion.recording.y[:, force.output]
         if np.isfinite(values).any():
-            measured[:, place], near[:, place] = motion.smoothed(values)
+            measured[:, place], near[:, place], sigma[place] = motion.smoothed(values)
             usable[:, touched[place]] &= near[:, place : place + 1]
     slow = (np.abs(motion.qvel) < of.friction_speeds) & of.has_friction
 
@@ -370,8 +383,10 @@ def _recorded(
     return RecordedEquations(
         motion=motion,
         forces=measured,
+        force_sigma=sigma,
         has_force=np.asarray(near.any(axis=0)),
         moments=moments,
+        usable=usable,
         windows=tuple(windows),
     )
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices, scaled_to_unit_diagonal
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, MjfimError, RecordingError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
@@ -26,6 +26,7 @@ from mjfim.identification.aligned_recording import AlignedRecording, align, on_g
 from mjfim.identification.assessment.residual_tests import whiteness_of
 from mjfim.identification.inverse_dynamics.equations import MotionEquations
 from mjfim.identification.inverse_dynamics.motion import measured_forces
+from mjfim.identification.inverse_dynamics.residual_forces import residual_forces
 from mjfim.identification.linear_coordinates import CadPrior, LinearCoordinates
 from mjfim.model.control_laws import LawField
 from mjfim.model.elements import model_length, translations
@@ -501,9 +502,6 @@ def _force_sizes(system: System, rows: Array, equations: MotionEquations) -> Arr
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
-# Largest number of averages of an equation that a record holds.
-SHOWN_ROWS = 1500
-
 # Smallest number of rows that is enough for a fit, over the number of its parameters.
 ROWS_PER_PARAMETER = 4.0
 
@@ -546,8 +544,11 @@ def inverse_dynamics(
             f"{listed(system.parameters.names)}"
         )
     system = on_grid_of(system, recordings)
+    aligned = [align(system, each) for each in recordings]
     with one_blas_thread():
-        return fit_equations(system, [align(system, each) for each in recordings], begun)
+        found = fit_equations(system, aligned, begun)
+        residuals = residual_forces(system, aligned, [found.theta] * len(aligned))
+    return replace(found, residual_forces=residuals)
 
 
 def fit_equations(
@@ -591,9 +592,7 @@ def fit_equations(
 
     found = search.run()
     taken = equations.system.plant.engine_steps + system.plant.engine_steps - steps
-    return replace(
-        _record(search, found, recordings), seconds=time.perf_counter() - begun, steps=taken
-    )
+    return replace(_record(search, found), seconds=time.perf_counter() - begun, steps=taken)
 
 
 def try_fit_equations(
@@ -613,20 +612,17 @@ def try_fit_equations(
         found = fit_equations(system, recordings, start)
     except (MjfimError, np.linalg.LinAlgError):
         return None
-    has_forces = any(each.measured.any() for each in found.degrees_of_freedom)
+    has_forces = any(each.force > 0.0 for each in found.degrees_of_freedom)
     return found if has_forces else None
 
 
 # ---- record
 
 
-def _record(
-    search: EquationSearch, found: FoundEquations, recordings: Sequence[AlignedRecording]
-) -> InverseDynamicsFit:
+def _record(search: EquationSearch, found: FoundEquations) -> InverseDynamicsFit:
     """The record of a solution, without its time."""
     parameters = search.parameters
-    longest = int(np.argmax([recording.t[-1] for recording in recordings]))
-    fits = tuple(_equation_fits(search, found, longest))
+    fits = tuple(_equation_fits(search, found))
     times = {fit.name: fit.correlation for fit in fits}
     correlation = np.array([times.get(each.name, 1.0) for each in search.equations.equations])
     covariance, unknown, determined, condition = search.accuracy(found, correlation)
@@ -656,17 +652,14 @@ def _record(
         iterations=found.count,
         success=found.success,
         status=status,
-        recording=recordings[longest].name,
         sizes=parameters.magnitude,
     )
 
 
-def _equation_fits(
-    search: EquationSearch, found: FoundEquations, shown: int
-) -> Iterator[EquationFit]:
-    """The fits of all equations that have rows, with the series of one recording."""
+def _equation_fits(search: EquationSearch, found: FoundEquations) -> Iterator[EquationFit]:
+    """The fits of all equations that have rows."""
     equations, rows = search.equations, found.rows
-    recording, times = equations.places[0], equations.times
+    recording = equations.places[0]
     values = _residual(rows), rows[1], rows[2]
     residuals, measured, inertial = (np.sqrt(equations.mean_squares(each)) for each in values)
     for i, equation in enumerate(equations.equations):
@@ -675,8 +668,6 @@ def _equation_fits(
             continue
         residual = _residual(rows)[own] * found.weights[own]
         parts = [residual[recording[own] == k] for k in np.unique(recording[own])]
-        drawn = own[recording[own] == shown]
-        drawn = drawn[evenly_spread_indices(len(drawn), SHOWN_ROWS)]
         yield EquationFit(
             name=equation.name,
             unit=equation.unit,
@@ -686,7 +677,5 @@ def _equation_fits(
             cutoff=1.0 / max(each.windows[i][2] for each in equations.recorded),
             sigma=float(found.sigma[i]),
             correlation=max(whiteness_of(equation.name, parts).time, 1.0),
-            t=times[drawn],
-            measured=rows[1][drawn],
-            explained=rows[0][drawn],
+            force=float(measured[i]),
         )

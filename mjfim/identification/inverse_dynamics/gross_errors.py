@@ -170,7 +170,7 @@ class _Search:
         held = np.isin(parameters.names, system.experiment.fit.hold)
         active = np.flatnonzero(parameters.changes_model & ~held)
         unknowns = len(active) + FREE_FORCES * system.space.nv
-        if len(equations.times) < ROWS_PER_UNKNOWN * unknowns:
+        if len(equations.places[0]) < ROWS_PER_UNKNOWN * unknowns:
             raise RecordingError(f"{recording.name}: too short for the equation of motion")
 
         # Bounds on both sides are stated; a single one may be that of physics.

@@ -92,16 +92,15 @@ class RegressionSpline:
         """(n,) values of a derivative at the times t: (n,)."""
         return np.asarray(self.curve(t, nu=derivative))
 
-    @property
-    def slope_sigma(self) -> float:
-        """Standard deviation of the slope by the noise of the readings [unit/s].
+    def sigma(self, derivative: int) -> float:
+        """Standard deviation of a derivative by the noise of the readings [unit, unit/s, unit/s²].
 
         The spline passes all frequencies up to pi / spacing.
         """
         limit = np.pi / self.spacing
         omega = (np.arange(FREQUENCIES) + 0.5) / FREQUENCIES * limit
         of_values, of_slopes = self.weights
-        density = omega**2 / (of_values + of_slopes * omega**2)
+        density = omega ** (2 * derivative) / (of_values + of_slopes * omega**2)
         variance = self.variance * float(density.mean()) * limit / np.pi
         return float(np.sqrt(variance))
 
@@ -263,7 +262,8 @@ class MeasuredMotion:
         qacc: (n, nv) accelerations [m/s² or rad/s²].
         usable: (n, nv) True where readings of the degree of freedom are near.
         spacing: (nv,) distances of the knots of the coarsest splines [s].
-        speed_sigma: (nv,) standard deviations of the velocities by noise [m/s or rad/s].
+        sigma: (3, nv) standard deviations of positions, velocities and accelerations by noise
+            [m or rad, per s, per s²].
     """
 
     recording: AlignedRecording
@@ -274,7 +274,7 @@ class MeasuredMotion:
     qacc: Array
     usable: np.ndarray
     spacing: Array
-    speed_sigma: Array
+    sigma: Array
 
     @property
     def step(self) -> float:
@@ -300,21 +300,22 @@ class MeasuredMotion:
             mean[:, place] = np.diff(np.interp(ends, edges, integral), axis=0)[0] / self.step
         return mean
 
-    def smoothed(self, values: Array) -> tuple[Array, np.ndarray]:
+    def smoothed(self, values: Array) -> tuple[Array, np.ndarray, float]:
         """Values that were measured beside the motion, without noise of higher frequencies.
 
         Args:
             values: (M,) values at the times of the recording; NaN for missing ones.
 
         Returns:
-            (n,) values at the points, and True where a measured one is near.
+            (n,) values at the points, True where a measured one is near, and the standard
+            deviation of the values by noise.
         """
         known = np.isfinite(values)
         t = self.recording.t[known]
         spacing = POINTS_PER_INTERVAL * self.step
         reading = Readings(t=t, values=values[known], sigma=1.0, derivative=0)
         spline = fit_spline([reading], spacing=spacing)
-        return spline.at(self.t), _is_near(self.t, t, REACH * spacing)
+        return spline.at(self.t), _is_near(self.t, t, REACH * spacing), spline.sigma(0)
 
 
 def measured_motion(
@@ -363,16 +364,17 @@ def measured_motion(
     qpos, qvel, qacc = _motion(system, splines, t, lag)
 
     usable = np.ones((len(t), space.nv), dtype=bool)
-    spacing, speed_sigma = np.zeros(space.nv), np.zeros(space.nv)
+    spacing, sigma = np.zeros(space.nv), np.zeros((3, space.nv))
     for key, (outputs, dofs) in curves.items():
         spline, own = splines[key], list(dofs)
         measured = recording.measured[:, list(outputs.values())]
         reach = REACH * max(spline.spacing, step)
         usable[:, own] &= _is_near(t, recording.t[measured.any(axis=1)], reach)[:, None]
         spacing[own] = np.maximum(spacing[own], spline.spacing)
-        # The angular velocity is twice a combination of the slopes of a unit quaternion.
-        sigma = spline.slope_sigma * (2.0 if len(dofs) > 1 else 1.0)
-        speed_sigma[own] = np.maximum(speed_sigma[own], sigma)
+        # A rotation is twice a combination of the changes of a unit quaternion.
+        factor = 2.0 if len(dofs) > 1 else 1.0
+        own_sigma = factor * np.array([[spline.sigma(derivative)] for derivative in range(3)])
+        sigma[:, own] = np.maximum(sigma[:, own], own_sigma)
     return MeasuredMotion(
         recording=recording,
         t=t,
@@ -382,7 +384,7 @@ def measured_motion(
         qacc=qacc,
         usable=usable,
         spacing=spacing,
-        speed_sigma=speed_sigma,
+        sigma=sigma,
     )
 
 

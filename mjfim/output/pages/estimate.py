@@ -33,9 +33,10 @@ from mjfim.output.page import (
     tabulated,
     warned,
 )
-from mjfim.output.pages.studies import equation_parts
+from mjfim.output.pages.studies import residual_parts
 from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
+from mjfim.records.estimate_parts import MOST, InformationInTime
 from mjfim.records.robots import RecordingComparison, p_text
 from mjfim.records.terms import Decision, Selection, SelectionStep, as_toml
 
@@ -62,19 +63,19 @@ ABOUT_STD = (
 
 def estimate_page(estimate: Estimate) -> Page:
     """Describe estimates with intervals, the fit of every output, and predictions."""
-    equation, rms = estimate.inverse_dynamics, estimate.residual_rms
+    rms = estimate.residual_rms
     residuals = {"output": [*rms], "residual rms": numbers(rms.values())}
     parts: dict[str, Sequence[Part]] = {
         "Parameters": [*_parameter_parts(estimate), *_correlation_tables(estimate)],
+        "Which seconds decide": _seconds_parts(estimate.in_time),
         "Added terms": [] if estimate.selection is None else selection_parts(estimate.selection),
         "Length of the segments": horizon_parts(estimate.horizons),
-        "Equation of motion": [] if equation is None else list(equation_parts(equation)),
         "Recordings": recording_parts(estimate),
         "Drawn robots": list(sample_parts(estimate)),
         "Predictions": _prediction_parts(estimate.predictions),
         "Signals": [Plot("fit")] if estimate.recordings else [],
+        "Residual torque": residual_parts(estimate.residual_forces),
         "Residuals": [tabulated("Fit of every output", residuals, detail=True), Plot("spectra")],
-        "Search": [Plot("trace")] if len(estimate.trace) > 1 else [],
     }
     causes, details = estimate.causes, estimate.details
     return Page(
@@ -267,6 +268,19 @@ def _correlation_tables(estimate: Estimate) -> Iterator[Table]:
     ]
     columns = {"parameter": names, **dict(zip(names, cells, strict=True))}
     yield tabulated("Correlation of the estimates", columns, detail=True)
+
+
+def _seconds_parts(found: InformationInTime | None) -> Sequence[Part]:
+    """How few seconds hold most of the information on each parameter."""
+    if found is None:
+        return ()
+    columns = {
+        "parameter": found.parameters,
+        f"{100.0 * MOST:.0f} % of the information in": numbers(found.seconds_of_most, 2, " s"),
+        "of the priors": numbers(100.0 * found.prior, 2, " %"),
+    }
+    title = "Shortest time that holds most of the information of the recordings"
+    return (tabulated(title, columns, detail=True), Plot("deciding_seconds"))
 
 
 # ---- predictions

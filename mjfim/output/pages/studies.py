@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import PurePath
 
 import numpy as np
@@ -34,7 +34,7 @@ from mjfim.output.page import (
 )
 from mjfim.output.words import BEST_CASE, NOT_ALONE, complete_labels
 from mjfim.records.campaign import Campaign, CampaignStatus
-from mjfim.records.estimate_parts import InverseDynamicsFit
+from mjfim.records.estimate_parts import InverseDynamicsFit, ResidualForce
 from mjfim.records.robots import RobotComparison, p_text
 from mjfim.records.studies import (
     DESIGN,
@@ -447,7 +447,7 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
     verdict = _equation_verdict(fit)
     steps = ('Identify with `fit.start = "inverse_dynamics"`, which predicts the motion itself.',)
     if verdict.level is not Level.GOOD:
-        steps = ("Look at the forces in `inverse_dynamics.png`: signs, units, delays, friction.",)
+        steps = ("Look at `residual_torque.png`: friction, signs and units of the forces, delays.",)
     std = [
         number(value, 2, infinite="-" if name in fit.absent else NOT_ALONE)
         for name, value in zip(fit.parameters, fit.std, strict=True)
@@ -515,4 +515,29 @@ def equation_parts(fit: InverseDynamicsFit) -> Iterator[Part]:
         "neither the bias by noise in velocities and accelerations nor that by a wrong model."
     )
     yield Text(text, Emphasis.WEAK, detail=True)
-    yield Plot("inverse_dynamics")
+    yield from residual_parts(fit.residual_forces)
+
+
+def residual_parts(found: Sequence[ResidualForce]) -> Sequence[Part]:
+    """What the model does not explain at each joint: a table and a picture."""
+    if not found:
+        return ()
+    frictions = np.array([each.friction for each in found])
+    table = tabulated(
+        "Residual torque: forces of the actuators less those that the measured motion needs",
+        {
+            "joint": [named(each.joint, each.unit) for each in found],
+            "rms": numbers([each.rms for each in found], 2),
+            "by noise": numbers([each.sigma for each in found], 2),
+            "of the force": numbers([100.0 * each.share for each in found], 2, " %"),
+            "dry friction": numbers(frictions[:, 0], 2),
+            "viscous": numbers(frictions[:, 1], 2),
+        },
+        spare=("of the force",),
+        note=(
+            "dry friction that the model lacks: half of the step between the two directions; "
+            "viscous: slope over the speed, per m/s or rad/s"
+        ),
+        detail=True,
+    )
+    return (table, Plot("residual_torque"))

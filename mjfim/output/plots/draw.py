@@ -377,14 +377,19 @@ def _draw_intervals(axes: Axes, mark: Mark, colour: str) -> None:
 
 def _draw_cells(axes: Axes, cells: Cells) -> None:
     """Draw coloured cells with their words, or with a bar of colours."""
+    ends = None
+    if cells.edges is not None:
+        ends = (*cells.edges[[0, -1]].tolist(), len(cells.values) - 0.5, -0.5)
     image = axes.imshow(
         np.ma.masked_invalid(cells.values),
         cmap=colormaps["RdBu_r"].with_extremes(bad=ROLES["band"]),
         vmin=cells.middle - cells.reach,
         vmax=cells.middle + cells.reach,
         aspect="auto",
+        extent=ends,
     )
     axes.spines[:].set_visible(False)
+    axes.grid(False)
     if cells.scale is not None:
         bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.015, aspect=30)
         bar.set_ticks(list(cells.scale[0]), labels=list(cells.scale[1]))

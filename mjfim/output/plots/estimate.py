@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from mjfim.model.coordinates import split_unit
 from mjfim.output.page import IDENTIFIED, MEASURED, NOMINAL
 from mjfim.output.panels import (
     Axis,
+    Cells,
     Mark,
     Panel,
     Picture,
@@ -40,7 +42,7 @@ from mjfim.output.words import (
     without_zeros,
 )
 from mjfim.records.estimate import Estimate, Prediction
-from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
+from mjfim.records.estimate_parts import MOST, InformationInTime, ResidualForce
 from mjfim.records.trajectory import Labels, Recording, with_unit
 
 # Number of segments that are transformed at once.
@@ -73,8 +75,8 @@ def power_density(x: Array, rate: float, length: int) -> tuple[Array, Array]:
 
 
 # Largest numbers of outputs over time, of outputs with a spectrum, of predicted recordings, of
-# parameters over the iterations, and of equations; of more, those that say most are drawn.
-MAX_OUTPUTS, MAX_SPECTRA, MAX_PREDICTIONS, MAX_PARAMETERS, MAX_EQUATIONS = 8, 12, 8, 12, 10
+# parameters over the iterations, and of joints; of more, those that say most are drawn.
+MAX_OUTPUTS, MAX_SPECTRA, MAX_PREDICTIONS, MAX_PARAMETERS, MAX_JOINTS = 8, 12, 8, 12, 6
 
 # Largest number of samples of a recording that are drawn, and of segments whose boundaries are.
 MAX_SAMPLES, MAX_BOUNDARIES = 4000, 40
@@ -97,8 +99,16 @@ INDEPENDENT_SHARE = 1.0 / (1.0 + 2.0 / 36.0)
 # Probability below which a p-value is not written as a number.
 SMALLEST_WRITTEN_P = 1e-6
 
-# Times between averages of forces above this multiple of the usual one are gaps.
-GAP = 2.5
+# Largest numbers of parameters and recordings with a ribbon of information, of its cells, and of
+# marked places of a parameter; height of a ribbon [inch].
+MAX_RIBBONS, MAX_RIBBON_LOGS, MAX_CELLS, MAX_MARKED, RIBBON_HEIGHT = 24, 3, 150, 3, 0.25
+
+# Quantile of the shares at which the colours end, shares of priors from which they are written and
+# from which the title leaves a parameter out, and size of a marked pull over that by noise.
+STRONGEST_COLOUR, RELEVANT_PRIOR, MOSTLY_PRIOR, LARGE_PULL = 0.99, 0.01, 0.5, 3.0
+
+# Quantiles of residual forces between which a panel reaches.
+SHOWN_QUANTILES = (0.005, 0.995)
 
 
 # ---- parameters
@@ -191,49 +201,96 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
     return f"{text}   (at its bound)" if estimate.parameters[j] in estimate.at_bound else text
 
 
-def parameter_trace(estimate: Estimate, labels: Labels) -> Picture:
-    """Show the parameters over the iterations of the search over all data."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        change = np.ptp(estimate.trace, axis=0) / np.ptp(estimate.interval, axis=1)
-    order = np.argsort(-np.nan_to_num(change, posinf=0.0), kind="stable")
+# ---- information over time
+
+
+def deciding_seconds(estimate: Estimate, labels: Labels) -> Picture:
+    """Show the share of the information on each parameter per second of the recordings."""
+    found = estimate.in_time
+    assert found is not None
+    seconds = found.seconds_of_most
+    is_nuisance = np.isin(found.parameters, estimate.nuisance)
+    asked = np.flatnonzero(~is_nuisance | is_nuisance.all())
+    rows = np.sort(asked[np.argsort(seconds[asked], kind="stable")[:MAX_RIBBONS]]).tolist()
+    logs = np.unique(found.recording).astype(int)
+    gathered = [found.shares[found.recording == k].sum() for k in logs]
+    recordings = np.sort(logs[np.argsort(gathered)[::-1][:MAX_RIBBON_LOGS]]).tolist()
+    ribbons = {k: _ribbon(found, k) for k in recordings}
+    rates = np.concatenate([rate[:, rows].ravel() for _, rate, _ in ribbons.values()])
+    reach = float(np.quantile(rates, STRONGEST_COLOUR)) or 1.0
+
+    names = [labels.parameter(estimate.parameters.index(found.parameters[j])) for j in rows]
+    beside = [(f"{100.0 * MOST:.0f} % in", "text", [f"{seconds[j]:.2g} s" for j in rows])]
+    if (found.prior > RELEVANT_PRIOR).any():
+        beside.append(("priors", "muted", [f"{100.0 * found.prior[j]:.0f} %" for j in rows]))
+    remark = (
+        "share of the information per second: white for none, darkest for "
+        f"{format_number(reach, 2)} % per s or more"
+    )
     panels = []
-    for j in np.sort(order[:MAX_PARAMETERS]).tolist():
-        values = np.append(estimate.trace[1:, j], estimate.theta[j])
-        marks = [
-            hline(estimate.trace[0, j], NOMINAL, label=NOMINAL),
-            line(
-                np.arange(len(values)),
-                values,
-                IDENTIFIED,
-                symbol="o",
-                size=3.0,
-                label="estimate so far",
-            ),
-        ]
-        low, high = estimate.interval[j]
-        if np.isfinite(low) and np.isfinite(high):
-            label = "95 % interval of the result"
-            marks.append(hspan(low, high, IDENTIFIED, opacity=0.15, label=label))
+    for place, (k, (edges, rate, pull)) in enumerate(ribbons.items()):
         panels.append(
             Panel(
-                title=labels.parameter(j),
-                marks=marks,
-                x=Axis(label="iteration [–]", most=4, whole=True),
-                y=Axis(most=4),
+                title=_file_name(estimate.recordings[k].name),
+                remark=remark if place == 0 else "",
+                cells=Cells(values=rate.T[rows], reach=reach, edges=edges),
+                marks=[*_pulls(edges, pull[:, rows])],
+                x=Axis(label="time [s]" if place == len(ribbons) - 1 else ""),
+                y=row_axis(names),
+                beside=beside if place == 0 else (),
+                place=(place, 0),
             )
         )
+    told = [j for j in rows if found.prior[j] < MOSTLY_PRIOR] or rows
+    first, last = min(told, key=seconds.__getitem__), max(told, key=seconds.__getitem__)
+    total = sum(float(recording.t[-1]) for recording in estimate.recordings)
     note = (
-        "0: begin of the search over all data, after short searches for a start. The last point is "
-        "the identified value."
+        "The information on a parameter, with all others unknown, adds over all seconds and priors "
+        "to 1/σ²."
     )
-    which = "parameters, those that changed most over the width of their interval"
-    return grid(
-        "Parameters over the iterations of the fit",
-        panels,
-        [1.5] * len(panels),
-        min(4, len(panels)),
-        note + share_note(panels, estimate.theta, which),
+    if any(panel.marks for panel in panels):
+        note += (
+            " Triangles: here, residuals that are larger than noise draw the estimate by more than "
+            "1 σ; at most three for each parameter and recording."
+        )
+    span = f"{seconds[first]:.2g} s ({found.parameters[first]})"
+    if first != last:
+        span += f" to {seconds[last]:.2g} s ({found.parameters[last]})"
+    title = (
+        f"Which seconds decide: {100.0 * MOST:.0f} % of the information comes from {span} "
+        f"of {total:.3g} s"
     )
+    which = "parameters, those with the fewest deciding seconds"
+    note += share_note(rows, asked, which)
+    note += share_note(recordings, logs, "recordings, those with most information")
+    heights = [0.4 + RIBBON_HEIGHT * len(rows)] * len(panels)
+    heights[-1] += 0.2
+    return Picture(title=title, panels=panels, note=note, heights=heights)
+
+
+def _ribbon(found: InformationInTime, recording: int) -> tuple[Array, Array, Array]:
+    """Return the (m+1,) edges of intervals [s], (m, q) shares [%/s] and marked pulls [σ].
+
+    Pulls that are not marked are 0.
+    """
+    times = found.times[found.recording == recording]
+    count, end = min(len(times), MAX_CELLS), float(times.max())
+    edges = np.linspace(0.0, end, count + 1)
+    share, pull = found.on_grid(recording, edges)
+    by_noise = LARGE_PULL * found.scatter * np.sqrt(share)
+    size = np.where(np.abs(pull) > np.maximum(by_noise, 1.0), np.abs(pull), 0.0)
+    least = np.sort(size, axis=0)[-MAX_MARKED:][:1]
+    return edges, 100.0 * share * count / end, np.where(size >= least, np.sign(pull) * size, 0.0)
+
+
+def _pulls(edges: Array, pull: Array) -> Iterator[Mark]:
+    """Yield triangles where residuals draw an estimate up or down."""
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    for sign, symbol, words in ((1.0, "^", "up"), (-1.0, "v", "down")):
+        place, row = np.nonzero(np.sign(pull) == sign)
+        label = f"residuals draw it {words}"
+        if len(place):
+            yield dots(middle[place], row, "text", symbol=symbol, size=5.0, front=3.0, label=label)
 
 
 # ---- recordings over time
@@ -565,52 +622,82 @@ def _prediction_name(prediction: Prediction) -> str:
     return name if prediction.held_out else f"{name} *"
 
 
-# ---- equation of motion
+# ---- residual forces
 
 
-def inverse_dynamics(fit: InverseDynamicsFit) -> Picture:
-    """Show the forces of the actuators and those that the measured motion needs."""
-    order = sorted(fit.equations, key=lambda each: -np.nan_to_num(each.share))
-    shown = [each for each in fit.equations if each in order[:MAX_EQUATIONS]]
+def residual_torque(found: Sequence[ResidualForce]) -> Picture:
+    """Show the force that the model does not explain at each joint, over speed and position."""
+    order = sorted(found, key=lambda each: -each.noise_ratio)
+    shown = [each for each in found if each in order[:MAX_JOINTS]]
     panels = []
-    for row, each in enumerate(shown):
-        t, measured, explained = _with_gaps(each)
-        share = f"{100.0 * each.share:.2g} %" if np.isfinite(each.share) else "no force"
-        marks = [
-            line(t, measured, MEASURED, width=1.8, label="measured, or by the model"),
-            line(t, explained, IDENTIFIED, width=0.9, label="needed by the measured motion"),
+    for each in shown:
+        length, noun = ("rad", "angle") if each.unit == "N m" else ("m", "position")
+        step, slope = each.friction
+        title = "too few points in both directions"
+        if np.isfinite(step):
+            viscous = _with_unit(slope, f"{each.unit} s/{length}")
+            title = f"missing friction {_with_unit(step, each.unit)}, viscous {viscous}"
+        rms = f"rms {_with_unit(each.rms, each.unit)}{_over_noise(each)}"
+        panels += [
+            _force_panel(each, each.speed, f"speed [{length}/s]", title),
+            _force_panel(each, each.position, f"{noun} [{length}]", rms),
         ]
-        panels.append(
-            Panel(
-                title=f"{with_unit(shorten(each.name, 30), each.unit)}: residual {share}",
-                marks=marks,
-                x=Axis(label="time [s]" if row == len(shown) - 1 else ""),
-                y=Axis(most=3),
-                place=(row, 0),
-            )
-        )
-    shares = [100.0 * each.share for each in fit.equations if np.isfinite(each.share)]
-    title = "Equation of motion: no equation has a force"
-    if shares:
-        span = f"{min(shares):.2g} to {max(shares):.2g}" if len(shares) > 1 else f"{shares[0]:.2g}"
-        title = f"Equation of motion: residuals are {span} % of the forces"
+    worst = order[0]
+    title = f"Residual torque: {_with_unit(worst.rms, worst.unit)} rms at {worst.joint}"
+    title += _over_noise(worst)
+    if np.isfinite(worst.share):
+        title += f", {_with_unit(100.0 * worst.share, '%')} of the force of its actuators"
     note = (
-        f"Forces in {shorten(fit.recording, NAME_WIDTH)}, averaged over short windows; the share "
-        "is the root mean square residual over the force. Gaps: too little was measured, or "
-        "unknown forces act. An equation without actuators has no measured force."
+        "Force of the actuators, measured or by the model, less the force that the measured "
+        "motion needs by the identified model. Over the speed, a step at 0 is dry friction that "
+        "the model lacks; a negative one is too much of it. A slope is viscous friction, and a "
+        "peak near 0 a Stribeck effect. Over the position, a distance of both medians is friction "
+        "or backlash. A slope or a wave is a cable, a spring, gravity or cogging. A few distant "
+        "points are not drawn."
     )
-    if len(shown) < len(fit.equations):
-        note += f" {len(fit.equations) - len(shown)} equations with smaller residuals are left out."
-    return Picture(title=title, panels=panels, note=note, heights=[1.15] * len(shown))
+    note += share_note(shown, found, "joints, those with the largest residuals over the noise")
+    heights = [1.75] * len(shown)
+    return Picture(
+        title=title, panels=in_grid(panels, 2), note=note, heights=heights, widths=[1.0, 1.0]
+    )
 
 
-def _with_gaps(each: EquationFit) -> tuple[Array, Array, Array]:
-    """Return times and forces, with NaN where averages are missing."""
-    steps = np.diff(each.t)
-    usual = np.median(steps) if len(steps) else 0.0
-    gaps = np.flatnonzero(steps > GAP * usual) + 1
-    return (
-        np.insert(each.t, gaps, each.t[gaps]),
-        np.insert(each.measured, gaps, np.nan),
-        np.insert(each.explained, gaps, np.nan),
-    )
+def _over_noise(each: ResidualForce) -> str:
+    if not each.sigma > 0.0:
+        return ""
+    return f", {format_number(each.noise_ratio, 2)} times the noise"
+
+
+def _force_panel(each: ResidualForce, along: Array, label: str, title: str) -> Panel:
+    """Return the residual forces of a joint over a quantity, with medians by direction."""
+    low, high = np.quantile(each.force, SHOWN_QUANTILES)
+    low, high = min(low, -2.0 * each.sigma), max(high, 2.0 * each.sigma)
+    margin = MARGIN * (high - low)
+    limits = (low - margin, high + margin)
+    is_inside = (each.force >= limits[0]) & (each.force <= limits[1])
+
+    band = hspan(-2.0 * each.sigma, 2.0 * each.sigma, opacity=0.8, label="±2σ of the noise")
+    marks = [hline(0.0, width=0.8)] + ([band] if each.sigma > 0.0 else [])
+    look = {
+        "symbol": ".",
+        "size": float(np.clip(120.0 / np.sqrt(len(along)), 1.5, 4.0)),
+        "opacity": 0.35,
+    }
+    for sign, colour, words in ((1.0, "series0", "forwards"), (-1.0, "series1", "backwards")):
+        moves = np.sign(each.speed) == sign
+        shown = moves & is_inside
+        points = dots(along[shown], each.force[shown], colour, label=f"moves {words}", **look)
+        x, y = each.medians(along, moves)
+        marks += [
+            points,
+            line(x, y, "white", width=4.0, front=3.0),
+            line(x, y, colour, width=2.2, front=3.1, label=f"median, {words}"),
+        ]
+    up = Axis(label=with_unit(shorten(each.joint, 18), each.unit), most=4)
+    if margin > 0.0:
+        up = replace(up, limits=limits)
+    return Panel(title=title, marks=marks, x=Axis(label=label), y=up)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{format_number(value, 2)} {unit}"

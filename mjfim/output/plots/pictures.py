@@ -55,8 +55,8 @@ DESIGN_PICTURES = (
 ESTIMATE_PICTURES = (
     "parameters",
     "spectra",
-    "inverse_dynamics",
-    "trace",
+    "residual_torque",
+    "deciding_seconds",
     "pairs",
     "predictions",
     "horizons",
@@ -153,25 +153,24 @@ def _(estimate: Estimate) -> Pictures:
         name: partial(of_estimate.held_out, estimate, i, labels)
         for i, name in enumerate(numbered("held_out", held))
     }
-    forces = estimate.inverse_dynamics
     optional = {
         "selection": (
             estimate.selection is not None,
             partial(estimate_studies.selection, estimate),
         ),
         "horizons": (estimate.horizons is not None, partial(estimate_studies.horizons, estimate)),
-        "inverse_dynamics": (
-            forces is not None,
-            partial(of_estimate.inverse_dynamics, forces),  # type: ignore[arg-type]
+        "residual_torque": (
+            bool(estimate.residual_forces),
+            partial(of_estimate.residual_torque, estimate.residual_forces),
         ),
         "recordings": (
             estimate.recording_comparison is not None,
             partial(estimate_studies.recordings, estimate),
         ),
         "samples": (estimate.draws is not None, partial(estimate_studies.samples, estimate)),
-        "trace": (
-            len(estimate.trace) > 1,
-            partial(of_estimate.parameter_trace, estimate, labels),
+        "deciding_seconds": (
+            estimate.in_time is not None,
+            partial(of_estimate.deciding_seconds, estimate, labels),
         ),
         "pairs": (
             estimate_studies.has_pairs(estimate.std),
@@ -193,7 +192,9 @@ def _(estimate: Estimate) -> Pictures:
 
 @pictures_of.register
 def _(result: InverseDynamicsFit) -> Pictures:
-    return {"inverse_dynamics": partial(of_estimate.inverse_dynamics, result)}
+    if not result.residual_forces:
+        return {}
+    return {"residual_torque": partial(of_estimate.residual_torque, result.residual_forces)}
 
 
 @pictures_of.register

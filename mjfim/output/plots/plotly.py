@@ -229,6 +229,8 @@ def _heatmap(cells: Cells) -> Plotly:
         "hoverinfo": "z",
         "showscale": cells.scale is not None,
     }
+    if cells.edges is not None:
+        trace |= {"x": cells.edges.tolist(), "xgap": 0, "hoverinfo": "x+z"}
     if cells.scale is not None:
         places = [float(place) - cells.middle for place in cells.scale[0]]
         ticks = {"tickvals": places, "ticktext": list(cells.scale[1])}

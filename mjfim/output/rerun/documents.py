@@ -44,7 +44,7 @@ from mjfim.output.plots.design import (
     motion_panels,
     sensitivity_phase,
 )
-from mjfim.output.plots.estimate import fit, held_out
+from mjfim.output.plots.estimate import deciding_seconds, fit, held_out, residual_torque
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.plots import (
     Plane,
@@ -54,6 +54,7 @@ from mjfim.output.rerun.plots import (
     planes_of,
     rgb,
     series_tabs,
+    with_curves,
 )
 from mjfim.output.rerun.scene import (
     BodyPoses,
@@ -169,6 +170,13 @@ def log_estimate(
         for k, (picture, name) in enumerate(zip(pictures, names, strict=True), start=1)
     }
     states: Tabs = motion_panels(labels, shown)
+    if estimate.in_time is not None:
+        ribbons = deciding_seconds(estimate, complete_labels(estimate)).panels
+        states = {"information [% per s]": [with_curves(panel) for panel in ribbons]} | states
+    planes = []
+    if estimate.residual_forces:
+        torques = residual_torque(estimate.residual_forces).panels
+        planes = planes_of("residual torque", torques)
     tabs = series_tabs(recordings)
     if len(tabs) > MAX_TABS:
         tabs = [rrb.Tabs(*tabs, name="recordings", active_tab=0)]
@@ -177,10 +185,13 @@ def log_estimate(
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
     root = ("robots", IDENTIFIED)
     view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
+    tabs += grid_tabs("residual torque", [plane.view() for plane, _ in planes])
     tabs += series_tabs(states)
     text = as_markdown(page_of(estimate), ESTIMATE_COLOURS)
     with open_recording(path, model, "estimate", view, tabs, text) as rec:
         log_series(rec, recordings | states)
+        for plane, panel in planes:
+            plane.log(rec, panel.marks)
         _log_robots(rec, model, poses, {}, [IDENTIFIED])
 
 

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.arrays import Array
-from mjfim.output.panels import ROLES, Mark, Panel
+from mjfim.output.panels import ROLES, SERIES, Mark, Panel
 from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
 from mjfim.records.base import record
 
@@ -98,6 +98,16 @@ def log_series(rec: rr.RecordingStream, tabs: Tabs) -> None:
             ends = np.array([min(map(np.min, times)), max(map(np.max, times))])
             for k, mark in enumerate(panel.marks):
                 _log_mark(rec, (name, panel.title, f"{k} {mark.label or mark.kind}"), mark, ends)
+
+
+def with_curves(panel: Panel) -> Panel:
+    """Return a panel of cells over time as one of curves, one for each row."""
+    assert panel.cells is not None and panel.cells.edges is not None
+    curves = [
+        Mark(kind="steps", x=panel.cells.edges, y=row, role=f"series{k % len(SERIES)}", label=name)
+        for k, (name, row) in enumerate(zip(panel.y.names or (), panel.cells.values, strict=True))
+    ]
+    return replace(panel, marks=curves)
 
 
 def _log_mark(rec: rr.RecordingStream, parts: EntityParts, mark: Mark, ends: Array) -> None:

@@ -1,0 +1,121 @@
+"""Residual forces along measured motions: dry friction that the model lacks, and the noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjfim.errors import RecordingError
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import align
+from mjfim.identification.inverse_dynamics import inverse_dynamics, residual_forces
+from mjfim.output.plots.draw import figure_of
+from mjfim.output.plots.estimate import MAX_JOINTS, residual_torque
+from mjfim.records.estimate_parts import ResidualForce
+from mjfim.records.trajectory import Recording
+from tests.identification.test_inverse_dynamics import CART_PENDULUM, STATE, cart, cart_log
+from tests.support.numerics import Array
+
+# Dry friction of the robot's slide, which the model lacks [N].
+FRICTION = 0.5
+
+
+def forces_along(folder: Path, log: Recording) -> tuple[ResidualForce, ...]:
+    """Residual forces of the model without dry friction, at the parameters of the robot."""
+    system = System.resolve(cart(folder), threads=1)
+    return residual_forces(system, [align(system, log)], [system.parameters.guess])
+
+
+def rough_log(folder: Path, sigma: float) -> Recording:
+    """A log of the cart whose slide has dry friction."""
+    text = CART_PENDULUM.replace('type="slide"', f'type="slide" frictionloss="{FRICTION}"')
+    return cart_log(cart(folder / "robot", text), sigma, seconds=10.0)
+
+
+def fast_medians(each: ResidualForce, sign: float) -> Array:
+    """Medians of one direction without the slowest one, in which noise mixes the directions."""
+    speed, force = each.medians(each.speed, sign * each.speed > 0.0)
+    return force[np.abs(speed) > np.abs(speed).min()]
+
+
+def test_medians_step_by_the_friction_that_the_model_lacks(tmp_path: Path) -> None:
+    slide, hinge = forces_along(tmp_path, rough_log(tmp_path, 1e-3))
+    assert [slide.joint, slide.unit, hinge.joint, hinge.unit] == ["slide", "N", "hinge", "N m"]
+    for sign in (1.0, -1.0):
+        assert np.median(fast_medians(slide, sign)) == pytest.approx(sign * FRICTION, rel=0.1)
+        assert np.abs(np.median(fast_medians(hinge, sign))) < 0.1 * FRICTION
+    step, slope = slide.friction
+    assert step == pytest.approx(FRICTION, rel=0.1)
+    assert abs(slope) * np.abs(slide.speed).max() < 0.2 * FRICTION
+    assert slide.noise_ratio > 3.0
+
+
+@pytest.mark.parametrize("sigma", [1e-3, 1e-2])
+def test_of_the_right_model_only_noise_remains(sigma: float, tmp_path: Path) -> None:
+    for each in forces_along(tmp_path, cart_log(cart(tmp_path), sigma)):
+        assert each.noise_ratio == pytest.approx(1.0, abs=0.5)
+
+
+def test_measured_forces_replace_those_of_the_model(tmp_path: Path) -> None:
+    """A log whose control is wrong by a factor, but whose force was measured."""
+    measured = (*STATE, "drive")
+    experiment = cart(tmp_path, noise=dict.fromkeys(measured, 0.01))
+    log = cart_log(experiment, 1e-3, measured=measured)
+    wrong = replace(log, ctrl=0.5 * log.ctrl)
+    system = System.resolve(experiment, threads=1)
+    slide, _ = residual_forces(system, [align(system, wrong)], [system.parameters.guess])
+    assert slide.share < 0.1
+    without = replace(wrong, y=wrong.y[:, :4], outputs=STATE)
+    slide, _ = residual_forces(system, [align(system, without)], [system.parameters.guess])
+    assert slide.share > 0.5
+
+
+def test_each_recording_has_its_own_parameters(tmp_path: Path) -> None:
+    log = rough_log(tmp_path, 1e-3)
+    system = System.resolve(cart(tmp_path), threads=1)
+    theta, aligned = system.parameters.guess, align(system, log)
+    heavy = theta * np.array([2.0, 1.0, 1.0, 1.0])
+    one, other, both = (
+        residual_forces(system, [aligned] * len(at), at)[0]
+        for at in ([theta], [heavy], [theta, heavy])
+    )
+    assert both.rms**2 == pytest.approx(0.5 * (one.rms**2 + other.rms**2), rel=1e-9)
+
+
+def test_a_degree_of_freedom_that_was_not_measured_is_named(tmp_path: Path) -> None:
+    log = cart_log(cart(tmp_path), 1e-3)
+    log = replace(log, y=log.y[:, [0, 2]], outputs=(STATE[0], STATE[2]))
+    with pytest.raises(RecordingError, match="no measured position or velocity of hinge"):
+        forces_along(tmp_path, log)
+
+
+def test_the_picture_shows_the_medians_and_the_worst_joints(tmp_path: Path) -> None:
+    fit = inverse_dynamics(cart(tmp_path), [rough_log(tmp_path, 1e-3)])
+    slide, hinge = fit.residual_forces
+    assert fit.pictures == ("residual_torque",)
+    picture = residual_torque(fit.residual_forces)
+    median = next(m for m in picture.panels[0].marks if m.label == "median, forwards")
+    np.testing.assert_array_equal(median.y, slide.medians(slide.speed, slide.speed > 0.0)[1])
+    written = [each["rms"] for each in fit.summary()["residual_forces"]]
+    assert written == [slide.rms, hinge.rms]
+
+    many = [replace(hinge, joint=str(k)) for k in range(MAX_JOINTS)]
+    picture = residual_torque([*many, slide])
+    assert picture.title.startswith("Residual torque:") and "at slide" in picture.title
+    assert picture.panels[-1].y.label == "slide [N]"
+    assert len(picture.panels) == 2 * MAX_JOINTS and f"Shown: {MAX_JOINTS} of 7" in picture.note
+
+
+def test_a_joint_without_residuals_or_directions_is_drawn() -> None:
+    speed = np.linspace(0.1, 1.0, 30)
+    still = ResidualForce(
+        joint="a", unit="N", position=speed, speed=speed, force=0.0 * speed, sigma=0.0, size=0.0
+    )
+    assert np.isnan(still.friction).all() and np.isinf(still.share)
+    picture = residual_torque([still])
+    assert picture.title == "Residual torque: 0.0 N rms at a"
+    assert picture.panels[0].title == "too few points in both directions"
+    figure_of(picture)
