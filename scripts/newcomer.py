@@ -274,7 +274,8 @@ def _judge_design(found: Walk, folder: Path) -> None:
     stated = tomllib.loads((folder / EXPERIMENT).read_text(encoding="utf-8"))
     model = mujoco.MjModel.from_xml_path(str(folder / stated["model"]))
     with np.load(folder / "design" / "design.npz") as arrays:
-        trajectory = {name: arrays[name] for name in ("t", "qpos", "qvel", "act", "ctrl")}
+        names = ("t", "qpos", "qvel", "act", "ctrl", "gain")
+        trajectory = {name: arrays[name] for name in names}
     found.violations = violations(model, trajectory, stated.get("limits", {}))
 
     rehearsal = design["rehearsal"]
@@ -286,12 +287,13 @@ def _judge_design(found: Walk, folder: Path) -> None:
     ratios = [std / predicted for predicted, std in pairs if predicted and std]
     found.approximate = sum(not 1 / 1.4 <= ratio <= 1 / 0.7 for ratio in ratios)
     broken = 0
+    play = {"each_step": False, "feedback": rehearsal["feedback"]}
     rng = np.random.default_rng(37)
     system = System.resolve(Experiment.from_file(folder / EXPERIMENT), threads=1)
     for _ in range(ROBOTS):
         theta = _physical(system, WRONG, rng)
         robot = system.model_at(theta)
-        left = violations(robot, trajectory, stated.get("limits", {}), each_step=False)
+        left = violations(robot, trajectory, stated.get("limits", {}), **play)
         # A robot that reaches a clamp leaves no limit, and the rehearsal counts it apart.
         broken += any(not each.startswith("force") for each in left)
     found.kept_in_mujoco = 1.0 - broken / ROBOTS
@@ -341,6 +343,7 @@ def violations(
     stated: Mapping[str, Any],
     *,
     each_step: bool = True,
+    feedback: bool = False,
 ) -> list[str]:
     """Play a design in plain MuJoCo, and describe each range that it leaves.
 
@@ -349,9 +352,10 @@ def violations(
 
     Args:
         model: The untouched model (`mujoco.MjModel`).
-        trajectory: t, qpos, qvel, act and ctrl of design.npz.
+        trajectory: t, qpos, qvel, act, ctrl and, for feedback, gain of design.npz.
         stated: Table `limits` of the experiment file: ranges of controls and velocities by name.
         each_step: Whether to look at every engine step, and not only whenever a control begins.
+        feedback: Whether the gains pull the robot to the designed motion.
 
     Returns:
         One sentence for each range.
@@ -371,8 +375,17 @@ def violations(
             if excess > worst.get(name, (ROUNDING, 0.0))[0] or np.isnan(excess):
                 worst[name] = (excess, float(data.time))
 
+    low, high = np.where(
+        model.actuator_ctrllimited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]]
+    )
+    ahead = np.zeros(model.nv)
     for k, ctrl in enumerate(trajectory["ctrl"]):
         data.ctrl[:] = ctrl
+        if feedback:
+            planned = {name: trajectory[name][k] for name in ("qpos", "qvel", "act")}
+            mujoco.mj_differentiatePos(model, ahead, 1.0, data.qpos, planned["qpos"])
+            behind = [ahead, planned["qvel"] - data.qvel, planned["act"] - data.act]
+            data.ctrl[:] = np.clip(ctrl + trajectory["gain"][k] @ np.concatenate(behind), low, high)
         steps = round((times[k + 1] - times[k]) / model.opt.timestep)
         look()
         for _ in range(steps):
