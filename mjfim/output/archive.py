@@ -90,13 +90,12 @@ def rotation_vectors(quaternions: Array) -> Array:
     return vectors
 
 
-# When a controller should use the gains. It is the name of the last column of design.csv, so it has
-# neither commas nor quotation marks; the column holds zeros.
+# When a controller should use the gains, for design.json and the player.
 GAIN_NOTE = (
-    "gains are for u = ctrl + gain (planned state - measured state). Use them where small errors "
+    "Gains are for u = ctrl + gain (planned state - measured state). Use them where small errors "
     "grow along the motion (torque control without servos; mjfim design warns about it) and the "
     "state is measured with little noise and delay. Leave them out where position servos correct "
-    "errors already. Record the control that was really sent in both cases"
+    "errors already. Record the control that was really sent in both cases."
 )
 
 
@@ -126,8 +125,6 @@ def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Pl
 def design_columns(playback: Playback, system: System) -> dict[str, Array]:
     """Return the columns of `design.csv` by name, each (M+1,): time, state, controls and gains.
 
-    The name of the last column says when to use the gains; the column holds zeros.
-
     Controls and gains hold until the next row; the last row has none (NaN).
 
     Args:
@@ -142,8 +139,7 @@ def design_columns(playback: Playback, system: System) -> dict[str, Array]:
 
     columns = {"t": playback.t}
     columns |= dict(zip(state_names(system.model), playback.state.T, strict=True))
-    columns |= dict(zip([*controls, *gains], held.T, strict=True))
-    return columns | {f"note: {GAIN_NOTE}": np.zeros(rows + 1)}
+    return columns | dict(zip([*controls, *gains], held.T, strict=True))
 
 
 def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
@@ -225,8 +221,8 @@ def write_design(
     write_table(folder / "design.csv", design_columns(playback, system))
     write_table(folder / "reference.csv", reference_columns(playback, system))
 
-    values = {**origin_of(system, folder), **design.summary(), **(further or {})}
-    write_json(folder / "design.json", values)
+    values = {**origin_of(system, folder), **design.summary(), "gains": GAIN_NOTE}
+    write_json(folder / "design.json", {**values, **(further or {})})
 
 
 def summary_with_origin(

@@ -206,9 +206,8 @@ def test_json_names_nuisance_parameters_and_priors(tmp_path: Path) -> None:
 def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
     """design.csv has all digits and named columns, and can be the initial control of a design."""
     with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
-        (*header, note), *rows = csv.reader(stream)
+        header, *rows = csv.reader(stream)
     states = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
-    assert note.startswith("note: gains are for") and "Use them where" in note
     assert header == ["t", *states, "ctrl:force", *(f"gain:force:{name}" for name in states)]
     assert len(rows) == N + 1
     assert rows[-1][5] == ""

@@ -44,11 +44,10 @@ def write_player(path: Path, plan: RobotPlan) -> None:
     system, space, drives = plan.system, plan.system.space, plan.drives
     names = list(state_names(system.model))
     sigma = dict(zip(system.outputs.names, np.sqrt(np.diag(system.noise.covariance)), strict=True))
-    columns = design_columns(plan.playback, system)
-    rows = np.column_stack([columns[name] for name in columns if not name.startswith("note:")])
+    rows = np.column_stack([*design_columns(plan.playback, system).values()])
     design = {
         "name": plan.name,
-        "gains": f"{GAIN_NOTE[0].upper()}{GAIN_NOTE[1:]}.",
+        "gains": GAIN_NOTE,
         "state": names,
         "controls": list(system.controls),
         "sizes": [space.nq, space.nv],
