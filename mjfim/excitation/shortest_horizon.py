@@ -195,15 +195,15 @@ def target_accuracies(task: DesignTask) -> Array:
     Raises:
         ExperimentError: No parameter states a target.
     """
-    stated = [None if q.nuisance else q.wanted for q in task.parameters.parameters]
-    if not any(stated):
+    wanted = task.parameters.wanted
+    if np.isinf(wanted).all():
         tables = task.experiment.parameters.items()
         name = next((n for n, table in tables if table.inertial is None), "<name>")
         raise ExperimentError(
             f"{task.experiment.source}: no parameter states which standard deviation is wanted; "
             f"state it in the parameter's unit, for example parameters.{name}.wanted = 0.01"
         )
-    return np.array([np.inf if value is None else value for value in stated])
+    return wanted
 
 
 def largest_ratio_to_target(std: Array, wanted: Array) -> tuple[float, int]:

@@ -101,7 +101,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         "gain": (N, NU, 2 * NV),
         "sensitivity": (N + 1, 2 * NV, P),
     }
-    further = {"information": (P, P), "eigenvalues": (P,), "std": (P,), "min_eigenvalue": (N + 1,)}
+    further = {"information": (P, P), "eigenvalues": (P,), "std": (P,), "std_over_time": (N + 1, P)}
     m = shapes["motions.iteration"][0]
     moving = {"t": (), "qpos": (NQ,), "ctrl": (NU,)}
     assert 2 <= m <= MAX_MOTIONS
@@ -113,6 +113,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         **{f"final.{key}": shape for key, shape in further.items()},
         **{f"initial.{key}": shape for key, shape in further.items()},
         **{"theta": (P,), "sizes": (P,), "prior": (P, P), "data": (P, P)},
+        **{"labels.wanted": (P,), "labels.published": (P,), "labels.bounds": (P, 2)},
         "record": (),
     }
     assert robots["rehearsal.theta"] == (5, P) and robots["rehearsal.steps.std"] == (P,)

@@ -20,10 +20,10 @@ from mjfim.output import plots, words
 from mjfim.output.archive import rotation_vectors
 from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals
 from mjfim.output.plots.design import (
+    accuracy,
+    accuracy_over_time,
     convergence,
     limits,
-    sensitivity_phase,
-    standard_deviations,
     trajectories,
 )
 from mjfim.output.plots.draw import figure_of, log_ticks, plain_number, save
@@ -31,6 +31,7 @@ from mjfim.output.plots.estimate import fit, parameter_intervals
 from mjfim.output.plots.estimate_studies import selection
 from mjfim.output.plots.pictures import draw, picture_names
 from mjfim.output.plots.studies import check, histogram
+from mjfim.output.words import relative
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import Decision, Selection, SelectionStep
@@ -60,15 +61,13 @@ def panel_named(picture: Picture, beginning: str) -> Panel:
 # ---- designs
 
 
-def test_trajectories_show_both_motions_and_their_information() -> None:
+def test_trajectories_show_both_motions() -> None:
     design = make_design()
     picture = trajectories(design, LABELS)
     joint = panel_named(picture, "joint_0 [rad]")
     for role, evaluation in (("initial", design.initial), ("designed", design.final)):
         (curve,) = marks_of(joint, role)
         np.testing.assert_array_equal(curve.y, evaluation.trajectory.qpos[:, 0])
-    (root,) = marks_of(picture.panels[-1], "designed")
-    np.testing.assert_allclose(root.y**2, design.final.min_eigenvalue)
     assert [panel for panel in picture.panels if panel.is_shaded]
     assert [key.label for key in picture.legend()] == ["initial", "designed"]
 
@@ -80,12 +79,6 @@ def test_rotation_vectors_have_no_jumps() -> None:
     turned = np.column_stack([np.cos(angle / 2.0), np.sin(angle / 2.0)[:, None] * axis])
     flipped = turned * np.where(np.arange(400) % 2, 1.0, -1.0)[:, None]
     np.testing.assert_allclose(rotation_vectors(flipped), angle[:, None] * axis, atol=1e-6)
-
-
-def test_phase_plots_are_limited_in_number_and_say_so() -> None:
-    picture = sensitivity_phase(make_design(2, 9), make_labels(2, 9))
-    assert len(picture.panels) == 6
-    assert "Shown: 6 of 9 parameters" in picture.note
 
 
 def test_convergence_shows_begin_end_and_stages() -> None:
@@ -117,15 +110,44 @@ def test_convergence_of_any_history_is_drawn(costs: tuple[float, ...], tmp_path:
 
 
 @pytest.mark.parametrize("everything", [True, False])
-def test_unknown_standard_deviations_are_hatched_to_the_end(*, everything: bool) -> None:
+def test_parameters_that_are_not_determined_are_arrows_at_the_edge(*, everything: bool) -> None:
     design = make_design()
     std = np.full(3, np.inf) if everything else np.array([np.inf, 1.0, 2.0])
     design = dataclasses.replace(design, final=dataclasses.replace(design.final, std=std))
-    panel = standard_deviations(design, LABELS).panels[0]
-    (hatched,) = (mark for mark in panel.marks if mark.hollow)
-    assert panel.x.limits is not None
-    np.testing.assert_allclose(hatched.x, panel.x.limits[1])
-    assert len(hatched.x) == (3 if everything else 1)
+    panel = accuracy(design, LABELS).panels[0]
+    (arrows,) = (mark for mark in panel.marks if mark.symbol == ">")
+    assert arrows.y.tolist() == ([0, 1, 2] if everything else [0])
+    assert accuracy_over_time(design, LABELS).panels[0].message == (
+        "no parameter is determined alone" if everything else ""
+    )
+
+
+def test_accuracies_are_dots_in_percent_beside_what_is_wanted() -> None:
+    """A parameter whose nominal value is 0 has no percent, only its standard deviation."""
+    labels = dataclasses.replace(LABELS, wanted=np.array([0.02, np.inf, 0.3]))
+    design = dataclasses.replace(make_design(), labels=labels, theta=np.array([2.0, 0.0, 3.0]))
+    panel = accuracy(design, labels).panels[0]
+    std = design.stated_std
+    (final,) = marks_of(panel, "designed", "dots")
+    np.testing.assert_allclose(final.x, 100.0 * std[[0, 2]] / design.sizes[[0, 2]])
+    assert final.y.tolist() == [0.0, 2.0]
+    (tick,) = marks_of(panel, "text", "dots")
+    np.testing.assert_allclose(tick.x, [2.0, np.nan, 15.0])
+    assert panel.beside[1][2][1] == f"{std[1]:.3g}"
+
+
+def test_curves_over_time_meet_the_wanted_accuracy_at_their_dots() -> None:
+    labels = dataclasses.replace(LABELS, wanted=np.array([0.12, 0.09, np.inf]))
+    design = dataclasses.replace(make_design(), labels=labels)
+    panel = accuracy_over_time(design, labels).panels[0]
+    assert panel.y.log
+    for j, goal in ((0, 12.0), (1, 6.0)):
+        _, curve = marks_of(panel, f"series{j}")
+        first = int(np.flatnonzero(curve.y <= goal)[0])
+        (dot,) = marks_of(panel, f"series{j}", "dots")
+        assert (dot.x[0], dot.y[0]) == (pytest.approx(curve.x[first]), pytest.approx(goal))
+        assert curve.label.endswith(relative(design.stated_std[j], design.sizes[j]))
+    assert marks_of(panel, "series2", "dots") == []
 
 
 # ---- limits
@@ -328,7 +350,7 @@ def test_parameters_that_are_not_known_alone_are_hatched_and_without_correlation
 def test_wrong_names_labels_and_endings_are_refused(tmp_path: Path) -> None:
     design = dataclasses.replace(make_design(), labels=LABELS)
     assert picture_names(design)[0] == "trajectories"
-    with pytest.raises(MjfimError, match=r"picture of a Design .*valid: convergence, "):
+    with pytest.raises(MjfimError, match=r"picture of a Design .*valid: accuracy, "):
         draw(design, "portrait")
     with pytest.raises(MjfimError, match=r"trajectorys.*did you mean 'trajectories'"):
         design.plot("trajectorys")

@@ -184,7 +184,7 @@ def test_the_summary_holds_outcome_warnings_and_colours(file: Path) -> None:
     text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
     assert "it violates limits (position)" in text
     assert "the two parameters are nearly confounded" in text
-    assert text.rstrip().endswith("change per unit of a parameter.")
+    assert text.rstrip().endswith("in place of the designed trajectory.")
 
 
 def test_a_file_is_replaced_only_when_the_new_one_is_complete(
@@ -207,7 +207,7 @@ def test_a_file_is_replaced_only_when_the_new_one_is_complete(
 def test_a_design_without_history_motions_or_information_is_logged(
     cart: mujoco.MjModel, design: Design, tmp_path: Path
 ) -> None:
-    blind = replace(design.initial, std=np.array([np.inf, 0.1]), min_eigenvalue=np.zeros(41))
+    blind = replace(design.initial, std_over_time=np.full((41, 2), np.inf))
     path = tmp_path / "design.rrd"
     bare = replace(design, initial=blind, history=(), motions=None, usage=())
     log_design(path, cart, bare, labels_of_model(cart))

@@ -29,9 +29,9 @@ DESIGN = {
     "report.html",
     "design.rrd",
     "trajectories.png",
-    "sensitivity_phase.png",
+    "accuracy_over_time.png",
+    "accuracy.png",
     "convergence.png",
-    "standard_deviations.png",
     "rehearsal.png",
 }
 

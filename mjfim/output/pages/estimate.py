@@ -75,7 +75,10 @@ def estimate_page(estimate: Estimate) -> Page:
         "Drawn robots": list(sample_parts(estimate)),
         "Predictions": _prediction_parts(estimate.predictions),
         "Signals": [Plot("fit")] if estimate.recordings else [],
-        "Residuals": [tabulated("Fit of every output", residuals, detail=True), Plot("spectra")],
+        "Residuals": [
+            tabulated("Fit of every output", residuals, detail=True),
+            Plot("spectra", detail=True),
+        ],
         "Search": [Plot("trace")] if len(estimate.trace) > 1 else [],
     }
     causes, details = estimate.causes, estimate.details
@@ -464,7 +467,7 @@ def horizon_parts(study: HorizonStudy | None) -> Sequence[Part]:
         Text(f"{study.about_choice} {study.about_growth}"),
         *(Text(caution, Emphasis.WARNING) for caution in cautions),
         table,
-        Plot("horizons"),
+        Plot("horizons", detail=True),
     )
 
 

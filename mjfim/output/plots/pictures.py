@@ -45,10 +45,10 @@ if TYPE_CHECKING:
 
 # Pictures of a design, and of an estimate beside those of its fits and predictions.
 DESIGN_PICTURES = (
+    "accuracy_over_time",
+    "accuracy",
     "trajectories",
-    "sensitivity_phase",
     "convergence",
-    "standard_deviations",
     "limits",
     "rehearsal",
 )
@@ -130,9 +130,9 @@ def _(design: Design) -> Pictures:
     labels = complete_labels(design)
     pictures: Pictures = {
         "trajectories": partial(of_design.trajectories, design, labels),
-        "sensitivity_phase": partial(of_design.sensitivity_phase, design, labels),
+        "accuracy_over_time": partial(of_design.accuracy_over_time, design, labels),
+        "accuracy": partial(of_design.accuracy, design, labels),
         "convergence": partial(of_design.convergence, design),
-        "standard_deviations": partial(of_design.standard_deviations, design, labels),
     }
     if design.usage:
         pictures["limits"] = partial(of_design.limits, design, labels)
