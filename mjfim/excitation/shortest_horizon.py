@@ -110,6 +110,7 @@ def smallest_feasible(
     largest: int,
     grid: SampleGrid,
     tolerance: Callable[[int], int],
+    enough: Callable[[int], int] = int,
 ) -> tuple[int | None, int | None]:
     """Find the smallest number of samples whose ratio is at most 1.
 
@@ -123,6 +124,8 @@ def smallest_feasible(
         largest: Largest number of samples, on the grid.
         grid: Numbers that are allowed.
         tolerance: Largest acceptable width of the bracket, as a function of its upper end.
+        enough: Number of samples after which the experiment with a feasible number of samples has
+            reached the ratio 1 already.
 
     Returns:
         The smallest evaluated number that is feasible, and the largest one that is infeasible; None
@@ -144,7 +147,8 @@ def smallest_feasible(
             is_open = feasible - infeasible > width
             following = _next_inside(known, infeasible, feasible, width, grid) if is_open else None
         elif feasible is not None:
-            smaller = min(feasible * _step_factor(value, len(known)), feasible - 1)
+            smaller = feasible * _step_factor(value, len(known))
+            smaller = min(smaller, enough(feasible), feasible - 1)
             following = grid.round_down(smaller) if feasible > grid.minimum else None
         else:
             larger = grid.round_up(max(following * _step_factor(value, len(known)), following + 1))
@@ -231,7 +235,7 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
     Raises:
         UnidentifiableError: A parameter with a target cannot be identified by itself.
     """
-    unreachable = np.flatnonzero(np.isfinite(wanted) & ~np.isfinite(design.final.std))
+    unreachable = np.flatnonzero(np.isfinite(wanted) & ~np.isfinite(design.stated_std))
     if not len(unreachable):
         return
 
@@ -456,7 +460,9 @@ class _HorizonSearch:
 
         largest = self.grid.round_down(longest * rate)
         first = min(self.grid.round_up(self.base.samples), largest)
-        found, below = smallest_feasible(self.ratio, first, largest, self.grid, self.tolerance_at)
+        found, below = smallest_feasible(
+            self.ratio, first, largest, self.grid, self.tolerance_at, self.enough
+        )
         has_reached = found is not None
         if found is None:
             # After a stop, the result is the design that is closest to the targets.
@@ -488,6 +494,16 @@ class _HorizonSearch:
 
         resolution = samples - self.grid.round_down(samples - 1)
         return max(int(width + ROUNDING_TOLERANCE), resolution)
+
+    def enough(self, samples: int) -> int:
+        """Number of samples after which the design of a number of samples reaches all targets.
+
+        An experiment that ends there keeps its limits where the final state is free.
+        """
+        if self.base.experiment.boundary.end != "free":
+            return samples
+        seconds = float(self.designs[samples].seconds_to(self.targets).max())
+        return self.grid.round_up(seconds * self.base.experiment.rate)
 
     def at(self, samples: int) -> Experiment:
         """The experiment with a number of samples, and those repeats that divide it."""
@@ -575,11 +591,11 @@ class _HorizonSearch:
 
         # After a stop, a design counts if it keeps the limits, and reaches the targets or is the
         # first one.
-        ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
+        ratio, parameter = largest_ratio_to_target(design.stated_std, self.targets)
         if is_stopped and (violated or (not ratio <= 1.0 and self.designs)):
             return None
         known = self.designs.get(samples)
-        if known is None or ratio < largest_ratio_to_target(known.final.std, self.targets)[0]:
+        if known is None or ratio < largest_ratio_to_target(known.stated_std, self.targets)[0]:
             self.designs[samples] = design
         name = task.parameters.names[parameter]
         return Tried(horizon=horizon, ratio=ratio, parameter=name)
@@ -592,7 +608,7 @@ class _HorizonSearch:
         reason = longest.why
         if design is not None:
             names = self.base.parameters.names
-            missed = missed_targets(names, design.final.std, self.targets)
+            missed = missed_targets(names, design.stated_std, self.targets)
             reason = f"the target is missed by {missed}"
         return OutOfReachError(
             f"{self.base.experiment.source}: even {longest.horizon:g} s is too short: {reason}. "

@@ -29,6 +29,7 @@ from mjfim.output.plots.pictures import (
     histogram_name,
     numbered,
     pictures_of,
+    usual,
 )
 from mjfim.output.report import Media, kinds_in, write_report
 from mjfim.output.video import report_video
@@ -404,7 +405,7 @@ def _write_figures(
 
     # Matplotlib takes seconds to import, which nobody waits for who has pressed Ctrl-C twice.
     pictures = {}
-    write_optional("the pictures", lambda: pictures.update(pictures_of(record)))
+    write_optional("the pictures", lambda: pictures.update(usual(record)))
     write_pictures(folder, pictures, picture_format)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_pseudo_inverse
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
@@ -101,6 +101,9 @@ class IterateMotions(Record):
 # Number of iterations at the end of a search over which its improvement is measured.
 IMPROVEMENT_WINDOW = 10
 
+
+# Eigenvalues of an information of unit diagonal below this share of the largest one count as zero.
+SMALLEST_EIGENVALUE = 1e-13
 
 # Smallest improvement per iteration that is stated as a number.
 LEAST_IMPROVEMENT = 1e-4
@@ -572,6 +575,14 @@ class Design(ShownRecord):
         std = self.final.std
         ratio = np.divide(self.stated_std, std, out=np.ones(len(std)), where=np.isfinite(std))
         return np.asarray(self.final.std_over_time * ratio)
+
+    @property
+    def covariance(self) -> Array:
+        """(p, p) predicted covariance; NaN where a parameter is not identifiable alone."""
+        inverse = scaled_pseudo_inverse(self.final.information, SMALLEST_EIGENVALUE)
+        spread = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
+        std = np.where(np.isfinite(self.stated_std), self.stated_std, np.nan) / spread
+        return np.asarray(inverse * np.outer(std, std))
 
     @property
     def shares(self) -> Array:

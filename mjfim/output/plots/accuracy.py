@@ -24,15 +24,17 @@ class Accuracies(NamedTuple):
             where they are unknown.
         role: Role of the dots.
         label: Source in words.
-        symbol: Symbol of the dots, as matplotlib names it.
+        size: Size of the dots [points].
         hollow: Whether they are white inside.
+        symbol: Their symbol, as matplotlib names it.
     """
 
     std: Array
     role: str
     label: str
-    symbol: str = "o"
+    size: float = 7.0
     hollow: bool = False
+    symbol: str = "o"
 
 
 def accuracy_panel(
@@ -61,7 +63,7 @@ def accuracy_panel(
         marks.append(dots(goal, rows, "text", label="wanted σ", **tick))
     for source, values in zip(sources, percent, strict=True):
         known = np.isfinite(values)
-        look = {"symbol": source.symbol, "hollow": source.hollow, "size": 7.0, "front": 3.0}
+        look = {"symbol": source.symbol, "size": source.size, "hollow": source.hollow, "front": 3.0}
         marks.append(dots(values[known], rows[known], source.role, label=source.label, **look))
         # An arrow at the edge stands for a parameter that is not identifiable alone.
         lost = np.isinf(source.std)

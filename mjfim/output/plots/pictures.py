@@ -54,6 +54,7 @@ DESIGN_PICTURES = (
 )
 ESTIMATE_PICTURES = (
     "parameters",
+    "accuracy",
     "spectra",
     "inverse_dynamics",
     "trace",
@@ -64,6 +65,9 @@ ESTIMATE_PICTURES = (
     "samples",
     "recordings",
 )
+
+# Pictures of how a result was found. The report has them folded, and files are drawn on request.
+ON_REQUEST = {"convergence", "spectra", "horizons"}
 
 # Functions that make the pictures of a record, by their names.
 Pictures = dict[str, Callable[[], Picture]]
@@ -113,6 +117,11 @@ def draw(
     if os.fspath(file):
         save(figure, file)
     return figure
+
+
+def usual(record: ShownRecord) -> Pictures:
+    """Return functions that make the pictures of a record that are files without a request."""
+    return {name: make for name, make in pictures_of(record).items() if name not in ON_REQUEST}
 
 
 @singledispatch
@@ -175,7 +184,7 @@ def _(estimate: Estimate) -> Pictures:
         ),
         "pairs": (
             estimate_studies.has_pairs(estimate.std),
-            partial(estimate_studies.estimate_pairs, estimate),
+            partial(estimate_studies.estimate_pairs, estimate, labels),
         ),
         "predictions": (
             bool(estimate.predictions),
@@ -184,6 +193,7 @@ def _(estimate: Estimate) -> Pictures:
     }
     return {
         "parameters": partial(of_estimate.parameter_intervals, estimate, labels),
+        "accuracy": partial(of_estimate.accuracy, estimate, labels),
         "spectra": partial(of_estimate.residual_spectra, estimate, labels),
         **{name: make for name, (has_it, make) in optional.items() if has_it},
         **fits,
@@ -319,4 +329,4 @@ def _import_what_draws() -> None:
 def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
     from mjfim.output.plots.draw import content
 
-    return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}
+    return {name: content(draw(), picture_format) for name, draw in usual(record).items()}
