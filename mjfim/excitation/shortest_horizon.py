@@ -110,7 +110,6 @@ def smallest_feasible(
     largest: int,
     grid: SampleGrid,
     tolerance: Callable[[int], int],
-    enough: Callable[[int], int] = int,
 ) -> tuple[int | None, int | None]:
     """Find the smallest number of samples whose ratio is at most 1.
 
@@ -124,8 +123,6 @@ def smallest_feasible(
         largest: Largest number of samples, on the grid.
         grid: Numbers that are allowed.
         tolerance: Largest acceptable width of the bracket, as a function of its upper end.
-        enough: Number of samples after which the experiment with a feasible number of samples has
-            reached the ratio 1 already.
 
     Returns:
         The smallest evaluated number that is feasible, and the largest one that is infeasible; None
@@ -147,8 +144,7 @@ def smallest_feasible(
             is_open = feasible - infeasible > width
             following = _next_inside(known, infeasible, feasible, width, grid) if is_open else None
         elif feasible is not None:
-            smaller = feasible * _step_factor(value, len(known))
-            smaller = min(smaller, enough(feasible), feasible - 1)
+            smaller = min(feasible * _step_factor(value, len(known)), feasible - 1)
             following = grid.round_down(smaller) if feasible > grid.minimum else None
         else:
             larger = grid.round_up(max(following * _step_factor(value, len(known)), following + 1))
@@ -460,9 +456,7 @@ class _HorizonSearch:
 
         largest = self.grid.round_down(longest * rate)
         first = min(self.grid.round_up(self.base.samples), largest)
-        found, below = smallest_feasible(
-            self.ratio, first, largest, self.grid, self.tolerance_at, self.enough
-        )
+        found, below = smallest_feasible(self.ratio, first, largest, self.grid, self.tolerance_at)
         has_reached = found is not None
         if found is None:
             # After a stop, the result is the design that is closest to the targets.
@@ -494,16 +488,6 @@ class _HorizonSearch:
 
         resolution = samples - self.grid.round_down(samples - 1)
         return max(int(width + ROUNDING_TOLERANCE), resolution)
-
-    def enough(self, samples: int) -> int:
-        """Number of samples after which the design of a number of samples reaches all targets.
-
-        An experiment that ends there keeps its limits where the final state is free.
-        """
-        if self.base.experiment.boundary.end != "free":
-            return samples
-        seconds = float(self.designs[samples].seconds_to(self.targets).max())
-        return self.grid.round_up(seconds * self.base.experiment.rate)
 
     def at(self, samples: int) -> Experiment:
         """The experiment with a number of samples, and those repeats that divide it."""

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.design import design_task
-from mjfim.excitation.task import DesignTask
 from mjfim.output.words import when_learnt
 from mjfim.records.design import round_share
 from tests.support import results
@@ -54,7 +53,7 @@ def test_times_are_those_of_a_plain_loop() -> None:
 @pytest.mark.parametrize(
     ("share", "rounded"), [(0.006, 0.01), (0.01, 0.01), (0.011, 0.02), (0.3, 0.5), (0.7, 1.0)]
 )
-def test_without_wanted_accuracies_the_target_is_a_round_share(share: float, rounded: float) -> None:
+def test_without_wanted_accuracies_the_target_is_round(share: float, rounded: float) -> None:
     assert round_share(share) == pytest.approx(rounded)
     design = make_design()
     design = replace(design, final=replace(design.final, std=share * design.sizes))
