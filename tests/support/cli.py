@@ -31,14 +31,13 @@ DESIGN = {
     "trajectories.png",
     "accuracy_over_time.png",
     "accuracy.png",
-    "convergence.png",
     "rehearsal.png",
 }
 
 # Files that `mjfim identify` writes.
 ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml"}
 ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
-    f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions", "pairs", "trace")
+    f"{name}.png" for name in ("fit", "parameters", "accuracy", "predictions", "pairs", "trace")
 }
 
 # Files that `mjfim montecarlo` writes for the cart-pendulum.
