@@ -90,15 +90,6 @@ def rotation_vectors(quaternions: Array) -> Array:
     return vectors
 
 
-# When a controller should use the gains, for design.json and the player.
-GAIN_NOTE = (
-    "Gains are for u = ctrl + gain (planned state - measured state). Use them where small errors "
-    "grow along the motion (torque control without servos; mjfim design warns about it) and the "
-    "state is measured with little noise and delay. Leave them out where position servos correct "
-    "errors already. Record the control that was really sent in both cases."
-)
-
-
 def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Playback:
     """Simulate a designed trajectory at `playback_rate`, at the parameters of the design.
 
@@ -221,8 +212,8 @@ def write_design(
     write_table(folder / "design.csv", design_columns(playback, system))
     write_table(folder / "reference.csv", reference_columns(playback, system))
 
-    values = {**origin_of(system, folder), **design.summary(), "gains": GAIN_NOTE}
-    write_json(folder / "design.json", {**values, **(further or {})})
+    values = {**origin_of(system, folder), **design.summary(), **(further or {})}
+    write_json(folder / "design.json", values)
 
 
 def summary_with_origin(

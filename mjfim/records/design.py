@@ -98,6 +98,15 @@ class IterateMotions(Record):
         )
 
 
+# When a controller should use the gains, for design.json and the player.
+GAIN_NOTE = (
+    "Gains are for u = ctrl + gain (planned state - measured state). Use them where small errors "
+    "grow along the motion (torque control without servos; mjfim design warns about it) and the "
+    "state is measured with little noise and delay. Leave them out where position servos correct "
+    "errors already. Record the control that was really sent in both cases."
+)
+
+
 # Number of iterations at the end of a search over which its improvement is measured.
 IMPROVEMENT_WINDOW = 10
 
@@ -654,6 +663,7 @@ class Design(ShownRecord):
                 self.parameters[j]: {"std": float(targets[j]), "seconds": seconds[j]}
                 for j in np.flatnonzero(np.isfinite(targets)).tolist()
             },
+            "gains": GAIN_NOTE,
             "limits": {
                 "margins": self.limits,
                 "satisfied": self.within_limits,

@@ -15,7 +15,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.model.coordinates import state_names
-from mjfim.output.archive import GAIN_NOTE, design_columns
+from mjfim.output.archive import design_columns
 from mjfim.output.export import TARGETS
 from mjfim.output.export.trajectories import (
     DATASET_FILES,
@@ -28,7 +28,7 @@ from mjfim.output.export.trajectories import (
     write_lerobot_dataset,
     write_trajectory_yaml,
 )
-from mjfim.records.design import Design
+from mjfim.records.design import GAIN_NOTE, Design
 
 # The text in the player that stands for the design.
 PLACE = 'r"""{}"""'

@@ -71,7 +71,7 @@ def accuracy_panel(
             arrow = {"symbol": ">", "size": 7.0, "hollow": True, "label": "not identifiable alone"}
             marks.append(dots(np.full(lost.sum(), high), rows[lost], source.role, **arrow))
     beside = [
-        (source.label, source.role, list(map(_text, source.std.tolist(), sizes.tolist())))
+        (source.label, source.role, list(map(share_text, source.std.tolist(), sizes.tolist())))
         for source in sources
     ]
     return Panel(
@@ -82,7 +82,7 @@ def accuracy_panel(
     )
 
 
-def _text(std: float, size: float) -> str:
+def share_text(std: float, size: float) -> str:
     """Write a standard deviation in percent, or in its unit where there is no size."""
     if np.isnan(std):
         return ""

@@ -297,11 +297,15 @@ def accuracy(design: Design, labels: Labels) -> Picture:
     panel = accuracy_panel(names, sizes, sources, goal)
     changes = [improvement(*pair) for pair in zip(before.tolist(), after.tolist(), strict=True)]
 
+    title, shares = "Predicted accuracy of one experiment", after / sizes
+    if np.isfinite(shares).any():
+        worst = int(np.nanargmax(np.where(np.isfinite(shares), shares, np.nan)))
+        title += f": σ is at most {relative(after[worst], sizes[worst])} ({names[worst]})"
     note = BEST_CASE
     if not np.array_equal(np.abs(design.theta), design.sizes):
         note += " Percent of an entry of a vector or tensor are a share of the whole."
     return Picture(
-        title="Predicted accuracy of one experiment",
+        title=title,
         panels=[replace(panel, beside=[*panel.beside, ("change", "text", changes)])],
         note=note,
         heights=[height_of_rows(len(names))],
@@ -345,10 +349,14 @@ def accuracy_over_time_panel(design: Design, labels: Labels, shown: Sequence[int
     begin, curves, targets_met = float(design.trajectory.t[0]), [], []
     for place, j in enumerate(shown):
         role, size, goal = f"series{place}", sizes[j], targets[j] / sizes[j]
-        label = f"{labels.parameters[j]} {relative(design.stated_std[j], design.sizes[j])}"
+        final = relative(design.stated_std[j], design.sizes[j])
         for t, values, look in (
             (design.initial.trajectory.t, design.initial.std_over_time, INITIAL_LOOK),
-            (design.trajectory.t, design.std_over_time, {"width": 2.0, "label": label}),
+            (
+                design.trajectory.t,
+                design.std_over_time,
+                {"width": 2.0, "label": f"{shorten(labels.parameters[j])} {final}"},
+            ),
         ):
             percent = values[:, j] / size
             curves.append(line(t, np.where(percent <= high, percent, np.nan), role, **look))

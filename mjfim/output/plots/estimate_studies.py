@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -267,7 +267,7 @@ def has_pairs(std: Array) -> bool:
 
 
 class Spread(NamedTuple):
-    """A normal distribution of the parameters.
+    """A normal distribution of the parameters, or a single value of each of them.
 
     Attributes:
         values: (p,) middle [theta-unit].
@@ -275,6 +275,7 @@ class Spread(NamedTuple):
         role: Role of what is drawn.
         label: What it is, in a word.
         dash: Dashes of its lines.
+        symbol: Symbol at the middle, for single values; empty for none.
     """
 
     values: Array
@@ -282,13 +283,13 @@ class Spread(NamedTuple):
     role: str
     label: str
     dash: str = "-"
+    symbol: str = ""
 
 
 def pairs(
     names: Sequence[str],
     units: Sequence[str],
     spreads: Sequence[Spread],
-    points: Mapping[str, tuple[Array, str, str]],
     *,
     bounds: Array | None = None,
     title: str,
@@ -300,7 +301,6 @@ def pairs(
         names: Names of the p parameters.
         units: Their units.
         spreads: Distributions; the first one is filled, and its σ are the unit of all axes.
-        points: Values that are marked, their role and symbol, by their names.
         bounds: (p, 2) bounds, which are grey where they are near; None for none.
         title: Title of the picture.
         note: What is behind the first distribution.
@@ -319,10 +319,6 @@ def pairs(
     limits = np.full((len(unit), 2), np.nan)
     if bounds is not None:
         limits = (bounds - main.values[:, None]) / unit[:, None]
-    offsets = {
-        label: ((values - main.values) / unit, role, symbol)
-        for label, (values, role, symbol) in points.items()
-    }
 
     def density(j: int) -> list[Mark]:
         """Draw the normal densities of one parameter over their peaks."""
@@ -333,7 +329,7 @@ def pairs(
             if np.isfinite(variance) and variance > 0.0:
                 y = np.exp(-0.5 * (x - each.values[j]) ** 2 / variance)
                 marks.append(line(x, y, each.role, dash=each.dash))
-        return [*marks, *_beyond(limits[j], vspan), *_near(offsets, j, None)]
+        return [*marks, *_beyond(limits[j], vspan), *_near(scaled, j, None)]
 
     def ellipses(j: int, i: int) -> list[Mark]:
         """Draw the ellipses of parameter j across and i up."""
@@ -347,7 +343,7 @@ def pairs(
         ]
         marks += [mark for each in scaled for mark in _edge(each, j, i)]
         strips = (*_beyond(limits[j], vspan), *_beyond(limits[i], hspan))
-        return [*marks, *strips, *_near(offsets, j, i)]
+        return [*marks, *strips, *_near(scaled, j, i)]
 
     def axis(j: int) -> Axis:
         """Return the axis of a parameter in its standard deviations, with values at two ticks."""
@@ -360,7 +356,9 @@ def pairs(
         for size, opacity in reversed(ELLIPSES)
     ]
     keys += [
-        line([], [], each.role, dash=each.dash, label=f"{each.label} 2 σ") for each in spreads[1:]
+        line([], [], each.role, dash=each.dash, label=f"{each.label} 2 σ")
+        for each in spreads[1:]
+        if not each.symbol
     ]
     shown = _most_correlated(correlation)
     return _corner(names, units, shown, density, ellipses, axis, title=title, note=note, keys=keys)
@@ -388,13 +386,14 @@ def _beyond(limits: Array, span: Callable[..., Mark]) -> list[Mark]:
     return [span(*pair, **look) for pair in ends]
 
 
-def _near(offsets: Mapping[str, tuple[Array, str, str]], j: int, i: int | None) -> list[Mark]:
-    """Mark the values that lie in the panel of parameter j across and i up, or of j alone."""
+def _near(spreads: Sequence[Spread], j: int, i: int | None) -> list[Mark]:
+    """Mark the single values in the panel of parameter j across and i up, or of j alone."""
     marks = []
-    for label, (offset, role, symbol) in offsets.items():
-        across, up = offset[j], 0.05 if i is None else offset[i]
-        if max(abs(across), abs(up)) <= RANGE:
-            marks.append(dots([across], [up], role, symbol=symbol, size=5.0, label=label))
+    for each in spreads:
+        across, up = each.values[j], 0.05 if i is None else each.values[i]
+        if each.symbol and np.abs([across, up]).max() <= RANGE:
+            look = {"symbol": each.symbol, "label": each.label}
+            marks.append(dots([across], [up], each.role, size=5.0, **look))
     return marks
 
 
@@ -410,14 +409,15 @@ def estimate_pairs(estimate: Estimate, labels: Labels) -> Picture:
     if known.any():
         variances = np.divide(1.0, known, out=np.full(len(known), np.nan), where=known > 0.0)
         spreads.append(Spread(guess, np.diag(variances), "text", "prior", "--"))
-    points: dict[str, tuple[Array, str, str]] = {NOMINAL: (guess, NOMINAL, "x")}
-    if np.isfinite(labels.published).any():
-        points["published"] = (labels.published, MEASURED, "D")
+    unknown = np.full(estimate.covariance.shape, np.nan)
+    spreads += [
+        Spread(guess, unknown, NOMINAL, NOMINAL, symbol="x"),
+        Spread(labels.published, unknown, MEASURED, "published", symbol="D"),
+    ]
     return pairs(
         estimate.parameters,
         estimate.units,
         spreads,
-        points,
         bounds=labels.bounds,
         title="Joint uncertainty of the identified parameters",
         note=(

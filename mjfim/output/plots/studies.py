@@ -43,7 +43,7 @@ from mjfim.output.panels import (
     vspan,
     words,
 )
-from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows
+from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows, share_text
 from mjfim.output.plots.estimate_studies import Spread, pairs
 from mjfim.output.words import (
     BEST_CASE,
@@ -52,7 +52,6 @@ from mjfim.output.words import (
     format_with_uncertainty,
     normal_density,
     quotient_unit,
-    relative,
     share_note,
     shorten,
     squared_unit,
@@ -110,8 +109,9 @@ def check(result: Check) -> Picture:
     label = f"predicted, {result.source} ({duration(result)})"
     source = Accuracies(std, source_role(result), label)
     # A share of a nominal value of 0 says nothing.
-    panel = accuracy_panel(names, np.where(values == 0.0, np.nan, sizes), [source], goals)
-    goal = [f"wanted {relative(row.wanted, row.size)}" for row in rows]
+    sizes = np.where(values == 0.0, np.nan, sizes)
+    panel = accuracy_panel(names, sizes, [source], goals)
+    goal = [f"wanted {share_text(*pair)}" for pair in zip(goals[: len(rows)], sizes, strict=False)]
     panels = [replace(panel, beside=[("", source.role, panel.beside[0][2]), ("", "text", goal)])]
 
     note = BEST_CASE
@@ -191,7 +191,6 @@ def check_pairs(result: Check) -> Picture:
         [row.name for row in rows],
         [row.unit for row in rows],
         [Spread(values, result.covariance, source_role(result), "predicted")],
-        {},
         title=f"Predicted joint uncertainty, {result.source} ({duration(result)})",
         note=BEST_CASE,
     )
