@@ -115,6 +115,8 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     low, high = ((end - guess) / percent for end in estimate.interval.T)
 
     left, right = range_of_intervals(centre, low, high)
+    published = (labels.published - guess) / percent
+    left, right = np.nanmin([left, *published]), np.nanmax([right, *published])
     margin = 0.06 * (max(right, 0.0) - min(left, 0.0))
     rows = np.arange(count)
     is_at_bound = np.array([name in estimate.at_bound for name in estimate.parameters])
@@ -150,7 +152,6 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
             **look,
         )
         marks.append(at)
-    published = (labels.published - guess) / percent
     if np.isfinite(published).any():
         marks.append(dots(published, rows, MEASURED, symbol="D", front=4.0, label="published"))
     note = (

@@ -327,8 +327,11 @@ def pairs(
         for each in scaled:
             variance = each.covariance[j, j]
             if np.isfinite(variance) and variance > 0.0:
-                y = np.exp(-0.5 * (x - each.values[j]) ** 2 / variance)
-                marks.append(line(x, y, each.role, dash=each.dash))
+                # A narrow curve has points of its own.
+                fine = np.concatenate([x, each.values[j] + np.sqrt(variance) * x])
+                fine = np.unique(np.clip(fine, -RANGE, RANGE))
+                y = np.exp(-0.5 * (fine - each.values[j]) ** 2 / variance)
+                marks.append(line(fine, y, each.role, dash=each.dash))
         return [*marks, *_beyond(limits[j], vspan), *_near(scaled, j, None)]
 
     def ellipses(j: int, i: int) -> list[Mark]:
