@@ -241,7 +241,7 @@ def improvement(before: float, after: float) -> str:
 
 # Largest number of parameters that a sentence names, and share of the motion from which on it says
 # that a part of it tells nothing.
-MAX_NAMED, NOTABLE_SHARE = 4, 0.1
+MAX_NAMED, NOTABLE_SHARE = 3, 0.1
 
 
 def when_learnt(design: Design) -> str:
@@ -256,18 +256,19 @@ def when_learnt(design: Design) -> str:
     if not asked:
         return ""
     seconds = design.seconds_to(targets)
-    shares = (targets / design.sizes)[asked]
-    is_same = np.ptp(shares) < SAME_SIZE * shares[0]
-    goal = f"σ of {100.0 * shares[0]:.2g} %" if is_same else "wanted σ"
+    is_stated = np.isfinite(complete_labels(design).wanted).any()
+    goal = f"a σ of {100.0 * targets[asked[0]] / design.sizes[asked[0]]:.2g} %"
     missed = [design.parameters[j] for j in asked if not np.isfinite(seconds[j])]
     if missed:
-        return f"One experiment does not reach the {goal} of {first_ones(missed)}."
+        what = "the wanted σ" if is_stated else goal
+        return f"One experiment does not reach {what} for {first_ones(missed)}."
 
     last = sorted(asked, key=lambda j: seconds[j])[-MAX_NAMED:]
-    named = [f"{design.parameters[j]} {seconds[j]:.3g} s" for j in last]
+    named = [f"{shorten(design.parameters[j])} {seconds[j]:.3g} s" for j in last]
     others = "" if len(last) == len(asked) else "others earlier, "
     end = float(seconds[last[-1]])
-    sentence = f"Every {goal} is reached after {end:.3g} s ({others}{', '.join(named)})"
+    reached = "Every wanted σ is reached" if is_stated else f"Every parameter reaches {goal}"
+    sentence = f"{reached} after {end:.3g} s ({others}{', '.join(named)})"
     if t[-1] - end >= NOTABLE_SHARE * t[-1]:
         sentence += f"; the last {t[-1] - end:.3g} s are not needed for it"
     is_behind = (design.initial.std_over_time <= design.std_over_time)[:, asked].all(axis=1)

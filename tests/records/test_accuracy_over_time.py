@@ -70,7 +70,7 @@ def test_a_sentence_says_when_each_parameter_is_known() -> None:
     assert sentence.startswith(f"Every wanted σ is reached after {end:.3g} s (")
     assert f"the last {2.0 - end:.3g} s are not needed for it." in sentence
     hard = replace(WANTED, wanted=np.array([1e-9, 0.09, np.inf]))
-    missed = f"does not reach the wanted σ of {design.parameters[0]}."
+    missed = f"does not reach the wanted σ for {design.parameters[0]}."
     assert when_learnt(replace(design, labels=hard)).endswith(missed)
 
 
@@ -81,3 +81,4 @@ def test_a_sentence_says_how_long_the_initial_motion_tells_more() -> None:
     slow = replace(design, final=replace(design.final, std_over_time=late))
     assert "Until 1.2 s the initial motion tells more." in when_learnt(slow)
     assert "initial" not in when_learnt(design)
+    assert when_learnt(design).startswith("Every parameter reaches a σ of 10 % after ")

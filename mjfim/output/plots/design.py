@@ -293,8 +293,8 @@ def accuracy(design: Design, labels: Labels) -> Picture:
     before = np.array([*design.initial.std[wanted], *(each.std_initial for each in combined)])
     after = np.array([*design.stated_std[wanted], *(each.std_final for each in combined)])
     goal = np.array([*labels.wanted[wanted], *[np.inf] * len(combined)])
-    sources = (Accuracies(before, INITIAL, INITIAL), Accuracies(after, DESIGNED, DESIGNED))
-    panel = accuracy_panel(names, sizes, sources, goal)
+    first = Accuracies(before, INITIAL, INITIAL, size=10.0, hollow=True)
+    panel = accuracy_panel(names, sizes, [first, Accuracies(after, DESIGNED, DESIGNED)], goal)
     changes = [improvement(*pair) for pair in zip(before.tolist(), after.tolist(), strict=True)]
 
     title, shares = "Predicted accuracy of one experiment", after / sizes
