@@ -136,6 +136,7 @@ IDENTIFIED = "identified.xml"
 ENDINGS = "|".join(PictureFormat)
 STALE: dict[type[ShownRecord], str] = {
     Comparison: r"control_[\w-]+\.csv",
+    Design: rf"({'|'.join(DESIGN_PICTURES)})\.({ENDINGS})",
     Estimate: rf"((fit|held_out)(_\d+)?|{'|'.join(ESTIMATE_PICTURES)})\.({ENDINGS})"
     r"|identified(_.*)?\.(xml|urdf)",
 }
