@@ -291,7 +291,9 @@ def _judge_design(found: Walk, folder: Path) -> None:
     for _ in range(ROBOTS):
         theta = _physical(system, WRONG, rng)
         robot = system.model_at(theta)
-        broken += bool(violations(robot, trajectory, stated.get("limits", {}), each_step=False))
+        left = violations(robot, trajectory, stated.get("limits", {}), each_step=False)
+        # A robot that reaches a clamp leaves no limit, and the rehearsal counts it apart.
+        broken += any(not each.startswith("force") for each in left)
     found.kept_in_mujoco = 1.0 - broken / ROBOTS
 
 

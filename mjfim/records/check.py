@@ -291,7 +291,8 @@ class Check(ShownRecord):
         not_excited: Groups of parameters that another control would separate.
         self_test: Test of the derivatives.
         steps: Standard deviations by finite steps along one motion; None where they were not made.
-        rehearsal: What a given motion does to robots; None for a start and for recordings.
+        rehearsal: What the motion does to robots; None for recordings.
+        is_start: Whether the motion is the initial control, at which a design begins.
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
             are equal.
@@ -315,6 +316,7 @@ class Check(ShownRecord):
     verdict: tuple[str, ...]
     steps: FiniteSteps | None = None
     rehearsal: Rehearsal | None = None
+    is_start: bool = False
     combined: tuple[CombinationAccuracy, ...] = ()
     missing: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
@@ -369,8 +371,8 @@ class Check(ShownRecord):
         """True if the check found no fault.
 
         The derivatives agree, all parameters are identifiable, one repetition reaches every stated
-        accuracy, and a design would not refuse the experiment. Limits that the initial control
-        violates are no fault, because a design looks for a motion inside.
+        accuracy, and a design would not refuse the experiment. Limits that a start violates are no
+        fault, because a design looks for a motion inside. A fall that no limit forbids is one.
         """
         known = {row.name for row in self.rows if np.isfinite(row.std)}
 
@@ -380,8 +382,19 @@ class Check(ShownRecord):
         stated = [row for row in self.rows if row.stated and not row.nuisance]
         reached = all(row.repetitions == 1 for row in stated)
         passed = self.self_test.passed and not self.missing and not self.refused
-        passed = passed and (self.rehearsal is None or self.rehearsal.is_safe)
-        return passed and separable and not self.not_excited and reached
+        return passed and not self.is_dangerous and separable and not self.not_excited and reached
+
+    @property
+    def is_dangerous(self) -> bool:
+        """True if nobody would play the motion, and, for a start, no limit turns a design away."""
+        if self.rehearsal is None:
+            return False
+        return self.rehearsal.falls if self.is_start else not self.rehearsal.is_safe
+
+    @property
+    def reaches_all(self) -> bool:
+        """True if every parameter that is asked for reaches its wanted σ, stated or 5 %."""
+        return all(row.repetitions == 1 for row in self.rows if not row.nuisance)
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
@@ -486,7 +499,6 @@ def _about_accuracy(check: Check, identifiable: Sequence[ParameterCheck]) -> Ite
     is_certain = check.self_test.passed and not check.missing
     if is_certain and not _unknown_groups(check) and not check.not_excited:
         reached = "its wanted σ" if any(row.stated for row in identifiable) else "a σ of 5 %"
-        yield (
-            f"every identifiable parameter reaches {reached} with {check.source}: "
-            "nothing more is needed"
-        )
+        # A start has to become a motion that a robot can play.
+        end = "" if check.is_start else ": nothing more is needed"
+        yield f"every identifiable parameter reaches {reached} with {check.source}{end}"

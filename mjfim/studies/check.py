@@ -338,7 +338,7 @@ def check_task(
             source=source,
             duration=float(curve.t[-1]),
             is_start=trajectory is None,
-            is_played=trajectory is not None,
+            is_motion=True,
         )
 
 
@@ -470,7 +470,7 @@ def _checked(
     source: str,
     duration: float,
     is_start: bool,
-    is_played: bool = False,
+    is_motion: bool = False,
 ) -> Check:
     """The record for the user; what a request to stop leaves out is named in it.
 
@@ -484,7 +484,7 @@ def _checked(
         source: What is checked, in words.
         duration: Duration of the data [s].
         is_start: Whether it is the initial control, at which a design begins.
-        is_played: Whether it is a motion that a robot is to play.
+        is_motion: Whether it is one motion that a robot could play.
     """
     missing = []
 
@@ -501,11 +501,9 @@ def _checked(
         missing.append("the test of the derivatives")
     refused: tuple[str, ...] = ()
     violations: tuple[LimitViolation, ...] = ()
-    warning = ""
     # Without actuators there is no control that a design could begin with.
     if is_start and task.controls and task.release is None and not stop.requested:
         refused, violations = _refusals(task, found)
-        warning = growth_warning(growth_along(task, task.initial)) or ""
 
     # Standard deviations of the wanted parameters. They are infinite where a parameter cannot be
     # identified individually.
@@ -526,12 +524,14 @@ def _checked(
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
 
-    # A motion that a robot is to play is rehearsed without feedback.
-    rehearsal = None
-    if is_played and steps is not None and point.trajectory is not None:
-        played = point.trajectory
+    # A motion that a robot could play is rehearsed without feedback.
+    rehearsal, warning = None, ""
+    if is_motion and steps is not None and point.trajectory is not None and not refused:
+        begin_stage("rehearsing the motion")
+        played, growth = point.trajectory, growth_along(task, point.trajectory)
         gain = np.zeros((played.samples, len(task.controls), task.space.nx))
-        rehearsal = rehearsed(task, played, gain, steps)
+        rehearsal = rehearsed(task, played, gain, steps, growth)
+        warning = growth_warning(growth) or ""
 
     # Eigenvalues of the criterion, without combinations that no experiment can identify.
     criterion = replace(task.information, basis=found.basis)
@@ -562,6 +562,7 @@ def _checked(
         self_test=tested,
         steps=steps,
         rehearsal=rehearsal,
+        is_start=is_start,
         verdict=(),
         combined=() if not_excited else found.combinations(information, values, total, total),
         missing=tuple(missing),

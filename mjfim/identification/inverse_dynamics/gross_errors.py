@@ -23,6 +23,7 @@ from mjfim.errors import MjfimError, RecordingError, WrongLogError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.inverse_dynamics.equations import MotionEquations
+from mjfim.identification.inverse_dynamics.fit import try_fit_equations
 from mjfim.identification.segments import measured_states
 from mjfim.model.coordinates import ScalarJoint, actuator_names, scalar_joints
 from mjfim.model.variants import RELAXED, Relaxation
@@ -221,6 +222,13 @@ class _Search:
         if not cures:
             return ""
         _, _, change = min(cures, key=lambda each: each[:2])
+        # Parameters that are far off make a good log look wrong.
+        recording = self.equations.recorded[0].motion.recording
+        other = try_fit_equations(self.system, [recording], self.start)
+        if other is not None:
+            elsewhere = replace(self, start=np.clip(other.theta, *self.bounds))
+            if not (elsewhere.fitted(none)[1] > GROSS_SHARE**2).any():
+                return ""
         cure = self._cure(change)
         return cure and f"{change.words}; without this error the model explains the motion. {cure}"
 

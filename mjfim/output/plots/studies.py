@@ -15,6 +15,7 @@ from mjfim.output.page import (
     IDENTIFIED,
     INITIAL,
     MEASURED,
+    NOMINAL,
     OTHER,
     TRAJECTORY_TERMS,
     as_sentence,
@@ -552,9 +553,10 @@ def rehearsal(result: Rehearsal) -> Picture:
     panels = [_margins(result)] if result.limits else []
     panels.append(_speeds(result))
     control = "with the gains K(t)" if result.feedback else "open loop"
+    found = "some reach a clamp" if result.is_clamping else "safe to play"
     title = (
         f"{result.robots} robots, parameters up to {100 * result.wrong:g} % off, {control}: "
-        f"{'safe to play' if result.is_safe else 'do not play'}"
+        f"{found if result.is_safe else 'do not play'}"
     )
     note = "Dots are robots, bars the model."
     if not result.limits:
@@ -580,6 +582,8 @@ def _margins(result: Rehearsal) -> Panel:
         role, label = MEASURED, "robots, all keep the limit"
         if not result.kept[:, i].all():
             role, label = DESIGNED, "robots, some exceed the limit"
+            if result.is_clamped[i]:
+                role, label = NOMINAL, "robots, some reach the clamp"
         marks += _row(percent[:, i], i, role, label)
     names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in result.limits]
     return Panel(
