@@ -116,7 +116,8 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
 
     left, right = range_of_intervals(centre, low, high)
     published = (labels.published - guess) / percent
-    left, right = np.nanmin([left, *published]), np.nanmax([right, *published])
+    seen = 1.06 * published
+    left, right = np.nanmin([left, *seen]), np.nanmax([right, *seen])
     margin = 0.06 * (max(right, 0.0) - min(left, 0.0))
     rows = np.arange(count)
     is_at_bound = np.array([name in estimate.at_bound for name in estimate.parameters])
