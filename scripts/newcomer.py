@@ -407,14 +407,15 @@ def _joints(
     data, shown = simulations
     scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     for i in range(model.njnt):
+        name, v = model.joint(i).name or f"joint{i}", int(model.jnt_dofadr[i])
         if int(model.jnt_type[i]) not in scalar:
             yield from _ball(model, data, i)
+            yield from _free(model, data, i, name, stated)
             continue
-        name, v = model.joint(i).name or str(i), int(model.jnt_dofadr[i])
-        if model.jnt_limited[i]:
+        boxes = stated.get("position", {})
+        if model.jnt_limited[i] or name in boxes:
             position = data.qpos[int(model.jnt_qposadr[i])]
-            ends = stated.get("position", {}).get(name, model.jnt_range[i])
-            yield f"position of {name}", _excess(position, ends)
+            yield f"position of {name}", _excess(position, boxes.get(name, model.jnt_range[i]))
         if model.jnt_actfrclimited[i]:
             yield f"force at {name}", _excess(shown.qfrc_actuator[v], model.jnt_actfrcrange[i])
         speeds = stated.get("velocity", {})
@@ -432,6 +433,33 @@ def _ball(model: Any, data: Any, joint: int) -> Iterator[tuple[str, float]]:
         angle = 2.0 * np.arctan2(np.linalg.norm(xyz), abs(w))
         name = model.joint(joint).name or str(joint)
         yield f"angle of {name}", _excess(angle, (-np.inf, float(model.jnt_range[joint].max())))
+
+
+def _free(
+    model: Any, data: Any, joint: int, name: str, stated: Mapping[str, Any]
+) -> Iterator[tuple[str, float]]:
+    """Name and excess of the place, the speeds and the tilt of a free joint."""
+    if int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
+        return
+    q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    boxes = stated.get("position", {}).get(name, ())
+    for axis, position, ends in zip("xyz", data.qpos[q : q + 3], boxes, strict=False):
+        yield f"{axis} of {name}", _excess(position, ends)
+
+    # The angle between the upward axes of the body, now and in the reference position.
+    turned, upright = np.zeros(3), np.zeros(3)
+    mujoco.mju_rotVecQuat(turned, (0.0, 0.0, 1.0), data.qpos[q + 3 : q + 7])
+    mujoco.mju_rotVecQuat(upright, (0.0, 0.0, 1.0), model.qpos0[q + 3 : q + 7])
+    found = {
+        "velocity": np.linalg.norm(data.qvel[v : v + 3]),
+        "angular_velocity": np.linalg.norm(data.qvel[v + 3 : v + 6]),
+        "tilt": np.arccos(np.clip(turned @ upright, -1.0, 1.0)),
+    }
+    for kind, value in found.items():
+        bounds = stated.get(kind, {})
+        bound = bounds.get(name) if isinstance(bounds, dict) else bounds
+        if bound is not None:
+            yield f"{kind} of {name}", _excess(float(value), (-np.inf, float(bound)))
 
 
 def _tendons(model: Any, shown: Any, stated: Mapping[str, Any]) -> Iterator[tuple[str, float]]:

@@ -485,7 +485,12 @@ def _about_accuracy(check: Check, identifiable: Sequence[ParameterCheck]) -> Ite
     if missed:
         # Nobody wants 5 %, but it shows how many repetitions a usual accuracy needs.
         worst = max(stated or missed, key=lambda row: row.std / row.wanted)
-        fault = "miss the wanted σ" if stated else "have a σ of more than 5 % of their size"
+        few = len(stated or missed) == 1
+        fault = (
+            f"{'has' if few else 'have'} a σ of more than 5 % of {'its' if few else 'their'} size"
+        )
+        if stated:
+            fault = f"{'misses' if few else 'miss'} the wanted σ"
         needed = "no number of repetitions reaches"
         if worst.repetitions:
             needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"

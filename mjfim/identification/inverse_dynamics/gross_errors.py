@@ -73,6 +73,9 @@ LEAST_FACTOR = 0.1
 # Difference of mean logarithms of mean squares within which two errors explain a log equally well.
 TIE = 0.3
 
+# What comes before the lines that cure an error.
+STATE = "State in [recording.columns]: "
+
 # Relative rounding of times.
 ROUNDING = 1e-9
 
@@ -372,9 +375,21 @@ class _Search:
                 continue
             for column, name in zip(columns[k], columns[source], strict=False):
                 of = stated.get(name, ColumnSpec(column=name))
-                zero = f", offset = {of.offset * factor + offset:.4g}" if offset else ""
-                entries = f'column = "{of.column}", scale = {of.scale * factor:.4g}{zero}'
-                lines.append(f'"{column}" = {{ {entries} }}')
+                lines.append(column_line(column, of, factor, offset))
                 if offset:
                     break
-        return f"State in [recording.columns]: {'; '.join(lines)}" if lines else ""
+        return f"{STATE}{'; '.join(lines)}" if lines else ""
+
+
+def column_line(column: str, of: ColumnSpec, factor: float = 1.0, offset: float = 0.0) -> str:
+    """Write a line of `[recording.columns]` that changes what a column of a log means.
+
+    Args:
+        column: Name of the signal.
+        of: Where its values are until now.
+        factor: Factor on the signal.
+        offset: Constant that is added to it [unit of the signal].
+    """
+    zero = f", offset = {of.offset * factor + offset:.4g}" if offset else ""
+    entries = f'column = "{of.column}", scale = {of.scale * factor:.4g}{zero}'
+    return f'"{column}" = {{ {entries} }}'

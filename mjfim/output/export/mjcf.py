@@ -347,6 +347,10 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
     Raises:
         ModelError: No MJCF expresses the values.
     """
+    # A floor that only the experiment states is no part of the model.
+    if system.experiment.limits.floor is not None:
+        bare = system.experiment.replace(limits={"floor": None})
+        system = System.resolve(bare, source=system.source.stated)
     wanted = system.model_at(theta, at_keyframe=False)
     urdfs, remarks = write_identified_urdfs(path, system, theta)
     texts = {file.resolve() for file, _ in elements_of(system.model_path)}

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, Array
 from mjfim.errors import first_ones, listed
 from mjfim.output.page import (
     Emphasis,
@@ -136,6 +136,9 @@ def _verdict(design: Design) -> Verdict:
         )
         return Verdict(text, Level.DOUBTFUL)
     reservation = _reservation(design) or _reservation_of_robots(rehearsal)
+    poorly = _with_interval(design, POORLY_KNOWN_SHARE)
+    if poorly and not reservation:
+        reservation = f"it hardly determines {_with_widest(design, poorly)}"
     if reservation:
         return Verdict(f"This motion can be played, but {reservation}. {seen}", Level.DOUBTFUL)
     equal = "It is no better than its start. " if design.is_start else ""
@@ -240,10 +243,14 @@ def _unlimited(
     return f"{which} no limit, up to {' and '.join(shown)}"
 
 
-def _undetermined(design: Design) -> list[int]:
-    """Numbers of the wanted parameters whose standard deviation exceeds their size."""
-    std, sizes = design.stated_std, design.sizes
-    return [j for j in design.wanted if not np.isfinite(std[j]) or 0.0 < sizes[j] < std[j]]
+def _with_interval(design: Design, share: float) -> list[int]:
+    """Numbers of the wanted parameters whose predicted 95 % interval is wide.
+
+    Half its width is at least a share of their size.
+    """
+    widths, least = NORMAL_95 * design.stated_std, share * design.sizes
+    is_wide = ~np.isfinite(widths) | ((least > 0.0) & (widths >= least))
+    return [j for j in design.wanted if is_wide[j]]
 
 
 def _reservation(design: Design) -> str:
@@ -251,23 +258,27 @@ def _reservation(design: Design) -> str:
 
     A start outside the limits may tell more.
     """
-    found = _undetermined(design)
-    if not found and _tells_less(design):
+    undetermined = _with_interval(design, UNDETERMINED_SHARE)
+    if undetermined:
+        return f"it does not determine {_with_widest(design, undetermined)}"
+    if _tells_less(design):
         before, after = _least_eigenvalues(design)
         return (
             f"it tells less than its start (λ_min {before:.3g} → {after:.3g}), because the cost "
             "weighs the control or the tracking more than the information"
         )
-    if not found:
-        return ""
+    return ""
+
+
+def _with_widest(design: Design, found: list[int]) -> str:
+    """Names of parameters, and the accuracy of that which is known worst."""
     std, sizes = design.stated_std, design.sizes
+    names = first_ones([design.parameters[j] for j in found])
     worst = max(found, key=lambda j: float(std[j] / sizes[j]) if np.isfinite(std[j]) else np.inf)
-    text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
     if not np.isfinite(std[worst]):
-        return text
-    share = relative(std[worst], sizes[worst])
-    of_one = f": σ is {share} of its size"
-    return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
+        return names
+    of_one = f": σ is {relative(std[worst], sizes[worst])} of its size"
+    return names + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
 
 
 def _reservation_of_robots(rehearsal: Rehearsal) -> str:
@@ -323,9 +334,9 @@ def _next_steps(design: Design) -> Iterator[str]:
             f"Remove or fix one parameter of each group, give it a prior, or measure another "
             f"output: {groups}."
         )
-    undetermined = _undetermined(design) if design.separable else []
-    if undetermined:
-        names = first_ones([design.parameters[j] for j in undetermined])
+    wide = _with_interval(design, POORLY_KNOWN_SHARE) if design.separable else []
+    if wide:
+        names = first_ones([design.parameters[j] for j in wide])
         yield (
             f"Determine {names} with a longer or larger motion, by measuring another output, or "
             "state what is known with `prior`."
@@ -622,7 +633,7 @@ def _check_verdict(check: Check) -> Verdict:
         shares = {row.name: row.relative for row in check.rows if not row.nuisance}
         worst = max(shares, key=lambda name: shares[name])
         sigma = relative(shares[worst], 1.0)
-        if shares[worst] >= 1.0:
+        if NORMAL_95 * shares[worst] >= UNDETERMINED_SHARE:
             text = f"{check.source} does not determine {worst}: its σ is {sigma} of its size."
             return Verdict(text, Level.DOUBTFUL)
         text = (

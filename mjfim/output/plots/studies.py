@@ -561,6 +561,8 @@ def rehearsal(result: Rehearsal) -> Picture:
     note = "Dots are robots, bars the model."
     if not result.limits:
         note += " The experiment states no limits."
+    elif (result.margins > 1.0).any():
+        note += " Margins above 100 % are drawn there."
     height = max(2.6, 1.0 + 0.24 * max(len(result.limits), len(result.joints)))
     return Picture(
         title=title,
@@ -574,12 +576,11 @@ def rehearsal(result: Rehearsal) -> Picture:
 def _margins(result: Rehearsal) -> Panel:
     """Return a row per limit: margin of the model, and of every robot."""
     margins = np.where(np.isfinite(result.margins), result.margins, LEAST_MARGIN)
-    percent = 100.0 * np.maximum(margins, LEAST_MARGIN)
+    percent = 100.0 * np.clip(margins, LEAST_MARGIN, 1.0)
     low = min(-5.0, float(percent.min(initial=0.0)) - 5.0)
-    high = max(100.0, float(percent[0].max(initial=0.0)) + 5.0)
     marks = [vspan(low, 0.0, DESIGNED, opacity=0.1)]
     for i in range(len(result.limits)):
-        role, label = MEASURED, "robots, all keep the limit"
+        role, label = MEASURED, "robots"
         if not result.kept[:, i].all():
             role, label = DESIGNED, "robots, some exceed the limit"
             if result.is_clamped[i]:
@@ -589,7 +590,7 @@ def _margins(result: Rehearsal) -> Panel:
     return Panel(
         title=f"{result.all_kept} of {result.robots} robots keep all limits",
         marks=marks,
-        x=Axis(label="margin over half of the range [%]", limits=(low, high)),
+        x=Axis(label="margin over half of the range [%]", limits=(low, 105.0)),
         y=row_axis(names),
     )
 
