@@ -23,13 +23,19 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import labels_of_system
 from mjfim.files import write_json
+from mjfim.model.coordinates import split_unit
+from mjfim.model.units import per_second
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
+from mjfim.output.page import DESIGNED, INITIAL
+from mjfim.output.panels import Axis, Panel, Picture, dots, grid, line
+from mjfim.output.plots.draw import save
 from mjfim.output.plots.pictures import draw
+from mjfim.output.words import quotient_unit
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.studies import MonteCarloStudy
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Labels, Trajectory
 
 # Experiment of the study.
 EXPERIMENT = Path(__file__).resolve().parents[1] / "models" / "cart_pendulum.toml"
@@ -203,6 +209,40 @@ def efficiency_table(study: MonteCarloStudy) -> Table:
     return table
 
 
+def sensitivity_phase(design: Design, labels: Labels) -> Picture:
+    """Phase plots of the sensitivities ψ of the angle to each parameter (the paper's figure 3).
+
+    Args:
+        design: The design.
+        labels: Names and units of its columns.
+    """
+    panels = [_phase_plot(design, labels, j) for j in range(len(design.theta))]
+    note = "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative."
+    title = "Sensitivity of the motion to each parameter"
+    return grid(title, panels, [2.75] * len(panels), len(panels), note)
+
+
+def _phase_plot(design: Design, labels: Labels, j: int) -> Panel:
+    """Sensitivity to one parameter of the coordinate whose velocity it changes most."""
+    nv = design.trajectory.qvel.shape[1]
+    change = np.abs(design.final.sensitivity[:, nv : 2 * nv, j]).max(axis=0)
+    dof = int(np.argmax(change / np.abs(design.trajectory.qvel).max(axis=0)))
+    marks = []
+    for evaluation, term, front in ((design.initial, INITIAL, 3.0), (design.final, DESIGNED, 2.0)):
+        position, velocity = evaluation.sensitivity[:, [dof, nv + dof], j].T
+        marks.append(line(position, velocity, term, label=term, width=1.6, front=front))
+    name, unit = split_unit(labels.positions[dof])
+    x, y = (
+        Axis(label=f"∂{name}{prime}/∂{labels.parameters[j]}\n[{shown}]", most=3)
+        for prime, shown in (
+            ("", quotient_unit(unit, labels.parameter_units[j])),
+            ("′", quotient_unit(per_second(unit), labels.parameter_units[j])),
+        )
+    )
+    start = dots([0.0], [0.0], "text", size=3.5, label="start", front=4.0)
+    return Panel(marks=[*marks, start], x=x, y=y)
+
+
 def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCarloStudy) -> None:
     """Write Figures 2-6 as PNG and the Rerun file.
 
@@ -215,7 +255,6 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
     names = labels_of_system(task.system)
     drawn = {
         "figure_2": (design, "trajectories"),
-        "figure_3": (design, "sensitivity_phase"),
         "convergence": (design, "convergence"),
         **{
             f"figure_{number}": (study, f"histogram_{parameter}")
@@ -225,6 +264,7 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
 
     for name, (record, picture) in drawn.items():
         draw(record, picture, folder / f"{name}.png")
+    save(sensitivity_phase(design, names), folder / "figure_3.png")
     rerun_log.log_design(folder / "design.rrd", task.system.model_at(task.theta), design, names)
 
 

@@ -58,6 +58,14 @@ def identify(
             "prediction of left-out data.",
         ),
     ] = False,
+    predicted: Annotated[
+        Path | None,
+        typer.Option(
+            "--predicted",
+            metavar="DIR",
+            help="Folder of the design or check whose predicted σ are shown beside the estimates.",
+        ),
+    ] = None,
     samples: Annotated[
         int | None,
         typer.Option(
@@ -83,8 +91,14 @@ def identify(
     from mjfim.output.folders import estimate_files, parts_of_identified, sample_files
     from mjfim.output.pages.files import log_section
     from mjfim.recordings.read import read_log, recording_paths
+    from mjfim.records.check import Check
+    from mjfim.records.design import Design
 
     stated = with_model(stated)  # it may be edited while it is identified
+    prediction: Design | Check | None = None
+    if predicted is not None:
+        kind = Check if (predicted / "check.npz").is_file() else Design
+        prediction = kind.load(predicted)
     system = System.resolve(stated, threads=run.threads)
     inputs = input_files(stated, [*recordings, *(held_out or [])])
     fitted_paths = recording_paths(recordings, system.channels)
@@ -112,6 +126,8 @@ def identify(
         result = estimated(
             stated, fitted, held_out=kept, callback=show, threads=run.threads, executor=workers
         )
+    if prediction is not None:
+        result = result.with_prediction(prediction)
     if result.selection is not None:
         selected = mjfim.selected_experiment(stated, result.selection)
         system = System.resolve(selected, threads=run.threads)

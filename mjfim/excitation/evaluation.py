@@ -86,7 +86,7 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
         information=point.information,
         eigenvalues=point.criterion.eigenvalues,
         std=information.std(point.information),
-        min_eigenvalue=information.accumulated_eigenvalue(point.sensitivity),
+        std_over_time=information.accumulated_std(point.sensitivity),
         criterion=point.criterion.value,
         cost=point.cost,
         growth=largest_amplification(A, task.sizes[: task.space.nx]),

@@ -195,15 +195,15 @@ def target_accuracies(task: DesignTask) -> Array:
     Raises:
         ExperimentError: No parameter states a target.
     """
-    stated = [None if q.nuisance else q.wanted for q in task.parameters.parameters]
-    if not any(stated):
+    wanted = task.parameters.wanted
+    if np.isinf(wanted).all():
         tables = task.experiment.parameters.items()
         name = next((n for n, table in tables if table.inertial is None), "<name>")
         raise ExperimentError(
             f"{task.experiment.source}: no parameter states which standard deviation is wanted; "
             f"state it in the parameter's unit, for example parameters.{name}.wanted = 0.01"
         )
-    return np.array([np.inf if value is None else value for value in stated])
+    return wanted
 
 
 def largest_ratio_to_target(std: Array, wanted: Array) -> tuple[float, int]:
@@ -231,7 +231,7 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
     Raises:
         UnidentifiableError: A parameter with a target cannot be identified by itself.
     """
-    unreachable = np.flatnonzero(np.isfinite(wanted) & ~np.isfinite(design.final.std))
+    unreachable = np.flatnonzero(np.isfinite(wanted) & ~np.isfinite(design.stated_std))
     if not len(unreachable):
         return
 
@@ -575,11 +575,11 @@ class _HorizonSearch:
 
         # After a stop, a design counts if it keeps the limits, and reaches the targets or is the
         # first one.
-        ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
+        ratio, parameter = largest_ratio_to_target(design.stated_std, self.targets)
         if is_stopped and (violated or (not ratio <= 1.0 and self.designs)):
             return None
         known = self.designs.get(samples)
-        if known is None or ratio < largest_ratio_to_target(known.final.std, self.targets)[0]:
+        if known is None or ratio < largest_ratio_to_target(known.stated_std, self.targets)[0]:
             self.designs[samples] = design
         name = task.parameters.names[parameter]
         return Tried(horizon=horizon, ratio=ratio, parameter=name)
@@ -592,7 +592,7 @@ class _HorizonSearch:
         reason = longest.why
         if design is not None:
             names = self.base.parameters.names
-            missed = missed_targets(names, design.final.std, self.targets)
+            missed = missed_targets(names, design.stated_std, self.targets)
             reason = f"the target is missed by {missed}"
         return OutOfReachError(
             f"{self.base.experiment.source}: even {longest.horizon:g} s is too short: {reason}. "

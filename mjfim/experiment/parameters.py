@@ -122,6 +122,7 @@ def _single_parameter(
         function=spec.function,
         nuisance=spec.nuisance,
         wanted=spec.wanted,
+        published=spec.published,
         per_recording=spec.per_recording,
     )
 

@@ -653,4 +653,7 @@ def labels_of_system(system: System) -> Labels:
         parameters=system.parameters.names,
         parameter_units=system.units,
         outputs=outputs,
+        wanted=system.parameters.wanted,
+        published=system.parameters.published,
+        bounds=np.column_stack([system.parameters.lower, system.parameters.upper]),
     )

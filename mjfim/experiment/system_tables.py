@@ -449,7 +449,14 @@ class ParameterSpec(Section):
         default=None,
         description=(
             "Target for the standard deviation [parameter unit], which `check`, `design "
-            "--shortest` and campaigns use."
+            "--shortest`, campaigns and pictures use."
+        ),
+    )
+    published: FiniteWithUnit | None = Field(
+        default=None,
+        description=(
+            "Value of a data sheet or of a publication [parameter unit]. Estimates are compared "
+            "with it in pictures and tables; nothing is computed from it."
         ),
     )
 
@@ -491,7 +498,9 @@ class ParameterSpec(Section):
             return
 
         single = [
-            key for key in ("guess", "true", "bounds", "wanted") if getattr(self, key) is not None
+            key
+            for key in ("guess", "true", "bounds", "wanted", "published")
+            if getattr(self, key) is not None
         ]
         if self.unit:
             single.append("unit")

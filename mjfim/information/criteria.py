@@ -210,15 +210,26 @@ def standard_deviations(information: Array) -> Array:
     """Cramer-Rao standard deviations.
 
     Args:
-        information: (p, p) information [1 / (theta_i theta_j unit)].
+        information: (..., p, p) information [1 / (theta_i theta_j unit)].
 
     Returns:
-        (p,) standard deviations [theta-unit], all infinite if the information is singular.
+        (..., p) standard deviations [theta-unit], all infinite if the information is singular.
     """
     scaled, scale = scaled_to_unit_diagonal(information)
-    values, vectors = np.linalg.eigh(scaled)
-    if values[0] <= SINGULAR_RATIO * values[-1]:
-        return np.full(len(scale), np.inf)
+    variances = np.sum(inverse_root(scaled) ** 2, axis=-1)
+    return np.asarray(np.sqrt(np.nan_to_num(variances, nan=np.inf)) / scale)
 
-    variances = np.sum(vectors**2 / values, axis=1)
-    return np.asarray(np.sqrt(variances) / scale)
+
+def inverse_root(information: Array) -> Array:
+    """Matrices W with `W W'` the inverse of an information.
+
+    Args:
+        information: (..., p, p) information of unit diagonal.
+
+    Returns:
+        (..., p, p) matrices; NaN where the information is singular.
+    """
+    values, vectors = np.linalg.eigh(information)
+    is_singular = values[..., 0] <= SINGULAR_RATIO * values[..., -1]
+    usable = np.where(is_singular[..., None], np.nan, values)
+    return np.asarray(vectors / np.sqrt(usable)[..., None, :])

@@ -25,14 +25,14 @@ from functools import cached_property
 
 import numpy as np
 
-from mjfim.arrays import Array, scaled_to_unit_diagonal
+from mjfim.arrays import Array, evenly_spread_indices, scaled_to_unit_diagonal
 from mjfim.information.criteria import (
     CRITERIA,
     NEGLIGIBLE_WEIGHT,
     PSEUDO_INVERSE_CUTOFF,
-    SINGULAR_RATIO,
     Criterion,
     c_optimality,
+    inverse_root,
     smooth_e_optimality,
     standard_deviations,
 )
@@ -45,6 +45,10 @@ from mjfim.records.trajectory import Sensitivity
 # A unit vector lies within the identifiable combinations if the squared length of its part outside
 # is below this number.
 ROUND_OFF_SHARE = 1e-6
+
+
+# Largest number of samples at which accumulated standard deviations are computed.
+MAX_TIMES = 400
 
 
 # One of the r terms v^r w_r' of V: (N+1, ny) weights v of the measured outputs, (N+1, ny)
@@ -175,14 +179,26 @@ class FisherInformation:
         flat = self.noise.whitened_rows(sensitivity.G)
         return flat.T @ flat + self.prior
 
-    def accumulated_eigenvalue(self, sensitivity: Sensitivity) -> Array:
-        """(N+1,) smallest eigenvalue of R from the information up to each sample."""
-        measured = self.noise.measured(len(sensitivity.G) - 1)
-        G = self.noise.whiten(sensitivity.G) * measured[..., None]
-        total = np.cumsum(np.swapaxes(G, 1, 2) @ G, axis=0) + self.prior
+    def accumulated_std(self, sensitivity: Sensitivity) -> Array:
+        """Standard deviations from the prior and the measurements up to each sample.
 
-        smallest = np.linalg.eigvalsh(self.reduced(total)[0])[:, 0]
-        return np.asarray(np.maximum(smallest, 0.0))
+        Of a long trajectory, `MAX_TIMES` evenly spread samples are computed. Others have the larger
+        value of the one before.
+
+        Args:
+            sensitivity: Sensitivities of the outputs to the parameters.
+
+        Returns:
+            (N+1, p) standard deviations [theta-unit]; see `std`.
+        """
+        count, _, p = sensitivity.G.shape
+        measured = self.noise.measured(count - 1)
+        G = self.noise.whiten(sensitivity.G) * measured[..., None]
+
+        ends = evenly_spread_indices(count, MAX_TIMES)
+        parts = [part.reshape(-1, p) for part in np.split(G, ends[:-1] + 1)]
+        total = np.cumsum([part.T @ part for part in parts], axis=0) + self.prior
+        return self.std(total)[np.searchsorted(ends, np.arange(count), side="right") - 1]
 
     def scaled(self, information: Array) -> Array:
         """I~ = S I S / f_m of information I: (..., p, p)."""
@@ -355,28 +371,28 @@ class FisherInformation:
         """Cramer-Rao standard deviations of the parameters.
 
         Args:
-            information: (p, p) information [1 / (theta_i theta_j unit)].
+            information: (..., p, p) information [1 / (theta_i theta_j unit)].
 
         Returns:
-            (p,) standard deviations [theta-unit], infinite for a parameter that is not an
+            (..., p) standard deviations [theta-unit], infinite for a parameter that is not an
             identifiable combination by itself.
         """
         if self.basis is None:
             return standard_deviations(information)
 
-        std = np.full(len(information), np.inf)
-        variances = np.diag(self.covariance(information))
-        std[self.wanted] = np.nan_to_num(np.sqrt(variances), nan=np.inf)
+        std = np.full(information.shape[:-1], np.inf)
+        variances = np.diagonal(self.covariance(information), axis1=-2, axis2=-1)
+        std[..., self.wanted] = np.nan_to_num(np.sqrt(variances), nan=np.inf)
         return std
 
     def covariance(self, information: Array) -> Array:
         """Cramer-Rao covariance of the wanted parameters.
 
         Args:
-            information: (p, p) information [1 / (theta_i theta_j unit)].
+            information: (..., p, p) information [1 / (theta_i theta_j unit)].
 
         Returns:
-            (t, t) covariance [theta_i theta_j unit], NaN for a parameter that is not an
+            (..., t, t) covariance [theta_i theta_j unit], NaN for a parameter that is not an
             identifiable combination by itself.
         """
         covariance, basis = self._identifiable_covariance(information)
@@ -398,27 +414,21 @@ class FisherInformation:
         return np.asarray(np.sqrt(variances))
 
     def _identifiable_covariance(self, information: Array) -> tuple[Array, Array]:
-        """(t, t) covariance within the identifiable combinations, and their basis in scaled units.
+        """(..., t, t) covariance within identifiable combinations, and their basis in scaled units.
 
         The covariance is zero along directions outside the combinations, and NaN if the reduced
         information is singular.
         """
         t = self.wanted
         basis = np.eye(len(t)) if self.basis is None else self._basis_with_prior(self.basis)
-        unknown = np.full((len(t), len(t)), np.nan)
         if not basis.shape[1]:
-            return unknown, basis
+            return np.full((*information.shape[:-2], len(t), len(t)), np.nan), basis
 
         R, _ = replace(self, basis=basis).reduced(information)
         unit, size = scaled_to_unit_diagonal(R)
-        values, vectors = np.linalg.eigh(unit)
-        if values[0] <= SINGULAR_RATIO * values[-1]:
-            return unknown, basis
-
-        axes = basis @ (vectors / size[:, None])
-        scaled = (axes / values) @ axes.T
-        covariance = scaled * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
-        return covariance, basis
+        axes = basis @ (inverse_root(unit) / size[..., None])
+        scaled = axes @ np.swapaxes(axes, -1, -2)
+        return scaled * np.outer(self.scale[t], self.scale[t]) / self.measure_rate, basis
 
     # Identifiable combinations
 

@@ -118,6 +118,7 @@ class Parameter:
         nuisance: Whether it is unknown but of no interest, so that the design spends no effort on
             it.
         wanted: Standard deviation aimed at, or None.
+        published: Value with which estimates are compared, or None.
         group: Name of the group with which it was declared; empty for a single parameter.
         per_recording: Whether every recording has a separate value.
         cad_prior: For a coordinate of a body's inertia, the standard deviation of the logarithm of
@@ -136,6 +137,7 @@ class Parameter:
     function: SpecEdit | None = None
     nuisance: bool = False
     wanted: float | None = None
+    published: float | None = None
     group: str = ""
     per_recording: bool = False
     cad_prior: float | None = None
@@ -242,6 +244,16 @@ class ParameterSet:
     def magnitude(self) -> Array:
         """(p,) magnitudes to which finite-difference steps are relative."""
         return self._values(lambda p: p.size or abs(p.guess) or p.scale)
+
+    @property
+    def wanted(self) -> Array:
+        """(p,) standard deviations aimed at, infinite where none is stated [theta-unit]."""
+        return self._values(lambda p: np.inf if p.nuisance or p.wanted is None else p.wanted)
+
+    @property
+    def published(self) -> Array:
+        """(p,) values with which estimates are compared, NaN where none is stated [theta-unit]."""
+        return self._values(lambda p: np.nan if p.published is None else p.published)
 
     def sizes(self, theta: Array) -> Array:
         """(p,) sizes with which standard deviations are compared, all positive [theta-unit].

@@ -90,16 +90,6 @@ def rotation_vectors(quaternions: Array) -> Array:
     return vectors
 
 
-# When a controller should use the gains. It is the name of the last column of design.csv, so it has
-# neither commas nor quotation marks; the column holds zeros.
-GAIN_NOTE = (
-    "gains are for u = ctrl + gain (planned state - measured state). Use them where small errors "
-    "grow along the motion (torque control without servos; mjfim design warns about it) and the "
-    "state is measured with little noise and delay. Leave them out where position servos correct "
-    "errors already. Record the control that was really sent in both cases"
-)
-
-
 def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Playback:
     """Simulate a designed trajectory at `playback_rate`, at the parameters of the design.
 
@@ -126,8 +116,6 @@ def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Pl
 def design_columns(playback: Playback, system: System) -> dict[str, Array]:
     """Return the columns of `design.csv` by name, each (M+1,): time, state, controls and gains.
 
-    The name of the last column says when to use the gains; the column holds zeros.
-
     Controls and gains hold until the next row; the last row has none (NaN).
 
     Args:
@@ -142,8 +130,7 @@ def design_columns(playback: Playback, system: System) -> dict[str, Array]:
 
     columns = {"t": playback.t}
     columns |= dict(zip(state_names(system.model), playback.state.T, strict=True))
-    columns |= dict(zip([*controls, *gains], held.T, strict=True))
-    return columns | {f"note: {GAIN_NOTE}": np.zeros(rows + 1)}
+    return columns | dict(zip([*controls, *gains], held.T, strict=True))
 
 
 def reference_columns(playback: Playback, system: System) -> dict[str, Array]:

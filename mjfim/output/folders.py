@@ -29,6 +29,7 @@ from mjfim.output.plots.pictures import (
     histogram_name,
     numbered,
     pictures_of,
+    usual,
 )
 from mjfim.output.report import Media, kinds_in, write_report
 from mjfim.output.video import report_video
@@ -135,6 +136,7 @@ IDENTIFIED = "identified.xml"
 ENDINGS = "|".join(PictureFormat)
 STALE: dict[type[ShownRecord], str] = {
     Comparison: r"control_[\w-]+\.csv",
+    Design: rf"({'|'.join(DESIGN_PICTURES)})\.({ENDINGS})",
     Estimate: rf"((fit|held_out)(_\d+)?|{'|'.join(ESTIMATE_PICTURES)})\.({ENDINGS})"
     r"|identified(_.*)?\.(xml|urdf)",
 }
@@ -406,7 +408,7 @@ def _write_figures(
 
     # Matplotlib takes seconds to import, which nobody waits for who has pressed Ctrl-C twice.
     pictures = {}
-    write_optional("the pictures", lambda: pictures.update(pictures_of(record)))
+    write_optional("the pictures", lambda: pictures.update(usual(record)))
     write_pictures(folder, pictures, picture_format)
 
 

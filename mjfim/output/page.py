@@ -195,9 +195,13 @@ class Listing:
 
 @dataclass(frozen=True)
 class Plot:
-    """The pictures of the record whose names begin like this, as `fit`, or `fit_1` and `fit_2`."""
+    """The pictures of the record whose names begin like this, as `fit`, or `fit_1` and `fit_2`.
+
+    Details are folded away.
+    """
 
     name: str
+    detail: bool = False
 
 
 Part = Table | Text | Listing | Plot

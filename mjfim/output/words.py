@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.errors import first_ones
 from mjfim.output.page import number
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction
@@ -236,6 +237,45 @@ def improvement(before: float, after: float) -> str:
     if not (np.isfinite(before) and np.isfinite(after) and after > 0 and before > 0):
         return "-"
     return f"÷ {before / after:.1f}" if before >= after else f"× {after / before:.1f}"
+
+
+# Largest number of parameters that a sentence names, and share of the motion from which on it says
+# that a part of it tells nothing.
+MAX_NAMED, NOTABLE_SHARE = 3, 0.1
+
+
+def when_learnt(design: Design) -> str:
+    """Say after which time each parameter is known, and which seconds tell nothing.
+
+    Args:
+        design: The design.
+    """
+    t = design.trajectory.t - design.trajectory.t[0]
+    targets = design.targets
+    asked = [j for j in design.wanted if np.isfinite(targets[j])]
+    if not asked:
+        return ""
+    seconds = design.seconds_to(targets)
+    is_stated = np.isfinite(complete_labels(design).wanted).any()
+    goal = f"a σ of {100.0 * targets[asked[0]] / design.sizes[asked[0]]:.2g} %"
+    missed = [design.parameters[j] for j in asked if not np.isfinite(seconds[j])]
+    if missed:
+        what = "the wanted σ" if is_stated else goal
+        return f"One experiment does not reach {what} for {first_ones(missed)}."
+
+    last = sorted(asked, key=lambda j: seconds[j])[-MAX_NAMED:]
+    named = [f"{shorten(design.parameters[j])} {seconds[j]:.3g} s" for j in last]
+    others = "" if len(last) == len(asked) else "others earlier, "
+    end = float(seconds[last[-1]])
+    reached = "Every wanted σ is reached" if is_stated else f"Every parameter reaches {goal}"
+    sentence = f"{reached} after {end:.3g} s ({others}{', '.join(named)})"
+    if t[-1] - end >= NOTABLE_SHARE * t[-1]:
+        sentence += f"; the last {t[-1] - end:.3g} s are not needed for it"
+    is_behind = (design.initial.std_over_time <= design.std_over_time)[:, asked].all(axis=1)
+    begin = float(t[np.argmin(is_behind)])
+    if begin >= NOTABLE_SHARE * t[-1]:
+        sentence += f". Until {begin:.3g} s the initial motion tells more"
+    return f"{sentence}."
 
 
 def predicted_data(predictions: Sequence[Prediction]) -> str:

@@ -12,7 +12,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError, listed, unknown
 
 # Prefixes of the columns that a design.csv has besides the time and the controls.
-DESIGN_PREFIXES = ("qpos:", "qvel:", "act:", "gain:", "note:")
+DESIGN_PREFIXES = ("qpos:", "qvel:", "act:", "gain:")
 
 # Tolerance of rounded time stamps, as a fraction of the sample period.
 STAMP_TOLERANCE = 1e-6

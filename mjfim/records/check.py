@@ -360,6 +360,13 @@ class Check(ShownRecord):
         return float(self.eigenvalues[-1] / smallest) if smallest > 0.0 else np.inf
 
     @property
+    def covariance(self) -> Array:
+        """(t, t) predicted covariance of `wanted`; NaN where one is not identifiable alone."""
+        std = np.array([row.std for row in self.rows if not row.nuisance])
+        std = np.where(np.isfinite(std), std, np.nan)
+        return np.asarray(self.correlation * np.outer(std, std))
+
+    @property
     def ok(self) -> bool:
         """True if the check found no fault.
 

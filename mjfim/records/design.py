@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_pseudo_inverse
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
@@ -101,9 +101,21 @@ class IterateMotions(Record):
         )
 
 
+# When a controller should use the gains, for design.json and the player.
+GAIN_NOTE = (
+    "Gains are for u = ctrl + gain (planned state - measured state). Use them where small errors "
+    "grow along the motion (torque control without servos; mjfim design warns about it) and the "
+    "state is measured with little noise and delay. Leave them out where position servos correct "
+    "errors already. Record the control that was really sent in both cases."
+)
+
+
 # Number of iterations at the end of a search over which its improvement is measured.
 IMPROVEMENT_WINDOW = 10
 
+
+# Eigenvalues of an information of unit diagonal below this share of the largest one count as zero.
+SMALLEST_EIGENVALUE = 1e-13
 
 # Smallest improvement per iteration that is stated as a number.
 LEAST_IMPROVEMENT = 1e-4
@@ -127,8 +139,8 @@ class Evaluation(SavedRecord):
             scaled, with nuisance parameters marginalised, for identifiable combinations only.
         std: (p,) Cramér-Rao standard deviations [theta-unit]; infinite if a parameter is not
             identifiable alone.
-        min_eigenvalue: (N+1,) smallest eigenvalue of the information per second, accumulated up to
-            each sample.
+        std_over_time: (N+1, p) standard deviations from the prior and the measurements up to each
+            sample [theta-unit]; the last row is `std`.
         criterion: phi, the information term of the cost.
         cost: J.
         growth: Largest open-loop amplification of a small deviation along the trajectory; NaN if
@@ -141,7 +153,7 @@ class Evaluation(SavedRecord):
     information: Array
     eigenvalues: Array
     std: Array
-    min_eigenvalue: Array
+    std_over_time: Array
     criterion: float
     cost: float
     growth: float = float("nan")
@@ -279,6 +291,13 @@ def improvement_per_iteration(history: Sequence[HistoryRow], size: float) -> flo
         return float("nan")
     fall = min(row.cost for row in before) - min(row.cost for row in counted)
     return float(1.0 - (1.0 + fall / size) ** (-1.0 / iterations))
+
+
+def round_share(share: float) -> float:
+    """Smallest 1, 2 or 5 times a power of ten that is not below a share."""
+    power = 10.0 ** np.floor(np.log10(share))
+    rounded = (factor * power for factor in (1.0, 2.0, 5.0, 10.0))
+    return float(next(each for each in rounded if each >= share))
 
 
 @record
@@ -575,6 +594,56 @@ class Design(ShownRecord):
         return self.final.std if self.rehearsal is None else self.rehearsal.steps.stated
 
     @property
+    def std_over_time(self) -> Array:
+        """(N+1, p) standard deviations to state, by the measurements up to each sample."""
+        std = self.final.std
+        ratio = np.divide(self.stated_std, std, out=np.ones(len(std)), where=np.isfinite(std))
+        return np.asarray(self.final.std_over_time * ratio)
+
+    @property
+    def covariance(self) -> Array:
+        """(p, p) predicted covariance; NaN where a parameter is not identifiable alone."""
+        inverse = scaled_pseudo_inverse(self.final.information, SMALLEST_EIGENVALUE)
+        spread = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
+        std = np.where(np.isfinite(self.stated_std), self.stated_std, np.nan) / spread
+        return np.asarray(inverse * np.outer(std, std))
+
+    @property
+    def shares(self) -> Array:
+        """(p,) what is one hundred percent: the sizes; NaN where the value is 0."""
+        return np.where(self.theta == 0.0, np.nan, self.sizes)
+
+    @property
+    def targets(self) -> Array:
+        """(p,) standard deviations to reach: the wanted ones [theta-unit].
+
+        Where none is stated, the smallest share 1, 2 or 5 times a power of ten that all parameters
+        reach which are determined. Infinite for parameters that are not asked for.
+        """
+        wanted = np.full(len(self.theta), np.inf) if self.labels is None else self.labels.wanted
+        if np.isfinite(wanted).any():
+            return wanted
+        is_asked = np.isin(self.parameters, self.nuisance, invert=True)
+        sizes = np.where(is_asked, self.shares, np.nan)
+        share = self.stated_std / sizes
+        if not (share < 1.0).any():
+            return wanted
+        return np.nan_to_num(round_share(share[share < 1.0].max()) * sizes, nan=np.inf)
+
+    def seconds_to(self, targets: Array) -> Array:
+        """Return the time after which each parameter is known as well as a target.
+
+        Args:
+            targets: (p,) standard deviations [theta-unit].
+
+        Returns:
+            (p,) times from the beginning [s]; infinite where the design does not reach a target.
+        """
+        is_reached = self.std_over_time <= targets
+        t = self.trajectory.t - self.trajectory.t[0]
+        return np.where(is_reached.any(axis=0), t[np.argmax(is_reached, axis=0)], np.inf)
+
+    @property
     def separable(self) -> bool:
         """True if every wanted parameter is identifiable alone, from data or with its prior.
 
@@ -601,8 +670,15 @@ class Design(ShownRecord):
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
+        targets = self.targets
+        seconds = self.seconds_to(targets).tolist()
         return {
             **super().summary(),
+            "reached": {
+                self.parameters[j]: {"std": float(targets[j]), "seconds": seconds[j]}
+                for j in np.flatnonzero(np.isfinite(targets)).tolist()
+            },
+            "gains": GAIN_NOTE,
             "limits": {
                 "margins": self.limits,
                 "satisfied": self.within_limits,

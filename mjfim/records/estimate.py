@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, field
+from dataclasses import asdict, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,8 @@ import numpy as np
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import first_ones
 from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array, record
-from mjfim.records.check import join_names
+from mjfim.records.check import Check, join_names
+from mjfim.records.design import Design
 from mjfim.records.estimate_parts import (
     InformationInTime,
     InverseDynamicsFit,
@@ -475,6 +476,8 @@ class Estimate(ShownRecord):
             contains neither the bias of a wrong model nor the errors of held parameters, and no
             scatter of parameters that are stated to differ between recordings. Infinite on the
             diagonal where a parameter is not determined; empty in records of earlier versions.
+        prediction: (p, p) covariance that a design or a check predicted, NaN where it predicted
+            none; empty where none was given (`with_prediction`).
     """
 
     parameters: tuple[str, ...]
@@ -534,6 +537,7 @@ class Estimate(ShownRecord):
     in_time: InformationInTime | None = None
     tested_data: TermTestData | None = None
     honest_covariance: Array = no_array(0, 0)
+    prediction: Array = no_array(0, 0)
 
     file_stem = "estimate"
     made_by = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -544,6 +548,8 @@ class Estimate(ShownRecord):
         "std",
         "covariance",
         "honest_covariance",
+        "honest_std",
+        "predicted_std",
         "initial_theta",
         "sizes",
         "chi2",
@@ -619,10 +625,36 @@ class Estimate(ShownRecord):
     def guess_sizes(self) -> Array:
         """(p,) sizes of the guess, of which its difference from the estimate is a share.
 
-        They are zero for a single number whose guess is zero [theta-unit].
+        They are zero where the guess is zero [theta-unit].
         """
-        is_single = self.sizes == np.abs(self.theta)
+        is_single = (self.sizes == np.abs(self.theta)) | (self.initial_theta == 0.0)
         return np.where(is_single, np.abs(self.initial_theta), self.sizes)
+
+    @property
+    def honest_std(self) -> Array:
+        """(p,) a quarter of the width of the 95 % interval; NaN where it is not determined."""
+        is_known = np.isfinite(self.std) & np.isin(self.parameters, self.held, invert=True)
+        return np.where(is_known, 0.25 * np.ptp(self.interval, axis=1), np.nan)
+
+    @property
+    def predicted_std(self) -> Array:
+        """(p,) standard deviations that a design or a check predicted; NaN for none."""
+        if not len(self.prediction):
+            return np.full(len(self.theta), np.nan)
+        return np.sqrt(np.diag(self.prediction))
+
+    def with_prediction(self, prediction: Design | Check) -> Estimate:
+        """Return the estimate beside the accuracy that was predicted before the recording.
+
+        Args:
+            prediction: The design that was played, or a check; parameters are found by name.
+        """
+        names = prediction.wanted if isinstance(prediction, Check) else prediction.parameters
+        places = {name: place for place, name in enumerate(names)}
+        of = [places.get(name, len(names)) for name in self.parameters]
+        known = np.full((len(names) + 1,) * 2, np.nan)
+        known[:-1, :-1] = prediction.covariance
+        return replace(self, prediction=known[np.ix_(of, of)])
 
     @property
     def reason_without_nominal(self) -> str:

@@ -13,7 +13,10 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError
-from mjfim.records.base import Record, SavedRecord, record
+from mjfim.records.base import Record, SavedRecord, no_array, record
+
+# Bounds of a parameter without any.
+NO_BOUNDS = (-np.inf, np.inf)
 
 
 def with_unit(name: str, unit: str) -> str:
@@ -34,6 +37,9 @@ class Labels(Record):
         parameters: p names of the parameters, without unit.
         parameter_units: p units of the parameters; empty where a parameter has none.
         outputs: Labels of some measured columns by their names; others are in the model's unit.
+        wanted: (p,) stated standard deviations to reach, infinite without one [theta-unit].
+        published: (p,) values with which estimates are compared, NaN without one [theta-unit].
+        bounds: (p, 2) lower and upper bounds [theta-unit].
     """
 
     qpos: tuple[str, ...]
@@ -43,6 +49,9 @@ class Labels(Record):
     parameters: tuple[str, ...] = ()
     parameter_units: tuple[str, ...] = ()
     outputs: dict[str, str] = field(default_factory=dict)
+    wanted: Array = no_array()
+    published: Array = no_array()
+    bounds: Array = no_array(0, 2)
 
     def __post_init__(self) -> None:
         names, units = len(self.parameters), len(self.parameter_units)
@@ -51,6 +60,11 @@ class Labels(Record):
                 f"labels name {names} parameters but {units} units; give one unit (or '') per "
                 "parameter"
             )
+        for name, missing in (("wanted", np.inf), ("published", np.nan), ("bounds", NO_BOUNDS)):
+            if len(getattr(self, name)) != names:
+                shape = (names, *np.shape(missing))
+                object.__setattr__(self, name, np.broadcast_to(missing, shape))
+        super().__post_init__()
 
     def parameter(self, j: int) -> str:
         """Return the label of parameter j."""

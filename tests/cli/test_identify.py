@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+import mjfim
 from mjfim.cli.progress import ProgressDisplay
 from mjfim.output.manifest import MANIFEST
 from tests.support.cli import (
@@ -168,3 +169,15 @@ def test_no_robots_are_drawn_from_undetermined_parameters(
     assert "--samples: no robots were drawn: the recordings do not determine extra" in said
     assert {"samples", "samples.csv", "samples.png"}.isdisjoint(names(out))
     assert read(out / "estimate.json")["draws"] is None
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_the_accuracy_that_a_design_predicted_stands_beside_the_estimates(
+    home: Path, study: Path, recorded: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "fit"
+    words = ("identify", study, recorded, "-o", folder, "--predicted")
+    assert run(*words, home / "out").exit_code == 0
+    stated = mjfim.Design.load(home / "out").stated_std
+    np.testing.assert_allclose(read(folder / "estimate.json")["predicted_std"], stated, rtol=1e-9)
+    misused(run(*words, tmp_path, "--force"), "design.npz: this file is missing")

@@ -21,6 +21,7 @@ from mjfim.excitation.shortest_horizon import (
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
+from mjfim.output.words import when_learnt
 from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, StudyEvent
@@ -67,6 +68,11 @@ def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
         largest_ratio_to_target(evaluated.std, target_accuracies(task))[0], rel=1e-6
     )
     assert shorter.summary()["horizon"] == shorter.horizon
+
+    # The last parameter is known just before the end, by the numbers of the picture over time.
+    seconds = shorter.design.seconds_to(target_accuracies(task))
+    assert 0.8 * shorter.horizon < seconds.max() <= shorter.horizon
+    assert f"Every wanted σ is reached after {seconds.max():.3g} s" in when_learnt(shorter.design)
 
 
 @pytest.mark.slow

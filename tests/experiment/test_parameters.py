@@ -150,8 +150,17 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         r"parameters\.arm: .*ten parameters; guess would fit only one",
     ),
     "more for ten": (
-        {"arm": {**ARM, "bounds": [0.0, 1.0], "wanted": 0.1, "unit": "kg", "scale": 2.0}},
-        r"parameters\.arm: .*bounds, wanted, unit, scale would fit only one",
+        {
+            "arm": {
+                **ARM,
+                "bounds": [0.0, 1.0],
+                "wanted": 0.1,
+                "published": 0.3,
+                "unit": "kg",
+                "scale": 2.0,
+            }
+        },
+        r"parameters\.arm: .*bounds, wanted, published, unit, scale would fit only one",
     ),
     "coordinates": (
         {"arm": {**ARM, "coordinates": "central"}},

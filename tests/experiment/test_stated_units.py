@@ -82,6 +82,7 @@ WITH_UNITS: dict[str, Any] = {
             "targets": [{"path": "body/arm:ipos[2]", "scale": -1.0, "offset": "1 cm"}],
             "guess": "-30 cm",
             "wanted": "1 mm",
+            "published": "-31 cm",
         },
     },
     "noise": {
@@ -122,6 +123,7 @@ PLAIN: dict[str, Any] = {
             "targets": [{"path": "body/arm:ipos[2]", "scale": -1.0, "offset": 0.01}],
             "guess": -0.3,
             "wanted": 0.001,
+            "published": -0.31,
         },
     },
     "noise": {

@@ -216,9 +216,7 @@ def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_covarian
         total += S.G[k][rows].T @ np.linalg.inv(covariance[np.ix_(rows, rows)]) @ S.G[k][rows]
     made = replace(information(), noise=Noise(covariance=covariance, strides=strides))
     assert relative_error(made.matrix(S), total) < 1e-13
-    assert made.accumulated_eigenvalue(S)[-1] == pytest.approx(
-        made.evaluate(total).eigenvalues[0], rel=1e-9
-    )
+    assert_allclose(made.accumulated_std(S)[-1], np.sqrt(np.diag(np.linalg.inv(total))), rtol=1e-9)
     alone = replace(made, noise=Noise(covariance=np.diag(np.diag(covariance)), strides=strides))
     assert relative_error(alone.matrix(S), total) > 0.1
 
@@ -249,20 +247,39 @@ def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tm
     assert (found[2].std[:3] > 1.01 * found[0].std).all()
 
 
-def test_accumulated_smallest_eigenvalue_is_monotone_and_ends_at_the_whole() -> None:
-    for stride in (1, 3):
-        S, made = random_sensitivity(7), information(stride)
-        series = made.accumulated_eigenvalue(S)
-        assert series.shape == (13,)
-        assert (np.diff(series) >= -1e-12 * series[-1]).all()
-        assert series[0] == 0.0
-        assert series[-1] == pytest.approx(made.evaluate(made.matrix(S)).eigenvalues[0], rel=1e-10)
-        known = replace(made, prior=np.diag([9.0, 4.0, 400.0, 1.0]))
-        assert known.accumulated_eigenvalue(S)[0] == pytest.approx(4.0 / 50.0)
-        half = replace(made, prior=np.zeros((4, 4))).matrix(Sensitivity(psi=S.psi[:7], G=S.G[:7]))
-        assert series[6] == pytest.approx(
-            np.linalg.eigvalsh(made.scaled(half))[0], rel=1e-9, abs=1e-12
-        )
+@pytest.mark.parametrize("interest", [None, np.array([0, 2])])
+def test_accumulated_standard_deviations_are_those_of_a_plain_sum(interest: np.ndarray | None):
+    """Priors, correlated noise and nuisance parameters count as in the whole; the end is it."""
+    S, strides = random_sensitivity(7), np.array([1, 2, 3])
+    covariance = np.array([[0.01, 0.03, 0.0], [0.03, 0.25, 0.0], [0.0, 0.0, 4.0]])
+    made = replace(
+        information(),
+        noise=Noise(covariance=covariance, strides=strides),
+        prior=np.diag([0.0, 4.0, 400.0, 1.0]),
+        interest=interest,
+    )
+    found, total = made.accumulated_std(S), np.array(made.prior)
+    assert found.shape == (13, 4)
+    assert np.isinf(found[0]).all()
+    for k in range(1, 13):
+        rows = np.flatnonzero(k % strides == 0)
+        total += S.G[k][rows].T @ np.linalg.inv(covariance[np.ix_(rows, rows)]) @ S.G[k][rows]
+        if np.linalg.matrix_rank(total) == 4:
+            assert_allclose(found[k], np.sqrt(np.diag(np.linalg.inv(total))), rtol=1e-8)
+    assert_allclose(found[-1], made.std(made.matrix(S)), rtol=1e-10)
+
+
+def test_long_trajectories_have_accumulated_standard_deviations_that_are_not_too_small() -> None:
+    rng = np.random.default_rng(3)
+    S = Sensitivity(psi=np.zeros((1501, 1, 4)), G=rng.normal(size=(1501, 3, 4)))
+    made = information()
+    found = made.accumulated_std(S)
+    assert (np.diff(found[10:], axis=0) <= 0.0).all()
+    assert_allclose(found[-1], made.std(made.matrix(S)), rtol=1e-10)
+    for k in (100, 777, 1403):
+        upto = made.std(made.matrix(Sensitivity(psi=S.psi[: k + 1], G=S.G[: k + 1])))
+        assert (found[k] >= upto * (1.0 - 1e-12)).all()
+        assert_allclose(found[k], upto, rtol=0.03)
 
 
 def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_rate(

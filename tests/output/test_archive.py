@@ -101,7 +101,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         "gain": (N, NU, 2 * NV),
         "sensitivity": (N + 1, 2 * NV, P),
     }
-    further = {"information": (P, P), "eigenvalues": (P,), "std": (P,), "min_eigenvalue": (N + 1,)}
+    further = {"information": (P, P), "eigenvalues": (P,), "std": (P,), "std_over_time": (N + 1, P)}
     m = shapes["motions.iteration"][0]
     moving = {"t": (), "qpos": (NQ,), "ctrl": (NU,)}
     assert 2 <= m <= MAX_MOTIONS
@@ -113,6 +113,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         **{f"final.{key}": shape for key, shape in further.items()},
         **{f"initial.{key}": shape for key, shape in further.items()},
         **{"theta": (P,), "sizes": (P,), "prior": (P, P), "data": (P, P)},
+        **{"labels.wanted": (P,), "labels.published": (P,), "labels.bounds": (P, 2)},
         "record": (),
     }
     assert robots["rehearsal.theta"] == (5, P) and robots["rehearsal.steps.std"] == (P,)
@@ -206,9 +207,8 @@ def test_json_names_nuisance_parameters_and_priors(tmp_path: Path) -> None:
 def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
     """design.csv has all digits and named columns, and can be the initial control of a design."""
     with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
-        (*header, note), *rows = csv.reader(stream)
+        header, *rows = csv.reader(stream)
     states = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
-    assert note.startswith("note: gains are for") and "Use them where" in note
     assert header == ["t", *states, "ctrl:force", *(f"gain:force:{name}" for name in states)]
     assert len(rows) == N + 1
     assert rows[-1][5] == ""

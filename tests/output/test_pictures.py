@@ -20,20 +20,24 @@ from mjfim.output import plots, words
 from mjfim.output.archive import rotation_vectors
 from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals
 from mjfim.output.plots.design import (
+    accuracy,
+    accuracy_over_time,
     convergence,
     limits,
-    sensitivity_phase,
-    standard_deviations,
     trajectories,
 )
 from mjfim.output.plots.draw import figure_of, log_ticks, plain_number, save
+from mjfim.output.plots.estimate import accuracy as accuracy_of_estimate
 from mjfim.output.plots.estimate import fit, parameter_intervals
-from mjfim.output.plots.estimate_studies import pairs, selection
-from mjfim.output.plots.pictures import draw, picture_names
+from mjfim.output.plots.estimate_studies import Spread, estimate_pairs, pairs, selection
+from mjfim.output.plots.pictures import draw, picture_names, pictures_of, usual
 from mjfim.output.plots.studies import check, histogram
+from mjfim.output.report import report_of
+from mjfim.output.words import relative
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import Decision, Selection, SelectionStep
+from mjfim.records.trajectory import with_unit
 from tests.support import results
 from tests.support.made_records import (
     make_design,
@@ -60,15 +64,13 @@ def panel_named(picture: Picture, beginning: str) -> Panel:
 # ---- designs
 
 
-def test_trajectories_show_both_motions_and_their_information() -> None:
+def test_trajectories_show_both_motions() -> None:
     design = make_design()
     picture = trajectories(design, LABELS)
     joint = panel_named(picture, "joint_0 [rad]")
     for role, evaluation in (("initial", design.initial), ("designed", design.final)):
         (curve,) = marks_of(joint, role)
         np.testing.assert_array_equal(curve.y, evaluation.trajectory.qpos[:, 0])
-    (root,) = marks_of(picture.panels[-1], "designed")
-    np.testing.assert_allclose(root.y**2, design.final.min_eigenvalue)
     assert [panel for panel in picture.panels if panel.is_shaded]
     assert [key.label for key in picture.legend()] == ["initial", "designed"]
 
@@ -80,12 +82,6 @@ def test_rotation_vectors_have_no_jumps() -> None:
     turned = np.column_stack([np.cos(angle / 2.0), np.sin(angle / 2.0)[:, None] * axis])
     flipped = turned * np.where(np.arange(400) % 2, 1.0, -1.0)[:, None]
     np.testing.assert_allclose(rotation_vectors(flipped), angle[:, None] * axis, atol=1e-6)
-
-
-def test_phase_plots_are_limited_in_number_and_say_so() -> None:
-    picture = sensitivity_phase(make_design(2, 9), make_labels(2, 9))
-    assert len(picture.panels) == 6
-    assert "Shown: 6 of 9 parameters" in picture.note
 
 
 def test_convergence_shows_begin_end_and_stages() -> None:
@@ -117,15 +113,44 @@ def test_convergence_of_any_history_is_drawn(costs: tuple[float, ...], tmp_path:
 
 
 @pytest.mark.parametrize("everything", [True, False])
-def test_unknown_standard_deviations_are_hatched_to_the_end(*, everything: bool) -> None:
+def test_parameters_that_are_not_determined_are_arrows_at_the_edge(*, everything: bool) -> None:
     design = make_design()
     std = np.full(3, np.inf) if everything else np.array([np.inf, 1.0, 2.0])
     design = dataclasses.replace(design, final=dataclasses.replace(design.final, std=std))
-    panel = standard_deviations(design, LABELS).panels[0]
-    (hatched,) = (mark for mark in panel.marks if mark.hollow)
-    assert panel.x.limits is not None
-    np.testing.assert_allclose(hatched.x, panel.x.limits[1])
-    assert len(hatched.x) == (3 if everything else 1)
+    panel = accuracy(design, LABELS).panels[0]
+    (arrows,) = (mark for mark in panel.marks if mark.symbol == ">")
+    assert arrows.y.tolist() == ([0, 1, 2] if everything else [0])
+    assert accuracy_over_time(design, LABELS).panels[0].message == (
+        "no parameter is determined alone" if everything else ""
+    )
+
+
+def test_accuracies_are_dots_in_percent_beside_what_is_wanted() -> None:
+    """A parameter whose nominal value is 0 has no percent, only its standard deviation."""
+    labels = dataclasses.replace(LABELS, wanted=np.array([0.02, np.inf, 0.3]))
+    design = dataclasses.replace(make_design(), labels=labels, theta=np.array([2.0, 0.0, 3.0]))
+    panel = accuracy(design, labels).panels[0]
+    std = design.stated_std
+    (final,) = marks_of(panel, "designed", "dots")
+    np.testing.assert_allclose(final.x, 100.0 * std[[0, 2]] / design.sizes[[0, 2]])
+    assert final.y.tolist() == [0.0, 2.0]
+    (tick,) = marks_of(panel, "text", "dots")
+    np.testing.assert_allclose(tick.x, [2.0, np.nan, 15.0])
+    assert panel.beside[1][2][1] == f"{std[1]:.3g}"
+
+
+def test_curves_over_time_meet_the_wanted_accuracy_at_their_dots() -> None:
+    labels = dataclasses.replace(LABELS, wanted=np.array([0.12, 0.09, np.inf]))
+    design = dataclasses.replace(make_design(), labels=labels)
+    panel = accuracy_over_time(design, labels).panels[0]
+    assert panel.y.log
+    for j, goal in ((0, 12.0), (1, 6.0)):
+        _, curve = marks_of(panel, f"series{j}")
+        first = int(np.flatnonzero(curve.y <= goal)[0])
+        (dot,) = marks_of(panel, f"series{j}", "dots")
+        assert (dot.x[0], dot.y[0]) == (pytest.approx(curve.x[first]), pytest.approx(goal))
+        assert curve.label.endswith(relative(design.stated_std[j], design.sizes[j]))
+    assert marks_of(panel, "series2", "dots") == []
 
 
 # ---- limits
@@ -304,7 +329,7 @@ def test_outliers_and_endless_bounds_do_not_widen_a_histogram() -> None:
 # ---- checks
 
 
-def test_parameters_that_are_not_known_alone_are_hatched_and_without_correlation() -> None:
+def test_parameters_that_are_not_known_alone_are_arrows_and_without_correlation() -> None:
     combined = (CombinationAccuracy(expression="a + b", value=1.0, std_initial=1.0, std_final=0.5),)
     made = results.check()
     rows = tuple(dataclasses.replace(row, std=np.inf, relative=np.inf) for row in made.rows[:2])
@@ -313,13 +338,110 @@ def test_parameters_that_are_not_known_alone_are_hatched_and_without_correlation
     found = dataclasses.replace(
         made, rows=(*rows, made.rows[2]), combined=combined, correlation=correlation
     )
-    bars, heat = check(found).panels
-    assert bars.y.names == [*found.wanted, "a + b"]
-    (hatched,) = (mark for mark in bars.marks if mark.hollow)
-    assert len(hatched.x) == 2
+    rows_of_dots, heat = check(found).panels
+    names = [with_unit(row.name, row.unit) for row in found.rows]
+    assert rows_of_dots.y.names == [*names, "a + b"]
+    (arrows,) = (mark for mark in rows_of_dots.marks if mark.symbol == ">")
+    assert arrows.y.tolist() == [0.0, 1.0]
     assert heat.cells is not None
     assert heat.cells.values.shape == (3, 3)
     assert np.isnan(heat.cells.values[:2]).all()
+
+
+def test_colours_of_correlations_are_proportional_to_them() -> None:
+    made = results.check()
+    cells = check(made).panels[1].cells
+    assert cells is not None
+    off_diagonal = ~np.eye(3, dtype=bool)
+    np.testing.assert_array_equal(cells.values[off_diagonal], made.correlation[off_diagonal])
+
+
+# ---- estimates beside what was predicted and published
+
+
+def beside_a_design(**changes: object) -> tuple[Estimate, Design]:
+    """An estimate with priors, bounds and published values, beside the design that was played."""
+    labels = dataclasses.replace(
+        make_labels(2, 3),
+        parameters=results.PARAMETERS,
+        wanted=np.array([0.05, np.inf, np.inf]),
+        published=np.array([1.02, np.nan, np.nan]),
+        bounds=np.array([[0.0, 1.01], [-np.inf, np.inf], [0.0, np.inf]]),
+    )
+    made = results.estimate(labels=labels, prior=np.diag([0.0, 25.0, 0.0]), **changes)
+    design = results.design()
+    return made.with_prediction(design), design
+
+
+def test_an_estimate_stands_beside_the_accuracy_that_was_predicted() -> None:
+    made, design = beside_a_design()
+    np.testing.assert_allclose(made.prediction, np.linalg.inv(design.final.information), rtol=1e-9)
+    checked = results.check()
+    beside = results.estimate().with_prediction(checked)
+    np.testing.assert_allclose(beside.predicted_std, [row.std for row in checked.rows])
+    other = dataclasses.replace(design, parameters=("mass", "else", "damping"))
+    found = results.estimate().with_prediction(other).predicted_std
+    assert np.isnan(found).tolist() == [False, True, False]
+
+
+def test_predicted_formal_honest_and_published_are_on_one_line() -> None:
+    made, design = beside_a_design()
+    panel = accuracy_of_estimate(made, made.labels or LABELS).panels[0]
+    half = 0.25 * (made.interval[:, 1] - made.interval[:, 0])
+    expected = {
+        "predicted σ": design.stated_std,
+        "formal σ": made.std,
+        "honest σ": half,
+        "to published": np.array([abs(1.02 - made.theta[0]), np.nan, np.nan]),
+    }
+    for label, std in expected.items():
+        (mark,) = (mark for mark in panel.marks if mark.label == label)
+        share = 100.0 * std / np.abs(made.theta)
+        np.testing.assert_allclose(mark.x, share[np.isfinite(share)])
+    texts = {heading: words for heading, _, words in panel.beside}
+    stored = made.summary()
+    shares = np.array(stored["honest_std"]) / np.abs(made.theta)
+    assert texts["honest σ"] == [relative(share, 1.0) for share in shares.tolist()]
+    (tick,) = marks_of(panel, "text", "dots")
+    np.testing.assert_allclose(tick.x, [5.0 / abs(made.theta[0]), np.nan, np.nan])
+
+
+def test_pairs_show_the_honest_covariance_priors_bounds_and_the_prediction() -> None:
+    made, design = beside_a_design()
+    wide = 4.0 * made.covariance
+    made = dataclasses.replace(made, honest_covariance=wide)
+    picture = estimate_pairs(made, made.labels or LABELS)
+    labels = {mark.label for mark in picture.legend()}
+    assert {"honest 1 σ", "formal 2 σ", "predicted 2 σ", "prior 2 σ"} <= labels
+    first, pair = picture.panels[0], picture.panels[1]
+
+    # The edge of 2 σ, in honest standard deviations: a plain quadratic form is 4 along it.
+    unit = np.sqrt(np.diag(wide))
+    chosen = np.ix_([0, 1], [0, 1])
+    edges = [mark for mark in pair.marks if mark.kind == "line"]
+    for mark, matrix in zip(edges, (wide, made.covariance, design.covariance), strict=True):
+        points = np.stack([mark.x, mark.y]) * unit[:2, None]
+        form = np.einsum("ik,ij,jk->k", points, np.linalg.inv(matrix[chosen]), points)
+        np.testing.assert_allclose(form, 4.0, rtol=1e-6)
+    (strip,) = (mark for mark in first.marks if mark.kind == "vspan")
+    np.testing.assert_allclose(strip.x, (1.01 - made.theta[0]) / unit[0])
+
+
+def test_a_nominal_value_of_zero_has_no_percent() -> None:
+    made = make_estimate(3)
+    guess = np.array(made.initial_theta)
+    guess[1] = 0.0
+    of_whole = dataclasses.replace(made, initial_theta=guess, sizes=2.0 * np.abs(made.theta))
+    assert (of_whole.guess_sizes == 0.0).tolist() == [False, True, False]
+
+
+def test_pictures_of_the_search_are_files_only_on_request() -> None:
+    for record, folded in ((results.design(), "convergence"), (results.estimate(), "spectra")):
+        assert folded in picture_names(record)
+        assert folded not in usual(record)
+        html = report_of([record])
+        title = pictures_of(record)[folded]().title
+        assert f"<details><summary>{title}</summary>" in html
 
 
 # ---- names and words
@@ -328,7 +450,7 @@ def test_parameters_that_are_not_known_alone_are_hatched_and_without_correlation
 def test_wrong_names_labels_and_endings_are_refused(tmp_path: Path) -> None:
     design = dataclasses.replace(make_design(), labels=LABELS)
     assert picture_names(design)[0] == "trajectories"
-    with pytest.raises(MjfimError, match=r"picture of a Design .*valid: convergence, "):
+    with pytest.raises(MjfimError, match=r"picture of a Design .*valid: accuracy, "):
         draw(design, "portrait")
     with pytest.raises(MjfimError, match=r"trajectorys.*did you mean 'trajectories'"):
         design.plot("trajectorys")
@@ -436,14 +558,7 @@ def test_a_fixed_parameter_is_in_no_pair() -> None:
     """A parameter at its guess without a standard deviation has no ellipse and warns of nothing."""
     covariance = np.diag([0.0, 1e-4, 4e-4])
     values = np.array([1.0, 2.0, 3.0])
-    picture = pairs(
-        ["a", "b", "c"],
-        ["", "", ""],
-        values,
-        covariance,
-        "estimate",
-        guess=values,
-        title="",
-        note="",
-    )
+    estimate = Spread(values, covariance, "identified", "honest")
+    nominal = Spread(values, np.full((3, 3), np.nan), "nominal", "nominal", symbol="x")
+    picture = pairs(["a", "b", "c"], ["", "", ""], [estimate, nominal], title="", note="")
     assert len(picture.panels) == 3  # b, c, and both

@@ -17,6 +17,7 @@ from rerun.chunk import RrdReader
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.experiment.system import labels_of_model
+from mjfim.output.plots.design import accuracy_over_time
 from mjfim.output.rerun import log_design, log_estimate, log_trajectories, show
 from mjfim.output.rerun.camera import (
     FIELD_OF_VIEW,
@@ -27,6 +28,7 @@ from mjfim.output.rerun.camera import (
 )
 from mjfim.output.rerun.plots import round_numbers
 from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses, entity_path
+from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
 from mjfim.records.estimate_parts import InformationInTime, ResidualForce
@@ -110,8 +112,21 @@ def test_every_view_of_a_design_has_content_and_nothing_warns(file: Path) -> Non
     assert len(RrdReader(file).blueprints()) == 1
     names = blueprint_column(file, "ContainerBlueprint:display_name").values()
     assert {name[0] for name in names} >= {
-        "separate", "positions", "controls", "limits", "optimiser", "iterates"
+        "separate", "accuracy", "positions", "controls", "limits", "optimiser", "iterates"
     }  # fmt: skip
+
+
+def test_accuracy_over_time_is_that_of_the_picture(file: Path, design: Design) -> None:
+    panel = accuracy_over_time(design, complete_labels(design)).panels[0]
+    curves = [(k, mark) for k, mark in enumerate(panel.marks) if mark.kind == "line" and mark.label]
+    assert len(curves) == 2
+    for j, (k, mark) in enumerate(curves):
+        path = ("accuracy", panel.title, f"{k} {mark.label}")
+        times, values = column(file, path, "sim_time", "Scalars:scalars")
+        percent = 100.0 * design.std_over_time[:, j] / design.sizes[j]
+        shown = np.isfinite(mark.y)
+        np.testing.assert_allclose(np.ravel(values), percent[shown])
+        np.testing.assert_allclose(times * 1e-9, design.trajectory.t[shown], atol=1e-9)
 
 
 def test_series_are_exact(file: Path, design: Design) -> None:
@@ -185,7 +200,7 @@ def test_the_summary_holds_outcome_warnings_and_colours(file: Path) -> None:
     text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
     assert "it violates limits (position)" in text
     assert "the two parameters are nearly confounded" in text
-    assert text.rstrip().endswith("change per unit of a parameter.")
+    assert text.rstrip().endswith("in place of the designed trajectory.")
 
 
 def test_a_file_is_replaced_only_when_the_new_one_is_complete(
@@ -208,7 +223,7 @@ def test_a_file_is_replaced_only_when_the_new_one_is_complete(
 def test_a_design_without_history_motions_or_information_is_logged(
     cart: mujoco.MjModel, design: Design, tmp_path: Path
 ) -> None:
-    blind = replace(design.initial, std=np.array([np.inf, 0.1]), min_eigenvalue=np.zeros(41))
+    blind = replace(design.initial, std_over_time=np.full((41, 2), np.inf))
     path = tmp_path / "design.rrd"
     bare = replace(design, initial=blind, history=(), motions=None, usage=())
     log_design(path, cart, bare, labels_of_model(cart))

@@ -95,7 +95,7 @@ def test_a_design_and_its_check_state_the_same_accuracy(
     notebook = design._repr_html_()
     for text in (in_terminal(design), notebook, report, in_terminal(check), check._repr_html_()):
         assert missing([*sigmas, *shares], text) == []
-    assert missing(shares, texts_of(design.plot("standard_deviations"))) == []
+    assert missing(shares, texts_of(design.plot("accuracy"))) == []
 
     # The verdict names the largest of these shares.
     worst = shares[int(np.argmax(np.array(std) / design.sizes))]
@@ -108,10 +108,10 @@ def test_a_share_of_a_whole_vector_is_the_same_in_table_verdict_and_figure(desig
     std = design.final.std.tolist()
     shares = [relative(*pair) for pair in zip(std, of_vectors.sizes.tolist(), strict=True)]
 
-    figure, table = texts_of(of_vectors.plot("standard_deviations")), in_terminal(of_vectors)
+    figure, table = texts_of(of_vectors.plot("accuracy")), in_terminal(of_vectors)
     for text in (figure, table):
         assert missing(shares, text) == []
-    assert "share of the magnitude of the whole" in " ".join(figure.split())
+    assert "a share of the whole" in " ".join(figure.split())
     assert f"{shares[0]} of {number(of_vectors.sizes[0], 2)}" in table
 
 

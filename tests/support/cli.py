@@ -29,9 +29,8 @@ DESIGN = {
     "report.html",
     "design.rrd",
     "trajectories.png",
-    "sensitivity_phase.png",
-    "convergence.png",
-    "standard_deviations.png",
+    "accuracy_over_time.png",
+    "accuracy.png",
     "rehearsal.png",
 }
 
@@ -42,7 +41,7 @@ ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
     for name in (
         "fit",
         "parameters",
-        "spectra",
+        "accuracy",
         "predictions",
         "pairs",
         "deciding_seconds",

@@ -17,7 +17,7 @@ from mjfim.records.design import (
 )
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording, Trajectory
-from tests.support.made_records import make_row
+from tests.support.made_records import falling, make_row
 from tests.support.paths import ROOT, SHARED_MODELS
 
 MODELS = {
@@ -88,14 +88,15 @@ def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Eva
     """Make an evaluation of two parameters with smooth sensitivities and growing information."""
     nx, t = 2 * model.nv + model.na, trajectory.t
     psi = gain * np.sin(t)[:, None, None] * np.arange(1.0, 2 * nx + 1).reshape(1, nx, 2)
+    std = np.array([0.5, 0.25]) / gain
     return Evaluation(
         trajectory=trajectory,
         gain=np.zeros((trajectory.samples, model.nu, nx)),
         sensitivity=psi,
         information=gain * np.eye(2),
         eigenvalues=gain * np.ones(2),
-        std=np.array([0.5, 0.25]) / gain,
-        min_eigenvalue=gain * t**2,
+        std=std,
+        std_over_time=falling(std, t),
         criterion=1.0 / gain,
         cost=2.0 / gain,
     )

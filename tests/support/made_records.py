@@ -46,6 +46,12 @@ def make_labels(dofs: int, count: int, width: int = 0) -> Labels:
     )
 
 
+def falling(std: Array, t: Array) -> Array:
+    """Standard deviations that fall like the root of the time (n,) to the last ones: (n, p)."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(std * np.sqrt(t[-1] / t)[:, None])
+
+
 def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
     """Make sinusoids of the given size; a larger motion is more informative."""
     t = np.asarray(np.linspace(0.0, 2.0, 51), dtype=np.float64)
@@ -59,7 +65,6 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
     )
     eigenvalues = np.asarray(size**2 * (1.0 + np.arange(count)), dtype=np.float64)
     std = 0.1 / size / np.sqrt(1.0 + np.arange(count))
-    smallest = np.asarray(size**2 * t / 2.0, dtype=np.float64)
     criterion = 1.0 / size**2
     return Evaluation(
         trajectory=curve,
@@ -68,7 +73,7 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
         information=np.diag(std**-2),
         eigenvalues=eigenvalues,
         std=std,
-        min_eigenvalue=smallest,
+        std_over_time=falling(std, t),
         criterion=criterion,
         cost=criterion + 0.01,
     )

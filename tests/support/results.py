@@ -34,7 +34,12 @@ from mjfim.records.studies import (
 )
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Labels, Recording, Trajectory
-from tests.support.made_records import bare_estimate, make_recording_comparison, ten_iterates
+from tests.support.made_records import (
+    bare_estimate,
+    falling,
+    make_recording_comparison,
+    ten_iterates,
+)
 
 # Names of the parameters of all results.
 PARAMETERS = ("mass", "length", "damping")
@@ -101,7 +106,7 @@ def evaluation(size: float, samples: int) -> Evaluation:
         information=np.linalg.inv(covariance(std)),
         eigenvalues=size**2 * np.array([1.0, 2.0, 3.0]),
         std=std,
-        min_eigenvalue=size**2 * t,
+        std_over_time=falling(std, t),
         criterion=size**-2,
         cost=size**-2,
     )

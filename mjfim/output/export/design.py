@@ -15,7 +15,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.model.coordinates import state_names
-from mjfim.output.archive import GAIN_NOTE, design_columns
+from mjfim.output.archive import design_columns
 from mjfim.output.export import TARGETS
 from mjfim.output.export.trajectories import (
     DATASET_FILES,
@@ -28,7 +28,7 @@ from mjfim.output.export.trajectories import (
     write_lerobot_dataset,
     write_trajectory_yaml,
 )
-from mjfim.records.design import Design
+from mjfim.records.design import GAIN_NOTE, Design
 
 # The text in the player that stands for the design.
 PLACE = 'r"""{}"""'
@@ -44,11 +44,10 @@ def write_player(path: Path, plan: RobotPlan) -> None:
     system, space, drives = plan.system, plan.system.space, plan.drives
     names = list(state_names(system.model))
     sigma = dict(zip(system.outputs.names, np.sqrt(np.diag(system.noise.covariance)), strict=True))
-    columns = design_columns(plan.playback, system)
-    rows = np.column_stack([columns[name] for name in columns if not name.startswith("note:")])
+    rows = np.column_stack([*design_columns(plan.playback, system).values()])
     design = {
         "name": plan.name,
-        "gains": f"{GAIN_NOTE[0].upper()}{GAIN_NOTE[1:]}.",
+        "gains": GAIN_NOTE,
         "state": names,
         "controls": list(system.controls),
         "sizes": [space.nq, space.nv],

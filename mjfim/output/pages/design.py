@@ -35,6 +35,7 @@ from mjfim.output.words import (
     complete_labels,
     improvement,
     relative,
+    when_learnt,
 )
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup
 from mjfim.records.design import Design, ScaledStart
@@ -68,12 +69,12 @@ PLAY = (
 
 def design_page(design: Design) -> Page:
     """Describe predicted standard deviations before and after a design, and how it ended."""
-    search: list[Part] = [Plot("convergence"), _eigenvalue_table(design)]
+    search: list[Part] = [_eigenvalue_table(design), Plot("convergence", detail=True)]
     if len(design.starts) > 1:
         search.append(_start_table(design))
     sections = [
         Section("Accuracy", list(_accuracy_parts(design))),
-        Section("Motion", [Plot("trajectories"), Plot("sensitivity_phase")]),
+        Section("Motion", [Plot("trajectories")]),
         Section("Optimisation", search),
     ]
     if design.limits:
@@ -476,7 +477,11 @@ def _accuracy_parts(design: Design) -> Iterator[Part]:
     if design.outcome.lower() not in _verdict(design).text.lower():
         yield Text(capitalised(design.outcome), detail=design.sound)
     yield _accuracy_table(design)
-    yield Plot("standard_deviations")
+    learnt = when_learnt(design)
+    if learnt:
+        yield Text(learnt)
+    yield Plot("accuracy_over_time")
+    yield Plot("accuracy")
     broken = [str(violation) for violation in design.initial_violations]
     if broken:
         others = len(broken) - MAX_VIOLATIONS

@@ -34,7 +34,7 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.pages.studies import residual_parts
-from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
+from mjfim.output.words import NOT_ALONE, complete_labels, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.estimate_parts import MOST, InformationInTime
 from mjfim.records.robots import RecordingComparison, p_text
@@ -75,7 +75,10 @@ def estimate_page(estimate: Estimate) -> Page:
         "Predictions": _prediction_parts(estimate.predictions),
         "Signals": [Plot("fit")] if estimate.recordings else [],
         "Residual torque": residual_parts(estimate.residual_forces),
-        "Residuals": [tabulated("Fit of every output", residuals, detail=True), Plot("spectra")],
+        "Residuals": [
+            tabulated("Fit of every output", residuals, detail=True),
+            Plot("spectra", detail=True),
+        ],
     }
     causes, details = estimate.causes, estimate.details
     return Page(
@@ -195,7 +198,9 @@ def _parameter_parts(estimate: Estimate) -> Iterator[Part]:
     if estimate.status.lower().rstrip(".") not in _verdict(estimate).text.lower():
         yield Text(capitalised(estimate.status))
     yield _estimate_table(estimate)
+    yield Plot("accuracy")
     yield Plot("parameters")
+    yield Plot("pairs", detail=True)
     if estimate.payload is not None:
         yield from (Text(sentence) for sentence in estimate.payload.sentences)
     for remark in (estimate.restart, estimate.prior_directions):
@@ -233,10 +238,14 @@ def _estimate_table(estimate: Estimate) -> Table:
         NOMINAL: numbers(estimate.initial_theta, 4),
         IDENTIFIED: list(map(_as_accurate, estimate.theta, std)),
         "formal σ": formal,
-        "honest σ": numbers(np.where(known, 0.25 * (high - low), np.nan), 2),
+        "honest σ": numbers(estimate.honest_std, 2),
         "95 % low": list(map(_as_accurate, np.where(known, low, np.nan), std)),
         "high": list(map(_as_accurate, np.where(known, high, np.nan), std)),
     }
+    published = complete_labels(estimate).published
+    for name, values in (("predicted σ", estimate.predicted_std), ("published", published)):
+        if np.isfinite(values).any():
+            columns[name] = numbers(values, 4 if name == "published" else 2)
     if any(at_bound):
         columns["at bound"] = ["yes" if is_at_bound else "" for is_at_bound in at_bound]
     return tabulated(
@@ -457,7 +466,7 @@ def horizon_parts(study: HorizonStudy | None) -> Sequence[Part]:
         Text(f"{study.about_choice} {study.about_growth}"),
         *(Text(caution, Emphasis.WARNING) for caution in cautions),
         table,
-        Plot("horizons"),
+        Plot("horizons", detail=True),
     )
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a design: motion and information, sensitivities, search, accuracy, limits."""
+"""Pictures of a design: motion, search, accuracy, limits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from mjfim.output.panels import (
     Picture,
     area,
     around,
-    bars,
     dots,
     grid,
     hline,
@@ -31,16 +30,16 @@ from mjfim.output.panels import (
     mark,
     row_axis,
     vline,
-    words,
 )
+from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows
 from mjfim.output.words import (
     BEST_CASE,
     format_number,
     improvement,
-    quotient_unit,
     relative,
     share_note,
     shorten,
+    when_learnt,
 )
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.trajectory import Labels, Trajectory
@@ -97,18 +96,18 @@ def whole_percent(share: float) -> str:
     return f"{percent} %"
 
 
-# Number of panels of the trajectories, and of phase plots, side by side, and largest number of
-# phase plots.
-PANEL_COLUMNS, PHASE_COLUMNS, MAX_PHASE_PLOTS = 4, 3, 6
+# Look of the curves of the initial motion where colours tell parameters.
+INITIAL_LOOK = {"width": 0.9, "dash": "--"}
+
+# Number of panels of the trajectories side by side, and largest σ that is drawn over time, over its
+# target.
+PANEL_COLUMNS, LARGEST_OVER_TARGET = 4, 10.0
 
 # Widths of the lines of the initial and of the designed trajectory [points].
 LINE_WIDTHS = (1.1, 1.6)
 
 # Distance from the motion, over its range, up to which a limit is drawn beside it.
 NEAR_LIMIT = 0.5
-
-# Largest number of rows of bars that have numbers.
-MAX_HIGH_ROWS = 12
 
 # Unit of the force of an actuator or joint, by the unit of its control or of its position.
 FORCE_OF_CONTROL = {
@@ -130,7 +129,7 @@ MAX_ENVELOPES, MAX_ROWS, FULL_ROW = 2, 12, 0.86
 
 
 def trajectories(design: Design, labels: Labels) -> Picture:
-    """Show states, controls and the information gathered up to each time (the paper's figure 2)."""
+    """Show states and controls of both motions (the paper's figure 2)."""
     both: dict[str, Trajectory] = {
         INITIAL: design.initial.trajectory,
         DESIGNED: design.final.trajectory,
@@ -147,18 +146,14 @@ def trajectories(design: Design, labels: Labels) -> Picture:
         ]
         panels += in_grid(named, columns, row)
         row += -(-len(found) // columns)
-    note = (
-        "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the "
-        "measurement rate. All horizontal axes: time [s]."
-    )
+    note = "All horizontal axes: time [s]."
     if groups["controls"]:
         note += " Grey background: controls."
-    information = replace(information_panel(design), place=(row, 0), is_wide=True)
     return Picture(
-        title="Trajectories and the information that they gather",
-        panels=[*panels, information],
+        title="Initial and designed motion",
+        panels=panels,
         note=note,
-        heights=[1.15] * row + [1.85],
+        heights=[1.15] * row,
         widths=[1.0] * columns,
     )
 
@@ -228,79 +223,6 @@ def _near_limits(limits: Sequence[float], values: Sequence[Array]) -> list[Mark]
     ]
 
 
-def information_panel(design: Design) -> Panel:
-    """Return the root of the smallest eigenvalue of the information up to each time."""
-    marks = []
-    for evaluation, term, width in zip(
-        (design.initial, design.final), (INITIAL, DESIGNED), LINE_WIDTHS, strict=True
-    ):
-        t = evaluation.trajectory.t
-        root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-        last = format_number(root[-1])
-        marks += [
-            _curve(t, root, term, width),
-            words([t[-1]], [root[-1]], [last], term),
-        ]
-    return Panel(
-        title="√λ_min up to each time [√s / unit of θ]",
-        marks=marks,
-        x=Axis(label="time [s]"),
-        y=Axis(label="information", most=4),
-    )
-
-
-# ---- sensitivities
-
-
-def sensitivity_phase(design: Design, labels: Labels) -> Picture:
-    """Show what moves most with each parameter, as phase plots of ψ (the paper's figure 3)."""
-    nv = design.trajectory.qvel.shape[1]
-    psi = design.final.sensitivity
-    change = np.abs(psi[:, nv : 2 * nv]).max(axis=0)
-    speed = np.abs(design.trajectory.qvel).max(axis=0)
-    change /= np.where(speed > 0.0, speed, np.inf)[:, None]
-
-    # The wanted parameters with the largest relative standard deviations; one that the motion does
-    # not determine comes last.
-    moving = [j for j in design.wanted if change[:, j].any()]
-    std = np.where(np.isfinite(design.final.std), design.final.std, 0.0)
-    relative_std = std / np.where(design.sizes > 0.0, design.sizes, np.inf)
-    shown = sorted(sorted(moving, key=lambda j: -relative_std[j])[:MAX_PHASE_PLOTS])
-
-    panels = [_phase_plot(design, labels, int(np.argmax(change[:, j])), j) for j in shown]
-    if not panels:
-        panels = [Panel(message="the motion depends on no parameter")]
-    which = "parameters, those with the largest predicted relative standard deviations"
-    note = "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative."
-    return grid(
-        "Sensitivity of the motion to each parameter",
-        panels,
-        [2.75] * len(panels),
-        min(len(panels), PHASE_COLUMNS),
-        note + share_note(shown, moving, which),
-    )
-
-
-def _phase_plot(design: Design, labels: Labels, dof: int, j: int) -> Panel:
-    """Return the sensitivity of one degree of freedom to one parameter."""
-    nv = design.trajectory.qvel.shape[1]
-    marks = []
-    for evaluation, term, front in ((design.initial, INITIAL, 3.0), (design.final, DESIGNED, 2.0)):
-        position, velocity = evaluation.sensitivity[:, [dof, nv + dof], j].T
-        marks.append(line(position, velocity, term, label=term, width=1.6, front=front))
-    name, unit = split_unit(labels.positions[dof])
-    divisor, parameter = labels.parameter_units[j], shorten(labels.parameters[j], 14)
-    axes = [
-        Axis(
-            label=f"∂{shorten(name, 14)}{prime}/∂{parameter}\n[{quotient_unit(of, divisor)}]",
-            most=3,
-        )
-        for prime, of in (("", unit), ("′", per_second(unit)))
-    ]
-    start = dots([0.0], [0.0], "text", size=3.5, label="start", front=4.0)
-    return Panel(marks=[*marks, start], x=axes[0], y=axes[1])
-
-
 # ---- search
 
 
@@ -363,55 +285,95 @@ def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
 # ---- accuracy
 
 
-def standard_deviations(design: Design, labels: Labels) -> Picture:
-    """Show the predicted standard deviations along both trajectories."""
+def accuracy(design: Design, labels: Labels) -> Picture:
+    """Show the predicted standard deviations of both trajectories in percent, and wanted ones."""
     wanted, combined = list(design.wanted), design.combined
     names = [labels.parameter(j) for j in wanted] + [each.expression for each in combined]
-    sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
-    stds = np.array(
-        [
-            [*design.initial.std[wanted], *(each.std_initial for each in combined)],
-            [*design.final.std[wanted], *(each.std_final for each in combined)],
-        ]
-    )
-    # Infinite bars reach beyond all others.
-    low, high = around(stds, factor=3.0)
-    all_known = bool(np.isfinite(stds).all())
-    high *= 1.0 if all_known else 10.0
+    sizes = np.array([*design.shares[wanted], *(abs(each.value) or np.nan for each in combined)])
+    before = np.array([*design.initial.std[wanted], *(each.std_initial for each in combined)])
+    after = np.array([*design.stated_std[wanted], *(each.std_final for each in combined)])
+    goal = np.array([*labels.wanted[wanted], *[np.inf] * len(combined)])
+    first = Accuracies(before, INITIAL, INITIAL, size=10.0, hollow=True)
+    panel = accuracy_panel(names, sizes, [first, Accuracies(after, DESIGNED, DESIGNED)], goal)
+    changes = [improvement(*pair) for pair in zip(before.tolist(), after.tolist(), strict=True)]
 
-    rows = np.arange(len(names))
-    marks, beside = [], []
-    for std, term, offset in zip(stds, (INITIAL, DESIGNED), (-0.19, 0.19), strict=True):
-        known, at = np.isfinite(std), rows + offset
-        ends, places = std[known], at[known]
-        marks.append(bars(ends, places, term, left=low, size=0.36, label=term))
-        if len(names) <= MAX_HIGH_ROWS:
-            texts = [format_number(value) for value in ends]
-            marks.append(words(ends, places, texts, term))
-        if not known.all():
-            beyond = np.full(len(at[~known]), high)
-            marks.append(bars(beyond, at[~known], term, left=low, size=0.36, hollow=True))
-        shares = [str(relative(*pair)) for pair in zip(std.tolist(), sizes, strict=True)]
-        beside.append(("relative σ", term, shares))
-    changes = [improvement(*pair) for pair in stds.T.tolist()]
-
+    title, shares = "Predicted accuracy of one experiment", after / sizes
+    if np.isfinite(shares).any():
+        worst = int(np.nanargmax(np.where(np.isfinite(shares), shares, np.nan)))
+        title += f": σ is at most {relative(after[worst], sizes[worst])} ({names[worst]})"
     note = BEST_CASE
-    if not all_known:
-        note += " Hatched: the parameter is not identifiable alone from this trajectory."
     if not np.array_equal(np.abs(design.theta), design.sizes):
-        note += (
-            " A relative σ is a share of the value; for an entry of a vector or tensor, and for a "
-            "value of zero, it is a share of the magnitude of the whole."
-        )
-    panel = Panel(
-        marks=marks,
-        x=Axis(label="predicted σ [unit of the parameter]", log=True, limits=(low, high)),
-        y=row_axis(names),
-        beside=[*beside, ("change", "text", changes)],
-    )
-    height = 0.7 + (0.5 if len(names) <= MAX_HIGH_ROWS else 0.3) * len(names)
+        note += " Percent of an entry of a vector or tensor are a share of the whole."
     return Picture(
-        title="Predicted accuracy (Cramér–Rao)", panels=[panel], note=note, heights=[height]
+        title=title,
+        panels=[replace(panel, beside=[*panel.beside, ("change", "text", changes)])],
+        note=note,
+        heights=[height_of_rows(len(names))],
+    )
+
+
+def accuracy_over_time(design: Design, labels: Labels) -> Picture:
+    """Show the standard deviation of each parameter, by the measurements up to each time."""
+    asked = [j for j in design.wanted if np.isfinite(design.stated_std[j] / design.shares[j])]
+    targets = design.targets
+    seconds = design.seconds_to(targets)
+    last_first = sorted(asked, key=lambda j: (-seconds[j], -design.stated_std[j] / design.sizes[j]))
+    shown = sorted(last_first[: len(SERIES)])
+    which = "parameters, those that are known last"
+    return Picture(
+        title=when_learnt(design).removesuffix(".") or "Accuracy over time",
+        panels=[accuracy_over_time_panel(design, labels, shown)],
+        note=f"Beside the names: σ at the end. {BEST_CASE}{share_note(shown, asked, which)}",
+        heights=[3.4],
+        keys=[line([], [], "muted", label="initial motion", **INITIAL_LOOK)],
+    )
+
+
+def accuracy_over_time_panel(design: Design, labels: Labels, shown: Sequence[int]) -> Panel:
+    """Return curves of the standard deviations in percent, with the times at which targets are met.
+
+    Args:
+        design: The design.
+        labels: Names of its parameters.
+        shown: Numbers of the parameters.
+    """
+    targets = design.targets
+    seconds = design.seconds_to(targets)
+    sizes = design.sizes / 100.0
+    ends = (np.stack([design.initial.std, design.stated_std]) / sizes)[:, shown]
+    goals = np.where(np.isfinite(targets), targets, np.nan)[shown] / sizes[shown]
+    _, high = around(np.concatenate([ends.ravel(), LARGEST_OVER_TARGET * goals]), factor=1.5)
+    low, _ = around(np.concatenate([ends.ravel(), goals]), factor=1.5)
+
+    is_stated = bool(np.isfinite(labels.wanted).any())
+    begin, curves, targets_met = float(design.trajectory.t[0]), [], []
+    for place, j in enumerate(shown):
+        role, size, goal = f"series{place}", sizes[j], targets[j] / sizes[j]
+        final = relative(design.stated_std[j], design.sizes[j])
+        for t, values, look in (
+            (design.initial.trajectory.t, design.initial.std_over_time, INITIAL_LOOK),
+            (
+                design.trajectory.t,
+                design.std_over_time,
+                {"width": 2.0, "label": f"{shorten(labels.parameters[j])} {final}"},
+            ),
+        ):
+            percent = values[:, j] / size
+            curves.append(line(t, np.where(percent <= high, percent, np.nan), role, **look))
+        if np.isfinite(goal):
+            word = "wanted σ" if is_stated else f"σ of {goal:.2g} %"
+            is_common = np.allclose(goals[np.isfinite(goals)], goal)
+            look = {"dash": ":", "width": 1.4, "label": word}
+            targets_met.append(hline(goal, "muted" if is_common else role, **look))
+        if np.isfinite(goal) and np.isfinite(seconds[j]):
+            met = {"size": 6.0, "front": 4.0, "label": "reached"}
+            targets_met.append(dots([begin + seconds[j]], [goal], role, **met))
+    return Panel(
+        title="σ by the measurements up to each time [% of the value]",
+        marks=[*curves, *targets_met],
+        x=Axis(label="time [s]"),
+        y=Axis(label="σ [%]", log=True, limits=(low, high)),
+        message="" if shown else "no parameter is determined alone",
     )
 
 

@@ -461,10 +461,8 @@ def legend_columns(labels: Sequence[str], width: float) -> int:
     entry = (LEGEND_LINE + LEGEND_GAP) * NORMAL_FONT / 72.0
     widths = [text_width(label) + entry for label in labels]
     for columns in range(len(labels), 1, -1):
-        # The entries of a legend run down its columns.
-        rows = -(-len(labels) // columns)
-        total = sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows))
-        if total <= width:
+        # The entries of a legend run down its columns, of which the first ones may be longer.
+        if sum(map(max, np.array_split(widths, columns))) <= width:
             return columns
     return 1
 

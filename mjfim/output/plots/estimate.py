@@ -1,4 +1,4 @@
-"""Pictures of an estimate: parameters, fits and predictions over time, spectra of the residuals."""
+"""Pictures of an estimate: parameters, accuracy, fits and predictions over time, spectra."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices
 from mjfim.model.coordinates import split_unit
-from mjfim.output.page import IDENTIFIED, MEASURED, NOMINAL
+from mjfim.output.page import DESIGNED, IDENTIFIED, MEASURED, NOMINAL, capitalised
 from mjfim.output.panels import (
     Axis,
     Cells,
@@ -33,6 +33,7 @@ from mjfim.output.panels import (
     row_axis,
     vline,
 )
+from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows
 from mjfim.output.words import (
     format_number,
     format_with_uncertainty,
@@ -124,6 +125,9 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     low, high = ((end - guess) / percent for end in estimate.interval.T)
 
     left, right = range_of_intervals(centre, low, high)
+    published = (labels.published - guess) / percent
+    seen = 1.06 * published
+    left, right = np.nanmin([left, *seen]), np.nanmax([right, *seen])
     margin = 0.06 * (max(right, 0.0) - min(left, 0.0))
     rows = np.arange(count)
     is_at_bound = np.array([name in estimate.at_bound for name in estimate.parameters])
@@ -159,6 +163,8 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
             **look,
         )
         marks.append(at)
+    if np.isfinite(published).any():
+        marks.append(dots(published, rows, MEASURED, symbol="D", front=4.0, label="published"))
     note = (
         "The formal interval is right only if the model and the noise are right. The 95 % interval "
         "also allows for autocorrelated residuals."
@@ -188,6 +194,44 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
         note=note,
         heights=[0.6 + (0.42 if count <= MAX_PARAMETERS else 0.27) * count],
     )
+
+
+def accuracy(estimate: Estimate, labels: Labels) -> Picture:
+    """Show predicted, formal and honest σ in percent, and the distance to published values."""
+    names, honest = [labels.parameter(j) for j in range(len(estimate.theta))], estimate.honest_std
+    std = np.where(np.isnan(honest), np.nan, estimate.std)
+    sources = [
+        Accuracies(estimate.predicted_std, DESIGNED, "predicted σ", size=12.0, hollow=True),
+        Accuracies(std, IDENTIFIED, "formal σ", size=8.5, hollow=True),
+        Accuracies(honest, IDENTIFIED, "honest σ", size=5.0),
+        Accuracies(np.abs(labels.published - estimate.theta), MEASURED, "to published", symbol="D"),
+    ]
+    shown = [source for source in sources if np.isfinite(source.std).any()]
+    sizes = np.where(estimate.theta == 0.0, np.nan, estimate.sizes)
+    return Picture(
+        title=capitalised("; ".join(_about_accuracy(estimate, labels)) or "accuracy of the fit"),
+        panels=[accuracy_panel(names, sizes, shown, labels.wanted)],
+        note=(
+            "Honest σ: a quarter of the width of the 95 % interval. To published: distance of the "
+            "estimate from the published value."
+        ),
+        heights=[height_of_rows(len(names))],
+    )
+
+
+def _about_accuracy(estimate: Estimate, labels: Labels) -> Iterator[str]:
+    """Compare the honest σ with what was predicted, and the estimates with published values."""
+    honest, names = estimate.honest_std, estimate.parameters
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = honest / estimate.predicted_std
+        distance = np.abs(labels.published - estimate.theta) / honest
+    if np.isfinite(ratio).any():
+        j = int(np.nanargmax(ratio))
+        yield f"honest σ at most {format_number(ratio[j], 2)} times the predicted one ({names[j]})"
+    if np.isfinite(distance).any():
+        j = int(np.nanargmax(distance))
+        distance_text = f"{format_number(distance[j], 2)} honest σ"
+        yield f"published values are at most {distance_text} away ({names[j]})"
 
 
 def _interval_text(estimate: Estimate, j: int, unit: str) -> str:

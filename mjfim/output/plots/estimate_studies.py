@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from mjfim.output.panels import (
     dots,
     grid,
     hline,
+    hspan,
     intervals,
     line,
     mark,
@@ -27,11 +29,11 @@ from mjfim.output.panels import (
     vline,
     vspan,
 )
-from mjfim.output.words import format_number, normal_density, share_note, shorten
+from mjfim.output.words import format_number, share_note, shorten
 from mjfim.records.estimate import Estimate, HorizonStudy
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Decision, SelectionStep
-from mjfim.records.trajectory import with_unit
+from mjfim.records.trajectory import Labels, with_unit
 
 # Largest numbers of parameters of pictures of pairs and of lengths, of parameters and of recordings
 # that are compared; of more, those that say most are drawn.
@@ -264,88 +266,167 @@ def has_pairs(std: Array) -> bool:
     return bool(np.count_nonzero(np.isfinite(std) & (std > 0.0)) > 1)
 
 
+class Spread(NamedTuple):
+    """A normal distribution of the parameters, or a single value of each of them.
+
+    Attributes:
+        values: (p,) middle [theta-unit].
+        covariance: (p, p) covariance; not finite where a parameter is not determined.
+        role: Role of what is drawn.
+        label: What it is, in a word.
+        dash: Dashes of its lines.
+        symbol: Symbol at the middle, for single values; empty for none.
+    """
+
+    values: Array
+    covariance: Array
+    role: str
+    label: str
+    dash: str = "-"
+    symbol: str = ""
+
+
 def pairs(
     names: Sequence[str],
     units: Sequence[str],
-    values: Array,
-    covariance: Array,
-    role: str,
+    spreads: Sequence[Spread],
     *,
-    guess: Array | None = None,
+    bounds: Array | None = None,
     title: str,
     note: str,
 ) -> Picture:
-    """Show the joint uncertainty of every pair of parameters as ellipses of 1 σ and 2 σ.
+    """Show the joint uncertainty of every pair of parameters as ellipses.
 
     Args:
         names: Names of the p parameters.
         units: Their units.
-        values: (p,) their values.
-        covariance: (p, p) their covariance.
-        role: Role of the ellipses.
-        guess: (p,) nominal values that are marked, if they are near.
+        spreads: Distributions; the first one is filled, and its σ are the unit of all axes.
+        bounds: (p, 2) bounds, which are grey where they are near; None for none.
         title: Title of the picture.
-        note: What is behind the covariance.
+        note: What is behind the first distribution.
     """
-    std = np.sqrt(np.diagonal(covariance))
-    known = np.isfinite(std) & (std > 0.0)
-    size = np.where(known, std, np.nan)
-    correlation = np.clip(covariance / np.outer(size, size), -1.0, 1.0)
-    shown = _most_correlated(correlation)
-    offsets = np.full(len(std), np.inf) if guess is None else (guess - values) / size
-    x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
-    angle = np.linspace(0.0, 2.0 * np.pi, CURVE_POINTS)
-
-    def nominal(across: float, up: float) -> list[Mark]:
-        """Mark the nominal values of a panel, if they lie in it."""
-        if max(abs(across), abs(up)) > RANGE:
-            return []
-        return [dots([across], [up], NOMINAL, symbol="x", size=5.0, label=NOMINAL)]
+    main = spreads[0]
+    std = np.sqrt(np.maximum(np.diagonal(main.covariance), 0.0))
+    unit = np.where(np.isfinite(std) & (std > 0.0), std, np.nan)
+    scaled = [
+        each._replace(
+            values=(each.values - main.values) / unit,
+            covariance=each.covariance / np.outer(unit, unit),
+        )
+        for each in spreads
+    ]
+    correlation = np.clip(scaled[0].covariance, -1.0, 1.0)
+    limits = np.full((len(unit), 2), np.nan)
+    if bounds is not None:
+        limits = (bounds - main.values[:, None]) / unit[:, None]
 
     def density(j: int) -> list[Mark]:
-        """Draw the normal density of one parameter."""
-        y = normal_density(x)
-        return [area(x, np.zeros(len(x)), y, role), line(x, y, role), *nominal(offsets[j], 0.02)]
+        """Draw the normal densities of one parameter over their peaks."""
+        x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
+        marks = [area(x, np.zeros(len(x)), np.exp(-0.5 * x**2), main.role)]
+        for each in scaled:
+            variance = each.covariance[j, j]
+            if np.isfinite(variance) and variance > 0.0:
+                # A narrow curve has points of its own.
+                fine = np.concatenate([x, each.values[j] + np.sqrt(variance) * x])
+                fine = np.unique(np.clip(fine, -RANGE, RANGE))
+                y = np.exp(-0.5 * (fine - each.values[j]) ** 2 / variance)
+                marks.append(line(fine, y, each.role, dash=each.dash))
+        return [*marks, *_beyond(limits[j], vspan), *_near(scaled, j, None)]
 
     def ellipses(j: int, i: int) -> list[Mark]:
         """Draw the ellipses of parameter j across and i up."""
         r = correlation[i, j]
-        rest = np.sqrt(1.0 - r**2)
         # Lower and upper half of each ellipse, over its width.
         across = np.sin(np.linspace(-0.5, 0.5, CURVE_POINTS) * np.pi)
-        half = rest * np.sqrt(1.0 - across**2)
-        filled = [
-            area(s * across, s * (r * across - half), s * (r * across + half), role, opacity=o)
+        half = np.sqrt((1.0 - r**2) * (1.0 - across**2))
+        marks = [
+            area(s * across, s * (r * across - half), s * (r * across + half), main.role, opacity=o)
             for s, o in ELLIPSES
         ]
-        up = r * np.cos(angle) + rest * np.sin(angle)
-        edge = line(2.0 * np.cos(angle), 2.0 * up, role, width=0.8)
-        return [*filled, edge, *nominal(offsets[j], offsets[i])]
+        marks += [mark for each in scaled for mark in _edge(each, j, i)]
+        strips = (*_beyond(limits[j], vspan), *_beyond(limits[i], hspan))
+        return [*marks, *strips, *_near(scaled, j, i)]
 
     def axis(j: int) -> Axis:
         """Return the axis of a parameter in its standard deviations, with values at two ticks."""
-        ticks = values[j] + std[j] * np.array([-TICK, TICK])
+        ticks = main.values[j] + std[j] * np.array([-TICK, TICK])
         texts = _distinct(ticks)
         return Axis(ticks=[-TICK, TICK], names=texts, limits=(-RANGE, RANGE))
 
     keys = [
-        line([], [], role, width=7.0, opacity=opacity + 0.1, label=f"{size:g} σ")
+        line([], [], main.role, width=7.0, opacity=opacity + 0.1, label=f"{main.label} {size:g} σ")
         for size, opacity in reversed(ELLIPSES)
     ]
+    keys += [
+        line([], [], each.role, dash=each.dash, label=f"{each.label} 2 σ")
+        for each in spreads[1:]
+        if not each.symbol
+    ]
+    shown = _most_correlated(correlation)
     return _corner(names, units, shown, density, ellipses, axis, title=title, note=note, keys=keys)
 
 
-def estimate_pairs(estimate: Estimate) -> Picture:
-    """Show the joint uncertainty of the estimates of every pair of parameters."""
+def _edge(spread: Spread, j: int, i: int) -> list[Mark]:
+    """Return the ellipse of 2 σ of parameter j across and i up; none where it is not known."""
+    chosen = [j, i]
+    covariance = spread.covariance[np.ix_(chosen, chosen)]
+    if not np.isfinite(covariance).all() or not np.diag(covariance).all():
+        return []
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * np.pi, CURVE_POINTS)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    x, y = 2.0 * vectors * np.sqrt(np.maximum(values, 0.0)) @ circle
+    middle = spread.values[chosen]
+    return [line(x + middle[0], y + middle[1], spread.role, width=0.9, dash=spread.dash)]
+
+
+def _beyond(limits: Array, span: Callable[..., Mark]) -> list[Mark]:
+    """Shade what lower and upper bound of a parameter exclude, where they are near."""
+    look = {"opacity": 0.8, "label": "outside the bounds"}
+    below, above = (limits[0] > -RANGE), (limits[1] < RANGE)
+    ends = [(-RANGE, limits[0])] * bool(below) + [(limits[1], RANGE)] * bool(above)
+    return [span(*pair, **look) for pair in ends]
+
+
+def _near(spreads: Sequence[Spread], j: int, i: int | None) -> list[Mark]:
+    """Mark the single values in the panel of parameter j across and i up, or of j alone."""
+    marks = []
+    for each in spreads:
+        across, up = each.values[j], 0.05 if i is None else each.values[i]
+        if each.symbol and np.abs([across, up]).max() <= RANGE:
+            look = {"symbol": each.symbol, "label": each.label}
+            marks.append(dots([across], [up], each.role, size=5.0, **look))
+    return marks
+
+
+def estimate_pairs(estimate: Estimate, labels: Labels) -> Picture:
+    """Show the joint uncertainty of the estimates: honest, formal, predicted and prior."""
+    theta, guess = estimate.theta, estimate.initial_theta
+    spreads = [Spread(theta, estimate.covariance, IDENTIFIED, "formal", ":")]
+    if len(estimate.honest_covariance):
+        spreads.insert(0, Spread(theta, estimate.honest_covariance, IDENTIFIED, "honest"))
+    if len(estimate.prediction):
+        spreads.append(Spread(theta, estimate.prediction, DESIGNED, "predicted", "--"))
+    known = np.diag(estimate.prior)
+    if known.any():
+        variances = np.divide(1.0, known, out=np.full(len(known), np.nan), where=known > 0.0)
+        spreads.append(Spread(guess, np.diag(variances), "text", "prior", "--"))
+    unknown = np.full(estimate.covariance.shape, np.nan)
+    spreads += [
+        Spread(guess, unknown, NOMINAL, NOMINAL, symbol="x"),
+        Spread(labels.published, unknown, MEASURED, "published", symbol="D"),
+    ]
     return pairs(
         estimate.parameters,
         estimate.units,
-        estimate.theta,
-        estimate.covariance,
-        IDENTIFIED,
-        guess=estimate.initial_theta,
+        spreads,
+        bounds=labels.bounds,
         title="Joint uncertainty of the identified parameters",
-        note="Formal uncertainty: it is right only if the model and the noise are right.",
+        note=(
+            "The honest one agrees with the 95 % intervals. The formal one is right only if the "
+            "model and the noise are right."
+        ),
     )
 
 

@@ -45,15 +45,16 @@ if TYPE_CHECKING:
 
 # Pictures of a design, and of an estimate beside those of its fits and predictions.
 DESIGN_PICTURES = (
+    "accuracy_over_time",
+    "accuracy",
     "trajectories",
-    "sensitivity_phase",
     "convergence",
-    "standard_deviations",
     "limits",
     "rehearsal",
 )
 ESTIMATE_PICTURES = (
     "parameters",
+    "accuracy",
     "spectra",
     "residual_torque",
     "deciding_seconds",
@@ -64,6 +65,9 @@ ESTIMATE_PICTURES = (
     "samples",
     "recordings",
 )
+
+# Pictures of how a result was found. The report has them folded, and files are drawn on request.
+ON_REQUEST = {"convergence", "spectra", "horizons"}
 
 # Functions that make the pictures of a record, by their names.
 Pictures = dict[str, Callable[[], Picture]]
@@ -115,6 +119,11 @@ def draw(
     return figure
 
 
+def usual(record: ShownRecord) -> Pictures:
+    """Return functions that make the pictures of a record that are files without a request."""
+    return {name: make for name, make in pictures_of(record).items() if name not in ON_REQUEST}
+
+
 @singledispatch
 def pictures_of(record: ShownRecord) -> Pictures:
     """Return functions that make the pictures of a record, the usual one first.
@@ -130,9 +139,9 @@ def _(design: Design) -> Pictures:
     labels = complete_labels(design)
     pictures: Pictures = {
         "trajectories": partial(of_design.trajectories, design, labels),
-        "sensitivity_phase": partial(of_design.sensitivity_phase, design, labels),
+        "accuracy_over_time": partial(of_design.accuracy_over_time, design, labels),
+        "accuracy": partial(of_design.accuracy, design, labels),
         "convergence": partial(of_design.convergence, design),
-        "standard_deviations": partial(of_design.standard_deviations, design, labels),
     }
     if design.usage:
         pictures["limits"] = partial(of_design.limits, design, labels)
@@ -174,7 +183,7 @@ def _(estimate: Estimate) -> Pictures:
         ),
         "pairs": (
             estimate_studies.has_pairs(estimate.std),
-            partial(estimate_studies.estimate_pairs, estimate),
+            partial(estimate_studies.estimate_pairs, estimate, labels),
         ),
         "predictions": (
             bool(estimate.predictions),
@@ -183,6 +192,7 @@ def _(estimate: Estimate) -> Pictures:
     }
     return {
         "parameters": partial(of_estimate.parameter_intervals, estimate, labels),
+        "accuracy": partial(of_estimate.accuracy, estimate, labels),
         "spectra": partial(of_estimate.residual_spectra, estimate, labels),
         **{name: make for name, (has_it, make) in optional.items() if has_it},
         **fits,
@@ -320,4 +330,4 @@ def _import_what_draws() -> None:
 def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
     from mjfim.output.plots.draw import content
 
-    return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}
+    return {name: content(draw(), picture_format) for name, draw in usual(record).items()}

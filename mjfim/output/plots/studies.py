@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.output.page import (
@@ -44,7 +44,8 @@ from mjfim.output.panels import (
     vspan,
     words,
 )
-from mjfim.output.plots.estimate_studies import pairs
+from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows, share_text
+from mjfim.output.plots.estimate_studies import Spread, pairs
 from mjfim.output.words import (
     BEST_CASE,
     format_number,
@@ -101,45 +102,18 @@ def check(result: Check) -> Picture:
     """Show predicted and wanted relative standard deviations, and correlations of the estimates."""
     rows = [row for row in result.rows if not row.nuisance]
     combined = result.combined
-    shares = [c.std_final / abs(c.value) if c.value else np.nan for c in combined]
-    percent = 100.0 * np.array([*(row.relative for row in rows), *shares])
-    wanted = 100.0 * np.array([row.wanted / row.size for row in rows])
-    places = np.arange(len(percent))
-    known = np.isfinite(percent) & (percent > 0.0)
-    is_alone = np.array([np.isfinite(row.std) for row in rows] + [True] * len(combined))
-    is_single = places < len(rows)
-    low, high = around(np.concatenate([percent[known], wanted]), factor=3.0)
-
-    role = source_role(result)
-    label = f"predicted σ, {result.source} ({duration(result)})"
-    kinds: list[tuple[NDArray[np.bool_], dict[str, Any]]] = [
-        (known & is_single, {"label": label}),
-        (known & ~is_single, {"opacity": 0.45, "label": "identifiable combination"}),
-    ]
-    marks = [
-        bars(percent[chosen], places[chosen], role, left=low, **look)
-        for chosen, look in kinds
-        if chosen.any()
-    ]
-    if not is_alone.all():
-        rest = places[~is_alone]
-        look = {"hollow": True, "label": "not identifiable alone"}
-        marks.append(bars(np.full(len(rest), high), rest, "muted", left=low, **look))
-
-    # A light mark below the dark one can be seen on a bar.
-    at = {"symbol": "|", "size": 10.0}
-    marks += [
-        dots(wanted, places[: len(rows)], "white", width=3.2, **at),
-        dots(wanted, places[: len(rows)], "text", width=1.6, label="wanted σ", **at),
-    ]
-    texts = [format_percent(value / 100.0) if np.isfinite(value) else "" for value in percent]
-    names = [row.name for row in rows] + [each.expression for each in combined]
-    axis = Axis(
-        label="predicted σ, relative to the size of the parameter [%]",
-        log=True,
-        limits=(low, high),
-    )
-    panels = [Panel(marks=marks, x=axis, y=row_axis(names), beside=[("", role, texts)])]
+    names = [with_unit(row.name, row.unit) for row in rows] + [each.expression for each in combined]
+    std = np.array([*(row.std for row in rows), *(each.std_final for each in combined)])
+    values = np.array([*(row.value for row in rows), *(each.value for each in combined)])
+    sizes = np.array([*(row.size for row in rows), *(abs(each.value) for each in combined)])
+    goals = np.array([*(row.wanted for row in rows), *[np.inf] * len(combined)])
+    label = f"predicted, {result.source} ({duration(result)})"
+    source = Accuracies(std, source_role(result), label)
+    # A share of a nominal value of 0 says nothing.
+    sizes = np.where(values == 0.0, np.nan, sizes)
+    panel = accuracy_panel(names, sizes, [source], goals)
+    goal = [f"wanted {share_text(*pair)}" for pair in zip(goals[: len(rows)], sizes, strict=False)]
+    panels = [replace(panel, beside=[("", source.role, panel.beside[0][2]), ("", "text", goal)])]
 
     note = BEST_CASE
     count = len(result.wanted)
@@ -148,6 +122,8 @@ def check(result: Check) -> Picture:
         panels.append(_correlations(result, len(names)))
     elif count > 1:
         note = f"No parameter is identifiable alone, so there are no correlations. {note}"
+    if not all(row.stated for row in rows):
+        note += " Without a stated one, the wanted σ is 5 %."
     verdict = result.verdict[0] if result.verdict else "all parameters are identifiable"
     title = verdict.replace("`", "").removesuffix(".")
     if len(title) > MAX_TITLE:
@@ -156,7 +132,7 @@ def check(result: Check) -> Picture:
         title=as_sentence(title),
         panels=panels,
         note=note,
-        heights=[1.8 + (0.3 if len(names) <= MAX_STUDIED else 0.16) * len(names)],
+        heights=[1.0 + height_of_rows(len(names))],
         widths=[1.15, 1.0] if has_correlations else [1.0],
     )
 
@@ -193,15 +169,11 @@ def _correlations(result: Check, rows: int) -> Panel:
         up, across = np.nonzero(confounded)
         marks = [dots(across, up, "white", size=3.0)]
     sign = "bold" if texts else "dot"
-    remark = (
-        "correlation (red: positive, blue: negative); strength of the colour: root of its size; "
-        f"{sign}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
-    )
+    far = f"{sign}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
+    remark = f"correlation (red: positive, blue: negative); {far}"
     if np.isnan(correlation).any():
         remark += "; grey: not identifiable alone"
-    # Most correlations of a good experiment are small, and would be as pale as 0 without the root.
-    strength = np.sign(correlation) * np.sqrt(np.abs(correlation))
-    cells = Cells(values=strength, texts=texts, is_bold=confounded)
+    cells = Cells(values=correlation, texts=texts, is_bold=confounded)
     return Panel(
         cells=cells,
         marks=marks,
@@ -215,13 +187,11 @@ def _correlations(result: Check, rows: int) -> Panel:
 def check_pairs(result: Check) -> Picture:
     """Show the predicted joint uncertainty of the estimates of every pair of parameters."""
     rows = [row for row in result.rows if not row.nuisance]
-    std = np.array([row.std if np.isfinite(row.std) else np.nan for row in rows])
+    values = np.array([row.value for row in rows])
     return pairs(
         [row.name for row in rows],
         [row.unit for row in rows],
-        np.array([row.value for row in rows]),
-        result.correlation * np.outer(std, std),
-        source_role(result),
+        [Spread(values, result.covariance, source_role(result), "predicted")],
         title=f"Predicted joint uncertainty, {result.source} ({duration(result)})",
         note=BEST_CASE,
     )

@@ -38,11 +38,10 @@ from mjfim.output.page import (
 from mjfim.output.pages import page_of
 from mjfim.output.panels import Panel, line
 from mjfim.output.plots.design import (
+    accuracy_over_time,
     convergence,
-    information_panel,
     limit_panels,
     motion_panels,
-    sensitivity_phase,
 )
 from mjfim.output.plots.estimate import deciding_seconds, fit, held_out, residual_torque
 from mjfim.output.rerun.camera import Camera, place_camera
@@ -94,7 +93,7 @@ START_SECONDS = 3.0
 
 
 def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels) -> None:
-    """Write design.rrd: both robots, their signals, sensitivities, the search and a summary.
+    """Write design.rrd: accuracy over time, both robots, their signals, the search and a summary.
 
     Args:
         path: File to write.
@@ -106,20 +105,13 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
         INITIAL: design.initial.trajectory,
         DESIGNED: design.final.trajectory,
     }
-    tabs: Tabs = motion_panels(labels, both, design.usage)
-    tabs |= {
-        "limits": limit_panels(design, labels, rows=False),
-        "information": [information_panel(design)],
-    }
-    phases = sensitivity_phase(design, complete_labels(design))
-    planes = {
-        name: planes_of(name, picture.panels)
-        for name, picture in (("sensitivities ψ", phases), ("optimiser", convergence(design)))
-    }
+    learning = accuracy_over_time(design, complete_labels(design))
+    tabs: Tabs = {"accuracy": list(learning.panels)}
+    tabs |= motion_panels(labels, both, design.usage)
+    tabs |= {"limits": limit_panels(design, labels, rows=False)}
+    search = planes_of("optimiser", convergence(design).panels)
     iterates = _iterate_plots(design, labels)
-    grids = []
-    for name, found in planes.items():
-        grids += grid_tabs(name, [plane.view() for plane, _ in found])
+    grids = grid_tabs("optimiser", [plane.view() for plane, _ in search])
     grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
 
     poses = _poses_of(model, both)
@@ -127,9 +119,8 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
     text = as_markdown(page_of(design), DESIGN_COLOURS)
     with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids], text) as rec:
         log_series(rec, tabs)
-        for found in planes.values():
-            for plane, panel in found:
-                plane.log(rec, panel.marks)
+        for plane, panel in search:
+            plane.log(rec, panel.marks)
         _log_robots(rec, model, poses, {}, [INITIAL])
         _log_iterates(rec, model, design, iterates)
 
@@ -546,8 +537,7 @@ DESIGN_COLOURS = (
         (DESIGNED, "the designed trajectory"),
     )
     + " Grey lines: limits. Space bar: play or pause. The timeline `iteration` shows the search: "
-    "its iterates in place of the designed trajectory. The plots of ψ show sensitivities: how much "
-    "a position (→) and its velocity (↑) change per unit of a parameter."
+    "its iterates in place of the designed trajectory."
 )
 ESTIMATE_COLOURS = (
     _colours(

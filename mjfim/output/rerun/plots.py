@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.arrays import Array
-from mjfim.output.panels import ROLES, SERIES, Mark, Panel
+from mjfim.output.panels import ROLES, SERIES, Axis, Mark, Panel
 from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
 from mjfim.records.base import record
 
@@ -29,6 +29,9 @@ SIZE, LEFT, RIGHT, TOP, BOTTOM = (380.0, 200.0), 58.0, 20.0, 14.0, 34.0
 
 # Numbers beside an axis at most, and space above and below curves, over their range.
 MOST_NUMBERS, MARGIN = 6, 0.06
+
+# Share of a logarithmic axis that an axis of the viewer shows, which begins at zero.
+SHOWN_SHARE = 1.0 / 3.0
 
 # Plots of a group by the name of its tab.
 Tabs = dict[str, list[Panel]]
@@ -75,11 +78,19 @@ def series_tabs(tabs: Tabs) -> list[rrb.Container]:
                 origin=entity_path((name, panel.title)),
                 name=panel.title,
                 plot_legend=rrb.PlotLegend(visible=k % PLOTS_PER_PAGE == 0),
+                axis_y=_range(panel.y),
             )
             for k, panel in enumerate(panels)
         ]
         found += grid_tabs(name, views)
     return found
+
+
+def _range(axis: Axis) -> rrb.ScalarAxis | None:
+    """Return the stated range of an axis; the viewer shows the low part of a logarithmic one."""
+    if axis.limits is None:
+        return None
+    return rrb.ScalarAxis(range=(0.0, SHOWN_SHARE * axis.limits[1]) if axis.log else axis.limits)
 
 
 # ---- series over time
