@@ -264,7 +264,7 @@ def when_learnt(design: Design) -> str:
         return f"One experiment does not reach {what} for {first_ones(missed)}."
 
     last = sorted(asked, key=lambda j: seconds[j])[-MAX_NAMED:]
-    named = [f"{shorten(design.parameters[j])} {seconds[j]:.3g} s" for j in last]
+    named = [f"{design.parameters[j]} {seconds[j]:.3g} s" for j in last]
     others = "" if len(last) == len(asked) else "others earlier, "
     end = float(seconds[last[-1]])
     reached = "Every wanted σ is reached" if is_stated else f"Every parameter reaches {goal}"
