@@ -152,11 +152,9 @@ def test_targets_out_of_reach_are_short(combinations: tuple[str, ...]) -> None:
     task = SimpleNamespace(
         parameters=SimpleNamespace(names=NAMES), experiment=SimpleNamespace(source="robot.toml")
     )
-    final = SimpleNamespace(std=np.full(300, np.inf))
+    design = SimpleNamespace(stated_std=np.full(300, np.inf), combinations=combinations)
     with pytest.raises(UnidentifiableError) as raised:
-        require_reachable(
-            task, SimpleNamespace(final=final, combinations=combinations), np.ones(300)
-        )
+        require_reachable(task, design, np.ones(300))
     require_short(str(raised.value))
 
 
