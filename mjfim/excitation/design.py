@@ -339,6 +339,7 @@ def _record(
         motions=motions,
         improvement=improvement_per_iteration(history, stage.problem.size(final)),
         rehearsal=rehearsal,
+        prices=dict(winner.prices),
         reserve={} if reserve == "auto" else dict[str, float](reserve.items()),
     )
 

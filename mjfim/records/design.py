@@ -446,6 +446,9 @@ class Design(ShownRecord):
             relative to one nat per parameter. NaN where it is unknown.
         rehearsal: What the design does to the model and to simulated robots; None where it was
             interrupted before.
+        prices: Exponents e of the limits that hold the design back: where the range of one is a
+            little larger, the σ that the criterion minimises falls as `range^-e`. They are the
+            multipliers of the barrier at the end of the search; empty without a barrier.
         reserve: Key `limits.reserve` that the search kept, also where it was found automatically.
     """
 
@@ -475,6 +478,7 @@ class Design(ShownRecord):
     motions: IterateMotions | None = None
     improvement: float = float("nan")
     rehearsal: Rehearsal | None = None
+    prices: dict[str, float] = field(default_factory=dict)
     reserve: dict[str, float] = field(default_factory=dict)
 
     file_stem = "design"
@@ -503,6 +507,7 @@ class Design(ShownRecord):
         "prior",
         "data",
         "rehearsal",
+        "prices",
         "reserve",
     )
     json_names = {"outcome": "message"}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -107,6 +107,7 @@ class Candidate:
         status: Status of the last descent; None where its time was over.
         slope: Slope of the cost at the last iterate.
         history: Iterates.
+        prices: Exponents of the limits, see `Design`.
         steps: Engine steps.
         has_left: A descent without a barrier has left the limits, or was misled by derivatives.
         is_held_up: Its steps were very short.
@@ -126,6 +127,7 @@ class Candidate:
     status: Status | None = None
     slope: float = np.inf
     history: tuple[HistoryRow, ...] = ()
+    prices: Mapping[str, float] = field(default_factory=dict)
     steps: int = 0
     has_left: bool = False
     is_held_up: bool = False
@@ -409,6 +411,8 @@ class Climb:
                 return
 
             point, status = step.iterate.point, step.iterate.status
+            prices = problem.prices(point, ground.task.controls)
+            self.candidate = replace(self.candidate, prices=prices)
             margins = self._margins(step) if left == 1 else step.margins
             is_outside = min(margins.values(), default=0.0) < 0.0
             if left == 1 and not is_outside and status not in (None, Status.MAX_ITERATIONS):

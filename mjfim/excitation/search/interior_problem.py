@@ -7,6 +7,7 @@ outside the limits as well (Hauser & Saccon 2006).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -158,6 +159,22 @@ class InteriorProblem:
         """Cost of D-optimality that corresponds to one e-fold of every eigenvalue."""
         count = 1 if point.criterion is None else len(point.criterion.eigenvalues)
         return self.base.information.weight * count
+
+    def prices(self, point: InteriorPoint, controls: Sequence[str]) -> dict[str, float]:
+        """Exponents e of the limits at the end of a stage: σ falls as `range^-e`.
+
+        There, `mu dB/d(bound)` is the multiplier of a limit, the derivative of the merit by its
+        bound. The merit is twice the logarithm of the σ that the criterion minimises.
+
+        Args:
+            point: Minimum of `log J + mu B`.
+            controls: Names of the nu controls.
+
+        Returns:
+            Exponents by the titles of the limits.
+        """
+        slopes = self.constraints.narrowing(values_of(point), self.delta, controls)
+        return {title: 0.5 * self.mu * slope for title, slope in slopes.items() if slope != 0.0}
 
     def value(self, point: InteriorPoint) -> float:
         """`log J + mu B` at a point."""

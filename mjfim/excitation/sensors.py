@@ -1,0 +1,287 @@
+"""What each sensor tells about the parameters along one motion, from one linearisation of it.
+
+The noise of sensors is independent, so that their information adds. Without a sensor its matrix is
+missing from the sum; with half of its noise it counts four times.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from mjfim.arrays import Array
+from mjfim.errors import SimulationDivergedError
+from mjfim.excitation.task import DesignTask
+from mjfim.information.criteria import shared
+from mjfim.information.identifiability import Identifiability, null_space
+from mjfim.information.null_space import COARSER_STEP_FACTOR
+from mjfim.model.coordinates import output_label, split_unit
+from mjfim.plant.plant import SENSITIVITY_STEP
+from mjfim.records.trajectory import Sensitivity, Trajectory
+from mjfim.records.worth import DEFAULT_RELATIVE_STD, SensorWorth, Worth
+
+# Words for kinds of sensors, where they differ from MuJoCo's.
+KINDS = {
+    "qpos": "positions",
+    "qvel": "velocities",
+    "jointpos": "positions",
+    "jointvel": "velocities",
+}
+
+# Largest number of sensors of which every set is tried; of more, sets of kinds are tried.
+MOST_SENSORS = 12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sensor:
+    """The measurements of a sensor along a motion.
+
+    Attributes:
+        name: Its name; correlated sensors count as one, which has all their names.
+        kind: Kind of the sensor, in words.
+        noise: Standard deviation of its noise with its unit, in words.
+        rows: (n, p) whitened derivatives of its n measurements [1 / theta-unit].
+        error: (n, p) their change with a longer difference step.
+        is_added: Whether the model lacks it.
+    """
+
+    name: str
+    kind: str
+    noise: str
+    rows: Array
+    error: Array
+    is_added: bool = False
+
+
+def linearised(task: DesignTask, trajectory: Trajectory) -> tuple[Sensitivity, Sensitivity]:
+    """Sensitivities along a motion, and those with a longer difference step.
+
+    Raises:
+        SimulationDivergedError: The motion diverges when the parameters change a little.
+    """
+    differentiate = task.plant.derivatives.sensitivity
+    fine = differentiate(task.theta, trajectory)
+    if fine is None:
+        raise SimulationDivergedError("the motion diverges when the parameters change a little")
+    coarse = differentiate(task.theta, trajectory, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
+    return fine, coarse or fine
+
+
+def sensors_along(
+    task: DesignTask, fine: Sensitivity, coarse: Sensitivity, added: Iterable[str] = ()
+) -> Iterator[Sensor]:
+    """Collect the measurements of each sensor of a task.
+
+    Args:
+        task: The task.
+        fine: Sensitivities along the motion.
+        coarse: Sensitivities with a longer difference step.
+        added: Names of the sensors that the user's model lacks.
+    """
+    outputs, noise, model = task.system.outputs, task.system.noise, task.system.model
+    coordinates = task.system.source.coordinates
+    sensor_of = {each.name: (each.name, *each.groups)[-1] for each in coordinates.state}
+    sensor_of |= {each.name: each.sensor for each in coordinates.sensors}
+    names = np.array([sensor_of[name] for name in outputs.names])
+    rows = noise.whiten(fine.G)
+    error = noise.whiten(coarse.G) - rows
+    is_measured = noise.measured(len(rows) - 1) > 0.0
+
+    # Components of a sensor, and correlated sensors, belong together.
+    belong = (names[:, None] == names) | (noise.covariance != 0.0)
+    count, group_of = connected_components(belong, directed=False)
+    for group in range(count):
+        columns = np.flatnonzero(group_of == group)
+        first = str(names[columns[0]])
+        unit = split_unit(output_label(model, outputs.names[columns[0]]))[1]
+        mask = is_measured[:, columns]
+        yield Sensor(
+            name=" + ".join(dict.fromkeys(names[columns].tolist())),
+            kind=_kind(model, first),
+            noise=f"{noise.sigma[columns[0]]:.3g} {unit}".rstrip(),
+            rows=rows[:, columns][mask],
+            error=error[:, columns][mask],
+            is_added=first in added,
+        )
+
+
+def _kind(model: mujoco.MjModel, name: str) -> str:
+    """Kind of a sensor or of a component of the state, in words."""
+    stated = name.partition(":")[0]
+    if stated not in KINDS:
+        stated = mujoco.mjtSensor(model.sensor(name).type[0]).name
+        stated = stated.removeprefix("mjSENS_").lower()
+    return KINDS.get(stated, stated)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sensing:
+    """All sensors along a motion, any of which may be left out or be made more accurate.
+
+    Attributes:
+        task: The task.
+        sensors: The sensors.
+        hidden: (t, k) directions of the wanted parameters that no sensor shows.
+    """
+
+    task: DesignTask
+    sensors: tuple[Sensor, ...]
+    hidden: Array
+
+    @property
+    def present(self) -> Array:
+        """(s,) 1 for sensors of the experiment, 0 for added ones."""
+        return np.array([0.0 if sensor.is_added else 1.0 for sensor in self.sensors])
+
+    @cached_property
+    def _matrices(self) -> Array:
+        """(s, p, p) information of each sensor."""
+        return np.array([sensor.rows.T @ sensor.rows for sensor in self.sensors])
+
+    def std(self, weights: Array, repetitions: int = 1) -> Array:
+        """Standard deviations of the parameters.
+
+        Args:
+            weights: (s,) how many times the information of each sensor counts.
+            repetitions: Number of repetitions of the experiment.
+
+        Returns:
+            (p,) standard deviations [theta-unit]; infinite for nuisance parameters, and for those
+            that are not identifiable alone.
+        """
+        used = [
+            (np.sqrt(weight) * sensor.rows, np.sqrt(weight) * sensor.error)
+            for weight, sensor in zip(weights, self.sensors, strict=True)
+            if weight
+        ]
+        std = np.full(len(self.task.parameters), np.inf)
+        if not used:
+            return std
+        rows, errors = zip(*used, strict=True)
+        null = null_space(self.task.identifiability_test, rows, errors, self.hidden)
+        basis = null.basis if null.count else None
+        std[self.task.parameters.interest] = self._wanted_std(weights, basis, repetitions)
+        return std
+
+    def _wanted_std(self, weights: Array, basis: Array | None, repetitions: int = 1) -> Array:
+        """(t,) standard deviations of the wanted parameters in identifiable combinations."""
+        task = self.task
+        data = np.tensordot(weights, self._matrices, axes=1)
+        p = task.parameters
+        data = repetitions * shared(data, p.prior_information, p.recording_specific)
+        information = replace(task.information, prior=task.prior, basis=basis)
+        covariance = information.covariance(data + task.prior)
+        return np.nan_to_num(np.sqrt(np.diag(covariance)), nan=np.inf)
+
+    @property
+    def target(self) -> Array:
+        """(p,) wanted standard deviations, see `Worth`."""
+        p = self.task.parameters
+        sizes = p.sizes(self.task.theta)
+        stated = np.array([each.wanted or np.nan for each in p.parameters])
+        target = stated if np.isfinite(stated).any() else DEFAULT_RELATIVE_STD * sizes
+        return np.where(np.isin(np.arange(len(p)), p.interest), target, np.nan)
+
+    def fewest(self, target: Array) -> tuple[str, ...]:
+        """Find the smallest set of sensors, or of their kinds, that reaches a target.
+
+        Args:
+            target: (p,) wanted standard deviations [theta-unit]; NaN where none is wanted.
+
+        Returns:
+            Names; none where all sensors together do not reach the target.
+        """
+        wanted = target[self.task.parameters.interest]
+
+        def reaches(chosen: Iterable[Array]) -> bool:
+            """Whether the sensors of some masks suffice together."""
+            weights = np.maximum.reduce(list(chosen))
+            return not (self._wanted_std(weights, None) > wanted).any()
+
+        single, kinds = self._singles, self._kinds
+        choices = kinds if len(single) > MOST_SENSORS and kinds else single
+        if len(choices) > MOST_SENSORS or not reaches(choices.values()):
+            return ()
+        for count in range(1, len(choices) + 1):
+            for names in itertools.combinations(choices, count):
+                if reaches(choices[name] for name in names):
+                    return names
+        return ()
+
+    @property
+    def _singles(self) -> dict[str, Array]:
+        """(s,) masks of single sensors, by their names."""
+        return dict(zip([each.name for each in self.sensors], np.eye(len(self.sensors))))
+
+    @property
+    def _kinds(self) -> dict[str, Array]:
+        """(s,) masks of all sensors of a kind; empty where there is one kind only."""
+        kinds = np.array([each.kind for each in self.sensors])
+        each = dict.fromkeys(kinds.tolist())
+        masks = {f"all {kind}": 1.0 * (kinds == kind) for kind in each}
+        return masks if len(masks) > 1 else {}
+
+    def worth(self, source: str, horizon: float) -> Worth:
+        """What would help to determine the parameters along the motion.
+
+        Args:
+            source: The motion, in words.
+            horizon: Its duration [s].
+        """
+        p, present, target = self.task.parameters, self.present, self.target
+        several = {name: mask for name, mask in self._kinds.items() if mask.sum() > 1.0}
+        noises = {each.name: each.noise for each in self.sensors}
+        return Worth(
+            source=source,
+            horizon=horizon,
+            parameters=p.names,
+            units=self.task.system.units,
+            target=target,
+            std=self.std(present),
+            repeated=self.std(present, 2),
+            faster=self.std(2.0 * present),
+            sensors=tuple(
+                SensorWorth(
+                    name=name,
+                    noise=noises.get(name, ""),
+                    is_added=not (mask * present).any(),
+                    without=self.std(present * (1.0 - mask)),
+                    present=self.std(np.maximum(present, mask)),
+                    alone=self.std(mask),
+                    halved=self.std(np.maximum(present, 4.0 * mask)),
+                )
+                for name, mask in {**self._singles, **several}.items()
+            ),
+            fewest=self.fewest(target),
+        )
+
+
+def sensing_along(
+    task: DesignTask,
+    trajectory: Trajectory,
+    identifiability: Identifiability,
+    added: Iterable[str] = (),
+) -> Sensing:
+    """Linearise a motion and collect what each sensor shows.
+
+    Args:
+        task: The task.
+        trajectory: The motion.
+        identifiability: What the sensors of the experiment can identify.
+        added: Names of the sensors that the user's model lacks.
+
+    Raises:
+        SimulationDivergedError: The motion diverges when the parameters change a little.
+    """
+    fine, coarse = linearised(task, trajectory)
+    return Sensing(
+        task=task,
+        sensors=tuple(sensors_along(task, fine, coarse, added)),
+        hidden=identifiability.along_all.directions,
+    )
