@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -46,7 +47,7 @@ class Sensor:
         name: Its name; correlated sensors count as one, which has all their names.
         kind: Kind of the sensor, in words.
         noise: Standard deviation of its noise with its unit, in words.
-        rows: (n, p) whitened derivatives of its n measurements [1 / theta-unit].
+        rows: (n, p) whitened derivatives of its measurements [1 / theta-unit].
         error: (n, p) their change with a longer difference step.
         is_added: Whether the model lacks it.
     """
@@ -57,6 +58,19 @@ class Sensor:
     rows: Array
     error: Array
     is_added: bool = False
+
+    @classmethod
+    def of_rows(cls, rows: Array, coarse: Array, **words: Any) -> Sensor:
+        """A sensor with at most 2 p rows, whose products are those of all of its rows.
+
+        Args:
+            rows: (m, p) whitened derivatives of all measurements [1 / theta-unit].
+            coarse: (m, p) the same with a longer difference step.
+            **words: The other attributes.
+        """
+        both = np.concatenate([rows, coarse - rows], axis=1)
+        rows, error = np.split(np.asarray(np.linalg.qr(both, mode="r")), 2, axis=1)
+        return cls(rows=rows, error=error, **words)
 
 
 def linearised(task: DesignTask, trajectory: Trajectory) -> tuple[Sensitivity, Sensitivity]:
@@ -89,8 +103,7 @@ def sensors_along(
     sensor_of = {each.name: (each.name, *each.groups)[-1] for each in coordinates.state}
     sensor_of |= {each.name: each.sensor for each in coordinates.sensors}
     names = np.array([sensor_of[name] for name in outputs.names])
-    rows = noise.whiten(fine.G)
-    error = noise.whiten(coarse.G) - rows
+    rows, coarse_rows = noise.whiten(fine.G), noise.whiten(coarse.G)
     is_measured = noise.measured(len(rows) - 1) > 0.0
 
     # Components of a sensor, and correlated sensors, belong together.
@@ -101,12 +114,12 @@ def sensors_along(
         first = str(names[columns[0]])
         unit = split_unit(output_label(model, outputs.names[columns[0]]))[1]
         mask = is_measured[:, columns]
-        yield Sensor(
+        yield Sensor.of_rows(
+            rows[:, columns][mask],
+            coarse_rows[:, columns][mask],
             name=" + ".join(dict.fromkeys(names[columns].tolist())),
             kind=_kind(model, first),
             noise=f"{noise.sigma[columns[0]]:.3g} {unit}".rstrip(),
-            rows=rows[:, columns][mask],
-            error=error[:, columns][mask],
             is_added=first in added,
         )
 
@@ -217,7 +230,8 @@ class Sensing:
     @property
     def _singles(self) -> dict[str, Array]:
         """(s,) masks of single sensors, by their names."""
-        return dict(zip([each.name for each in self.sensors], np.eye(len(self.sensors))))
+        names = [each.name for each in self.sensors]
+        return dict(zip(names, np.eye(len(names)), strict=True))
 
     @property
     def _kinds(self) -> dict[str, Array]:

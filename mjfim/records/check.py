@@ -12,6 +12,7 @@ from mjfim.errors import first_ones, shortened
 from mjfim.records.base import Record, ShownRecord, record
 from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal
+from mjfim.records.worth import Worth
 
 # A coefficient that differs from 1 by less than this number is not written.
 UNIT_COEFFICIENT_TOLERANCE = 1e-6
@@ -292,6 +293,7 @@ class Check(ShownRecord):
         self_test: Test of the derivatives.
         steps: Standard deviations by finite steps along one motion; None where they were not made.
         rehearsal: What a given motion does to robots; None for a start and for recordings.
+        worth: What each sensor tells along one motion; None for recordings.
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
             are equal.
@@ -315,6 +317,7 @@ class Check(ShownRecord):
     verdict: tuple[str, ...]
     steps: FiniteSteps | None = None
     rehearsal: Rehearsal | None = None
+    worth: Worth | None = None
     combined: tuple[CombinationAccuracy, ...] = ()
     missing: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
@@ -342,6 +345,7 @@ class Check(ShownRecord):
         "self_test",
         "steps",
         "rehearsal",
+        "worth",
     )
     json_names = {
         "rows": "parameters",

@@ -12,6 +12,7 @@ from mjfim.arrays import Array
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
+from mjfim.records.worth import Worth
 
 # Largest number of iterates of one search whose motions are kept, and number of samples of each.
 MAX_MOTIONS, MOTION_SAMPLES = 40, 200
@@ -446,9 +447,8 @@ class Design(ShownRecord):
             relative to one nat per parameter. NaN where it is unknown.
         rehearsal: What the design does to the model and to simulated robots; None where it was
             interrupted before.
-        prices: Exponents e of the limits that hold the design back: where the range of one is a
-            little larger, the σ that the criterion minimises falls as `range^-e`. They are the
-            multipliers of the barrier at the end of the search; empty without a barrier.
+        worth: What each sensor tells along the designed trajectory, and what each limit costs;
+            None where the search was interrupted.
         reserve: Key `limits.reserve` that the search kept, also where it was found automatically.
     """
 
@@ -478,7 +478,7 @@ class Design(ShownRecord):
     motions: IterateMotions | None = None
     improvement: float = float("nan")
     rehearsal: Rehearsal | None = None
-    prices: dict[str, float] = field(default_factory=dict)
+    worth: Worth | None = None
     reserve: dict[str, float] = field(default_factory=dict)
 
     file_stem = "design"
@@ -507,7 +507,7 @@ class Design(ShownRecord):
         "prior",
         "data",
         "rehearsal",
-        "prices",
+        "worth",
         "reserve",
     )
     json_names = {"outcome": "message"}

@@ -56,6 +56,12 @@ class Price(Record):
     predicted: float = np.nan
     redesigned: float = np.nan
 
+    @classmethod
+    def of_limit(cls, title: str, exponent: float) -> Price:
+        """The price of a limit by its multiplier: σ falls as `range^-exponent`."""
+        change = (1.0 + PRICED_SHARE) ** -exponent - 1.0
+        return cls(name=title, step=f"{100 * PRICED_SHARE:g} % wider", predicted=change)
+
     @property
     def change(self) -> float:
         """Relative change of σ, by a new design where there is one."""

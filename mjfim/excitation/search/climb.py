@@ -45,6 +45,10 @@ TIGHTENING_MU = 4e-3
 REPEATED_MU = 1e-3
 MAX_REPEATED_STAGES = 3
 
+# Largest weight with which the multipliers of the barrier are those of the limits. The slope of the
+# merit has to be smaller than the weight.
+PRICED_MU = 1e-2
+
 # A violation at the end of a stage tightens the limit by this many times the violation; a limit
 # that holds with a margin is released by this share of the margin.
 TIGHTENING_GAIN = 1.2
@@ -107,7 +111,7 @@ class Candidate:
         status: Status of the last descent; None where its time was over.
         slope: Slope of the cost at the last iterate.
         history: Iterates.
-        prices: Exponents of the limits, see `Design`.
+        prices: Exponents of the limits at the end of the last stage, see `InteriorProblem`.
         steps: Engine steps.
         has_left: A descent without a barrier has left the limits, or was misled by derivatives.
         is_held_up: Its steps were very short.
@@ -411,8 +415,9 @@ class Climb:
                 return
 
             point, status = step.iterate.point, step.iterate.status
-            prices = problem.prices(point, ground.task.controls)
-            self.candidate = replace(self.candidate, prices=prices)
+            if step.iterate.slope <= weights[number] <= PRICED_MU:
+                prices = problem.prices(point, ground.task.controls)
+                self.candidate = replace(self.candidate, prices=prices)
             margins = self._margins(step) if left == 1 else step.margins
             is_outside = min(margins.values(), default=0.0) < 0.0
             if left == 1 and not is_outside and status not in (None, Status.MAX_ITERATIONS):
