@@ -103,6 +103,11 @@ class Worth(ShownRecord):
     file_stem = "worth"
     made_by = "`mjfim worth EXPERIMENT -o DIR`"
 
+    @property
+    def single(self) -> tuple[SensorWorth, ...]:
+        """The single sensors, without their kinds."""
+        return tuple(each for each in self.sensors if each.noise)
+
     def ratio(self, std: Array) -> float:
         """Largest ratio of standard deviations, (p,), to the wanted ones."""
         return float(np.nanmax(std / self.target))

@@ -45,9 +45,10 @@ TIGHTENING_MU = 4e-3
 REPEATED_MU = 1e-3
 MAX_REPEATED_STAGES = 3
 
-# Largest weight with which the multipliers of the barrier are those of the limits. The slope of the
-# merit has to be smaller than the weight.
+# Largest weight with which the multipliers of the barrier are those of the limits, and largest
+# slope of the merit over the weight.
 PRICED_MU = 1e-2
+PRICED_SLOPE = 0.1
 
 # A violation at the end of a stage tightens the limit by this many times the violation; a limit
 # that holds with a margin is released by this share of the margin.
@@ -415,7 +416,8 @@ class Climb:
                 return
 
             point, status = step.iterate.point, step.iterate.status
-            if step.iterate.slope <= weights[number] <= PRICED_MU:
+            weight = weights[number]
+            if weight <= PRICED_MU and step.iterate.slope <= PRICED_SLOPE * weight:
                 prices = problem.prices(point, ground.task.controls)
                 self.candidate = replace(self.candidate, prices=prices)
             margins = self._margins(step) if left == 1 else step.margins

@@ -43,7 +43,6 @@ from mjfim.output.panels import (
     vspan,
     words,
 )
-from mjfim.output.plots.estimate_studies import pairs
 from mjfim.output.words import (
     BEST_CASE,
     format_number,
@@ -208,21 +207,6 @@ def _correlations(result: Check, rows: int) -> Panel:
         y=blank_rows(rows),
         remark=remark,
         place=(0, 1),
-    )
-
-
-def check_pairs(result: Check) -> Picture:
-    """Show the predicted joint uncertainty of the estimates of every pair of parameters."""
-    rows = [row for row in result.rows if not row.nuisance]
-    std = np.array([row.std if np.isfinite(row.std) else np.nan for row in rows])
-    return pairs(
-        [row.name for row in rows],
-        [row.unit for row in rows],
-        np.array([row.value for row in rows]),
-        result.correlation * np.outer(std, std),
-        source_role(result),
-        title=f"Predicted joint uncertainty, {result.source} ({duration(result)})",
-        note=BEST_CASE,
     )
 
 
