@@ -33,6 +33,7 @@ KINDS = {
     "qvel": "velocities",
     "jointpos": "positions",
     "jointvel": "velocities",
+    "jointactfrc": "joint torques",
 }
 
 # Largest number of sensors of which every set is tried; of more, sets of kinds are tried.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.output.pages.worth import change, headline, percent, price_name
+from mjfim.output.pages.worth import SMALL_INCREASE, change, headline, percent, price_name
 from mjfim.output.panels import (
     Axis,
     Mark,
@@ -27,19 +27,20 @@ MOST_ROWS = 24
 
 def worth(result: Worth) -> Picture:
     """Show σ without and with each sensor beside the wanted one, and the price of each limit."""
-    order = sorted(result.sensors, key=lambda each: (each.is_added, -_reach(result, each)))
-    chosen = sorted(order, key=lambda each: -_reach(result, each))[:MOST_ROWS]
-    rows = [each for each in order if each in chosen]
+    reach = {each.name: _reach(result, each) for each in result.sensors}
+    order = sorted(result.sensors, key=lambda each: -reach[each.name])
+    relevant = [each for each in order if reach[each.name] > SMALL_INCREASE] or order
+    rows = sorted(relevant[:MOST_ROWS], key=lambda each: each.is_added)
     panels = [_sensors(result, rows)]
     heights = [1.1 + 0.3 * len(rows)]
     if result.prices:
         panels.append(_prices(result, max(len(rows), len(result.prices))))
         heights[0] = max(heights[0], 1.1 + 0.3 * len(result.prices))
-    note = f"The change of σ stands at the right. {BEST_CASE}"
+    note = f"Where no σ is wanted, 5 % of the size of the parameter. {BEST_CASE}"
     return Picture(
         title=headline(result).removesuffix("."),
         panels=panels,
-        note=note + share_note(rows, order, "sensors"),
+        note=note + share_note(rows, order, "sensors, those that change σ most"),
         heights=heights,
         widths=[1.6, 1.0][: len(panels)],
     )
@@ -65,7 +66,7 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
     better = ratios([each.present if each.is_added else each.halved for each in rows])
     alone = ratios([each.alone for each in rows])
     places = np.arange(len(rows))
-    low, high = around(np.concatenate([without, better, alone, [1.0, now]]))
+    low, high = around(np.concatenate([without, better, [1.0, now]]), factor=2.0)
     without_or_end = np.where(np.isnan(without), high, without)
     marks: list[Mark] = [
         vline(1.0, dash="--", label="wanted"),
@@ -74,7 +75,7 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
             line([better[k], without_or_end[k]], np.full(2, k), "band", width=5.0, front=1.0)
             for k in places
         ),
-        dots(alone, places, "muted", hollow=True, label="alone"),
+        dots(np.where(alone < high, alone, np.nan), places, "muted", hollow=True, label="alone"),
     ]
     kinds = [
         (~is_added, without, "series1", "without it"),
