@@ -7,9 +7,10 @@ missing from the sum; with half of its noise it counts four times.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -22,7 +23,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import shared
 from mjfim.information.identifiability import Identifiability, null_space
 from mjfim.information.null_space import COARSER_STEP_FACTOR
-from mjfim.model.coordinates import output_label, split_unit
+from mjfim.model.coordinates import ScalarJoint, output_label, split_unit
+from mjfim.model.units import per_second
 from mjfim.plant.plant import SENSITIVITY_STEP
 from mjfim.records.trajectory import Sensitivity, Trajectory
 from mjfim.records.worth import DEFAULT_RELATIVE_STD, SensorWorth, Worth
@@ -74,22 +76,8 @@ class Sensor:
         return cls(rows=rows, error=error, **words)
 
 
-def linearised(task: DesignTask, trajectory: Trajectory) -> tuple[Sensitivity, Sensitivity]:
-    """Sensitivities along a motion, and those with a longer difference step.
-
-    Raises:
-        SimulationDivergedError: The motion diverges when the parameters change a little.
-    """
-    differentiate = task.plant.derivatives.sensitivity
-    fine = differentiate(task.theta, trajectory)
-    if fine is None:
-        raise SimulationDivergedError("the motion diverges when the parameters change a little")
-    coarse = differentiate(task.theta, trajectory, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
-    return fine, coarse or fine
-
-
 def sensors_along(
-    task: DesignTask, fine: Sensitivity, coarse: Sensitivity, added: Iterable[str] = ()
+    task: DesignTask, fine: Sensitivity, coarse: Sensitivity, added: Collection[str]
 ) -> Iterator[Sensor]:
     """Collect the measurements of each sensor of a task.
 
@@ -277,26 +265,50 @@ class Sensing:
         )
 
 
+def _accelerations(
+    task: DesignTask, fine: Sensitivity, coarse: Sensitivity, joints: Mapping[ScalarJoint, float]
+) -> Iterator[Sensor]:
+    """Sensors of joint accelerations: changes of velocities from sample to sample."""
+    first, stride = task.space.nv, task.system.grid.stride
+    by_step = [np.diff(each.psi, axis=0)[stride - 1 :: stride] / task.dt for each in (fine, coarse)]
+    for joint, sigma in joints.items():
+        yield Sensor.of_rows(
+            *(slopes[:, first + joint.v] / sigma for slopes in by_step),
+            name=f"acceleration of {joint.name}",
+            kind="joint accelerations",
+            noise=f"{sigma:.3g} {per_second(per_second(joint.unit))}",
+            is_added=True,
+        )
+
+
 def sensing_along(
     task: DesignTask,
     trajectory: Trajectory,
     identifiability: Identifiability,
-    added: Iterable[str] = (),
+    added: Collection[str] = (),
+    accelerations: Mapping[ScalarJoint, float] = MappingProxyType({}),
 ) -> Sensing:
     """Linearise a motion and collect what each sensor shows.
 
     Args:
         task: The task.
         trajectory: The motion.
-        identifiability: What the sensors of the experiment can identify.
-        added: Names of the sensors that the user's model lacks.
+        identifiability: What the sensors of the task can identify.
+        added: Names of sensors of the task that the user's model lacks.
+        accelerations: Standard deviations of sensors of joint accelerations, by their joints.
 
     Raises:
         SimulationDivergedError: The motion diverges when the parameters change a little.
     """
-    fine, coarse = linearised(task, trajectory)
-    return Sensing(
-        task=task,
-        sensors=tuple(sensors_along(task, fine, coarse, added)),
-        hidden=identifiability.along_all.directions,
+    differentiate = task.plant.derivatives.sensitivity
+    fine = differentiate(task.theta, trajectory)
+    if fine is None:
+        raise SimulationDivergedError("the motion diverges when the parameters change a little")
+    coarse = differentiate(task.theta, trajectory, COARSER_STEP_FACTOR * SENSITIVITY_STEP) or fine
+    sensors = (
+        *sensors_along(task, fine, coarse, added),
+        *_accelerations(task, fine, coarse, accelerations),
     )
+    # What no sensor of the task shows, an acceleration may show.
+    hidden = identifiability.along_all.directions
+    return Sensing(task=task, sensors=sensors, hidden=hidden[:, : 0 if accelerations else None])

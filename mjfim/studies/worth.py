@@ -21,20 +21,18 @@ from mjfim.excitation.evaluation import designable, identifiability_along, requi
 from mjfim.excitation.search.descent import Barrier, Ground
 from mjfim.excitation.search.interior_problem import DIVERGED_POINT
 from mjfim.excitation.search.levels import DescentLevel
-from mjfim.excitation.sensors import Sensor, linearised, sensing_along
+from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
-from mjfim.model.units import per_second
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import begin_stage, shown_progress
-from mjfim.records.trajectory import Trajectory
 from mjfim.records.worth import PRICED_SHARE, Price, Worth
 
 # Sensors that can be added at a place of the model, by their words.
@@ -111,12 +109,14 @@ def _worth(
         source = "the design"
     point = task.problem.point(trajectory, CENTRAL_DIFFERENCES)
     require_evaluated(task, point)
-    sensing = sensing_along(task, trajectory, identifiability_along(task, point), names)
-    accelerations = tuple(_accelerations(task, trajectory, add))
-    if accelerations:
-        # What no sensor of the model shows, an acceleration may show.
-        hidden = np.zeros((len(task.parameters.interest), 0))
-        sensing = replace(sensing, sensors=(*sensing.sensors, *accelerations), hidden=hidden)
+    accelerations = {
+        joint: sigma
+        for key, sigma in add.items()
+        if key.startswith("acceleration")
+        for joint in _at_joints(system, key)
+    }
+    identifiability = identifiability_along(task, point)
+    sensing = sensing_along(task, trajectory, identifiability, names, accelerations)
     found = sensing.worth(source, task.horizon)
     if design is None or design.worth is None:
         return found
@@ -196,34 +196,6 @@ def _add_at_site(spec: Any, name: str, place: str, kind: mujoco.mjtSensor) -> No
     spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site)
 
 
-def _accelerations(
-    task: DesignTask, trajectory: Trajectory, add: Mapping[str, float]
-) -> Iterator[Sensor]:
-    """Sensors of joint accelerations: changes of velocities from sample to sample."""
-    wanted = [
-        (joint, sigma)
-        for key, sigma in add.items()
-        if key.partition(":")[0] == "acceleration"
-        for joint in _at_joints(task.system, key)
-    ]
-    if not wanted:
-        return
-    first, stride = task.space.nv, task.system.grid.stride
-    fine, coarse = (
-        np.diff(each.psi, axis=0)[stride - 1 :: stride] / task.dt
-        for each in linearised(task, trajectory)
-    )
-    for joint, sigma in wanted:
-        yield Sensor.of_rows(
-            fine[:, first + joint.v] / sigma,
-            coarse[:, first + joint.v] / sigma,
-            name=f"acceleration of {joint.name}",
-            kind="joint accelerations",
-            noise=f"{sigma:.3g} {per_second(per_second(joint.unit))}",
-            is_added=True,
-        )
-
-
 # ---- prices
 
 
@@ -263,6 +235,9 @@ def _checked_prices(
         changed.append((Price(name="end", step="free"), free.relaxed(), control))
 
     for place, (price, other, begin) in enumerate(changed):
+        if budget.stop.requested:
+            yield price
+            continue
         begin_stage(f"designing with {price.name} {price.step}", place, len(changed))
         found, _ = _redesigned(other, basis, begin, budget.share(1 / (len(changed) - place)))
         yield replace(price, redesigned=float(np.exp(found - present)) - 1.0)
