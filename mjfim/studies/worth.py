@@ -221,6 +221,8 @@ def _checked_prices(
 
     changed = []
     for price in sorted(predicted, key=lambda price: price.change):
+        if price.name not in limits:
+            continue
         wide = limits[price.name].widened(PRICED_SHARE)
         others = [limit for limit in task.limits if limit.title != price.name]
         changed.append((price, replace(relaxed, limits=(*others, wide)), control))

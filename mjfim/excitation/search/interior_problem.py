@@ -23,6 +23,9 @@ from mjfim.optimize.projection_operator import Expansion
 # larger weights it is so smooth that this is not worth the time.
 SHARP_MU = 4e-3
 
+# Smallest exponent of a limit that counts: 10 % more range change σ by a thousandth.
+LEAST_EXPONENT = 0.01
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InteriorPoint:
@@ -171,10 +174,11 @@ class InteriorProblem:
             controls: Names of the nu controls.
 
         Returns:
-            Exponents by the titles of the limits.
+            Exponents by the titles of the limits; those that hardly matter are left out.
         """
         slopes = self.constraints.narrowing(values_of(point), self.delta, controls)
-        return {title: 0.5 * self.mu * slope for title, slope in slopes.items() if slope != 0.0}
+        exponents = {title: 0.5 * self.mu * slope for title, slope in slopes.items()}
+        return {title: each for title, each in exponents.items() if each > LEAST_EXPONENT}
 
     def value(self, point: InteriorPoint) -> float:
         """`log J + mu B` at a point."""
