@@ -85,7 +85,7 @@ class Worth(ShownRecord):
         sensors: What each sensor tells; kinds of several sensors come behind them.
         fewest: The smallest set of sensors that reaches the wanted standard deviations; empty
             where all together do not reach them.
-        prices: What restrictions of the design cost, the most expensive first.
+        prices: What restrictions of the design cost.
     """
 
     source: str
@@ -102,6 +102,11 @@ class Worth(ShownRecord):
 
     file_stem = "worth"
     made_by = "`mjfim worth EXPERIMENT -o DIR`"
+
+    @property
+    def dearest(self) -> list[Price]:
+        """The prices, the highest first; those that are not known come last."""
+        return sorted(self.prices, key=lambda price: (np.isnan(price.change), price.change))
 
     @property
     def single(self) -> tuple[SensorWorth, ...]:

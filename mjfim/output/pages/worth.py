@@ -60,7 +60,7 @@ def headline(worth: Worth) -> str:
             what = best.name if added else f"half the noise of {best.name}"
             helps.append(f"{what} ({improvement(now, worth.ratio(_improved(best)))})")
     if worth.prices:
-        price = min(worth.prices, key=lambda price: price.change)
+        price = worth.dearest[0]
         helps.append(f"{price_name(price)} ({percent(price.change)})")
     return f"{capitalised(worth.source)} {reached}. What lowers σ: {', '.join(helps)}."
 
@@ -147,9 +147,9 @@ def _price_table(worth: Worth, detail: bool) -> Table:
     return tabulated(
         "Prices: how σ changes where a restriction is relaxed",
         {
-            "restriction": [price_name(price) for price in worth.prices],
-            "by its multiplier": [percent(price.predicted) for price in worth.prices],
-            "in a new design": [percent(price.redesigned) for price in worth.prices],
+            "restriction": [price_name(price) for price in worth.dearest],
+            "by its multiplier": [percent(price.predicted) for price in worth.dearest],
+            "in a new design": [percent(price.redesigned) for price in worth.dearest],
         },
         note="σ is what the criterion minimises: for E-optimality that of the worst combination.",
         detail=detail,
