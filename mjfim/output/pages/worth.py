@@ -79,6 +79,7 @@ def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:
     """
     present = [each for each in worth.sensors if not each.is_added]
     added = [each for each in worth.sensors if each.is_added]
+    added.sort(key=lambda each: worth.ratio(each.present))
     now = worth.ratio(worth.std)
     columns = {
         "sensor": [each.name for each in present],
