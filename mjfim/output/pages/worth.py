@@ -29,9 +29,6 @@ from mjfim.records.worth import Price, SensorWorth, Worth
 # Increase of σ up to which a sensor is hardly needed, and from which its row is marked (factors).
 SMALL_INCREASE, LARGE_INCREASE = 1.05, 2.0
 
-# What the changes of σ in a table are.
-NOTE = "Change of the largest σ / wanted σ, and the parameter that then has it."
-
 
 def worth_page(worth: Worth) -> Page:
     """Describe which sensor, which data and which limit would help."""
@@ -88,8 +85,9 @@ def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:
         "alone": [change(worth, each.alone) for each in present],
         "half its noise": [change(worth, each.halved) for each in present],
     }
+    note = "Change of the largest σ / wanted σ, and the parameter that then has it."
     marked = warned(not worth.ratio(each.without) < LARGE_INCREASE * now for each in present)
-    table = tabulated("Sensors", columns, marked, spare=("noise",), note=NOTE, detail=detail)
+    table = tabulated("Sensors", columns, marked, spare=("noise",), note=note, detail=detail)
     parts: list[Part] = [*(Text(each) for each in _sentences(worth)), Plot("worth"), table]
     if added:
         columns = {
@@ -98,7 +96,7 @@ def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:
             "σ with it": [change(worth, each.present) for each in added],
             "alone": [change(worth, each.alone) for each in added],
         }
-        parts.append(tabulated("Sensors that the model does not have", columns, note=NOTE))
+        parts.append(tabulated("Sensors that the model does not have", columns))
     if worth.prices:
         parts.append(_price_table(worth, detail))
     return [*parts, _parameter_table(worth)]
