@@ -45,7 +45,7 @@ class Price(Record):
     """What one restriction of a design costs.
 
     Attributes:
-        name: What restricts the design: the title of a limit, `time` or `end`.
+        name: What restricts the design: the title of a limit, `time` or `end state`.
         step: By how much it is relaxed, in words.
         predicted: Relative change of σ by the multiplier of the barrier; NaN without one.
         redesigned: Relative change of σ in a new design; NaN where none was made.

@@ -234,7 +234,7 @@ def _checked_prices(
     changed.append((time, relaxed.with_horizon(samples * task.dt, longer), longer))
     if task.experiment.boundary.end != "free":
         free = task.restated(task.experiment.replace(boundary={"end": "free"}))
-        changed.append((Price(name="end", step="free"), free.relaxed(), control))
+        changed.append((Price(name="end state", step="left free"), free.relaxed(), control))
 
     for place, (price, other, begin) in enumerate(changed):
         if budget.stop.requested:

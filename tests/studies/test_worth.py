@@ -162,7 +162,7 @@ def test_prices_of_limits_are_those_of_designs_with_wider_limits(
     assert design.worth is not None
     found = mjfim.worth(experiment, design, seconds=np.inf, progress=False)
     prices = {price.name: price for price in found.prices}
-    assert set(prices) == {"position of slide", "control of force", "time", "end"}
+    assert set(prices) == {"position of slide", "control of force", "time", "end state"}
 
     wider = 1.0 + PRICED_SHARE
     for name, limits in (
@@ -180,7 +180,7 @@ def test_prices_of_limits_are_those_of_designs_with_wider_limits(
     in_design = {price.name: price.predicted for price in design.worth.prices}
     for name, price in in_design.items():
         assert price == pytest.approx(prices[name].predicted, rel=0.1)
-    assert prices["time"].change < 0.0 and prices["end"].change < 0.0
+    assert prices["time"].change < 0.0 and prices["end state"].change < 0.0
 
 
 def test_without_time_only_multipliers_are_shown(
