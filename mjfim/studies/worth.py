@@ -50,7 +50,7 @@ AT_JOINTS = ("torque", "acceleration")
 # Barrier of a new design, which begins near its optimum and has one stage. The stage ends at this
 # slope of the merit, relative to the weight.
 BARRIER = Barrier(first=1e-3, last=1e-3)
-SETTLED = 0.01
+SETTLED = 1e-3
 
 
 def worth(

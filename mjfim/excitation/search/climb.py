@@ -46,9 +46,9 @@ REPEATED_MU = 1e-3
 MAX_REPEATED_STAGES = 3
 
 # Largest weight with which the multipliers of the barrier are those of the limits, and largest
-# slope of the merit over the weight.
+# slope of the merit over the weight. The error of a multiplier is about the root of this ratio.
 PRICED_MU = 1e-2
-PRICED_SLOPE = 0.1
+PRICED_SLOPE = 0.01
 
 # A violation at the end of a stage tightens the limit by this many times the violation; a limit
 # that holds with a margin is released by this share of the margin.
