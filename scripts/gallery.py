@@ -78,6 +78,7 @@ SHOWN_TIME = 1.5
 CAPTIONS = {
     "check": "Predicted and wanted σ of every parameter, and the correlations of the estimates",
     "pairs": "Joint uncertainty of the estimates of pairs of parameters",
+    "worth": "What each sensor tells, and what limits cost",
     "standard_deviations": "Predicted σ of every parameter, initial and designed",
     "trajectories": "Motion and controls, and the information gathered up to each time",
     "limits": "How much of each limit the design uses",
