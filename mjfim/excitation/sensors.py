@@ -183,12 +183,14 @@ class Sensing:
 
     @property
     def target(self) -> Array:
-        """(p,) wanted standard deviations, see `Worth`."""
+        """(p,) wanted standard deviations, see `Worth`; NaN for what no sensor determines."""
         p = self.task.parameters
-        sizes = p.sizes(self.task.theta)
-        stated = np.array([each.wanted or np.nan for each in p.parameters])
-        target = stated if np.isfinite(stated).any() else DEFAULT_RELATIVE_STD * sizes
-        return np.where(np.isin(np.arange(len(p)), p.interest), target, np.nan)
+        stated = np.array([each.wanted or np.nan for each in p.parameters])[p.interest]
+        usual = DEFAULT_RELATIVE_STD * p.sizes(self.task.theta)[p.interest]
+        target = np.full(len(p), np.nan)
+        target[p.interest] = stated if np.isfinite(stated).any() else usual
+        found = np.where(np.isfinite(self.std(np.ones(len(self.sensors)))), target, np.nan)
+        return found if np.isfinite(found).any() else target
 
     def fewest(self, target: Array) -> tuple[str, ...]:
         """Find the smallest set of sensors, or of their kinds, that reaches a target.

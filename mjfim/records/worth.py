@@ -78,7 +78,8 @@ class Worth(ShownRecord):
         parameters: Names of the p parameters.
         units: Their units; may be empty.
         target: (p,) wanted standard deviations, stated or 5 % of the size; NaN for nuisance
-            parameters and, where some are stated, for those without one [theta-unit].
+            parameters, for those that no sensor determines alone and, where some are stated, for
+            those without one [theta-unit].
         std: (p,) standard deviations with all sensors of the experiment [theta-unit].
         repeated: (p,) standard deviations after two repetitions [theta-unit].
         faster: (p,) standard deviations with twice as many samples a second [theta-unit].

@@ -189,3 +189,16 @@ def test_without_time_only_multipliers_are_shown(
         price.predicted for price in design.worth.prices
     ]
     assert all(np.isnan(price.redesigned) for price in found.prices)
+
+
+def test_what_no_sensor_determines_alone_does_not_count() -> None:
+    """Any motion shows only the sum of the mass of the cart and the armature of its joint."""
+    together = {
+        "M": {"target": "body/cart:mass"},
+        "a": {"target": "joint/slide:armature", "guess": 0.1},
+    }
+    found = mjfim.worth(cart().replace(parameters=together), progress=False)
+    assert found.parameters == ("m", "l", "c", "M", "a")
+    assert np.isfinite(found.target).tolist() == [True] * 3 + [False] * 2
+    assert np.isinf(found.std[3:]).all() and np.isfinite(found.ratio(found.std))
+    assert found.worst(found.std) in ("m", "l", "c")

@@ -47,7 +47,9 @@ def worth_page(worth: Worth) -> Page:
 def headline(worth: Worth) -> str:
     """Say what helps most: a sensor, data or a limit."""
     reached, now = "reaches every wanted σ", worth.ratio(worth.std)
-    if not now <= 1.0:
+    if np.isinf(now):
+        reached = f"does not determine {worth.worst(worth.std)} alone"
+    elif now > 1.0:
         reached = f"misses the wanted σ of {worth.worst(worth.std)} by a factor of {now:.2g}"
     helps = []
     for added in (False, True):
@@ -55,10 +57,11 @@ def headline(worth: Worth) -> str:
         if rows:
             best = min(rows, key=lambda each: worth.ratio(_improved(each)))
             what = best.name if added else f"half the noise of {best.name}"
-            helps.append(f"{what} ({improvement(now, worth.ratio(_improved(best)))})")
+            helps.append(f"{what} ({change(worth, _improved(best)).partition(' (')[0]})")
     if worth.prices:
         price = worth.dearest[0]
         helps.append(f"{price_name(price)} ({percent(price.change)})")
+    helps = [each for each in helps if "(same)" not in each] or ["none of these sensors"]
     return f"{capitalised(worth.source)} {reached}. What lowers σ: {', '.join(helps)}."
 
 
@@ -127,6 +130,8 @@ def change(worth: Worth, std: Array) -> str:
     now = worth.ratio(worth.std)
     if ratio == now or 1.0 / SMALL_INCREASE < ratio / now < SMALL_INCREASE:
         return "same"
+    if np.isinf(now):
+        return f"{ratio:.2g} of the wanted σ"
     text = improvement(now, ratio) if np.isfinite(ratio) else "∞"
     return f"{text} ({worst})" if worst != worth.worst(worth.std) else text
 

@@ -48,8 +48,8 @@ def worth(result: Worth) -> Picture:
 
 def _reach(result: Worth, sensor: SensorWorth) -> float:
     """Ratio of the largest and the smallest σ that a sensor makes a difference for."""
-    least = sensor.present if sensor.is_added else sensor.halved
-    return result.ratio(sensor.without) / result.ratio(least)
+    least = result.ratio(sensor.present if sensor.is_added else sensor.halved)
+    return 1.0 if np.isinf(least) else result.ratio(sensor.without) / least
 
 
 def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
@@ -70,7 +70,7 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
     without_or_end = np.where(np.isnan(without), high, without)
     marks: list[Mark] = [
         vline(1.0, dash="--", label="wanted"),
-        vline(now, "muted", label="now"),
+        *([vline(now, "muted", label="now")] if np.isfinite(now) else []),
         *(
             line([better[k], without_or_end[k]], np.full(2, k), "band", width=5.0, front=1.0)
             for k in places
