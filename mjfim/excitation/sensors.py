@@ -39,7 +39,7 @@ KINDS = {
 }
 
 # Largest number of sensors of which every set is tried; of more, sets of kinds are tried.
-MOST_SENSORS = 12
+MOST_SENSORS = 10
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
