@@ -32,6 +32,7 @@ DESIGN = {
     "sensitivity_phase.png",
     "convergence.png",
     "standard_deviations.png",
+    "worth.png",
     "rehearsal.png",
 }
 
