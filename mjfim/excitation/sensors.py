@@ -15,7 +15,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
@@ -97,18 +96,19 @@ def sensors_along(
 
     # Components of a sensor, and correlated sensors, belong together.
     belong = (names[:, None] == names) | (noise.covariance != 0.0)
-    count, group_of = connected_components(belong, directed=False)
-    for group in range(count):
-        columns = np.flatnonzero(group_of == group)
-        first = str(names[columns[0]])
-        unit = split_unit(output_label(model, outputs.names[columns[0]]))[1]
+    for _ in range(len(names).bit_length()):
+        belong = belong @ belong
+    for place in np.flatnonzero(belong.argmax(axis=1) == np.arange(len(names))).tolist():
+        columns = np.flatnonzero(belong[place])
+        first = str(names[place])
+        unit = split_unit(output_label(model, outputs.names[place]))[1]
         mask = is_measured[:, columns]
         yield Sensor.of_rows(
             rows[:, columns][mask],
             coarse_rows[:, columns][mask],
             name=" + ".join(dict.fromkeys(names[columns].tolist())),
             kind=_kind(model, first),
-            noise=f"{noise.sigma[columns[0]]:.3g} {unit}".rstrip(),
+            noise=f"{noise.sigma[place]:.3g} {unit}".rstrip(),
             is_added=first in added,
         )
 
