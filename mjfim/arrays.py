@@ -35,6 +35,12 @@ Array = Annotated[NDArray[np.float64], Stored]
 # Half width of the 95 % interval of a normal distribution [standard deviations].
 NORMAL_95 = 1.959963984540054
 
+# Half width of a 95 % interval over the size of the value (an entry of a vector or tensor has the
+# size of the whole), from which on a parameter is poorly known, and from which on experiments do
+# not determine it. They hold for predicted and for found intervals.
+POORLY_KNOWN_SHARE = 0.25
+UNDETERMINED_SHARE = 0.5
+
 # Lower bound of the diagonal entries by which a matrix is scaled; it avoids a division by zero.
 SMALLEST_DIAGONAL = 1e-300
 

@@ -55,6 +55,38 @@ def test_the_judge_sees_each_kind_of_limit() -> None:
     assert {"force of servo", "control of servo", "position of hinge"} == kinds
 
 
+def test_the_judge_sees_where_and_how_fast_a_free_body_goes() -> None:
+    """A body without weight flies along x at 2 m/s and turns about y at 1 rad/s for 1 s."""
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <option timestep="0.01" gravity="0 0 0"/>
+      <worldbody><body name="b"><freejoint name="base"/><geom size="0.1" mass="1"/></body>
+      </worldbody>
+    </mujoco>
+    """)
+    trajectory = {
+        "t": np.array([0.0, 1.0]),
+        "qpos": np.array([[0.0, 0, 0, 1, 0, 0, 0]]),
+        "qvel": np.array([[2.0, 0, 0, 0, 1, 0]]),
+        "act": np.zeros((2, 0)),
+        "ctrl": np.zeros((1, 0)),
+    }
+
+    def found(side: float, speed: float, turn: float, tilt: float) -> set[str]:
+        """Limits that are exceeded, of a box, of both speeds and of the tilt."""
+        box = {"position": {"base": [[-side, side]] * 3}, "velocity": {"base": speed}}
+        stated = {**box, "angular_velocity": {"base": turn}, "tilt": {"base": tilt}}
+        return {text.split(" by ")[0] for text in violations(model, trajectory, stated)}
+
+    assert found(2.1, 2.1, 1.1, 1.1) == set()
+    assert found(1.9, 1.9, 0.9, 0.9) == {
+        "x of base",
+        "velocity of base",
+        "angular_velocity of base",
+        "tilt of base",
+    }
+
+
 def test_the_judge_sees_ball_joints_and_tendons() -> None:
     model = mujoco.MjModel.from_xml_string("""
     <mujoco>

@@ -242,7 +242,9 @@ class Run:
             return
         with pool:
             yield Workers(pool)
-        if pool.has_lost_worker:
+        # A signal to all processes ends those that wait for work; then the run was stopped.
+        interruption = current_interruption()
+        if pool.has_lost_worker and not (interruption and interruption.presses):
             say_from_program(LOST_SENTENCE)
 
     def finish(

@@ -384,7 +384,13 @@ def _chosen(
         return best, point
 
     if not interrupted:
-        raise SimulationDivergedError("the simulation diverges from every start")
+        task = search.stage.task
+        control = best.over_horizon if best.best is None else best.best
+        raise SimulationDivergedError(
+            f"{task.experiment.source}: no initial control leads to a motion within the limits; "
+            f"the simulation diverges from the best one, {best.name}: "
+            f"{task.plant.why_diverged(task.theta, control)}"
+        )
     return best, begins[0]
 
 

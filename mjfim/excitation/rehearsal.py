@@ -30,7 +30,7 @@ from mjfim.model.clearance import (
     farthest_points,
     find_geom_pairs,
 )
-from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.coordinates import TRANSLATION, joint_dofs, joint_names
 from mjfim.model.elements import model_length
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.units import ANGLE, LENGTH, joint_unit, per_second
@@ -112,7 +112,7 @@ def rehearse(experiment: Experiment, design: Design, *, threads: int | None = No
 def rehearse_task(task: DesignTask, final: Evaluation) -> Rehearsal:
     """Rehearse the trajectory of an evaluation in a resolved task. See `rehearse`."""
     steps = steps_along(task, final.trajectory, final.information, final.std)
-    return rehearsed(task, final.trajectory, final.gain, steps)
+    return rehearsed(task, final.trajectory, final.gain, steps, final.growth)
 
 
 def steps_along(
@@ -132,7 +132,7 @@ def steps_along(
 
 @one_blas_thread()
 def rehearsed(
-    task: DesignTask, trajectory: Trajectory, gain: Array, steps: FiniteSteps
+    task: DesignTask, trajectory: Trajectory, gain: Array, steps: FiniteSteps, growth: float
 ) -> Rehearsal:
     """Play a trajectory on robots.
 
@@ -141,6 +141,7 @@ def rehearsed(
         trajectory: The trajectory, an open-loop simulation of the model.
         gain: (N, nu, nx) gains, which matter under feedback only.
         steps: Its standard deviations by finite steps.
+        growth: Largest growth of a small deviation along it.
     """
     spec, player = task.experiment.rehearsal, _RobotPlayer(task, trajectory, gain)
     rng = np.random.default_rng(spec.seed)
@@ -167,11 +168,13 @@ def rehearsed(
         joints=tuple(group.name for group in player.groups),
         units=tuple(group.unit for group in player.groups),
         unlimited=tuple(group.name for group in player.groups if not group.is_limited),
+        unplaced=tuple(group.name for group in player.groups if not group.is_placed),
         floor=player.floor,
         has_floor=player.has_floor,
         depth=player.depth,
         unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
         steps=steps,
+        growth=growth,
         **measured,
     )
 
@@ -206,6 +209,7 @@ class _SpeedGroup:
     dofs: tuple[int, ...]
     unit: str
     is_limited: bool
+    is_placed: bool
 
 
 @record
@@ -216,6 +220,7 @@ class _Played:
     speed: Array
     acceleration: Array
     end_speed: Array
+    travel: Array
     lowest: float = np.nan
     end_height: float = np.nan
     nearest: float = np.nan
@@ -346,7 +351,11 @@ class _RobotPlayer:
                 unknown = np.full(len(self.groups), np.nan)
                 margins = np.full(len(self.rehearsed_limits()), -np.inf)
                 yield _Played(
-                    margins=margins, speed=unknown, acceleration=unknown, end_speed=unknown
+                    margins=margins,
+                    speed=unknown,
+                    acceleration=unknown,
+                    end_speed=unknown,
+                    travel=unknown,
                 )
                 continue
             observed = None if out.observed is None else out.observed[i]
@@ -387,6 +396,7 @@ class _RobotPlayer:
             speed=largest(qvel),
             acceleration=largest(change),
             end_speed=largest(qvel[-1:]),
+            travel=largest(self.task.space.minus(states, states[0])),
             lowest=float(heights.min()),
             end_height=float(heights[-1]),
             nearest=nearest,
@@ -631,19 +641,29 @@ def _speed_groups(task: DesignTask) -> Iterator[_SpeedGroup]:
         # A limit may name a joint or one of its coordinates.
         limited[limit.kind] |= {limit.name, limit.name.rpartition(".")[0]}
 
+    # Both sides of a position need a limit; an angle without a sign has one side.
+    placed = {
+        (limit.kind, limit.name)
+        for limit in task.limits
+        if np.isfinite(limit.upper) and (limit.is_magnitude or np.isfinite(limit.lower))
+    }
+
     for joint, name in enumerate(joint_names(model)):
         first, count = int(model.jnt_dofadr[joint]), joint_dofs(model, joint)
         kinds: tuple[str, ...] = ("velocity", "angular_velocity")
-        groups = [(name, first, count, joint_unit(model, joint), kinds)]
+        is_placed = not placed.isdisjoint({("position", name), ("tilt", name)})
+        groups = [(name, first, count, joint_unit(model, joint), kinds, is_placed)]
         if count == 6:
+            is_boxed = placed.issuperset(("position", f"{name}.{part}") for part in TRANSLATION)
             groups = [
-                (name, first, 3, LENGTH, kinds[:1]),
-                (f"{name} (rotation)", first + 3, 3, ANGLE, kinds[1:]),
+                (name, first, 3, LENGTH, kinds[:1], is_boxed),
+                (f"{name} (rotation)", first + 3, 3, ANGLE, kinds[1:], is_placed),
             ]
-        for title, begin, number, unit, own in groups:
+        for title, begin, number, unit, own, is_own_placed in groups:
             yield _SpeedGroup(
                 name=title,
                 dofs=tuple(range(begin, begin + number)),
                 unit=per_second(unit),
                 is_limited=any(name in limited.get(kind, ()) for kind in own),
+                is_placed=is_own_placed,
             )

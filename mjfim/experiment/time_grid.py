@@ -62,7 +62,7 @@ class TimeGrid:
             raise ExperimentError(
                 f"playback_rate: {playback_rate:g} Hz is not a multiple of rate ({rate:g} Hz) that "
                 f"divides the engine's rate ({substeps * rate:g} Hz); valid: "
-                f"{', '.join(f'{k * rate:g}' for k in valid)}"
+                f"{', '.join(written_rate(k * rate) for k in valid)}"
             )
         return TimeGrid(
             dt=substeps * timestep,
@@ -118,14 +118,23 @@ def whole_number(ratio: float) -> int | None:
 
 
 def rates_near(steps: float, timestep: float) -> str:
-    """Rates [Hz] whose periods are whole numbers of timesteps [s] near a wanted one, in words."""
+    """Rates [Hz] whose periods are whole numbers of timesteps [s] near a wanted one, in words.
+
+    Those with few digits come first.
+    """
     near = max(round(steps), 1)
-    return ", ".join(f"{1.0 / (k * timestep):.6g}" for k in (near + 1, near, near - 1) if k)
+    rates = [written_rate(1.0 / (k * timestep)) for k in (near + 1, near, near - 1) if k]
+    return ", ".join(sorted(rates, key=len))
 
 
 def parts_of(rate: float) -> str:
     """Some rates that divide another one [Hz], for a message."""
-    return ", ".join(f"{rate / k:g}" for k in (1, 2, 4, 5, 10))
+    return ", ".join(written_rate(rate / k) for k in (1, 2, 4, 5, 10))
+
+
+def written_rate(rate: float) -> str:
+    """A rate [Hz] with so many digits that it is within the tolerance when it is read again."""
+    return f"{rate:.9g}"
 
 
 def _stride(key: str, rate: float, measure_rate: float) -> int:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError
+from mjfim.errors import SimulationDivergedError, WrongLogError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
@@ -24,6 +24,7 @@ from mjfim.identification.assessment.residual_tests import fit_quality, misfit_r
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.inverse_dynamics import refuse_gross_error
+from mjfim.identification.inverse_dynamics.gross_errors import STATE, column_line
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import (
     MISSED_ROUGH_SHARE,
@@ -35,6 +36,7 @@ from mjfim.identification.search import (
     quick_subset,
     with_length,
 )
+from mjfim.identification.segments import measured_states
 from mjfim.identification.starts import (
     SPREAD_STARTS,
     begin_fit,
@@ -58,6 +60,7 @@ from mjfim.optimize.levenberg_marquardt import (
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.recordings.checks import contradiction_remarks
+from mjfim.recordings.section import ColumnSpec
 from mjfim.records.estimate import Estimate, Restart
 from mjfim.records.events import FitEvent, begin_stage, shown_progress
 from mjfim.records.trajectory import Recording
@@ -244,6 +247,9 @@ def fit_task(
         begun_instead=instead,
     )
 
+    if checks_log and repeats and stated.elsewhere and is_doubtful(fit):
+        _refuse_other_zero(search, fit)
+
     # A result that does not explain the data may be a local minimum: fits over short segments give
     # other starts, the second time from many starts where most of the motion is unexplained.
     if repeats:
@@ -271,6 +277,53 @@ def _check_log(problem: FitProblem, task: FitTask) -> None:
     if not (is_faulty or any(any(contradiction_remarks(channels, each)) for each in logs)):
         begin_stage("looking for gross errors of the recordings")
         refuse_gross_error(problem.system, problem.recordings, task.start)
+
+
+def _refuse_other_zero(search: FitSearch, fit: FitResult) -> None:
+    """Refuse recordings that another zero of their encoders explains, and the model alone not.
+
+    At rest, a log with such an error begins elsewhere in positions only. A fit from the stated
+    initial state finds the zeros beside the parameters.
+
+    Raises:
+        WrongLogError: The fit explains the recordings. The message has the lines that cure them.
+    """
+    task = fit.task
+    system, begins = task.system, task.elsewhere
+    places = measured_states(system, fit.problem.recordings[0])
+    positions = {system.outputs.names[j] for x, j in places.items() if x < system.space.nq}
+    names = {name for begin in begins for name in begin.by}
+    if not names <= positions or len(begins) < len(task.recordings) + len(task.held_out):
+        return
+
+    zeros = {name: float(np.mean([each.by.get(name, 0.0) for each in begins])) for name in names}
+    unknown = {
+        f"?{name}": {"target": f"output/{name}:bias", "guess": zero, "scale": abs(zero)}
+        for name, zero in zeros.items()
+    }
+    initial = system.experiment.initial.model_copy(update={"free": {}})
+    experiment = system.experiment.model_copy(update={"initial": initial})
+    shifted = System.resolve(
+        experiment.replace(parameters=unknown), threads=system.threads, source=system.source
+    )
+    other = FitTask.of(shifted, task.recordings)
+    problem = other.problem()
+    try:
+        solved = replace(search, task=other).solve(problem, problem.begin(other.start), "zeros")
+    except SimulationDivergedError:
+        return
+    if other.elsewhere or is_doubtful(_with_solution(replace(fit, task=other), *solved)):
+        return
+    found = dict(zip(shifted.parameters.names, solved[1].unknowns.theta.tolist(), strict=True))
+    stated = experiment.recording.sources
+    lines = [
+        column_line(name, stated.get(name, ColumnSpec(column=name)), offset=-found[f"?{name}"])
+        for name in sorted(names)
+    ]
+    raise WrongLogError(
+        f"{listed([each.name for each in begins])}: another zero of {listed(sorted(names))}; "
+        f"without this error the model explains the motion. {STATE}{'; '.join(lines)}"
+    )
 
 
 def _beyond_stops(search: FitSearch, fit: FitResult) -> FitResult:

@@ -21,7 +21,12 @@ from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.assessment.residual_tests import RELEVANT_SIZE_RATIO
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
-from mjfim.identification.segments import SIGMA_PER_MEDIAN, begins_elsewhere, spread_over_data
+from mjfim.identification.segments import (
+    SIGMA_PER_MEDIAN,
+    OtherBegin,
+    begins_elsewhere,
+    spread_over_data,
+)
 from mjfim.model.parameters import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
     SearchSettings,
@@ -56,7 +61,7 @@ class FitTask:
         method: Method of the search.
         start: (p,) parameters at which the search starts, inside the bounds if the method has any
             [theta-unit].
-        elsewhere: Sentences about recordings that do not begin at the stated initial state.
+        elsewhere: Recordings that do not begin at the stated initial state.
     """
 
     system: System
@@ -64,7 +69,7 @@ class FitTask:
     held_out: tuple[Recording, ...]
     method: Method
     start: Array
-    elsewhere: tuple[str, ...] = ()
+    elsewhere: tuple[OtherBegin, ...] = ()
 
     @classmethod
     def of(

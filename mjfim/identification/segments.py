@@ -258,8 +258,29 @@ def has_free_starts(system: System) -> bool:
     return is_measured or (bool(system.experiment.initial.free) and not moves)
 
 
-def begins_elsewhere(system: System, recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Sentences about recordings whose first rows contradict the stated initial state.
+@dataclass(frozen=True, kw_only=True)
+class OtherBegin:
+    """A recording whose first rows contradict the stated initial state.
+
+    Attributes:
+        name: Name of its file.
+        by: By output, what the first rows show beyond the stated state [unit of the output].
+        words: These numbers in words.
+    """
+
+    name: str
+    by: dict[str, float]
+    words: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name} does not begin where [initial] says ({self.words}): its initial state "
+            "was estimated from its first rows"
+        )
+
+
+def begins_elsewhere(system: System, recordings: Sequence[Recording]) -> tuple[OtherBegin, ...]:
+    """Recordings whose first rows contradict the stated initial state.
 
     They may differ by the noise, stated or seen, and by what uncertain parameters explain.
 
@@ -299,16 +320,16 @@ def begins_elsewhere(system: System, recordings: Sequence[Recording]) -> tuple[s
         by_theta = np.where(counted & is_finite[1:, None, None], y[1:] - y[0], 0.0).sum(axis=1)
         by_theta = np.linalg.norm(by_theta / count / SMALL_MOVE, axis=0)
         limit = CLEAR_SIGMAS * np.hypot(sigma / np.sqrt(count), by_theta)
-        by = [
+        other = np.flatnonzero(np.abs(difference) > limit).tolist()
+        words = [
             f"{outputs[j].name.partition(':')[2] or outputs[j].name} {difference[j]:+.2g} "
             f"{outputs[j].unit}".rstrip()
-            for j in np.flatnonzero(np.abs(difference) > limit)
+            for j in other
         ]
-        if by:
-            found.append(
-                f"{Path(recording.name).name} does not begin where [initial] says ({listed(by)}): "
-                "its initial state was estimated from its first rows"
-            )
+        if other:
+            by = {outputs[j].name: float(difference[j]) for j in other}
+            name = Path(recording.name).name
+            found.append(OtherBegin(name=name, by=by, words=listed(words)))
     return tuple(found)
 
 

@@ -228,7 +228,7 @@ def control_sizes(model: Any, time: float) -> Array:
         control = model.actuator_ctrladr[actuator]
         count = model.actuator_ctrlnum[actuator]
         if count:
-            sizes[control : control + count] = _control_size(model, actuator, control, time)
+            sizes[control : control + count] = control_size(model, actuator, control, time)
     return sizes
 
 
@@ -300,7 +300,7 @@ def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     return found
 
 
-def _control_size(model: Any, actuator: int, control: int, time: float) -> float:
+def control_size(model: Any, actuator: int, control: int, time: float) -> float:
     """Natural size of a control of one actuator, see `control_sizes`."""
     stated = _largest_finite(model.actuator_ctrlrange[control])
     if stated > 0.0:

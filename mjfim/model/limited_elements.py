@@ -156,16 +156,13 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
     return found
 
 
-def actuators_of_tendon(model: Any, tendon: int) -> tuple[int, ...]:
-    """Addresses in actuator_force of the actuators that pull at a tendon.
-
-    Args:
-        model: MjModel.
-        tendon: Number of the tendon.
-    """
+def actuators_of_tendons(model: Any) -> list[tuple[int, ...]]:
+    """Addresses in actuator_force of the actuators that pull at each tendon of a model."""
     pulls = model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
-    pulling = np.flatnonzero(pulls & (model.actuator_trnid[:, 0] == tendon))
-    return tuple(int(model.actuator_outadr[i]) for i in pulling)
+    found: list[tuple[int, ...]] = [()] * model.ntendon
+    for i in np.flatnonzero(pulls):
+        found[model.actuator_trnid[i, 0]] += (int(model.actuator_outadr[i]),)
+    return found
 
 
 def _add_joint(
@@ -257,17 +254,17 @@ def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:
 
 def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
     """Enter the lengths of the tendons, and the sums of the forces of their actuators."""
-    sizes = actuator_force_sizes(model, time)
-    for i, name in enumerate(unique_names(model, "tendon")):
+    sizes, length = actuator_force_sizes(model, time), model_length(model)
+    names = unique_names(model, "tendon")
+    for i, (name, pulling) in enumerate(zip(names, actuators_of_tendons(model), strict=True)):
         # A tendon is a path in space, or a sum of joint coordinates.
         is_spatial = model.wrap_type[model.tendon_adr[i]] != mujoco.mjtWrap.mjWRAP_JOINT
         found.by_kind["tendon_length"][name] = LimitedElement(
             index=i,
             unit=LENGTH if is_spatial else "",
-            size=float(abs(model.tendon_length0[i])) or model_length(model),
+            size=float(abs(model.tendon_length0[i])) or length,
             stated=_range(model.tendon_limited, model.tendon_range, i),
         )
-        pulling = actuators_of_tendon(model, i)
         if pulling:
             found.by_kind["tendon_force"][name] = LimitedElement(
                 index=i,

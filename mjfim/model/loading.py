@@ -20,6 +20,7 @@ from mjfim.model.coordinates import ModelCoordinates
 from mjfim.model.model_files import (
     PACKAGE,
     PackedFiles,
+    changed_files,
     files_of_model,
     is_present,
     name_of,
@@ -438,15 +439,13 @@ def packed_model(files: PackedFiles, path: Path) -> ModelSource:
     key = files.digest, name_of(path)
 
     def load() -> ModelSource:
-        """Parse and compile the model, from the disk where these files are there."""
+        """Parse the model, from the disk where it is the same there; compile the packed files."""
         contents = {Path(name): content for name, content in files.contents.items()}
-        are_here = all(file.is_file() and file.read_bytes() == contents[file] for file in contents)
-        system = None
-        if not are_here:
-            system = mujoco.MjVfs()
-            for name, content in files.contents.items():
-                system[name] = content
-        source = ModelSource(path, files=system)
+        system = mujoco.MjVfs()
+        for name, content in files.contents.items():
+            system[name] = content
+        spec = load_spec(path, system if changed_files(contents) else None)
+        source = ModelSource(path, spec=spec, files=system)
         source.contents = contents
         return source
 

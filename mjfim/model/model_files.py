@@ -287,6 +287,11 @@ class PackedFiles:
         return self.contents.get(name_of(path))
 
 
+def changed_files(contents: Mapping[Path, bytes]) -> list[Path]:
+    """Return the files that are not on the disk with these contents."""
+    return [x for x, held in contents.items() if not x.is_file() or x.read_bytes() != held]
+
+
 def name_of(path: Path) -> str:
     """Return the normalised path of a file with slashes."""
     return Path(os.path.normpath(path)).as_posix()

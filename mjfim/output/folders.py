@@ -260,7 +260,9 @@ def find_experiment_file(source: Path) -> Path:
             f"{source}: no design.json beside it names the experiment; give its file with "
             "--experiment"
         )
-    return source.parent.resolve() / experiment
+    # As a person would type it: from the current folder, where the file is in it.
+    found = Path(os.path.normpath(source.parent.resolve() / experiment))
+    return found.relative_to(Path.cwd()) if found.is_relative_to(Path.cwd()) else found
 
 
 def check_folder(folder: Path) -> None:

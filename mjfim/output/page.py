@@ -333,5 +333,6 @@ def capitalised(sentence: str) -> str:
 
 
 def as_sentence(text: str) -> str:
-    """Begin a text with a capital letter, and end it with a full stop."""
-    return capitalised(text) + ("" if text.endswith((".", "!", "?")) else ".")
+    """Begin a text with a capital letter, and end it with a full stop, but no lines of a file."""
+    has_end = text.endswith((".", "!", "?")) or "\n" in text
+    return capitalised(text) + ("" if has_end else ".")

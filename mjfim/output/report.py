@@ -156,11 +156,11 @@ def template(file: str) -> Template:
 
 
 def _prose(text: str) -> Markup:
-    """A sentence as HTML: words in backquotes are code, and numbers stay with their units."""
+    """A text as HTML: words in backquotes are code, and numbers stay with their units."""
     from markupsafe import Markup, escape
 
     spaced = UNIT_SPACE.sub("\u00a0", str(escape(text)))
-    return Markup(CODE.sub(r"<code>\1</code>", spaced))
+    return Markup(CODE.sub(r"<code>\1</code>", spaced).replace("\n", "<br>"))
 
 
 # Results that have a report; of several in a folder, the first one stands at the top.

@@ -48,6 +48,9 @@ STYLES = {
     Emphasis.DERIVED: "cyan",
 }
 
+# Rich style of every verdict.
+VERDICT_STYLES = {Level.GOOD: "bold", Level.DOUBTFUL: "bold yellow", Level.BAD: "bold red"}
+
 
 @dataclass(frozen=True)
 class TerminalPage:
@@ -66,8 +69,7 @@ class TerminalPage:
         page = self.page
         verdict = capitalised(page.verdict.text)
         if verdict:
-            is_good = page.verdict.level is Level.GOOD
-            yield _styled(verdict, "bold" if is_good else "bold yellow")
+            yield _styled(verdict, VERDICT_STYLES[page.verdict.level])
         parts: list[Shown] = []
         width, hidden = options.max_width, 0
         for weight, sentences in page.remarks.items():

@@ -17,7 +17,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from enum import Enum
@@ -37,7 +37,8 @@ LONGEST_WAY = 60.0
 # be drawn later.
 FINISH_SECONDS = 6.0
 
-# Time after the second press of the user at which the process ends in any case [s].
+# Time after the second press of the user at which the process ends in any case, and after the first
+# one where there is nothing to keep and an import or code in C has not ended [s].
 LAST_SECONDS = 5.0
 
 # Exit code of an interrupted program.
@@ -263,20 +264,26 @@ class Interruption:
         self._announce = announce
         self._requests: list[StopToken] = []
         self._has_result = False
-        self._has_work_to_finish = False
         self._is_optional = False
         self._is_postponed = False
         self._first_press = math.inf
         self._before: dict[int, Any] = {}
 
-        # A queue of this kind may be used in a signal handler; None ends the thread that watches.
-        self._pressed: SimpleQueue[int | None] = SimpleQueue()
+        # Whether there is work to finish, from the handler. It may use a queue of this kind.
+        self._answered: SimpleQueue[bool] = SimpleQueue()
         self._watcher = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> Interruption:
         """Handle the signals from here on."""
         global _current
         if threading.current_thread() is threading.main_thread():
+            from socket import socketpair  # takes a while to import
+
+            # Python calls handlers when code in C returns, and the compile of a model may take
+            # minutes. The thread that watches is told of every signal at once.
+            self._signals, self._sender = socketpair()
+            self._sender.setblocking(False)
+            signal.set_wakeup_fd(self._sender.fileno(), warn_on_full_buffer=False)
             _current = self
             self._watcher.start()
             self._before = {number: signal.signal(number, self) for number in heard_signals()}
@@ -292,7 +299,9 @@ class Interruption:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
         # What the other thread still says belongs to this context, and not to what follows.
-        self._pressed.put(None)
+        signal.set_wakeup_fd(-1)
+        self._answered.put(False)
+        self._sender.close()
         self._watcher.join(timeout=1.0)
         if kind is None:
             self._end_if_postponed()
@@ -308,21 +317,19 @@ class Interruption:
         if self.presses and number not in SIGNALS[:2]:
             return
         self.presses += 1
-
-        # The thread that announces the first press must not see what this function changes later.
-        if self.presses == 1:
-            self._first_press = time.monotonic()
-            self._has_work_to_finish = bool(self._requests) or self._has_result
-        self._pressed.put(self.presses)
+        self._first_press = min(self._first_press, time.monotonic())
         for request in self._requests:
             request.request()
 
         # An import that ends halfway would leave modules behind that cannot be imported again.
-        if self._requests or self._has_result:
+        has_work = bool(self._requests) or self._has_result
+        if not has_work and _is_importing(frame):
+            self._is_postponed = True
+            return
+        self._answered.put(has_work)
+        if has_work:
             if self._is_optional and self.hurried and not _is_importing(frame):
                 raise UnfinishedError
-        elif _is_importing(frame):
-            self._is_postponed = True
         else:
             # The error ends the program; a further press must not disturb that.
             self._has_result = True
@@ -386,25 +393,45 @@ class Interruption:
         """End a program that goes on after an import in which the press came."""
         if self._is_postponed:
             self._is_postponed = False
+            self._answered.put(False)
             raise InterruptedByUserError
 
     def _watch(self) -> None:
-        """Announce the first press, and end the process some time after the second one."""
-        if self._pressed.get() is None:
+        """Announce the first press, and end the process where a press has no effect in time."""
+        if not self._has_come(SIGNALS):
             return
-        if self._has_work_to_finish:
+        try:
+            has_work = self._answered.get(timeout=LAST_SECONDS)
+        except Empty:
+            has_work = bool(self._requests) or self._has_result
+            if not has_work:
+                self._end(NOTHING_SENTENCE)
+        if has_work:
             self._announce(FIRST_SENTENCE)
-        if self._pressed.get() is None:
+        if not self._has_come(SIGNALS[:2]):
             return
 
         # The user wants an end; work that does not return in time is given up.
+        self._signals.settimeout(LAST_SECONDS)
         try:
-            while self._pressed.get(timeout=LAST_SECONDS) is not None:
+            while self._has_come(SIGNALS):
                 continue
-        except Empty:
-            self._announce(LAST_SENTENCE)
-            remove_temporary_files()
-            os._exit(INTERRUPTED_CODE)
+        except TimeoutError:
+            self._end(LAST_SENTENCE)
+
+    def _has_come(self, numbers: Sequence[int]) -> bool:
+        """Wait for one of some signals; False at the end of the context."""
+        while number := self._signals.recv(1):
+            if number[0] in numbers:
+                return True
+        self._signals.close()
+        return False
+
+    def _end(self, sentence: str) -> None:
+        """End the process at once."""
+        self._announce(sentence)
+        remove_temporary_files()
+        os._exit(INTERRUPTED_CODE)
 
 
 def _is_importing(frame: FrameType | None) -> bool:

@@ -657,10 +657,13 @@ def read_table(path: Path) -> dict[str, Array]:
     """Read all columns of a numeric CSV file, packed by gzip if it ends in `.gz`.
 
     Raises:
-        RecordingError: There is no such file, or it is damaged, or a column is not numeric.
+        RecordingError: There is no such file, or it is of another format or damaged, or a column
+            is not numeric.
     """
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
+    if READERS.get(path.suffix.lower(), _read_csv) is not _read_csv:
+        raise RecordingError(f"{path}: not a CSV table; a design keeps its control in design.csv")
     table = _read_csv(path, RecordingSpec())
     return {name: table.column(name) for name in table.names}
 

@@ -170,14 +170,14 @@ def explain(error: ValidationError, source: str, values: Mapping[str, Any]) -> s
 def _keys(values: Any, fault: Any) -> list[str]:
     """Keys of the faulty value; pydantic's names of the branches of a union are left out."""
     keys = []
-    for part in fault["loc"]:
+    for i, part in enumerate(fault["loc"], start=1):
         is_inside = isinstance(values, Mapping) or (
             isinstance(values, Sequence) and not isinstance(values, str)
         )
         try:
             values = values[part] if is_inside else None
         except (KeyError, IndexError, TypeError):
-            if fault["type"] != "missing":
+            if fault["type"] != "missing" or i < len(fault["loc"]):
                 continue
         if is_inside:
             keys.append(str(part))

@@ -292,8 +292,9 @@ class Check(ShownRecord):
         not_excited: Groups of parameters that another control would separate.
         self_test: Test of the derivatives.
         steps: Standard deviations by finite steps along one motion; None where they were not made.
-        rehearsal: What a given motion does to robots; None for a start and for recordings.
+        rehearsal: What the motion does to robots; None for recordings.
         worth: What each sensor tells along one motion; None for recordings.
+        is_start: Whether the motion is the initial control, at which a design begins.
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
             are equal.
@@ -318,6 +319,7 @@ class Check(ShownRecord):
     steps: FiniteSteps | None = None
     rehearsal: Rehearsal | None = None
     worth: Worth | None = None
+    is_start: bool = False
     combined: tuple[CombinationAccuracy, ...] = ()
     missing: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
@@ -366,8 +368,8 @@ class Check(ShownRecord):
         """True if the check found no fault.
 
         The derivatives agree, all parameters are identifiable, one repetition reaches every stated
-        accuracy, and a design would not refuse the experiment. Limits that the initial control
-        violates are no fault, because a design looks for a motion inside.
+        accuracy, and a design would not refuse the experiment. Limits that a start violates are no
+        fault, because a design looks for a motion inside. A fall that no limit forbids is one.
         """
         known = {row.name for row in self.rows if np.isfinite(row.std)}
 
@@ -377,8 +379,19 @@ class Check(ShownRecord):
         stated = [row for row in self.rows if row.stated and not row.nuisance]
         reached = all(row.repetitions == 1 for row in stated)
         passed = self.self_test.passed and not self.missing and not self.refused
-        passed = passed and (self.rehearsal is None or self.rehearsal.is_safe)
-        return passed and separable and not self.not_excited and reached
+        return passed and not self.is_dangerous and separable and not self.not_excited and reached
+
+    @property
+    def is_dangerous(self) -> bool:
+        """True if nobody would play the motion, and, for a start, no limit turns a design away."""
+        if self.rehearsal is None:
+            return False
+        return self.rehearsal.falls if self.is_start else not self.rehearsal.is_safe
+
+    @property
+    def reaches_all(self) -> bool:
+        """True if every parameter that is asked for reaches its wanted σ, stated or 5 %."""
+        return all(row.repetitions == 1 for row in self.rows if not row.nuisance)
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
@@ -469,7 +482,12 @@ def _about_accuracy(check: Check, identifiable: Sequence[ParameterCheck]) -> Ite
     if missed:
         # Nobody wants 5 %, but it shows how many repetitions a usual accuracy needs.
         worst = max(stated or missed, key=lambda row: row.std / row.wanted)
-        fault = "miss the wanted σ" if stated else "have a σ of more than 5 % of their size"
+        few = len(stated or missed) == 1
+        fault = (
+            f"{'has' if few else 'have'} a σ of more than 5 % of {'its' if few else 'their'} size"
+        )
+        if stated:
+            fault = f"{'misses' if few else 'miss'} the wanted σ"
         needed = "no number of repetitions reaches"
         if worst.repetitions:
             needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
@@ -483,7 +501,6 @@ def _about_accuracy(check: Check, identifiable: Sequence[ParameterCheck]) -> Ite
     is_certain = check.self_test.passed and not check.missing
     if is_certain and not _unknown_groups(check) and not check.not_excited:
         reached = "its wanted σ" if any(row.stated for row in identifiable) else "a σ of 5 %"
-        yield (
-            f"every identifiable parameter reaches {reached} with {check.source}: "
-            "nothing more is needed"
-        )
+        # A start has to become a motion that a robot can play.
+        end = "" if check.is_start else ": nothing more is needed"
+        yield f"every identifiable parameter reaches {reached} with {check.source}{end}"

@@ -14,6 +14,9 @@ from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
 from mjfim.records.worth import Worth
 
+# Relative difference of two costs J, or of two σ, below which they count as equal.
+TIE_TOLERANCE = 2e-2
+
 # Largest number of iterates of one search whose motions are kept, and number of samples of each.
 MAX_MOTIONS, MOTION_SAMPLES = 40, 200
 
@@ -554,10 +557,22 @@ class Design(ShownRecord):
 
     @property
     def is_start(self) -> bool:
-        """True if no trajectory was found that is better than the initial one."""
-        final, initial = self.final.trajectory, self.initial.trajectory
-        same_control = np.array_equal(final.ctrl, initial.ctrl)
-        return same_control and np.array_equal(final.state[0], initial.state[0])
+        """True if the cost and σ are, within 2 %, those of a start that keeps all limits."""
+        if self.initial_violations:
+            # What keeps them is the scaled initial control, of which the worst σ is known.
+            start = self.scaled_start
+            if start is None:
+                return False
+            before = [start.cost, start.min_eigenvalue**-0.5]
+            after = [self.final.cost, float(self.final.eigenvalues[0]) ** -0.5]
+            return np.allclose(before, after, rtol=TIE_TOLERANCE, atol=0.0)
+
+        wanted = list(self.wanted)
+        before = [self.initial.cost, *self.initial.std[wanted]]
+        after = [self.final.cost, *self.final.std[wanted]]
+        before += [each.std_initial for each in self.combined]
+        after += [each.std_final for each in self.combined]
+        return np.allclose(before, after, rtol=TIE_TOLERANCE, atol=0.0)
 
     @property
     def stated_std(self) -> Array:

@@ -22,6 +22,9 @@ CONFIRMED = (0.7, 1.4)
 # Share of the robots that may break a limit in a motion that is safe to play.
 MAX_BROKEN = 0.05
 
+# Excursion of a robot over that of the model up to which a reserve makes room for it.
+MAX_EXCURSION = 2.0
+
 # A joint rests at the end where its speed is below this share of its peak.
 REST_SHARE = 0.02
 
@@ -134,7 +137,9 @@ class Rehearsal(ShownRecord):
         speed: (n+1, j) largest speeds.
         acceleration: (n+1, j) largest accelerations [unit of the speed per s].
         end_speed: (n+1, j) speeds at the end.
+        travel: (n+1, j) largest distances from the start; angles for rotations [m or rad].
         unlimited: Names of those joints whose speed nothing limits.
+        unplaced: Names of those joints whose position nothing limits on at least one side.
         lowest: (n+1,) smallest height of any geom or body that moves, above the floor, or in the
             world where there is none [m].
         floor: Height of the floor in the world, or of the plane under the robot; minus infinity
@@ -148,6 +153,8 @@ class Rehearsal(ShownRecord):
         at_stop: (n+1,) share of the time in which a joint is at its stop.
         unbraked: Number of robots by the joint that cannot be braked at the end before it reaches a
             limit.
+        growth: Largest growth of a small deviation along the motion without feedback; NaN where it
+            is unknown.
         steps: Standard deviations by finite steps.
     """
 
@@ -163,7 +170,9 @@ class Rehearsal(ShownRecord):
     speed: Array
     acceleration: Array
     end_speed: Array
+    travel: Array
     unlimited: tuple[str, ...]
+    unplaced: tuple[str, ...]
     lowest: Array
     floor: float
     has_floor: bool
@@ -174,6 +183,7 @@ class Rehearsal(ShownRecord):
     at_stop: Array
     unbraked: dict[str, int]
     steps: FiniteSteps
+    growth: float = float("nan")
 
     file_stem = "rehearsal"
     made_by = "`mjfim rehearse DESIGN_FOLDER -o DIR`"
@@ -184,10 +194,13 @@ class Rehearsal(ShownRecord):
         "feedback",
         "latency",
         "all_kept",
+        "at_clamp",
         "below_floor",
         "floor",
         "unbraked",
         "unlimited",
+        "unplaced",
+        "growth",
         "steps",
     )
     json_names = {"is_safe": "safe", "all_kept": "all_limits_kept"}
@@ -218,9 +231,25 @@ class Rehearsal(ShownRecord):
         return int(np.isnan(self.end_height[1:]).sum())
 
     @property
+    def inside(self) -> np.ndarray:
+        """(n+1,) True where every limit that is no clamp is kept."""
+        is_kept = (self.kept | self.is_clamped).all(axis=1)
+        return np.asarray(is_kept & ~np.isnan(self.end_height))
+
+    @property
     def all_kept(self) -> int:
-        """Number of robots that keep every limit."""
-        return int((self.kept.all(axis=1) & ~np.isnan(self.end_height))[1:].sum())
+        """Number of robots that keep every limit that is no clamp."""
+        return int(self.inside[1:].sum())
+
+    @property
+    def too_many(self) -> float:
+        """Smallest number of robots that must not do what a person would not play."""
+        return max(MAX_BROKEN * self.robots, 1.0)
+
+    @property
+    def is_clamping(self) -> bool:
+        """True if too many robots reach a clamp for the information of the design to hold."""
+        return self.at_clamp >= self.too_many
 
     @property
     def passes_floor(self) -> np.ndarray:
@@ -239,13 +268,36 @@ class Rehearsal(ShownRecord):
         The model keeps all limits. At least 95 % of the robots keep those that are no clamps, stay
         above the floor, and can be braked at the end before a limit.
         """
-        allowed = MAX_BROKEN * self.robots
         is_model_safe = bool(self.kept[0].all()) and not self.passes_floor[0]
-        is_inside = (self.kept | self.is_clamped).all(axis=1) & ~np.isnan(self.end_height)
-        broken = int(np.count_nonzero(~is_inside[1:]))
+        broken = self.robots - self.all_kept
         worst = max(self.unbraked.values(), default=0)
-        has_few = max(broken, self.below_floor, worst) < max(allowed, 1.0)
-        return is_model_safe and has_few
+        return is_model_safe and max(broken, self.below_floor, worst) < self.too_many
+
+    @property
+    def falls(self) -> bool:
+        """True if too many robots, or the model, pass through the floor within all limits.
+
+        No design within these limits is kept from it.
+        """
+        is_fallen = self.passes_floor & self.inside
+        return bool(is_fallen[0] or np.count_nonzero(is_fallen[1:]) >= self.too_many)
+
+    @property
+    def excursions(self) -> Array:
+        """(l,) largest excursion of a robot towards each limit over that of the model."""
+        worst = np.where(np.isfinite(self.margins), self.margins, np.inf).min(
+            axis=0, initial=np.inf
+        )
+        used = 1.0 - self.margins[0]
+        ratio = np.divide(1.0 - worst, used, out=np.full(len(used), np.inf), where=used > 0.0)
+        return np.asarray(np.maximum(ratio, 1.0))
+
+    @property
+    def is_unstable(self) -> bool:
+        """True if robots leave limits because their differences grow along the motion."""
+        broken = ~(self.kept | self.is_clamped).all(axis=0)
+        is_far = bool((self.excursions[broken] > MAX_EXCURSION).any())
+        return is_far and not self.feedback and self.growth * self.wrong > 1.0
 
     @property
     def reserve(self) -> dict[str, float]:
@@ -256,18 +308,19 @@ class Rehearsal(ShownRecord):
         that cannot be braked needs room in its position.
         """
         found: dict[str, float] = {}
-        if self.is_safe and self.at_clamp < max(MAX_BROKEN * self.robots, 1.0):
+        if self.is_safe and not self.is_clamping:
             return found
         late = [each.kind == "position" and each.name in self.unbraked for each in self.limits]
         broken = np.flatnonzero(~self.kept.all(axis=0) | np.array(late, dtype=bool)).tolist()
         clamped = [i for i in broken if self.is_clamped[i]]
         for i in clamped or broken:
             kind, margins = self.limits[i].kind, self.margins[:, i]
-            worst = np.min(margins[np.isfinite(margins)], initial=0.0)
             used = 1.0 - margins[0]
-            growth = max((1.0 - worst) / used, 1.0 + self.wrong * late[i]) if used > 0.0 else 2.0
-            growth = 1.0 + self.wrong if clamped else growth
-            share = margins[0] - worst if kind == "clearance" else 1.0 - used / min(growth, 2.0)
+            growth = max(self.excursions[i], 1.0 + self.wrong * late[i])
+            growth = 1.0 + self.wrong if clamped else min(growth, MAX_EXCURSION)
+            share = 1.0 - used / growth
+            if kind == "clearance":
+                share = margins[0] - np.min(margins[np.isfinite(margins)], initial=0.0)
             share = np.ceil(100.0 * share) / 100.0
             if 0.0 < share < 1.0:
                 found[kind] = max(float(share), found.get(kind, 0.0))
@@ -305,6 +358,7 @@ class Rehearsal(ShownRecord):
                             ("speed", self.speed),
                             ("acceleration", self.acceleration),
                             ("end_speed", self.end_speed),
+                            ("travel", self.travel),
                         )
                     },
                 }

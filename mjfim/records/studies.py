@@ -8,14 +8,11 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.records.base import NamedEnum, Record, ShownRecord, record
+from mjfim.records.design import TIE_TOLERANCE
 from mjfim.records.trajectory import Labels
 
 # Key of mjfim's own design among the methods.
 DESIGN = "design"
-
-
-# Relative difference of two costs J below which they count as equal.
-TIE_TOLERANCE = 2e-2
 
 
 class MethodOutcome(NamedEnum):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 from itertools import pairwise
@@ -24,7 +26,7 @@ class TermNumber(Record):
         unit: Its unit; may be empty.
         scale: Size with which the parameter is compared [unit].
         is_size: Whether a test has estimated it.
-        name: Name of the parameter in a selected model; empty before it has one.
+        name: Name of the parameter.
     """
 
     path: str
@@ -94,37 +96,40 @@ class Term(Record):
 
     @property
     def recipe(self) -> str:
-        """Lines of TOML to add to the experiment file, with a semicolon between them.
+        """Lines of TOML that estimate the term, to be added at the end of the experiment file.
 
         Of a term at several joints, those of the first one.
         """
         element = self.path.partition(":")[0]
-        first = [each.path for each in self.numbers if each.path.partition(":")[0] == element]
-        targets = first if self.joints else [each.path for each in self.numbers]
-        tables = [f"terms.{name} = {_value(table)}" for name, table in self.tables.items()][:1]
-        others = [f"the same for {listed(self.joints[1:])}"] if self.joints else []
-        return "; ".join([*tables, *(f'target = "{path}"' for path in targets), *others])
+        numbers = [
+            each
+            for each in self.numbers
+            if not self.joints or each.path.partition(":")[0] == element
+        ]
+        terms = [as_toml(table, "terms", name) for name, table in self.tables.items()][:1]
+        parameters = [as_toml(each.table, "parameters", each.name) for each in numbers]
+        others = [f"# The same for {listed(self.joints[1:])}."] if self.joints else []
+        return "\n".join([*terms, *parameters, *others])
 
     def __str__(self) -> str:
         amount = f"{self.main.value:.2g} {self.main.unit}".strip()
         share = f"{100 * self.share:.2g} % of the sum of squares"
-        evidence = f"about {amount} ({self.sigmas:.0f} σ, {share})"
-        return f"{self.description}, {evidence}; to estimate it, add: {self.recipe}"
+        return f"{self.description}, about {amount} ({self.sigmas:.0f} σ, {share})"
 
     def summary(self) -> dict[str, Any]:
         """Return the term in estimate.json, as a suspect or with the names of its parameters."""
         main, *further = self.numbers
-        found = {
+        found: dict[str, Any] = {
             "words": self.description,
             "path": main.path,
             "value": main.value,
             "unit": main.unit,
             "sigmas": self.sigmas,
             "share": self.share,
+            "name": main.name,
+            "scale": main.scale,
+            "parameters": self.parameters,
         }
-        if main.name:
-            names = {"name": main.name, "scale": main.scale, "parameters": self.parameters}
-            found |= names
         if further:
             found["further"] = {each.path: each.value for each in further}
         if self.tables:
@@ -145,8 +150,8 @@ class TermTestData(Record):
         untested: Terms in words that could not be tested, because the model cannot have them or the
             simulation diverges with them.
         impossible: Terms in words, each with the reason, that a model of this kind cannot have.
-        unseen: By parameter, the largest move by a term that the tests may miss, in standard
-            deviations of the parameter, and the term in words.
+        unseen: By parameter, the largest move by a term that the tests may miss, as a share of the
+            size of the parameter, and the term in words.
     """
 
     share: float
@@ -200,7 +205,7 @@ class TermTestData(Record):
         """Sentence about parameters that a missing term could move unseen; empty for none."""
         if not self.unseen:
             return ""
-        moves = [f"{name} by {sigmas:.0f} σ ({term})" for name, (sigmas, term) in self.unseen]
+        moves = [f"{name} by {100 * share:.2g} % ({term})" for name, (share, term) in self.unseen]
         return f"A missing term that is too small for the tests could move {first_ones(moves)}."
 
     @property
@@ -231,12 +236,33 @@ def key_of_term(path: str, description: str, joints: Sequence[str]) -> str:
     return f"{description}: {', '.join(sorted(joints))}" if joints else path
 
 
+def as_toml(table: Mapping[str, object], *name: str, remark: str = "") -> str:
+    """Write a table of an experiment file, with a line for each key.
+
+    Args:
+        table: The table.
+        name: The parts of its name.
+        remark: Comment below its name; empty for none.
+    """
+    lines = [f"[{'.'.join(map(_key, name))}]", *([f"# {remark}"] if remark else [])]
+    lines += [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
+    return "\n".join(lines)
+
+
+def _key(name: str) -> str:
+    """A key in TOML, in quotation marks where it needs them."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
+
+
 def _value(value: object) -> str:
-    """A value in TOML; numbers with two digits."""
+    """A value in TOML; tables in one line, and lists of them with a line for each."""
     if isinstance(value, Mapping):
-        entries = ", ".join(f"{key} = {_value(entry)}" for key, entry in value.items())
+        entries = ", ".join(f"{_key(key)} = {_value(entry)}" for key, entry in value.items())
         return f"{{ {entries} }}"
-    return f"{value:.2g}" if isinstance(value, float) else f'"{value}"'
+    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+        entries = "".join(f"    {_value(entry)},\n" for entry in value)
+        return f"[\n{entries}]"
+    return json.dumps(value, ensure_ascii=False)
 
 
 class Decision(NamedEnum):

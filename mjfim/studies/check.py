@@ -337,7 +337,7 @@ def check_task(
             source=source,
             duration=float(curve.t[-1]),
             is_start=trajectory is None,
-            is_played=trajectory is not None,
+            is_motion=True,
         )
 
 
@@ -469,7 +469,7 @@ def _checked(
     source: str,
     duration: float,
     is_start: bool,
-    is_played: bool = False,
+    is_motion: bool = False,
 ) -> Check:
     """The record for the user; what a request to stop leaves out is named in it.
 
@@ -483,7 +483,7 @@ def _checked(
         source: What is checked, in words.
         duration: Duration of the data [s].
         is_start: Whether it is the initial control, at which a design begins.
-        is_played: Whether it is a motion that a robot is to play.
+        is_motion: Whether it is one motion that a robot could play.
     """
     missing = []
 
@@ -500,11 +500,9 @@ def _checked(
         missing.append("the test of the derivatives")
     refused: tuple[str, ...] = ()
     violations: tuple[LimitViolation, ...] = ()
-    warning = ""
     # Without actuators there is no control that a design could begin with.
     if is_start and task.controls and task.release is None and not stop.requested:
         refused, violations = _refusals(task, found)
-        warning = growth_warning(growth_along(task, task.initial)) or ""
 
     # Standard deviations of the wanted parameters. They are infinite where a parameter cannot be
     # identified individually.
@@ -525,16 +523,18 @@ def _checked(
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
 
-    # A motion that a robot is to play is rehearsed without feedback.
-    rehearsal = None
-    if is_played and steps is not None and point.trajectory is not None:
-        played = point.trajectory
+    # A motion that a robot could play is rehearsed without feedback.
+    rehearsal, warning = None, ""
+    if is_motion and steps is not None and point.trajectory is not None and not refused:
+        begin_stage("rehearsing the motion")
+        played, growth = point.trajectory, growth_along(task, point.trajectory)
         gain = np.zeros((played.samples, len(task.controls), task.space.nx))
-        rehearsal = rehearsed(task, played, gain, steps)
+        rehearsal = rehearsed(task, played, gain, steps, growth)
+        warning = growth_warning(growth) or ""
 
     # What each sensor tells along one motion.
     worth = None
-    if steps is not None and (is_start or is_played) and point.trajectory is not None:
+    if steps is not None and is_motion and point.trajectory is not None:
         worth = sensing_along(task, point.trajectory, found).worth(source, duration)
 
     # Eigenvalues of the criterion, without combinations that no experiment can identify.
@@ -567,6 +567,7 @@ def _checked(
         steps=steps,
         rehearsal=rehearsal,
         worth=worth,
+        is_start=is_start,
         verdict=(),
         combined=() if not_excited else found.combinations(information, values, total, total),
         missing=tuple(missing),

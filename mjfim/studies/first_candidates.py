@@ -12,17 +12,20 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from mjfim.errors import ExperimentError, ModelError, unknown
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, ModelError, first_ones, unknown
 from mjfim.experiment.time_grid import rates_near, whole_number
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.elements import (
     actuator_force_sizes,
+    control_sizes,
     element_name,
     force_sizes,
     free_name,
     identifier,
     names_of,
     position_sizes,
+    translations,
 )
 from mjfim.model.inertia import body_inertia
 from mjfim.model.loading import NO_PACKAGES, load_spec
@@ -197,7 +200,7 @@ SMALL_MASS = 0.1
 PAYLOAD_SHARE = 0.2
 
 # Size of an unknown payload, relative to what the strongest actuator holds at the robot's length;
-# and of friction that the MJCF does not state, relative to a natural force.
+# and of friction that the MJCF does not state, relative to the force of the joint's actuators.
 STRENGTH_SHARE = 0.05
 
 # A robot with more joints than this has one unknown for all elements with equal values.
@@ -251,7 +254,7 @@ class Candidate:
     @property
     def meaning(self) -> str:
         """What it is, for the comment."""
-        return f"{self.quantity} of {', '.join(self.owners)}" if self.owners else self.quantity
+        return f"{self.quantity} of {first_ones(self.owners)}" if self.owners else self.quantity
 
     @property
     def is_absent(self) -> bool:
@@ -336,9 +339,13 @@ def _tied(model: Any, found: Sequence[Candidate]) -> list[Candidate]:
             if kinds[first.quantity] > 1:
                 name = f"{name}_{first.owners[0]}_and_{len(others)}_more"
         name = free_name(name, tied)
+        # The strongest joint sets the size of what the model does not have.
+        strongest = max((first, *others), key=lambda each: each.scale or 0.0)
         tied[name] = replace(
             first,
             name=name,
+            scale=strongest.scale,
+            bounds=strongest.bounds,
             paths=(*first.paths, *(each.paths[0] for each in others)),
             owners=(*first.owners, *(each.owners[0] for each in others)),
         )
@@ -368,11 +375,12 @@ def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Ca
     mass = float(model.body_mass[body])
     radius = body_inertia(model, body).gyration_radius
     # A light wrist carries more than a share of its own mass.
-    scale = PAYLOAD_SHARE * mass
+    moving = model.body_mass[model.body_weldid > 0].sum()
+    scale = max(PAYLOAD_SHARE * mass, STRENGTH_SHARE * moving)
     gravity = np.linalg.norm(model.opt.gravity)
     if gravity > 0.0 and model.nu:
-        forces = np.abs(model.actuator_gear[:, 0]) * actuator_force_sizes(model, period)
-        scale = max(scale, STRENGTH_SHARE * forces.max() / (gravity * length))
+        torques = _strengths(model, period) * np.where(translations(model), length, 1.0)
+        scale = max(scale, STRENGTH_SHARE * torques.max() / (gravity * length))
     yield Candidate(
         name="payload",
         group="payload",
@@ -479,15 +487,16 @@ def _inertia(model: Any) -> Iterator[Candidate]:
 
 def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate]:
     """Fields of joints; those that are zero in the model have a natural size."""
-    forces, sizes = STRENGTH_SHARE * force_sizes(model, period), position_sizes(model)
+    forces, sizes = STRENGTH_SHARE * _strengths(model, period), position_sizes(model)
     for quantity, array, meaning in JOINT_FIELDS[group]:
         # A force of friction, over a natural speed or acceleration.
         power = {"damping": 1, "armature": 2}.get(quantity, 0)
+        natural = (2.0 * np.pi / period) ** power
         for joint in range(model.njnt):
             name, dof = element_name(model, "joint", joint), model.jnt_dofadr[joint]
             value = float(getattr(model, array)[dof])
             is_single = joint_dofs(model, joint) == 1
-            size = float(forces[dof] * period**power / sizes[dof] ** (power > 0))
+            size = float(forces[dof] / natural / sizes[dof] ** (power > 0))
             if name and (value > 0.0 or is_single):
                 yield Candidate(
                     name=f"{name}_{quantity}",
@@ -499,6 +508,26 @@ def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate
                     scale=None if value > 0.0 else rounded(size),
                     bounds=(0.0, rounded(10.0 * (value or size), 3)),
                 )
+
+
+def _strengths(model: Any, period: float) -> Array:
+    """(nv,) force of the actuators at each joint; without any, that of a natural motion."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    forces, controls = actuator_force_sizes(model, period), control_sizes(model, period)
+    for i in range(model.nactuator):
+        # The control of a motor is its force.
+        is_motor = model.actuator_ctrlnum[i] == 1 and not model.actuator_biastype[i]
+        if is_motor and not model.actuator_forcelimited[i]:
+            gain = abs(model.actuator_gainprm[i, 0])
+            forces[model.actuator_outadr[i]] = gain * controls[model.actuator_ctrladr[i]]
+
+    # The moments hold gears, and the ways of tendons.
+    moments = np.zeros((len(forces), model.nv))
+    places = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    mujoco.mju_sparse2dense(moments, data.actuator_moment, *places)
+    strongest = (np.abs(moments) * forces[:, None]).max(axis=0, initial=0.0)
+    return np.asarray(np.maximum(strongest, force_sizes(model, period)))
 
 
 def _servos(model: Any) -> Iterator[Candidate]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from functools import cache
@@ -15,12 +16,19 @@ import tomlkit
 from tomlkit.items import Table
 
 from mjfim.arrays import Array, scaled_to_unit_diagonal
-from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDivergedError
+from mjfim.errors import (
+    ExperimentError,
+    MjfimError,
+    ModelError,
+    SimulationDivergedError,
+    first_ones,
+)
 from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.excitation.limits.verification import verify, violations_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.model.coordinates import joint_dofs
 from mjfim.model.elements import position_sizes, unnamed_count
 from mjfim.model.limited_elements import QUATERNION_PLACE
 from mjfim.model.loading import ModelSource, resolve_packages, silence_mujoco_log
@@ -48,10 +56,12 @@ from mjfim.studies.first_motion import (
     TimeScale,
     choose_start,
     driven_dofs,
+    falling_bodies,
     first_amplitudes,
     influence_of_controls,
     propose_release,
     reach,
+    require_support,
     time_scale,
     two_digits,
 )
@@ -93,6 +103,9 @@ BEFORE_VIOLATION = 0.9
 SMALLEST_ENDED = 0.1
 FADE = 0.5
 
+# Significant digits of the initial state: the loops of closed chains stay closed.
+STATE_DIGITS = 9
+
 # Boundary of an experiment that begins at rest.
 AT_REST = {"start": "rest"}
 
@@ -123,8 +136,9 @@ class Proposal:
         others: Further parameters, for comments.
         limits: The table `[limits]`.
         boundary: The table `[boundary]`.
-        release: Release of a model without actuators; None for a model with actuators.
         remarks: Sentences for the head of the file.
+        release: Release of a model without actuators; None for a model with actuators.
+        flies: Whether a free body is held in the air.
     """
 
     model: str
@@ -141,6 +155,7 @@ class Proposal:
     boundary: Mapping[str, str] = field(default_factory=dict)
     remarks: Sequence[str] = ()
     release: ProposedRelease | None = None
+    flies: bool = False
 
     def values(self) -> dict[str, Any]:
         """Keys and tables of the experiment file."""
@@ -152,9 +167,9 @@ class Proposal:
         elif self.start.keyframe is not None:
             initial["keyframe"] = self.start.keyframe
         else:
-            initial["qpos"] = self.start.qpos.tolist()
+            initial["qpos"] = [rounded(q, STATE_DIGITS) for q in self.start.qpos]
             if self.start.act.any():
-                initial["act"] = self.start.act.tolist()
+                initial["act"] = [rounded(act, STATE_DIGITS) for act in self.start.act]
 
         values = {
             "model": self.model,
@@ -173,6 +188,8 @@ class Proposal:
             values["boundary"] = self.boundary
         if self.release is None:
             values["cost"] = {"control": 0.0}
+        if self.flies:
+            values["rehearsal"] = {"feedback": True}
         values["descent"] = {"seconds": SECONDS}
         return values
 
@@ -192,6 +209,7 @@ class Proposal:
         return control
 
 
+@silence_mujoco_log()
 def propose_experiment(
     path: Path,
     folder: Path,
@@ -218,9 +236,13 @@ def propose_experiment(
         raise ExperimentError(f"{path}: the model has no joint, so that nothing in it can move")
     data = mujoco.MjData(model)
     start = choose_start(model, wishes.keyframe)
+    if model.nu and not start.held:
+        require_support(model, path)
     data.qpos[:] = start.qpos
     data.ctrl[:] = start.control
     mujoco.mj_forward(model, data)
+    # Nobody flies a robot without feedback.
+    flies = start.held and not data.ncon and not model.neq and bool(falling_bodies(model))
     length = reach(model, data)
     times = wanted_times(time_scale(model, data), model, wishes)
 
@@ -278,11 +300,15 @@ def propose_experiment(
         others=absent,
         limits=limits,
         release=release,
+        flies=flies,
     )
     refinement = _Refinement(source=source, folder=folder, wishes=wishes)
-    if release is not None:
-        return refinement.released(draft, length)
-    return refinement.refined(draft)
+    try:
+        if release is not None:
+            return refinement.released(draft, length)
+        return refinement.refined(draft)
+    except SimulationDivergedError as error:
+        raise ModelError(f"{path}: {error}") from None
 
 
 def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
@@ -357,13 +383,13 @@ class _Refinement:
         at_rest = replace(draft, boundary=AT_REST)
         if draft.start.held and self._can_begin(system, at_rest):
             draft = at_rest
-        # Each joint of an arm is driven, so that the controls can stop it.
-        is_arm = len(driven_dofs(self.source.model)) == self.source.model.nv
+        # Each joint of an arm is driven, so that the controls can stop it; who flies, hovers.
+        can_stop = len(driven_dofs(self.source.model)) == self.source.model.nv or draft.flies
 
         remarks = []
         amplitudes = np.array(list(draft.amplitudes.values()))
         kept = self._kept_amplitudes(system, draft, amplitudes)
-        if draft.boundary and kept is not None and is_arm:
+        if draft.boundary and kept is not None and can_stop:
             # Servos stop a motion that fades; under torques, the design has to find the end.
             draft = replace(draft, boundary=AT_REST | {"end": "rest"})
             ended = self._kept_amplitudes(system, draft, kept)
@@ -403,12 +429,11 @@ class _Refinement:
         """(nu,) largest amplitudes that keep all limits, if possible with some room; or None."""
         task = self._task(system, _with_amplitudes(draft, amplitudes))
         room = cache(lambda share: self._room(task, share))
-        if room(SHRINKING**TRIALS) < 0.0:
-            return None
         for least in (ROOM, 0.0):
-            for trial in range(TRIALS + 1):
-                if room(SHRINKING**trial) >= least:
-                    return two_digits(amplitudes * SHRINKING**trial)
+            if room(SHRINKING**TRIALS) >= least:
+                # A smaller motion has more room.
+                trial = bisect_left(range(TRIALS), least, key=lambda k: room(SHRINKING**k))
+                return two_digits(amplitudes * SHRINKING**trial)
         return None
 
     def _within_limits(
@@ -469,15 +494,29 @@ class _Refinement:
         others = [each for i, each in enumerate(draft.chosen) if i not in chosen]
         others += draft.others
 
-        # Parameters of bodies and joints without a name cannot be proposed.
-        counts = {kind: unnamed_count(self.source.model, kind) for kind in ("body", "joint")}
+        idle = [name for name, amplitude in draft.amplitudes.items() if amplitude == 0.0]
+        remarks = list(remarks)
+        if idle:
+            remarks.append(
+                f"Warning: the start holds {first_ones(idle)} at the end of the range, where the "
+                "first motion does not use it; choose another start."
+            )
+
+        # Parameters of bodies and joints without a name cannot be proposed; a free joint has none.
+        model = self.source.model
+        joints = [model.joint(j).name for j in range(model.njnt) if joint_dofs(model, j) < 6]
         unnamed = [
-            f"Note: {count} elements of kind {kind} have no name in the MJCF, so that their "
-            "parameters are not proposed."
-            for kind, count in counts.items()
+            f"{count} {one if count == 1 else many}"
+            for count, one, many in (
+                (unnamed_count(model, "body"), "body", "bodies"),
+                (joints.count(""), "joint", "joints"),
+            )
             if count
         ]
-        remarks = [*remarks, *unnamed]
+        if unnamed:
+            remarks.append(
+                f"Note: nothing is proposed for {' and '.join(unnamed)} without a name in the MJCF."
+            )
         return replace(draft, remarks=remarks, chosen=proposed, others=others)
 
     def _experiment(self, draft: Proposal) -> Experiment:
@@ -662,13 +701,16 @@ BEHIND = {
     "rate": "samples and controls [Hz]",
     "horizon": "duration of the experiment [s]",
     "cost.control": "the ranges bound the control; no weight is needed",
-    "limits.velocity": "of driven joints [m/s or rad/s]",
-    "limits.position": "wider than in the MJCF, whose soft range the state at rest exceeds",
+    "limits.velocity": "[m/s or rad/s]",
+    "limits.angular_velocity": "[rad/s]",
+    "limits.tilt": "angle from upright [rad]",
+    "limits.position": "about the start; for a soft range of the MJCF, so wide that it holds there",
     "limits.tendon_length": "wider than in the MJCF, whose soft range the state at rest exceeds",
     "limits.clearance": "between bodies [m]; ignored pairs are nearer at the start",
     "limits.floor": "height of a plane below the robot, which the MJCF does not have [m]",
     "limits.reserve": "as much as robots that differ from the model need",
     "limits.bandwidth": "of the controls [Hz]; a larger one gives more information",
+    "rehearsal.feedback": "open loop, a small error of the thrust lets the robot fall",
     "descent.seconds": "time budget of a design [s]; more gives better designs",
 }
 
@@ -716,7 +758,7 @@ def _about(proposal: Proposal) -> dict[str, list[str]]:
     if proposal.release is None:
         initial = [f"The start: {start.reason}."]
         names = [model.key(i).name for i in range(model.nkey)]
-        others = [name for name in names if name and name != start.keyframe]
+        others = [name for name in names if name and name != start.near]
         initial += [f"Other keyframes: {', '.join(others)}."] if others else []
 
     limits = []

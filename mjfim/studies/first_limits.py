@@ -11,16 +11,22 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.limits import SOFT_KINDS, SOFT_SHARE, limits_of_model
-from mjfim.model.clearance import GeomDistances, find_geom_pairs, with_floor
-from mjfim.model.coordinates import joint_names
-from mjfim.model.elements import translations, unique_names
+from mjfim.model.clearance import FLOOR, GeomDistances, find_geom_pairs, with_floor
+from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.elements import identifier, translations, unique_names
+from mjfim.model.limited_elements import tilt_weights
 from mjfim.model.loading import ModelSource
 from mjfim.studies.first_candidates import rounded
-from mjfim.studies.first_motion import Start, TimeScale, driven_dofs
+from mjfim.studies.first_motion import Start, TimeScale, has_gravity
 
 # Derived limit of a speed, relative to the largest speed of the motion at rest, where that is
 # larger than the natural speed: a robot that sinks or falls keeps its limits.
 SPEED_ROOM = 2.0
+
+# Half of the width of the box of a free body or of a slide without a range, relative to the robot's
+# length, and largest tilt of a free body [rad].
+BOX = 2.0
+TILT = 0.8
 
 # Room of a range that is exceeded at rest, relative to the excess.
 SOFT_ROOM = 4.0
@@ -76,7 +82,8 @@ def playable_limits(
 ) -> dict[str, Any]:
     """Limits that the MJCF does not state, such that the robot at rest keeps them.
 
-    Speeds are those of a pendulum of the robot's length: they are limits of the driven joints.
+    Speeds are those of a pendulum of the robot's length. What is not fixed and has no range gets a
+    box about its start, and a free body a tilt.
 
     Args:
         source: The model.
@@ -91,25 +98,59 @@ def playable_limits(
     model = source.model
     resting = np.tile(start.control, (round(times.horizon / model.opt.timestep), 1))
     positions, velocities, lengths = played(model, start, resting)
-    natural = np.where(translations(model), length, 1.0) * 2.0 * np.pi / times.period
-    speeds = np.maximum(natural, SPEED_ROOM * np.abs(velocities).max(axis=0))
-    names = joint_names(model)
-    driven = driven_dofs(model)
-    derived = {
-        names[model.dof_jntid[dof]]: rounded(speeds[dof]) for dof in (driven if not stated else ())
-    }
-    velocity: Any = dict(stated) or derived
-    if len(driven) == model.nv and len(set(derived.values())) == 1:
-        velocity = next(iter(derived.values()))
+    sizes = np.where(translations(model), length, 1.0)
+    limits = _of_joints(model, positions, velocities, sizes, 2.0 * np.pi / times.period)
+    limits["velocity"] |= stated
+    for kind, found in _widened(model, positions, lengths).items():
+        limits.setdefault(kind, {}).update(found)
+    limits = {kind: found for kind, found in limits.items() if found}
 
-    limits: dict[str, Any] = {"velocity": velocity} if velocity else {}
-    limits |= _widened(model, positions, lengths)
+    # One number holds for all joints.
+    speeds = list(limits["velocity"].values())
+    if len(speeds) == model.njnt and len(set(speeds)) == 1:
+        limits["velocity"] = speeds[0]
     step = -(-len(positions) // MOST_CONFIGURATIONS)
     limits |= _clearance(source, positions[::step], rounded(CLEARANCE_SHARE * length, 1))
     bandwidth = max(BANDWIDTH / times.period, FEWEST_PERIODS / times.horizon)
     if bandwidth < 0.5 * times.rate:
         limits["bandwidth"] = rounded(bandwidth)
     return limits
+
+
+def _of_joints(
+    model: Any, positions: Array, velocities: Array, sizes: Array, natural: float
+) -> dict[str, Any]:
+    """Speeds of all joints, and a box and a tilt of what has no range and can go anywhere.
+
+    Args:
+        model: The compiled model.
+        positions: (n, nq) positions at rest.
+        velocities: (n, nv) velocities at rest.
+        sizes: (nv,) length of the robot, or one radian [m or rad].
+        natural: Speed of a pendulum of the robot's length [rad/s].
+    """
+    found: dict[str, Any] = {"velocity": {}, "angular_velocity": {}, "position": {}, "tilt": {}}
+    for joint, name in enumerate(joint_names(model)):
+        q, dof, count = model.jnt_qposadr[joint], model.jnt_dofadr[joint], joint_dofs(model, joint)
+        is_free, moved = count == 6, min(count, 3)
+        parts = {"velocity": dof, "angular_velocity": dof + 3} if is_free else {"velocity": dof}
+        for kind, first in parts.items():
+            fastest = np.linalg.norm(velocities[:, first : first + moved], axis=1).max()
+            speed = max(natural * sizes[first], SPEED_ROOM * fastest)
+            found[kind][name] = rounded(speed)
+
+        if translations(model)[dof] and not model.jnt_limited[joint]:
+            path = positions[:, q : q + moved]
+            width = BOX * sizes[dof] + SPEED_ROOM * np.abs(path - path[0]).max(axis=0)
+            ends = np.stack([path[0] - width, path[0] + width], axis=1)
+            box = [[rounded(low, 3), rounded(high, 3)] for low, high in ends.tolist()]
+            found["position"][name] = box if is_free else box[0]
+        if is_free and has_gravity(model):
+            turned = positions[:, q + 3 : q + 7] @ tilt_weights(model, joint).T
+            tilt = 2.0 * np.arcsin(np.clip(np.linalg.norm(turned, axis=1), 0.0, 1.0)).max()
+            if TILT + SPEED_ROOM * tilt < np.pi:
+                found["tilt"][name] = rounded(TILT + SPEED_ROOM * tilt)
+    return found
 
 
 def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
@@ -132,15 +173,19 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
     return {**found}
 
 
-def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:
+def _clearance(
+    source: ModelSource, positions: Array, least: float, *, may_add_floor: bool = True
+) -> dict[str, Any]:
     """The least distance [m], a floor, and the pairs of bodies that are nearer at rest.
 
-    A robot above its base, without anything around it, gets a floor at the height of its base.
+    A robot above its base, without anything around it, gets a floor at the height of its base, and
+    one that flies a floor at height 0.
 
     Args:
         source: The model.
         positions: (n, nq) positions at rest.
         least: The least distance [m].
+        may_add_floor: Whether a floor may be stated that the MJCF does not have.
     """
     data, model = mujoco.MjData(source.model), source.model
     data.qpos[:] = positions[0]
@@ -151,8 +196,9 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
     height = min((float(data.xpos[body, 2]) for body in bases), default=0.0)
     stated = {"clearance": least}
     is_fixed = not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
+    has_below = is_fixed or has_gravity(model)
     lowest = data.geom_xpos[moves[model.geom_bodyid], 2].min(initial=np.inf)
-    if is_fixed and not around and lowest > height:
+    if may_add_floor and has_below and not around and lowest > height:
         stated["floor"] = rounded(height, 6)
         model = with_floor(source, stated["floor"]).model
     try:
@@ -163,6 +209,11 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
 
     nearest = distances(positions, slopes=False)[0].min(axis=0)
     near = {name for name, d in zip(distances.columns, nearest, strict=True) if d < 2.0 * least}
+    # A hand that lies at the height of its base has no floor there.
+    floor = identifier(model, "geom", FLOOR)
+    above = {pair.bodies for pair in pairs if pair.second == floor}
+    if 2 * len(above & near) > len(above):
+        return _clearance(source, positions, least, may_add_floor=False)
     if len(near) == len(nearest):
         return {}
     names = np.array(unique_names(model, "body"))[model.geom_bodyid]

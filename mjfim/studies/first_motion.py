@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from copy import copy
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -11,8 +12,15 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, first_ones
 from mjfim.model.coordinates import joint_dofs, tangent_components
-from mjfim.model.elements import control_sizes, is_rk4, translations
+from mjfim.model.elements import (
+    control_sizes,
+    is_rk4,
+    position_sizes,
+    translations,
+    unique_names,
+)
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.records.base import record
 from mjfim.studies.first_candidates import require_keyframe, resting_keyframes, rounded
@@ -133,11 +141,19 @@ def pendulum_time(model: Any, data: Any) -> float | None:
         model: The compiled model.
         data: Its data in the initial state, after `mj_forward`.
     """
-    gravity = np.linalg.norm(model.opt.gravity)
-    is_off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-    if gravity == 0.0 or is_off:
+    if not has_gravity(model):
         return None
-    return float(np.sqrt(reach(model, data) / gravity))
+    return float(np.sqrt(reach(model, data) / np.linalg.norm(model.opt.gravity)))
+
+
+def has_gravity(model: Any) -> bool:
+    """Whether gravity acts.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    is_off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    return bool(model.opt.gravity.any()) and not is_off
 
 
 def free_time(model: Any) -> float:
@@ -210,6 +226,14 @@ MOVED_INSIDE = ", with joints moved away from the ends of their ranges"
 SETTLING_PERIODS = 60.0
 VELOCITY_LEFT = 1e-3
 
+# Inertia of a locked joint, relative to its own.
+LOCKING = 1e9
+
+# Push of a state that is held but not stable, relative to the sizes of the positions, and the share
+# of the velocity that is left after each period while it falls.
+PUSH = 1e-2
+FALLING_LEFT = 0.1
+
 
 @record
 class Start:
@@ -217,6 +241,7 @@ class Start:
 
     Attributes:
         keyframe: Name of the keyframe, or None.
+        near: Name of the keyframe that the state is or was moved away from; empty without one.
         qpos: (nq,) positions.
         act: (na,) activations.
         control: (nu,) control that holds the state, or that comes near to it.
@@ -231,6 +256,7 @@ class Start:
     control: Array
     drift: float
     reason: str
+    near: str = ""
 
     @property
     def held(self) -> bool:
@@ -241,9 +267,11 @@ class Start:
 def choose_start(model: Any, keyframe: str | None = None) -> Start:
     """Choose a state at rest in which an experiment can begin.
 
-    Named keyframes that a control holds come first, then the reference positions, then the state in
-    which the model settles while its driven joints are locked, or by itself. Where nothing holds,
-    the one that drifts least is taken: a robot with legs begins on its feet.
+    Named keyframes that a control holds come first, or the reference positions where there are
+    none, then the state in which the model settles from there while its driven joints are locked,
+    or by itself. A stable state comes before reference positions that are not: a pendulum begins
+    hanging. Where nothing holds, the one that drifts least is taken: a robot with legs begins on
+    its feet.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
@@ -257,26 +285,66 @@ def choose_start(model: Any, keyframe: str | None = None) -> Start:
 
     candidates = []
     for start in _candidates(model):
-        if start.held:
-            return start
         candidates.append(start)
-    return min(candidates, key=lambda start: start.drift)
+        if start.held and (start.near or _is_stable(model, start)):
+            return start
+    held = [start for start in candidates if start.held]
+    return held[0] if held else min(candidates, key=lambda start: start.drift)
+
+
+def falling_bodies(model: Any) -> list[str]:
+    """Names of the free bodies that fall by their weight where nothing is below them.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    if not has_gravity(model):
+        return []
+    is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    names = unique_names(model, "body")
+    return [names[body] for body in model.jnt_bodyid[is_free].tolist()]
+
+
+def require_support(model: Any, path: Path) -> None:
+    """Require something on which a free body can stand.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`), which no control holds.
+        path: Its file, for the message.
+
+    Raises:
+        ExperimentError: Nothing that does not move can be touched.
+    """
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    touchable = (model.geom_contype | model.geom_conaffinity) != 0
+    falling = falling_bodies(model)
+    if falling and not (fixed & touchable).any() and not model.npair:
+        raise ExperimentError(
+            f"{path}: nothing is below {first_ones(falling)}, which falls; give the file of the "
+            'scene with the floor, or add <geom type="plane" size="0 0 1"/> to the <worldbody>'
+        )
+
+
+def _is_stable(model: Any, start: Start) -> bool:
+    """Whether a state that a control holds stays where it is after a small disturbance."""
+    data = mujoco.MjData(model)
+    _signed_acceleration(model, data, start.qpos, start.control)
+    return not time_scale(model, data).unstable
 
 
 def _candidates(model: Any) -> Iterator[Start]:
     """Starts in the order of preference."""
-    for name in resting_keyframes(model):
-        yield _start_in_keyframe(model, model.key(name).id)
+    stated = [_start_in_keyframe(model, model.key(name).id) for name in resting_keyframes(model)]
+    if not stated:
+        resting = _resting_control(model, _inside_ranges(model, model.qpos0))
+        stated = [_start(model, model.qpos0, resting, "the reference positions of the MJCF")]
+    yield from stated
 
-    resting = _resting_control(model, _inside_ranges(model, model.qpos0))
-    first = _start(model, model.qpos0, resting, "the reference positions of the MJCF")
-    yield first
-
-    driven = driven_dofs(model)
-    for locked, how in ((driven, "while its driven joints are locked"), ((), "by itself")):
+    first, driven = stated[0], driven_dofs(model)
+    for locked, how in ((driven, "while its driven joints are locked"), ([], "by itself")):
         settled = _settled(model, first, locked)
         if settled is not None:
-            reason = f"the state in which the model comes to rest {how}"
+            reason = f"the state in which the model comes to rest {how}, from {first.reason}"
             # To move one joint of a closed chain would open it.
             yield _start(model, settled, first.control, reason, moves_inside=not model.neq)
 
@@ -300,7 +368,7 @@ def _start(
 
     A joint that rests on the end of its range has no room to move, so it is moved away from there.
     """
-    inside = _inside_ranges(model, qpos) if moves_inside else qpos
+    near, inside = keyframe or "", _inside_ranges(model, qpos) if moves_inside else qpos
     if not np.array_equal(inside, qpos):
         qpos, keyframe, reason = inside, None, reason + MOVED_INSIDE
     data = mujoco.MjData(model)
@@ -309,12 +377,10 @@ def _start(
 
     # The control of a keyframe is kept where it holds its state. Others have six significant
     # digits; those that hardly differ from zero are zero.
-    shown = control
-    if keyframe is None:
-        _, _, width = _ranges(model, data, control)
-        values = np.array([rounded(value, 6) for value in control])
-        shown = np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0)
-    elif (by_guess := _drift(model, data, qpos, guess)) <= 1.0:
+    _, _, width = _ranges(model, data, control)
+    values = np.array([rounded(value, 6) for value in control])
+    shown = np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0)
+    if keyframe is not None and (by_guess := _drift(model, data, qpos, guess)) <= 1.0:
         control = shown = np.array(guess)
         drift = by_guess
     return Start(
@@ -324,6 +390,7 @@ def _start(
         control=shown,
         drift=drift,
         reason=reason,
+        near=near,
     )
 
 
@@ -469,7 +536,7 @@ def driven_dofs(model: Any) -> list[int]:
     return [model.jnt_dofadr[j] for j in sorted(joints) if joint_dofs(model, j) == 1]
 
 
-def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
+def _settled(model: Any, start: Start, locked: list[int]) -> Array | None:
     """(nq,) positions in which the model comes to rest with a strong artificial damping.
 
     Slides and hinges whose degrees of freedom are locked keep their position. None where the
@@ -477,18 +544,24 @@ def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
     """
     if len(locked) == model.nv:
         return None
-    kept = [int(model.jnt_qposadr[model.dof_jntid[v]]) for v in locked]
+    # A joint with a large inertia stays where it is, and does not push the others.
+    model = copy(model)
+    model.dof_armature[locked] = LOCKING * model.dof_M0[locked]
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
+    if start.held:
+        # A pendulum that stands upright falls only if something pushes it.
+        push = PUSH * position_sizes(model)
+        push[locked] = 0.0
+        mujoco.mj_integratePos(model, data.qpos, push, 1.0)
     time = _time(model, data)
     step = model.opt.timestep
-    decay = VELOCITY_LEFT ** (step / time)
+    decay = (FALLING_LEFT if start.held else VELOCITY_LEFT) ** (step / time)
 
     for _ in range(int(SETTLING_PERIODS * time / step)):
         mujoco.mj_step(model, data)
         data.qvel *= decay
-        data.qvel[list(locked)] = 0.0
-        data.qpos[kept] = start.qpos[kept]
+        data.qvel[locked] = 0.0
         if (
             not np.isfinite(data.qpos).all()
             or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number

@@ -170,11 +170,10 @@ def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
     model = source.model
     counts = np.asarray(model.actuator_ctrlnum, dtype=int)
     numbers = np.repeat(np.arange(len(counts)), counts).tolist()
+    names = {kind: unique_names(model, kind) for kind in set(TRANSMISSIONS.values())}
     for control, i in zip(source.coordinates.controls, numbers, strict=True):
         kind = TRANSMISSIONS.get(mujoco.mjtTrn(model.actuator_trntype[i]), "")
-        drives = ""
-        if kind:
-            drives = f"{kind} {unique_names(model, kind)[model.actuator_trnid[i, 0]]}"
+        drives = f"{kind} {names[kind][model.actuator_trnid[i, 0]]}" if kind else ""
         yield ListedActuator(name=control, drives=drives, unit=control_unit(model, i))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
@@ -29,7 +28,6 @@ from mjfim.records.terms import (
     Selection,
     Term,
 )
-from mjfim.studies.first_candidates import rounded
 
 # Smallest number of parameters that are pooled.
 MIN_MEMBERS = 2
@@ -85,25 +83,6 @@ class FittedModel:
     def penalised_cost(self) -> float:
         """Cost and the number of parameters of the terms, by which chance reduces it (AIC)."""
         return self.cost + sum(len(term.parameters) for term in self.terms)
-
-
-def selected_term(candidate: Term, taken: Iterable[str]) -> Term:
-    """The term with names of its parameters, and with rounded sizes, which people read.
-
-    Args:
-        candidate: The term that tests have found.
-        taken: Names of the parameters that the model has already.
-    """
-    used = set(taken)
-    numbers = []
-    for number in candidate.numbers:
-        # Such as `pivot_damping` for `joint/pivot:damping`.
-        place, _, field = number.path.partition(":")
-        words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
-        name = free_name("_".join(words), used)
-        used.add(name)
-        numbers.append(replace(number, name=name, scale=rounded(number.scale)))
-    return replace(candidate, numbers=tuple(numbers))
 
 
 def selected_experiment(experiment: Experiment, selection: Selection) -> Experiment:

@@ -20,7 +20,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.report import estimate_from
-from mjfim.identification.assessment.term_tests import find_missing_terms
+from mjfim.identification.assessment.term_tests import find_missing_terms, with_names
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
@@ -45,7 +45,6 @@ from mjfim.studies.selected_models import (
     poorly_known,
     possible_pools,
     selected_experiment,
-    selected_term,
     start_of,
     values_of,
     with_selection,
@@ -466,7 +465,7 @@ class _Selector:
         None where the fit is no better, so that left-out data need not be predicted, where the
         model cannot be simulated, and after a request to stop.
         """
-        term = selected_term(candidate, model.result.task.system.parameters.names)
+        term = with_names(candidate, model.result.task.system.parameters.names)
         fit = self._fitted(replace(model, terms=(*model.terms, term)), term)
         if fit is None:
             return None

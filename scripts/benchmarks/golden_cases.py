@@ -45,9 +45,10 @@ CASES: dict[str, str] = {
     "design servo": "design servo_arm+descent.max_iterations=8 -o o",
     "design release": "design free_pendulum.toml -o o",
     "design robust": "design cart_pendulum_guess+robust.samples=3+descent.max_iterations=15 -o o",
-    "design shortest": "design cart_pendulum+descent.max_iterations=20 -o o --shortest",
+    "design shortest": "design cart_pendulum+descent.max_iterations=20"
+    "+parameters.m.wanted=0.01 -o o --shortest",
     "design previous": "design cart_pendulum+descent.max_iterations=10 -o a"
-    ' ; design cart_pendulum+descent.previous=[\\"a/design.npz\\"]+descent.max_iterations=40 -o o',
+    ' ; design cart_pendulum+descent.previous=[\\"a/design.csv\\"]+descent.max_iterations=40 -o o',
     # Hard limits.
     "limits": "design cart_pendulum_limits+boundary.end=free+descent.starts=1"
     "+descent.max_iterations=60 -o o",

@@ -40,15 +40,19 @@ def test_a_table_and_a_conclusion_are_printed(study: Path, checked: Result) -> N
 LIMITED = """
 import resource
 import sys
-resource.setrlimit(resource.RLIMIT_DATA, (4 * 2**30, 4 * 2**30))
+resource.setrlimit(resource.RLIMIT_DATA, (4 * 2**30, int(sys.argv.pop())))
 from mjfim.__main__ import main
 main()
 """
 
 
 @pytest.mark.slow
-def test_too_little_memory_for_the_engine_is_one_message(tmp_path: Path) -> None:
-    """The model compiles, but there is no memory for further copies of its state."""
+@pytest.mark.parametrize("hard", [4 * 2**30, -1])
+def test_too_little_memory_for_the_engine_is_one_message(tmp_path: Path, hard: int) -> None:
+    """The model compiles, but there is no memory for further copies of its state.
+
+    A soft limit of the user is kept, also where the hard limit is infinite (-1).
+    """
     pytest.importorskip("resource")
     # A model of its own: the one of `study` is shared by all tests.
     study = write_experiment(tmp_path)
@@ -56,7 +60,7 @@ def test_too_little_memory_for_the_engine_is_one_message(tmp_path: Path) -> None
     text = model.read_text(encoding="utf-8")
     model.write_text(text.replace("<worldbody>", '<size memory="1700M"/><worldbody>', 1))
     # In a process of its own: threads of the tests do not start with too little memory.
-    command = [sys.executable, "-c", LIMITED, "check", str(study), "--threads", "8"]
+    command = [sys.executable, "-c", LIMITED, "check", str(study), "--threads", "8", str(hard)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 2 and "allocate memory" in ended.stderr
     assert "Traceback" not in ended.stderr
@@ -71,6 +75,7 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
         "check.npz",
         "check.png",
         "report.html",
+        "rehearsal.png",
         "worth.png",
         MANIFEST,
     }

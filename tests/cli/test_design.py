@@ -78,7 +78,7 @@ def test_design_that_stops_at_its_budget(tmp_path: Path, lines: dict[str, str]) 
     result = run("design", path, "-o", tmp_path / "out", "--verbose")
     assert result.exit_code == 0
     said = " ".join(result.stdout.split())
-    assert "Ready to play" in said and "Stopped at its budget" in said
+    assert "This motion can be played" in said and "Stopped at its budget" in said
 
     # How much a longer search may gain is said, too.
     assert re.search(r"still improving by [\d.]+ % per iteration; for a better result", said)

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from typer.testing import Result
 
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
 from tests.support.cli import MODELS, loads, misused, names, run
 
 
@@ -72,6 +74,89 @@ def test_init_writes_a_file_that_validate_accepts(
     valid = run("validate", "cart_pendulum.toml")
     assert valid.exit_code == 0
     assert "is correct" in valid.stdout
+
+
+# Two links of a ROS package, whose meshes are files of it.
+PACKAGED = """
+<robot name="two">
+  <link name="base"/>
+  <link name="upper">
+    <inertial><origin xyz="0 0 -0.2"/><mass value="1.2"/>
+      <inertia ixx="0.01" iyy="0.01" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="package://arm_description/meshes/a.obj"/></geometry>
+    </collision>
+  </link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="9" velocity="3"/>
+    <dynamics damping="0.1" friction="0"/></joint>
+</robot>
+"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["above", "stated"])
+def test_a_urdf_of_a_ros_package_becomes_a_file_that_validate_accepts(
+    place: str, tmp_path: Path
+) -> None:
+    """The written MJCF finds the meshes, and has the motors and the mesh of the URDF."""
+    package = tmp_path / ("arm_description" if place == "above" else "elsewhere")
+    (package / "meshes").mkdir(parents=True)
+    (package / "meshes" / "a.obj").write_text(TETRAHEDRON, encoding="utf-8")
+    urdf = tmp_path / "arm_description" / "urdf" / "arm.urdf"
+    urdf.parent.mkdir(parents=True)
+    urdf.write_text(PACKAGED, encoding="utf-8")
+    words = ["--package", f"arm_description={package}"] if place == "stated" else []
+    file = tmp_path / "first" / "arm.toml"
+    file.parent.mkdir()
+    result = run("init", urdf, "-o", file, *words)
+    assert result.exit_code == 0, result.stderr
+    values = tomllib.loads(file.read_text("utf-8"))
+    assert values["limits"]["velocity"] in (3.0, {"shoulder": 3.0})
+    valid = run("validate", file)
+    assert valid.exit_code == 0, valid.stderr
+    model = System.resolve(Experiment.from_file(file)).model
+    assert (model.nu, model.nmesh, model.actuator("shoulder").ctrlrange[1]) == (1, 1, 9.0)
+
+
+# Three joints and a light wrist, with the motors of a small arm.
+WRIST = """
+<mujoco>
+  <compiler autolimits="true"/>
+  <default><joint axis="0 1 0" range="-120 120" damping="0.5"/></default>
+  <worldbody><geom type="plane" size="2 2 1"/>
+    <body name="upper" pos="0 0 1"><joint name="shoulder"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.03" mass="2"/>
+      <body name="fore" pos="0 0 0.3"><joint name="elbow"/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="1"/>
+        <body name="wrist_3" pos="0 0 0.3"><joint name="roll" axis="0 0 1"/>
+          <geom type="capsule" fromto="0 0 0 0.02 0 0.05" size="0.01" mass="0.05"/>
+        </body></body></body></worldbody>
+  <actuator><motor name="shoulder" joint="shoulder" ctrlrange="-60 60"/>
+    <motor name="elbow" joint="elbow" ctrlrange="-30 30"/>
+    <motor name="roll" joint="roll" ctrlrange="-5 5"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.slow
+def test_the_load_that_is_asked_for_is_an_unknown_of_a_size_that_the_motors_lift(
+    tmp_path: Path,
+) -> None:
+    model, file = tmp_path / "arm.xml", tmp_path / "arm.toml"
+    model.write_text(WRIST, encoding="utf-8")
+    result = run("init", model, "-o", file, "--payload", "wrist_3")
+    assert result.exit_code == 0, result.stderr
+    payload = tomllib.loads(file.read_text("utf-8"))["parameters"]["payload"]
+    [target] = payload["targets"]
+    assert target == {"path": "body/wrist_3:mass", "offset": 0.05}
+    # 5 % of what the shoulder holds at the length of the arm, which may be bent.
+    assert payload["scale"] == pytest.approx(0.05 * 60.0 / (9.81 * 0.6), rel=0.2)
+    assert run("validate", file).exit_code == 0
+
+    # Not any body can carry a load.
+    misused(run("init", model, "-o", tmp_path / "b.toml", "--payload", "hand"), "unknown body")
+    assert not (tmp_path / "b.toml").exists()
 
 
 @pytest.mark.slow

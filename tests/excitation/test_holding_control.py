@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjfim.excitation.limits.verification import require_feasible_start
 from mjfim.excitation.task_parts import holding_control, least_drift_control
 from tests.support.numerics import make_task
 from tests.support.stiff_servos import START, stiff_arm_task
@@ -71,3 +72,31 @@ def test_a_contact_that_a_longer_timestep_softens_holds_the_start_all_the_same(
     )
     assert task.initial_hold == pytest.approx([0.0], abs=1e-6)
     assert task.stretched(10).initial_hold == pytest.approx([0.0], abs=1e-6)
+
+
+def test_a_hold_at_the_end_of_a_range_is_inside_it_up_to_rounding(tmp_path: Path) -> None:
+    """Springs hold two equal arms, so that their controls are zero up to rounding."""
+    arm = (
+        '<body name="{0}" pos="0 {1} 0"><joint name="{0}" axis="0 1 0" stiffness="3" '
+        'springref="{2}" damping="0.1"/><geom size="0.1" mass="1" pos="0 0 -0.3"/></body>'
+    )
+    angle = 0.7
+    spring = np.rad2deg(angle + 9.81 * 0.3 * np.sin(angle) / 3.0)
+    xml = (
+        f"<mujoco><worldbody>{arm.format('a', 0, spring)}{arm.format('b', 1, spring)}</worldbody>"
+        '<actuator><motor name="a" joint="a" ctrlrange="0 5"/>'
+        '<motor name="b" joint="b" ctrlrange="-5 0"/></actuator></mujoco>'
+    )
+    task = make_task(
+        xml,
+        tmp_path,
+        rate=50.0,
+        horizon=1.0,
+        initial={"qpos": [angle, angle], "control": {"kind": "constant", "amplitude": 0.0}},
+        parameters={"mass": {"target": "body/a:mass"}},
+        noise={"state": 0.01},
+        boundary={"start": "rest"},
+    )
+    assert np.abs(task.initial_hold).max() < 1e-6
+    assert task.initial_hold[0] < 0.0 or task.initial_hold[1] > 0.0
+    require_feasible_start(task)

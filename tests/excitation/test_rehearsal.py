@@ -13,12 +13,18 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.arrays import evenly_spread_indices
+from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
+from mjfim.excitation.search.climb import Candidate
+from mjfim.excitation.search.search import Search
+from mjfim.files import write_json
+from mjfim.output.folders import find_experiment_file
 from mjfim.output.page import Level
 from mjfim.output.pages import page_of
 from mjfim.records.design import Design
 from mjfim.records.rehearsal import FiniteSteps
 from tests.support.cli import run
+from tests.support.paths import MODELS
 
 CART = """
 <mujoco model="cart_pendulum">
@@ -110,6 +116,8 @@ def test_robots_agree_with_a_plain_loop(plain: Played) -> None:
         speeds = np.abs(states[:, 2:])
         assert_allclose(found.speed[i], speeds.max(axis=0), rtol=1e-9)
         assert_allclose(found.end_speed[i], speeds[-1], rtol=1e-9)
+        travel = np.abs(states[:, :2] - states[0, :2]).max(axis=0)
+        assert_allclose(found.travel[i], travel, rtol=1e-9)
         change = np.abs(np.diff(states[:, 2:], axis=0)).max(axis=0) / 0.005
         assert_allclose(found.acceleration[i], change, rtol=1e-9)
         margins = {
@@ -124,6 +132,73 @@ def test_robots_agree_with_a_plain_loop(plain: Played) -> None:
         height = -0.5 * np.cos(states[-1, 1]) - 0.02
         assert found.end_height[i] == pytest.approx(height, abs=1e-9)
     assert not found.has_floor and not found.passes_floor.any()
+    # The slide has a range, the hinge has none.
+    assert found.unplaced == ("hinge",) and found.growth == design.final.growth
+
+
+WALLED = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom name="wall" type="box" size="0.05 0.2 0.05" pos="{wall} 0 -0.36"/>
+    <body name="arm">
+      <joint name="hinge" axis="0 -1 0" damping="0.2" range="-40 90" limited="true"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.8"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="torque" joint="hinge" ctrlrange="-5 5"/></actuator>
+</mujoco>
+"""
+
+WALLED_TABLES = """
+model = "arm.xml"
+rate = 50.0
+horizon = 2.0
+initial.control = { kind = "chirp", amplitude = 3.0, frequency = 0.7, frequency_end = 2.0 }
+parameters.mass = { target = "body/arm:mass" }
+noise.state = 0.004
+limits.enforce = false
+descent.max_iterations = 0
+rehearsal.robots = 5
+"""
+
+
+@pytest.mark.parametrize("wall", [0.36, 0.6])
+def test_distances_contacts_and_stops_agree_with_a_plain_loop(wall: float, tmp_path: Path) -> None:
+    """An arm that hits its stop, and a wall that is near, at 64 instants of every robot."""
+    text = WALLED.format(wall=wall)
+    (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(WALLED_TABLES, encoding="utf-8")
+    experiment = mjfim.Experiment.from_file(tmp_path / "arm.toml")
+    design = mjfim.design(experiment, threads=1, progress=False)
+    found = design.rehearsal
+    assert found is not None
+    for i, theta in enumerate(found.theta[:, 0].tolist()):
+        model = mujoco.MjModel.from_xml_string(text)
+        model.body_mass[1] = theta
+        data = mujoco.MjData(model)
+        states = [(data.qpos.copy(), data.qvel.copy())]
+        for u in np.repeat(design.trajectory.ctrl, 4, axis=0):
+            data.ctrl[:] = u
+            mujoco.mj_step(model, data)
+            states.append((data.qpos.copy(), data.qvel.copy()))
+        rows = evenly_spread_indices(len(states), 64)
+        touches, stops, nearest = [], [], np.inf
+        for row in rows.tolist():
+            data.qpos[:], data.qvel[:] = states[row]
+            mujoco.mj_forward(model, data)
+            touches.append(any(contact.dist < 0.0 for contact in data.contact))
+            stops.append(int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT) in data.efc_type)
+            distance = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None)
+            nearest = min(nearest, distance)
+        # A contact amplifies differences of round-off, which may move it by an instant.
+        assert found.in_contact[i] == pytest.approx(np.mean(touches), abs=1.01 / 64)
+        assert found.at_stop[i] == pytest.approx(np.mean(stops), abs=1.01 / 64)
+        # Depths of a penetration depend on the direction in which they are measured.
+        assert max(found.nearest[i], 0.0) == pytest.approx(max(nearest, 0.0), abs=1e-4)
+    is_near = wall < 0.5
+    assert bool(found.in_contact.max() > 0.02) is is_near and found.at_stop.max() > 0.02
+    assert bool(found.nearest.min() > 0.1) is not is_near
 
 
 @pytest.mark.slow
@@ -267,6 +342,20 @@ def test_what_falls_below_the_floor_is_not_played(
     stated = experiment.replace(rehearsal={"floor": "none"})
     assert mjfim.rehearse(stated, design).is_safe
 
+    # A check says the same of the start, unless a limit turns designs away from the floor.
+    checked = mjfim.check(experiment, progress=False)
+    page = page_of(checked, experiment="drone.toml")
+    assert (page.verdict.level is Level.BAD) is not is_safe and checked.is_dangerous is not is_safe
+    assert not checked.ok or is_safe
+    assert ("4 pass through" in page.verdict.text) is not is_safe
+    assert ("floor" in page.next_steps[0]) is not is_safe
+    if not is_safe:
+        box = {"position": {"base": [[-1.0, 1.0], [-1.0, 1.0], [0.5, 2.0]]}}
+        checked = mjfim.check(experiment.replace(limits=box), progress=False)
+        assert not checked.is_dangerous and checked.violations
+        warning = page_of(checked).warnings[0]
+        assert warning.startswith("The start itself is not to be played. Of 4 robots")
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize("room", [1e-4, 2.0])
@@ -303,6 +392,18 @@ def test_feedback_keeps_robots_near_the_plan(tmp_path: Path) -> None:
         for table in ({}, {"feedback": True, "latency": 0.0})
     ]
     assert spread[1] < 0.7 * spread[0]
+    # The noise of what the controller reads acts under feedback only.
+    for feedback in (False, True):
+        ends = [
+            mjfim.rehearse(
+                experiment.replace(
+                    noise={"state": noise}, rehearsal={"feedback": feedback, "robots": 2}
+                ),
+                design,
+            ).end_speed
+            for noise in (1e-6, 0.01)
+        ]
+        assert np.array_equal(*ends) is not feedback
     late = mjfim.rehearse(
         experiment.replace(rehearsal={"feedback": True, "latency": 0.007, "robots": 2}), design
     )
@@ -362,6 +463,27 @@ def test_a_standard_deviation_that_differs_is_stated_by_the_finite_step() -> Non
     assert "dry friction of hinge makes it approximate" in str(steps)
 
 
+@pytest.mark.parametrize(
+    ("change", "is_confirmed"),
+    [(1 / 1.401, False), (1 / 1.399, True), (1 / 0.701, True), (1 / 0.699, False)],
+)
+def test_ratios_from_0_7_to_1_4_confirm_a_standard_deviation(
+    change: float, is_confirmed: bool
+) -> None:
+    """A finite step whose effect is `ratio` times the predicted one has σ / ratio."""
+    steps = FiniteSteps(
+        names=("mass",),
+        predicted=np.array([0.1]),
+        std=np.array([0.1 * change]),
+        length=np.array([2.0]),
+        ratio=np.array([1.0 / change]),
+    )
+    assert steps.confirmed.tolist() == [is_confirmed]
+    assert steps.stated[0] == pytest.approx(0.1 if is_confirmed else 0.1 * change)
+    # Where neither contacts nor friction act, the outputs are curved.
+    assert ("in a strongly curved way" in str(steps)) is not is_confirmed
+
+
 @pytest.mark.slow
 def test_the_verb_plays_a_folder(tmp_path: Path) -> None:
     """It finds the experiment by itself, and agrees with the rehearsal of the design."""
@@ -372,9 +494,47 @@ def test_the_verb_plays_a_folder(tmp_path: Path) -> None:
     done = run("rehearse", made, "-o", out, "--robots", "7", "--seed", "3")
     assert done.exit_code == 0 and "7 of 7 robots" in done.stdout
     assert f"mjfim export {made} --to player" in " ".join(done.stdout.split())
+    alone = run("rehearse", made, "--robots", "2").stdout
+    assert ".." not in alone and "-o FOLDER" not in alone
+    checked = run("check", tmp_path / "cart.toml", "--design", made).stdout
+    assert f"mjfim export {made} --to player" in " ".join(checked.split())
     told = json.loads((out / "rehearsal.json").read_text(encoding="utf-8"))
     assert told["safe"] and told["robots"] == 7 and len(told["limits"]) == 4
     assert (out / "rehearsal.png").stat().st_size > 10_000
+
+
+def test_the_experiment_of_a_design_is_named_as_a_person_would(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the current folder where the file is in it, else from the root; never with `..`."""
+    (tmp_path / "made").mkdir()
+    write_json(tmp_path / "made" / "design.json", {"experiment": "../cart.toml"})
+    monkeypatch.chdir(tmp_path)
+    assert find_experiment_file(Path("made/design.npz")) == Path("cart.toml")
+    monkeypatch.chdir(tmp_path / "made")
+    assert find_experiment_file(Path("design.npz")) == tmp_path.resolve() / "cart.toml"
+
+
+def test_a_search_whose_motions_diverge_says_what_when_and_what_helps(
+    plain: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The start leaves a limit, and all that the search finds is too large for MuJoCo."""
+    experiment, design = plain
+    experiment = experiment.replace(limits={"enforce": True, "position": {"slide": [-0.01, 0.01]}})
+    wild = Candidate(name="chirp", control=np.full(design.trajectory.ctrl.shape, 1e11))
+
+    def found(*_: Any) -> Any:
+        """A search without iterates."""
+        yield from ()
+        return [wild]
+
+    monkeypatch.setattr(Search, "run", found)
+    with pytest.raises(SimulationDivergedError) as caught:
+        mjfim.design(experiment, threads=1, progress=False)
+    text = str(caught.value)
+    assert "cart.toml: no initial control leads to a motion within the limits" in text
+    assert "from the best one, chirp" in text and "control of actuator force is 1e+11" in text
+    assert "a larger gear of the actuator needs smaller controls" in text
 
 
 def test_misuse_is_one_sentence(plain: Played) -> None:
@@ -393,3 +553,47 @@ def test_a_model_alone_is_enough(plain: Played) -> None:
     assert alone.robots == 0 and alone.is_safe
     lost = replace(alone, margins=-alone.margins)
     assert not lost.is_safe
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "iterations"), [("cart_pendulum_limits.toml", 15), ("quadrotor.toml", 3)]
+)
+def test_shipped_designs_are_safe_because_of_what_their_files_state(
+    file: str, iterations: int
+) -> None:
+    """Without the reserve, the box and the end at rest nobody would play them."""
+    experiment = mjfim.Experiment.from_file(MODELS / file).replace(
+        descent={"starts": 1, "max_iterations": iterations}
+    )
+    design = mjfim.design(experiment, progress=False)
+    assert design.rehearsal is not None and design.rehearsal.is_safe and design.within_limits
+    stated = experiment.model_dump(exclude_unset=True)
+    del stated["boundary"]
+    stated["limits"].pop("reserve")
+    stated["limits"].pop("tilt", None)
+    if file == "quadrotor.toml":
+        del stated["limits"]
+    bare = mjfim.design(experiment.restated(stated), progress=False)
+    assert bare.rehearsal is not None and not bare.rehearsal.is_safe
+    assert page_of(bare).verdict.level is Level.BAD
+
+
+@pytest.mark.slow
+def test_a_closed_chain_is_designed_and_never_worse_than_its_start() -> None:
+    """The four-bar linkage, whose loop is an equality constraint."""
+    experiment = mjfim.Experiment.from_file(MODELS / "four_bar.toml").replace(
+        descent={"starts": 1, "max_iterations": 5}
+    )
+    design = mjfim.design(experiment, progress=False)
+    assert design.rehearsal is not None and design.rehearsal.diverged == 0
+    assert design.final.cost <= design.initial.cost
+    # The design in plain MuJoCo, whose loop stays closed.
+    model = mujoco.MjModel.from_xml_path(str(MODELS / "four_bar.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = design.trajectory.qpos[0], design.trajectory.qvel[0]
+    substeps = round(design.trajectory.dt / model.opt.timestep)
+    for u, qpos in zip(design.trajectory.ctrl, design.trajectory.qpos[1:], strict=True):
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data, substeps)
+        assert_allclose(data.qpos, qpos, atol=1e-9)

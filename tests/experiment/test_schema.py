@@ -362,6 +362,10 @@ FAULTS: dict[str, tuple[str, str]] = {
     "nested key": (edited("[cost]", "[cost]\ncontrl = 1"), "cost.contrl … 'control' … tracking"),
     "initial key": (edited("keyframe =", "keyfrme ="), "initial.keyfrme … 'keyframe' … qpos"),
     "signal key": (control('{ kind = "sine", amp = 1 }'), "initial.control.amp … amplitude, "),
+    "signal without kind": (
+        control("{ amplitude = 1 }"),
+        "initial.control.kind: this key is required",
+    ),
     "limits key": (
         SHORT + "[limits]\nspeed = 1\n",
         "limits.speed … acceleration, angular_velocity, bandwidth, clearance, control, "
@@ -404,7 +408,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     ),
     "rate": (
         edited("rate = 100.0", "rate = 30.0"),
-        "rate: at 30 Hz … 0.01 s … 25, 33.3333, 50 Hz … A log keeps its own rate",
+        "rate: at 30 Hz … 0.01 s … 25, 50, 33.3333333 Hz … A log keeps its own rate",
     ),
     "rate negative": (edited("rate = 100.0", "rate = -1.0"), "rate … greater than 0 … -1.0"),
     "measure rate": ("measure_rate = 30.0" + SHORT, "measure_rate: 30 Hz … 100 Hz … 50, 25"),

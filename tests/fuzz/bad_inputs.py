@@ -82,7 +82,10 @@ class Call:
         fails: True if exit code 0 is wrong.
         accepted: True if a refusal is wrong.
         room: Largest size of a file that can be written [bytes]; None for no limit.
-        has_home: False where the home folder cannot be used.
+        has_home: False where the home folder cannot be used; it is `home` where that exists.
+        forbidden: Folders in which the call may not write, and files that it may not read.
+        memory: Memory that the call may use [bytes]; None for that of the suite.
+        patience: Time after which the call is asked to stop, in place of an end of the case [s].
     """
 
     words: list[str]
@@ -92,6 +95,9 @@ class Call:
     accepted: bool = False
     room: int | None = None
     has_home: bool = True
+    forbidden: tuple[Path, ...] = ()
+    memory: int | None = None
+    patience: float | None = None
 
 
 def toml_of(value: Any) -> str:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow
+import pyarrow.csv
 import pyarrow.parquet
 
 from tests.fuzz.bad_inputs import (
@@ -601,6 +602,62 @@ def no_home(rng: Rng, folder: Path) -> Call:
     """A home folder in which nothing can be written; nothing else is wrong."""
     words = pick(rng, (SIMULATE, IDENTIFY, CHECK))
     return Call(words=list(words), spoiled="no home", accepted=True, has_home=False)
+
+
+def no_permission(rng: Rng, folder: Path) -> Call:
+    """A user who may not write here, may not read an input, or has a home that is read-only."""
+    how = pick(rng, ("nothing", "home", "current folder", "results", "input"))
+    results = folder / "out"
+    forbidden = {
+        "home": folder / "home",
+        "current folder": folder,
+        "results": results,
+        "input": folder / str(pick(rng, ("study.toml", "cart_pendulum.xml"))),
+    }
+    design = ("design", "study.toml", "-o", "out", "--threads", "1")
+    study = ("montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2")
+    words = pick(rng, (IDENTIFY, CHECK, (*CHECK, "run.csv", "-o", "out"), design, study))
+    if how == "home":
+        (folder / "home").mkdir()
+    if how == "results":
+        results.mkdir()
+    fails = how == "input" or (how in ("current folder", "results") and "-o" in words)
+    return Call(
+        words=list(words),
+        spoiled=f"no permission: {how}",
+        forbidden=(forbidden[how],) if how in forbidden else (),
+        has_home=how != "home",
+        fails=fails,
+        accepted=not fails,
+    )
+
+
+# Rows of a log that is far too long, the memory of a call that reads it [bytes], and the time after
+# which it is asked to stop [s].
+LONG_ROWS, LONG_MEMORY, LONG_PATIENCE = 10_000_000, 8 << 30, 240.0
+
+
+def long_log(rng: Rng, folder: Path) -> Call:
+    """A log of ten million rows, of which a window of a second may be wanted."""
+    columns = {}
+    for name, column in log_columns(folder).items():
+        columns[name] = np.resize(np.round(column, 3), LONG_ROWS)
+    step = columns["t"][1] - columns["t"][0]
+    columns["t"] = step * np.arange(LONG_ROWS)
+    name = str(pick(rng, ("log.csv", "log.npz", "log.parquet")))
+    if name == "log.npz":
+        np.savez(folder / name, **columns)
+    elif name == "log.csv":
+        pyarrow.csv.write_csv(pyarrow.table(columns), folder / name)
+    else:
+        pyarrow.parquet.write_table(pyarrow.table(columns), folder / name)
+    has_window = rng.random() < 0.5
+    if has_window:
+        with (folder / "study.toml").open("a", encoding="utf-8") as file:
+            file.write("\n[recording]\nwindow = [0.0, 1.0]\n")
+    words = pick(rng, (identify(name), [*CHECK, name]))
+    spoiled = f"{name}: {LONG_ROWS} rows{', a window of 1 s' if has_window else ''}"
+    return Call(words=words, spoiled=spoiled, memory=LONG_MEMORY, patience=LONG_PATIENCE)
 
 
 def full_disk(rng: Rng, folder: Path) -> Call:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import os
 import re
 import shutil
+import stat
 import subprocess
+import sys
 import tempfile
 import traceback
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from mjfim.files import replacing
 from mjfim.output.plots import draw
+from mjfim.parallel.budget import LAST_SECONDS
 from tests.fuzz.bad_inputs import Call, bad_input
-from tests.fuzz.faults import fault
+from tests.fuzz.faults import fault, long_log, no_permission
 from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import announce
@@ -26,6 +31,10 @@ from tests.support.cli import run as run_here
 
 # Share of the calls that run in a new process; the others run in the process of the suite.
 NEW_PROCESS = 0.04
+
+# What `prctl` calls to take a right (capability) from programs that are started, and the rights to
+# write, and to read and search, where permissions forbid it.
+DROP_RIGHT, RIGHTS_BEYOND_PERMISSIONS = 24, (1, 2)
 
 # Longest message of a refusal [characters].
 LONGEST_MESSAGE = 600
@@ -54,16 +63,21 @@ class Ending:
 def run(case: Case, folder: Path) -> Outcome:
     """Spoil something, call the command line, and judge how it ends."""
     rng = case.rng
-    spoil = fault if case.kind == "fault" else bad_input
+    spoils = {"fault": fault, "permission": no_permission, "log": long_log}
+    spoil = spoils.get(case.kind, bad_input)
+    if case.kind == "permission" and not may_be_refused():
+        reason = "skipped: this user may do everything"
+        return Outcome(case=case, group="skipped", description=reason)
     for name in STUDY:
         shutil.copy(valid_study() / name, folder)
     call = spoil(rng, folder)
     is_new = rng.random() < NEW_PROCESS or call.room is not None or not call.has_home
+    is_new |= case.kind in ("permission", "log")
     description = f"{call.words[0] if call.words else ''}: {call.spoiled}"
     announce(description)
 
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    ending = in_new_process(call, folder) if is_new else in_this_process(call, folder)
+    ending = in_new_process(call, folder, case.kind) if is_new else in_this_process(call, folder)
     complaints = [*judge(call, ending), *changes(folder, before)]
     return Outcome(
         case=case,
@@ -117,21 +131,30 @@ def in_this_process(call: Call, folder: Path) -> Ending:
     return Ending(code=result.exit_code, errors=result.stderr, results=result.stdout, fault=fault)
 
 
-def in_new_process(call: Call, folder: Path) -> Ending:
+def in_new_process(call: Call, folder: Path, kind: str) -> Ending:
     """Call the command line in a new process, with a time limit."""
-    with subprocess.Popen(
-        [*PROCESS, *call.words],
-        cwd=folder,
-        env=dict(os.environ) if call.has_home else _without_home(),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        errors="replace",
-        preexec_fn=None if call.room is None else functools.partial(_limit_files, call.room),
-    ) as process:
+    with (
+        _forbidden(call.forbidden),
+        subprocess.Popen(
+            [*PROCESS, *call.words],
+            cwd=folder,
+            env=dict(os.environ) if call.has_home else _without_home(folder),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            preexec_fn=functools.partial(_restrict, call) if hasattr(os, "fork") else None,
+        ) as process,
+    ):
+        limit = TIME_LIMITS[kind] - 5.0
         try:
-            results, errors = process.communicate(timeout=TIME_LIMITS["input"] - 5.0)
+            if call.patience is not None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(call.patience)
+                process.terminate()
+                limit = LAST_SECONDS + 15.0
+            results, errors = process.communicate(timeout=limit)
         except subprocess.TimeoutExpired:
             process.kill()
             results, errors = process.communicate()
@@ -139,18 +162,43 @@ def in_new_process(call: Call, folder: Path) -> Ending:
     return Ending(code=process.returncode, errors=errors, results=results)
 
 
-def _without_home() -> dict[str, str]:
+def _without_home(folder: Path) -> dict[str, str]:
     """The environment without a home folder, and without folders for the settings of programs."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("XDG_", "MPL"))}
-    return {**kept, "HOME": "/dev/null/home", "MPLBACKEND": "Agg"}
+    home = folder / "home" if (folder / "home").is_dir() else "/dev/null/home"
+    return {**kept, "HOME": str(home), "MPLBACKEND": "Agg"}
 
 
-def _limit_files(room: int) -> None:
-    """Limit the size of the files that this process writes. room: the limit [bytes]."""
-    with contextlib.suppress(ImportError):
-        import resource
+def may_be_refused() -> bool:
+    """Whether the permissions of files can hold for a call: Linux takes the rights of root away."""
+    return sys.platform == "linux" or (hasattr(os, "geteuid") and os.geteuid() != 0)
 
-        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+
+@contextlib.contextmanager
+def _forbidden(paths: tuple[Path, ...]) -> Iterator[None]:
+    """Forbid meanwhile to write in folders and to read files."""
+    modes = {path: path.stat().st_mode for path in paths}
+    try:
+        for path in paths:
+            path.chmod(0o555 if path.is_dir() else 0)
+        yield
+    finally:
+        for path, mode in modes.items():
+            path.chmod(stat.S_IMODE(mode))
+
+
+def _restrict(call: Call) -> None:
+    """Limit what this process may do: sizes of files, memory, and the rights of root."""
+    import resource
+
+    if call.room is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (call.room, call.room))
+    if call.memory is not None:
+        resource.setrlimit(resource.RLIMIT_DATA, (call.memory, call.memory))
+    if call.forbidden and os.geteuid() == 0:
+        library = ctypes.CDLL(None)
+        for right in RIGHTS_BEYOND_PERMISSIONS:
+            library.prctl(DROP_RIGHT, right, 0, 0, 0)
 
 
 def judge(call: Call, ending: Ending) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 # Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
-KINDS = ("problem", "input", "kill", "mechanism", "fault")
+KINDS = ("problem", "input", "kill", "mechanism", "fault", "permission", "log")
 
 # Time after which a case has failed [s]. It includes the time that a busy machine takes from it.
 TIME_LIMITS = {
@@ -16,6 +16,8 @@ TIME_LIMITS = {
     "kill": 300.0,
     "mechanism": 180.0,
     "fault": 60.0,
+    "permission": 180.0,
+    "log": 600.0,
 }
 
 

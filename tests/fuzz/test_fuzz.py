@@ -37,7 +37,14 @@ from tests.fuzz.workers import run_cases
 from tests.support.cli import write_experiment
 
 # Time of each kind in these tests [s]; no case begins later.
-SECONDS = {"problem": 8.0, "input": 8.0, "kill": 12.0, "mechanism": 8.0, "fault": 8.0}
+SECONDS = {
+    "problem": 8.0,
+    "input": 8.0,
+    "kill": 12.0,
+    "mechanism": 8.0,
+    "fault": 8.0,
+    "permission": 8.0,
+}
 
 
 @pytest.mark.slow

@@ -44,6 +44,8 @@ def run_case(case: Case, folder: Path) -> Outcome:
         "kill": kills.run,
         "mechanism": mechanism_problems.run,
         "fault": inputs.run,
+        "permission": inputs.run,
+        "log": inputs.run,
     }
     try:
         outcome = runs[case.kind](case, folder)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mjfim
+from mjfim.errors import WrongLogError
 from mjfim.experiment.system import System
 from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
@@ -53,6 +56,87 @@ def test_a_log_that_begins_elsewhere_is_fitted_and_said(
     true = np.array([2.0, 1.0, 1.0])
     assert np.all((low < true) & (true < high))
     assert 0.5 * (high[0] - low[0]) < widest * true[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("zero", [0.35, -0.2])
+def test_another_zero_of_an_encoder_is_named_with_the_line_that_cures_it(
+    experiment: mjfim.Experiment, zero: float
+) -> None:
+    """The log begins at rest, elsewhere by the zero; the equation of motion is too noisy for it."""
+    log = swung(experiment)
+    shifted = replace(log, y=log.y + zero * (np.array(log.outputs) == "qpos:hinge"))
+    with pytest.raises(WrongLogError, match="another zero of qpos:hinge") as error:
+        mjfim.identify(experiment, [shifted], progress=False)
+    line = str(error.value).partition("State in [recording.columns]: ")[2]
+    (column,) = tomllib.loads(line).items()
+    assert column[0] == "qpos:hinge"
+    assert column[1]["offset"] == pytest.approx(-zero, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_log_that_begins_elsewhere_and_misfits_is_fitted(
+    experiment: mjfim.Experiment, tmp_path: Path
+) -> None:
+    """A rail that rubs explains the residuals, and no zero does."""
+    text = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
+    robot = tmp_path / "robot.xml"
+    robot.write_text(text.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>'))
+    aside = {"keyframe": None, "qpos": (0.0, np.pi + 1.0)}
+    initial = experiment.initial.model_copy(update=aside)
+    made = experiment.model_copy(update={"initial": initial}).replace(model=str(robot))
+    estimate = mjfim.identify(experiment, [swung(made)], progress=False)
+    assert any("does not begin where [initial] says" in each for each in estimate.warnings)
+    assert "dry friction of slide" in estimate.causes[0]
+
+
+LEG = """
+<body name="{leg}" pos="{x} {y} 0">
+  <joint name="{leg}_hip" axis="0 1 0" damping="0.2" armature="0.01"/>
+  <inertial pos="0 0 -0.1" mass="0.6" diaginertia="3e-3 3e-3 4e-4"/>
+  <body name="{leg}_calf" pos="0 0 -0.2">
+    <joint name="{leg}_knee" axis="0 1 0" damping="0.2" armature="0.01"/>
+    <inertial pos="0 0 -0.1" mass="0.3" diaginertia="1e-3 1e-3 1e-4"/>
+  </body>
+</body>"""
+LEGS = {"FL": (0.2, 0.1), "FR": (0.2, -0.1), "RL": (-0.2, 0.1), "RR": (-0.2, -0.1)}
+
+
+@pytest.mark.slow
+def test_a_hanging_quadruped_whose_knees_are_bent_is_fitted(tmp_path: Path) -> None:
+    """Its model has straight legs; each of the four knees begins 1.1 rad away."""
+    legs = "".join(LEG.format(leg=leg, x=x, y=y) for leg, (x, y) in LEGS.items())
+    joints = [f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "knee")]
+    motors = "".join(f'<motor name="{each}" joint="{each}"/>' for each in joints)
+    (tmp_path / "quadruped.xml").write_text(
+        f"""<mujoco><option timestep="0.005" integrator="implicitfast"/>
+        <worldbody><body name="trunk" pos="0 0 1"><geom size="0.1" mass="5"/>{legs}</body>
+        </worldbody><actuator>{motors}</actuator></mujoco>""",
+        encoding="utf-8",
+    )
+    calves = [{"path": f"body/{leg}_calf:mass"} for leg in LEGS]
+    knees = [{"path": f"joint/{leg}_knee:damping"} for leg in LEGS]
+    stated = mjfim.Experiment(
+        model="quadruped.xml",
+        directory=tmp_path,
+        rate=200.0,
+        parameters={
+            "calf": {"targets": calves, "guess": 0.4, "true": 0.3},
+            "knee": {"targets": knees, "guess": 0.3, "true": 0.2, "bounds": [0.0, 5.0]},
+        },
+        noise={"state": 0.02},
+        fit={"bootstrap": 0},
+    )
+    t = 0.005 * np.arange(400)[:, None]
+    control = 0.8 * np.sin(2.0 * np.pi * (0.7 + 0.1 * np.arange(8)) * t)
+    robot = stated.replace(initial={"qpos": [0.0, -1.1] * 4})
+    estimate = mjfim.identify(stated, [mjfim.simulate(robot, control, 1)], progress=False)
+    assert estimate.success and not estimate.misfit
+    (said,) = [each for each in estimate.warnings if "does not begin where" in each]
+    assert all(f"{leg}_knee -1.1 rad" in said for leg in LEGS) and "hip -" not in said
+    low, high = estimate.interval.T
+    assert np.all((low < [0.3, 0.2]) & (high > [0.3, 0.2]))
+    assert np.all(high - low < 0.1 * np.array([0.3, 0.2]))
 
 
 def test_more_noise_than_stated_is_no_other_begin(experiment: mjfim.Experiment) -> None:

@@ -26,6 +26,16 @@ from tests.support.paths import MODELS
 pytestmark = pytest.mark.slow
 
 MULTISINE = {"kind": "multisine", "amplitude": 6.0, "frequency": 0.3, "harmonics": 5}
+PENDULUM = """<mujoco>
+  <option timestep="0.005" integrator="RK4"/>
+  <worldbody>
+    <body name="pole">
+      <joint name="hinge" axis="0 1 0" damping="0.05"/>
+      <inertial pos="0 0 -0.4" mass="0.6" diaginertia="0.008 0.008 0.0004"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>"""
 SHOULDER, ELBOW = ["qpos:shoulder", "qvel:shoulder"], ["qpos:elbow", "qvel:elbow"]
 
 
@@ -49,10 +59,11 @@ def logged(experiment: mjfim.Experiment, seed: int = 1) -> tuple[System, Recordi
     return system, simulate_system(system, DesignTask.of(system).initial, seed=seed)
 
 
-def refused(system: System, recording: Recording) -> str:
-    """What is said about a log; empty where it would be fitted."""
+def refused(system: System, recording: Recording, factors: tuple[float, ...] = (1.0,)) -> str:
+    """What is said about a log; empty where it would be fitted from factors of the guess."""
+    start = np.array(factors) * system.parameters.guess
     try:
-        refuse_gross_error(system, (align(system, recording),), system.parameters.guess)
+        refuse_gross_error(system, (align(system, recording),), start)
     except WrongLogError as error:
         return str(error)
     return ""
@@ -220,3 +231,32 @@ def test_clean_logs_of_other_robots_have_no_error(name: str, tmp_path: Path) -> 
         tables = {key: {"true": float(x)} for key, x in zip(stated.parameters, true, strict=True)}
         made = System.resolve(robot.replace(parameters=tables))
         assert refused(system, simulate_system(made, trajectory, seed=seed)) == ""
+
+
+FAR_OFF = [(0.32, 0.27, 0.13), (4.69, 0.15, 0.13), (3.39, 0.17, 5.59), (0.14, 0.13, 6.69)]
+
+
+@pytest.mark.parametrize("factors", FAR_OFF)
+def test_a_guess_that_is_far_off_is_no_error_of_the_log(
+    factors: tuple[float, ...], tmp_path: Path
+) -> None:
+    """A wrong length of a pendulum looks like a wrong scale of its torque, until it is fitted."""
+    (tmp_path / "pendulum.xml").write_text(PENDULUM, encoding="utf-8")
+    path = "body/pole:ipos[2]"
+    unknown: dict[str, Any] = {
+        "mass": {"target": "body/pole:mass", "bounds": [0.03, 12.0]},
+        "com": {"targets": [{"path": path, "scale": -1.0}], "bounds": [0.02, 8.0]},
+        "damping": {"target": "joint/hinge:damping", "bounds": [0.0025, 1.0]},
+    }
+    experiment = mjfim.Experiment(
+        model=str(tmp_path / "pendulum.xml"),
+        rate=100.0,
+        horizon=8.0,
+        noise={"qpos:hinge": 0.01},
+        parameters=unknown,
+        initial={"control": MULTISINE | {"amplitude": 1.2, "frequency": 0.4}},
+    )
+    system, recording = logged(experiment)
+    assert refused(system, recording, factors) == ""
+    wrong = with_ctrl(recording, lambda u: -0.1 * u)
+    assert "another sign or unit" in refused(system, wrong)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 
 import mjfim
 from mjfim.excitation.task import DesignTask
@@ -117,7 +118,66 @@ def test_a_bias_and_a_delay_are_found() -> None:
     assert biased.missing_terms[0].main.value == pytest.approx(0.03, rel=0.4)
     late = replace(clean, t=clean.t[2:] - clean.t[2], ctrl=clean.ctrl[2:], y=clean.y[:-2])
     lagging = mjfim.identify(experiment, [late])
-    assert "output:delay" in [s.path for s in lagging.missing_terms]
+    assert lagging.missing_terms[0].path == "output:delay"
+    assert "or a lag of force" in lagging.causes[0]
+    assert "which the log hardly tells apart" in lagging.causes[0]
+
+
+def test_the_move_by_an_unseen_term_is_that_of_least_squares(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is compared with differences of whole simulations and a plain linear fit."""
+    task = DesignTask.resolve(stated(horizon=4.0), threads=1)
+    system, theta = task.system, task.system.parameters.guess
+    tilt, size = "option:gravity[0]", 1e-4 * 9.81
+    candidates, _ = term_tests.candidates_of(system, np.ones(system.space.nv))
+    chosen = [each for each in candidates if each.tested[0].path == tilt]
+    monkeypatch.setattr(term_tests, "candidates_of", lambda *_: (chosen, []))
+    monkeypatch.setattr(term_tests, "LEAST_SAID_MOVE", 0.0)
+
+    extended = System.resolve(
+        stated(horizon=4.0).replace(parameters={"tilt": {"target": tilt, "scale": size}}), threads=1
+    )
+
+    def outputs(values: Array) -> Array:
+        """Readings in standard deviations, one after the other."""
+        y, _ = extended.plant.measure(np.array(values)[None], task.initial.ctrl)
+        return np.asarray(y[0] / extended.noise.sigma).ravel()
+
+    at = np.append(theta, 0.0)
+    steps = np.diag(np.append(1e-5 * theta, size))
+    J = np.array([(outputs(at + step) - outputs(at - step)) / (2.0 * step.max()) for step in steps])
+    own, of_tilt = J[:-1].T, J[-1]
+    move, *_ = np.linalg.lstsq(own, of_tilt, rcond=None)
+    left = np.linalg.norm(of_tilt - own @ move)
+    missed = (-scipy.special.ndtri(0.5e-3) + scipy.special.ndtri(0.95)) / left
+    expected = np.abs(missed * move) / theta
+
+    exact = system.plant.measure(theta[None], task.initial.ctrl)[0][0]
+    log = Recording(
+        t=system.dt * np.arange(len(exact)),
+        ctrl=task.initial.ctrl,
+        y=exact + 1e-3 * system.noise.sample(len(exact), np.random.default_rng(0)),
+        outputs=system.outputs.names,
+    )
+    problem = FitTask.of(system, [log]).problem()
+    data = find_missing_terms(problem, [log], problem.begin(theta)).data
+    assert data is not None and data.unseen
+    for name, (share, words) in data.unseen:
+        assert words == "a tilt of the base along x"
+        index = system.parameters.names.index(name)
+        assert share == pytest.approx(expected[index], rel=1e-2)
+        assert f"{name} by {100 * share:.2g} %" in data.unseen_sentence
+
+
+def test_a_term_for_which_a_parameter_stands_moves_nothing() -> None:
+    """A mass that is a parameter hides a payload at the same place."""
+    system = System.resolve(stated(horizon=4.0), threads=1)
+    log = logs_of(stated(horizon=4.0), 0)[0]
+    problem = FitTask.of(system, [log]).problem()
+    data = find_missing_terms(problem, [log], problem.begin(system.parameters.true)).data
+    assert data is not None
+    assert "payload" not in data.unseen_sentence
 
 
 def played_with_feedback(task: DesignTask, gain: float, seed: int) -> Recording:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.output.archive import write_recording
+from tests.support.cli import run
 
 PENDULUM = """
 <mujoco>
@@ -66,3 +69,50 @@ def test_an_identified_inertia_is_physical(
     found = mjfim.identify(experiment, [log], progress=False)
     assert not System.resolve(experiment).impossible(found.theta)
     assert "piece" in found.at_bound
+
+
+# Unknowns of a body, and a body whose moments they cannot have: the fit ends at one that is.
+UNKNOWNS = {
+    "ten barycentric numbers": """
+[parameters.body]
+inertial = "pendulum"
+coordinates = "barycentric"
+""",
+    "mass with centre": """
+[parameters.mass]
+target = "body/pendulum:mass"
+bounds = [0.01, 10.0]
+[parameters.centre]
+target = "body/pendulum:ipos[2]"
+bounds = [-1.0, 0.0]
+[parameters.moment]
+target = "body/pendulum:inertia[1]"
+bounds = [0.0, 1.0]
+""",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", UNKNOWNS)
+def test_the_identified_file_is_accepted_by_mujoco(tmp_path: Path, name: str) -> None:
+    """A and B are at least C; the parameters share no prior, and the log is noisy and short."""
+    text = EXPERIMENT.partition("[parameters.piece]")[0] + UNKNOWNS[name]
+    noise = "\n[noise]\nstate = 0.05\n\n[fit]\nbootstrap = 0\n"
+    file, log_file = tmp_path / "pendulum.toml", tmp_path / "log.csv"
+    file.write_text(text + noise, encoding="utf-8")
+    (tmp_path / "pendulum.xml").write_text(PENDULUM.format(xx=0.01, zz=5e-4), encoding="utf-8")
+    control = 1.5 * np.sin(0.02 * np.arange(300))[:, None]
+    system = System.resolve(mjfim.Experiment.from_file(file))
+
+    # The robot is a point mass at the tip of a rod, with a moment at the centre of almost nothing.
+    robot = PENDULUM.format(xx=2e-6, zz=2e-6).replace(" 0.01 ", " 1e-6 ")
+    (tmp_path / "pendulum.xml").write_text(robot, encoding="utf-8")
+    log = mjfim.simulate(mjfim.Experiment.from_file(file), control, 3)
+    write_recording(log_file, log, system)
+    (tmp_path / "pendulum.xml").write_text(PENDULUM.format(xx=0.01, zz=5e-4), encoding="utf-8")
+    run("identify", file, log_file, "-o", tmp_path / "fit")
+
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "fit" / "identified.xml"))
+    moments = np.sort(model.body_inertia[model.body("pendulum").id])
+    assert model.body_mass[model.body("pendulum").id] > 0.0
+    assert moments[0] >= 0.0 and moments[0] + moments[1] >= moments[2] * (1.0 - 1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,23 @@ import pytest
 import scipy
 
 import mjfim
-from mjfim.experiment.system import System
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.assessment import term_tests
-from mjfim.identification.assessment.term_tests import equivalent_sigmas, find_missing_terms
+from mjfim.identification.assessment.term_candidates import Candidate, candidates_of
+from mjfim.identification.assessment.term_tests import (
+    equivalent_sigmas,
+    find_missing_terms,
+    with_names,
+)
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.search import FitTask
 from mjfim.identification.segments import KnownActivations
 from mjfim.model.terms.library import KINDS
-from mjfim.studies.selected_models import selected_term
+from mjfim.records.terms import Term, TermNumber
 from mjfim.studies.selection import SIMILAR_SHARE
+from tests.support.paths import MODELS
 from tests.support.terms import (
     EXAMPLES,
     experiment_of,
@@ -148,17 +157,102 @@ def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind
     # Score tests are linear, so that a selection of terms compares fits with the first ones.
     compared = [t for t in found if t.sigmas**2 >= SIMILAR_SHARE * found[0].sigmas ** 2]
     first = next(term for term in compared if term.path == MISSED[kind])
-    ((name, stated_table),) = first.tables.items()
+    (stated_table,) = first.tables.values()
     assert stated_table["kind"] == kind
     assert first.source in KINDS[kind].sources
 
     # What the term needs can be added as it is said.
-    term = selected_term(first, system.parameters.names)
+    term = with_names(first, system.parameters.names)
     extended = System.resolve(stated.replace(parameters=term.parameters, terms=term.tables))
     assert set(term.parameters) < set(extended.parameters.names)
-    table, *targets = first.recipe.split("; ")
-    assert tomllib.loads(table)["terms"][name]["kind"] == kind
-    assert tomllib.loads(targets[0]) == {"target": first.path}
+    added = tomllib.loads(first.recipe)
+    assert added == {"terms": term.tables, "parameters": term.parameters}
+
+
+# One candidate of each kind for the cart-pendulum, by its target.
+CURES = {
+    "joint/slide:frictionloss": "slide_frictionloss",
+    "joint/hinge:armature": "hinge_armature",
+    "actuator/force:gainprm[0]": "force_gainprm_0",
+    "option:gravity[0]": "option_gravity_0",
+    "output/qpos:hinge:bias": "qpos_hinge_bias",
+    "output/qvel:slide:scale": "qvel_slide_scale",
+    "output:delay": "output_delay",
+    "term/slide_asymmetric_friction:offset": "slide_asymmetric_friction_offset",
+    "term/force_actuator_lag:time_constant": "force_actuator_lag_time_constant",
+    "term/pendulum_payload:mass": "pendulum_payload_mass",
+}
+
+
+def as_found(candidate: Candidate) -> Term:
+    """A candidate as a test would name it, of its own size."""
+    numbers = tuple(
+        TermNumber(path=each.path, value=each.size, unit=each.unit, scale=each.size, is_size=True)
+        for each in candidate.tested
+    )
+    return Term(
+        description=candidate.description,
+        numbers=(*numbers, *candidate.further),
+        tables=candidate.tables,
+    )
+
+
+def cart_file(folder: Path) -> tuple[Path, Path]:
+    """An experiment file of the cart-pendulum, and the model of a robot that rubs."""
+    text = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
+    robot = folder / "robot.xml"
+    robot.write_text(text.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>'))
+    file = folder / "cart.toml"
+    stated = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
+    file.write_text(stated.replace('"cart_', f'"{MODELS}/cart_'), encoding="utf-8")
+    return file, robot
+
+
+@pytest.mark.parametrize("path", CURES)
+def test_the_lines_of_a_cure_are_valid_at_the_end_of_the_file(tmp_path: Path, path: str) -> None:
+    """They are appended as they are printed, and a fit with them begins."""
+    file, robot = cart_file(tmp_path)
+    experiment = mjfim.Experiment.from_file(file).replace(model=str(robot))
+    system = System.resolve(experiment, threads=1)
+    candidates, _ = candidates_of(system, np.ones(system.space.nv))
+    candidate = next(each for each in candidates if each.tested[0].path == path)
+    term = with_names(as_found(candidate), system.parameters.names)
+
+    with file.open("a", encoding="utf-8") as text:
+        text.write(term.recipe)
+    cured = mjfim.Experiment.from_file(file).replace(model=str(robot))
+    assert set(cured.parameters) - set(experiment.parameters) == set(term.parameters)
+    assert CURES[path] in cured.parameters
+    assert all(spec.scale for name, spec in cured.parameters.items() if name in term.parameters)
+
+    log = simulate_system(system, DesignTask.of(system).initial, seed=0)
+    task = FitTask.of(System.resolve(cured, threads=1), [log.first_rows(100)])
+    problem = task.problem()
+    condensed = problem.condense(problem.begin(task.start))
+    assert condensed is not None
+    column = condensed.information()[:, task.system.parameters.names.index(CURES[path])]
+    assert np.isfinite(column).all()
+
+
+@pytest.mark.slow
+def test_a_fit_with_the_lines_of_a_cure_explains_the_log(tmp_path: Path) -> None:
+    """The cart-pendulum rubs; the lines under the verdict make its model complete."""
+    file, robot = cart_file(tmp_path)
+    quick = 'control = { kind = "multisine", amplitude = 4.0, frequency = 0.4, harmonics = 6 }'
+    text = file.read_text(encoding="utf-8").replace("horizon = 4.0", "horizon = 2.0")
+    file.write_text(re.sub("control = .*csv.*", quick, text), encoding="utf-8")
+    experiment = mjfim.Experiment.from_file(file)
+    rubbing = System.resolve(experiment.replace(model=str(robot)))
+    log = simulate_system(rubbing, DesignTask.of(rubbing).initial, seed=0)
+    before = mjfim.identify(experiment, [log], progress=False)
+    assert before.misfit
+
+    lines = before.causes[0].partition(":\n")[2]
+    file.write_text(file.read_text(encoding="utf-8") + lines, encoding="utf-8")
+    after = mjfim.identify(mjfim.Experiment.from_file(file), [log], progress=False)
+    assert after.success and not after.misfit
+    low, high = after.interval[after.parameters.index("slide_frictionloss")]
+    assert low < 0.5 < high
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,11 @@ from mjfim.identification.assessment.term_tests import (
     TermTests,
     find_missing_terms,
     first_terms,
+    with_names,
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
-from mjfim.studies.selected_models import selected_term
 from tests.support.numerics import Array
 from tests.support.terms import solution_near
 
@@ -119,11 +120,12 @@ def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: 
     # The recipe names what to add at the first joint, and the others.
     leader, *others = first.joints
     assert f'target = "term/{leader}_stribeck:speed"' in first.recipe
-    assert first.recipe.endswith(f"the same for {', '.join(others)}")
+    assert first.recipe.endswith(f"# The same for {', '.join(others)}.")
+    assert len(tomllib.loads(first.recipe)["parameters"]) == 2
     assert f"{others[0]}_stribeck" not in first.recipe
 
     # What the term needs can be added as one.
-    term = selected_term(first, ())
+    term = with_names(first, ())
     extended = System.resolve(experiment.replace(parameters=term.parameters, terms=term.tables))
     assert len(term.parameters) == 6
     assert set(term.parameters) < set(extended.parameters.names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -75,3 +76,61 @@ def test_a_fit_is_not_trapped_where_a_touch_comes_or_goes(
     assert found.success and not found.misfit
     assert ((found.interval[:, 0] < TRUE) & (found.interval[:, 1] > TRUE)).all()
     assert any("stops or contacts act: limit of j2" in each for each in found.warnings)
+
+
+HAMMER = """
+<mujoco model="hammer">
+  <option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody>
+    <geom name="anvil" type="box" pos="0.3 0.2 0" size="0.1 0.05 0.1"/>
+    <body name="arm">
+      <inertial pos="0.15 0 0" mass="1.5" diaginertia="0.001 0.015 0.015"/>
+      <joint name="pivot" type="hinge" axis="0 0 1" damping="0.3"/>
+      <geom name="head" type="sphere" pos="0.3 0 0" size="0.03" mass="0.001"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="pivot"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.slow
+def test_a_contact_without_any_stop_is_found_and_named(tmp_path: Path) -> None:
+    """An arm strikes an anvil and comes back; no joint has a range."""
+    (tmp_path / "hammer.xml").write_text(HAMMER, encoding="utf-8")
+    parameters = {
+        "mass": {"target": "body/arm:mass", "guess": 2.0, "true": 1.5, "bounds": [0.1, 9.0]},
+        "damping": {
+            "target": "joint/pivot:damping",
+            "guess": 0.4,
+            "true": 0.3,
+            "bounds": [0.0, 5.0],
+        },
+    }
+    experiment = mjfim.Experiment(
+        model="hammer.xml",
+        directory=tmp_path,
+        rate=500.0,
+        parameters=parameters,
+        noise={"state": 0.02},
+        fit={"bootstrap": 0},
+    )
+    t = 0.002 * np.arange(1500)[:, None]
+    control = 0.35 * np.sin(2.0 * np.pi * 0.6 * t)
+    log = mjfim.simulate(experiment, control, 1)
+
+    # Plain MuJoCo says in how many samples the head touches the anvil.
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "hammer.xml"))
+    data, touched = mujoco.MjData(model), 0
+    for u in control:
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data)
+        touched += bool(data.ncon)
+    assert 0 < touched < 300
+
+    found = mjfim.identify(experiment, [log], progress=False)
+    assert found.success and not found.misfit
+    true = np.array([1.5, 0.3])
+    assert ((found.interval[:, 0] < true) & (found.interval[:, 1] > true)).all()
+    (said,) = [each for each in found.warnings if "stops or contacts act" in each]
+    assert "contact " in said and "limit of" not in said

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjfim.errors import ModelError
 from mjfim.output.export.mjcf import identified_files, write_identified
 from tests.output.test_mjcf import assert_is_identified_model, changes, system_of
 from tests.support.contents import contents
@@ -214,6 +215,27 @@ def test_nothing_is_left_where_the_text_cannot_express_the_value(
     assert os.listdir(new.parent) == ["identified.xml"]
     model = mujoco.MjModel.from_xml_path(str(new))
     assert model.body("hand").pos[0] == 0.25
+
+
+def test_a_mesh_that_is_edited_meanwhile_is_told(robot: Path, tmp_path: Path) -> None:
+    """The written model reads it again; until then, the loaded one counts."""
+    system = system_of(robot, tmp_path, "joint/elbow:armature")
+    path, theta = tmp_path / "identified.xml", np.array([0.02])
+    loaded = system.source.edited(None, b"before", lambda spec: None)
+
+    # This edit changes no number.
+    mesh = robot.parent / "meshes" / "block.obj"
+    mesh.write_text(f"# edited\n{mesh.read_text()}")
+    (remark,) = write_identified(path, system, theta)
+    assert "block.obj changed while this ran" in remark
+
+    path.unlink()
+    mesh.write_text(tetrahedron(0.3))
+    compiled = system.source.edited(None, b"after", lambda spec: None)
+    assert compiled.body_mass.tolist() == loaded.body_mass.tolist()
+    with pytest.raises(ModelError, match=r"block\.obj changed while this ran"):
+        write_identified(path, system, theta)
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("edited", ["robot.xml", "parts/arm.xml"])

@@ -548,15 +548,21 @@ FOLLOWING = {"actuator_acc0", "body_invweight0", "body_subtreemass", "dof_M0", "
 FOLLOWING |= {"dof_length", "geom_aabb", "geom_rbound", "light_poscom0"}
 
 
-def test_only_the_identified_values_differ(tmp_path: Path) -> None:
-    """All arrays of MjModel are compared; a negative mass is named, and nothing is written."""
-    system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+@pytest.mark.parametrize("limits", [{}, {"clearance": 0.01, "floor": -3.0}])
+def test_only_the_identified_values_differ(limits: dict[str, float], tmp_path: Path) -> None:
+    """All arrays of MjModel are compared; a negative mass is named, and nothing is written.
+
+    A floor that only the experiment states is no part of the model.
+    """
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    system = System.resolve(experiment.replace(limits=limits))
+    stated = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
     path = tmp_path / "deep" / "identified.xml"
     assert write_identified(path, system, np.array([2.3456789, 1.2345678, 0.7654321])) == []
     found = mujoco.MjModel.from_xml_path(str(path))
     changed = set()
     for name in dir(found):
-        a, b = getattr(found, name), getattr(system.model, name)
+        a, b = getattr(found, name), getattr(stated, name)
         if isinstance(a, np.ndarray) and not np.allclose(a, b, rtol=1e-12, atol=1e-15):
             changed.add(name)
     assert changed - FOLLOWING == IDENTIFIED

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
-from mjfim.output.page import Emphasis, Level, Listing, Row, Table, named, number
+from mjfim.output.page import Emphasis, Level, Listing, Row, Table, Verdict, named, number
 from mjfim.output.pages import page_of
 from mjfim.output.pages.estimate import selection_parts
 from mjfim.output.rerun.documents import as_markdown
+from mjfim.output.terminal import TerminalPage
 from mjfim.output.words import improvement, relative
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import CampaignStatus
-from mjfim.records.design import CombinationAccuracy
+from mjfim.records.check import verdict_of_check
+from mjfim.records.design import CombinationAccuracy, LimitViolation, ScaledStart, Status
 from mjfim.records.terms import (
     AlternativeTerm,
     Decision,
@@ -59,6 +63,25 @@ def test_a_record_without_page_is_refused() -> None:
 
 
 BROKEN: dict[str, Any] = {"margins": np.vstack([[0.1, 0.1], np.full((20, 2), [-0.5, 0.1])])}
+UNSTABLE: dict[str, Any] = {"margins": 3.0 * BROKEN["margins"], "growth": 70.0}
+# Eleven of the robots reach the clamp of a force, and one breaks a limit besides.
+CLAMPED: dict[str, Any] = {
+    "limits": tuple(replace(limit, kind="joint_force") for limit in results.rehearsal().limits[:1]),
+    "margins": np.array([0.4, *[0.0] * 11, *[0.4] * 9])[:, None],
+}
+ALONE: dict[str, Any] = {
+    name: getattr(results.rehearsal(), name)[:1]
+    for name in (
+        *("theta", "margins", "speed", "acceleration", "end_speed", "travel"),
+        *("lowest", "end_height", "nearest", "in_contact", "at_stop"),
+    )
+}
+# A search that ended at its budget where it began, but for the last digit of its control.
+START = results.evaluation(0.1, 50)
+MOVED = replace(
+    START, trajectory=replace(START.trajectory, ctrl=np.nextafter(START.trajectory.ctrl, np.inf))
+)
+STOPPED: dict[str, Any] = {"status": Status.MAX_ITERATIONS, "improvement": 0.048}
 LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
 
 
@@ -73,6 +96,7 @@ LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
         ("identify", {"success": False, "status": "stopped early"}, Level.BAD, "stopped early."),
         ("identify", {"success": False, "combinations": ("a b",)}, Level.BAD, "combination only"),
         ("check", {}, Level.GOOD, "σ of 2 %"),
+        ("check", {"rehearsal": results.rehearsal(**UNSTABLE)}, Level.DOUBTFUL, "σ of 2 %"),
         ("check", {"refused": ("too long",), "verdict": ("a b",)}, Level.DOUBTFUL, "A b."),
         ("compare", {}, Level.GOOD, "The design is the best"),
         ("montecarlo", {}, Level.GOOD, "scatter as predicted"),
@@ -81,6 +105,15 @@ LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
         ("rehearse", {"lowest": np.full(21, -0.2)}, Level.BAD, "20 pass through the floor"),
         ("design", {"rehearsal": results.rehearsal(**BROKEN)}, Level.BAD, "Do not play"),
         ("design", {"rehearsal": None}, Level.DOUBTFUL, "not rehearsed"),
+        ("rehearse", CLAMPED, Level.DOUBTFUL, "only 9 of 20 robots reach no clamp (joint force"),
+        ("rehearse", CLAMPED, Level.DOUBTFUL, "20 of 20 robots whose"),
+        ("design", {"rehearsal": results.rehearsal(**CLAMPED)}, Level.DOUBTFUL, "only 9 of 20"),
+        ("rehearse", ALONE, Level.DOUBTFUL, "no robot that differs from the model was rehearsed"),
+        ("design", {"rehearsal": results.rehearsal(**ALONE)}, Level.DOUBTFUL, "no robot that"),
+        ("rehearse", {**ALONE, "margins": np.array([[-0.2, 0.4]])}, Level.BAD, "The model leaves"),
+        ("design", {"final": MOVED, **STOPPED}, Level.DOUBTFUL, "no better than its start"),
+        ("design", {"final": MOVED}, Level.GOOD, "It is no better than its start."),
+        ("design", {"final": results.evaluation(0.103, 50), **STOPPED}, Level.GOOD, "Ready"),
         ("design", {"final": results.evaluation(0.01, 50)}, Level.DOUBTFUL, "less than its start"),
         ("campaign", {}, Level.GOOD, "Reached"),
         ("campaign", {"status": CampaignStatus.INFEASIBLE}, Level.BAD, "No design keeps"),
@@ -299,3 +332,125 @@ def test_the_tables_to_keep_state_the_selected_experiment() -> None:
     assert "# in place of [parameters.d1], [parameters.d2]" in listing.items[-2]
     # The lines fit into a terminal, so that none is folded.
     assert max(len(line) for item in listing.items for line in item.split("\n")) < 76
+
+
+def test_a_start_outside_its_limits_is_equal_to_its_scaled_control() -> None:
+    """Where the initial control leaves limits, the share that keeps them counts."""
+    violation = LimitViolation(
+        kind="position", name="hinge", since=0.1, t=0.2, value=2.0, lower=-1.0, upper=1.0
+    )
+    scaled = ScaledStart(share=0.5, cost=1.01, min_eigenvalue=0.99)
+    outside = {"initial_violations": (violation,), **STOPPED}
+    for start, is_equal in ((scaled, True), (replace(scaled, min_eigenvalue=0.9), False)):
+        design = results.design(scaled_start=start, **outside)
+        assert (design.is_start, design.sound) == (is_equal, not is_equal)
+    assert not results.design(**outside).is_start
+
+
+def test_a_design_that_stops_at_its_budget_is_ready_in_its_short_form() -> None:
+    """What the search did is a detail where the motion can be played."""
+    page = page_of(results.design(**STOPPED))
+    assert page.verdict.level is Level.GOOD
+    short, complete = (printed(page, verbose=verbose) for verbose in (False, True))
+    for words in ("improving by 4.8 %", "raise it or start from this one"):
+        assert words not in short and words in complete
+
+
+def test_what_nothing_limits_and_every_end_in_motion_is_said() -> None:
+    """The largest of each unit, and all joints that move at the end, the fastest one first."""
+    joints = ("cart", "lift", "hinge")
+    rows = np.ones((21, 1))
+    rehearsal = results.rehearsal(
+        joints=joints,
+        units=("m/s", "m/s", "rad/s"),
+        speed=rows * np.array([2.0, 1.0, 3.0]),
+        acceleration=np.zeros((21, 3)),
+        end_speed=rows * np.array([0.56, 0.015, 0.85]),
+        travel=np.vstack([np.full((20, 3), 0.1), [0.8, 0.2, 2.1]]),
+        unlimited=("hinge",),
+        unplaced=joints,
+    )
+    text = page_of(rehearsal).verdict.text
+    places = "up to 2.1 rad (hinge) and 0.8 m (cart) from the start."
+    assert f"3 positions have no limit, {places}" in text
+    assert "1 speed has no limit, up to 3 rad/s (hinge)." in text
+    assert "It ends in motion: hinge at 0.85 rad/s, cart at 0.56 m/s." in text
+    resting = replace(rehearsal, end_speed=0.01 * rehearsal.speed, unlimited=(), unplaced=())
+    text = page_of(resting).verdict.text
+    assert text.endswith("It ends at rest.") and "no limit" not in text
+
+
+FALLEN = {"lowest": np.full(21, -0.2)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (FALLEN, "ranges of `position`"),
+        ({**FALLEN, "has_floor": False}, '`<geom type="plane" size="0 0 1"/>`'),
+        ({**BROKEN, "growth": 5.1}, "`reserve = {"),
+        ({**BROKEN, "margins": BROKEN["margins"] * 3.0, "growth": 4.9}, "`reserve = {"),
+        (UNSTABLE, "grow 70-fold"),
+        ({"unbraked": {"slide": 20}, "end_speed": np.ones((21, 2))}, 'end = "rest"'),
+        ({"end_height": np.full(21, np.nan)}, "a `prior` of each parameter"),
+    ],
+)
+def test_a_cure_stands_before_the_command_to_design_again(
+    changes: dict[str, Any], words: str
+) -> None:
+    """By cause: no floor, differences that grow, an end in motion, too little room."""
+    rehearsal = results.rehearsal(**changes)
+    assert not rehearsal.is_safe
+    for result in (rehearsal, results.design(rehearsal=rehearsal)):
+        first, *others = page_of(result, experiment="arm.toml").next_steps
+        assert words.removeprefix("`") in first and "mjfim design" not in first
+        assert others[-1] == "Then design again: `mjfim design arm.toml -o arm-design`."
+
+
+def test_robots_that_were_not_asked_for_are_not_counted() -> None:
+    text = printed(page_of(results.rehearsal(**ALONE)), verbose=True)
+    assert "0 of 0" not in text and "worst robot" not in text
+    low = results.rehearsal(lowest=np.full(21, -1.28), floor=-np.inf)
+    text = printed(page_of(low), verbose=True)
+    assert "lowest point 1.28 m below the origin of the world" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "Design a motion that a robot can play: `mjfim design my.toml -o my-design`"),
+        ({"repetitions": 4}, "Design a motion that tells more: `mjfim design my.toml -o"),
+        ({"is_start": False, "rehearsal": results.rehearsal()}, "`mjfim export made --to player"),
+        ({"is_start": False}, "Estimate the parameters: `mjfim identify my.toml RECORDING -o"),
+        ({"rehearsal": results.rehearsal()}, "Design a motion that a robot can play"),
+        ({"rehearsal": results.rehearsal(**FALLEN)}, "Keep the robot above the floor"),
+    ],
+)
+def test_the_step_after_a_check_agrees_with_its_findings(
+    changes: dict[str, Any], words: str
+) -> None:
+    """Nothing more is needed, or a motion that tells more; never both."""
+    changes = dict(changes)
+    check = results.check()
+    rows = [replace(row, repetitions=changes.get("repetitions", 1)) for row in check.rows]
+    changes.pop("repetitions", None)
+    check = replace(check, rows=tuple(rows), verdict=(), **changes)
+    check = replace(check, verdict=tuple(verdict_of_check(check)))
+    page = page_of(check, experiment="my.toml", design=Path("made"))
+    assert words in page.next_steps[0]
+    text = printed(page, verbose=True)
+    assert not ("nothing more is needed" in text and "tells more" in text)
+    assert "--design" not in text
+    if check.is_start:
+        margins = "Margins of the limits" in printed(page)
+        assert margins is check.is_dangerous
+
+
+def test_the_level_of_a_verdict_has_a_colour() -> None:
+    """Red, amber and plain on a terminal."""
+    for level, code in ((Level.GOOD, "1"), (Level.DOUBTFUL, "1;33"), (Level.BAD, "1;31")):
+        page = replace(page_with(), verdict=Verdict("Done.", level))
+        console = Console(force_terminal=True, color_system="standard", width=80)
+        with console.capture() as capture:
+            console.print(TerminalPage(page))
+        assert f"\x1b[{code}mDone." in capture.get()

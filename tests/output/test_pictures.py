@@ -28,7 +28,7 @@ from mjfim.output.plots.design import (
 )
 from mjfim.output.plots.draw import figure_of, log_ticks, plain_number, save
 from mjfim.output.plots.estimate import fit, parameter_intervals
-from mjfim.output.plots.estimate_studies import selection
+from mjfim.output.plots.estimate_studies import pairs, selection
 from mjfim.output.plots.pictures import draw, picture_names
 from mjfim.output.plots.studies import check, histogram
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
@@ -430,3 +430,20 @@ def test_pictures_need_no_matplotlib_and_figures_no_pyplot() -> None:
     pattern = re.compile(r"^(import|from) matplotlib", re.MULTILINE)
     importers = [p.name for p in package.rglob("*.py") if pattern.search(p.read_text())]
     assert importers == ["draw.py"]
+
+
+def test_a_fixed_parameter_is_in_no_pair() -> None:
+    """A parameter at its guess without a standard deviation has no ellipse and warns of nothing."""
+    covariance = np.diag([0.0, 1e-4, 4e-4])
+    values = np.array([1.0, 2.0, 3.0])
+    picture = pairs(
+        ["a", "b", "c"],
+        ["", "", ""],
+        values,
+        covariance,
+        "estimate",
+        guess=values,
+        title="",
+        note="",
+    )
+    assert len(picture.panels) == 3  # b, c, and both

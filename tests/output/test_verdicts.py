@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from html import unescape
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mjfim.output.page import Level
+from mjfim.output.page import Level, as_sentence
 from mjfim.output.pages import page_of
 from mjfim.output.plots.pictures import pictures_of
+from mjfim.output.report import as_html
 from mjfim.output.words import relative
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.check import verdict_of_check
@@ -140,6 +142,32 @@ def test_an_accuracy_is_missed_only_where_one_was_wanted(
     assert (page.verdict.level is Level.GOOD) is not stated
 
 
+# σ over the size of a parameter -> what a design that predicts it says; None for a green box.
+DETERMINED = {
+    0.01: None,
+    0.12: None,
+    0.13: "it hardly determines length: σ is 13 % of its size",
+    0.23: "it hardly determines length: σ is 23 % of its size",
+    0.26: "it does not determine length: σ is 26 % of its size",
+    0.8: "it does not determine length: σ is 80 % of its size",
+}
+
+
+@pytest.mark.parametrize("share", DETERMINED)
+def test_a_design_and_a_fit_agree_on_what_is_determined(share: float) -> None:
+    std = THETA * [0.01, share, 0.01]
+    steps = results.finite_steps(predicted=std)
+    design = results.design(rehearsal=results.rehearsal(steps=steps))
+    verdict = page_of(replace(design, final=replace(design.final, std=std))).verdict
+    words = DETERMINED[share]
+    assert verdict.level is (Level.GOOD if words is None else Level.DOUBTFUL)
+    assert (words or "determines every parameter") in verdict.text
+
+    fit = page_of(results.estimate(std=std)).verdict.text
+    is_undetermined = "does not determine" in verdict.text
+    assert ("except length (not determined)" in fit) == is_undetermined
+
+
 def test_what_is_not_determined_has_no_green_box() -> None:
     check = results.check()
     rows = (replace(check.rows[0], relative=4.0, std=4.0 * check.rows[0].size), *check.rows[1:])
@@ -194,6 +222,23 @@ def test_the_cause_stands_under_the_verdict_with_the_command_that_cures_it(tmp_p
         f"'{folder}'-identify`"
     )
     assert command in lines[1]
+    # What a misfit asks for comes before more data, even where parameters are poorly known.
+    assert page_of(cause(sloppy=("length",))).next_steps[0] == (
+        "Decide what the model lacks: `mjfim identify EXPERIMENT logs/swing.csv --held-out "
+        "logs/new.csv --select -o FOLDER`."
+    )
+    assert "tells more" not in " ".join(page_of(cause(sloppy=("length",))).next_steps)
+
+
+def test_the_lines_of_a_cure_stay_lines_everywhere() -> None:
+    """They are copied from a terminal, a notebook or a report into the experiment file."""
+    lines = '[parameters.slide_frictionloss]\ntarget = "joint/slide:frictionloss"\nscale = 0.33'
+    text = f"the model may lack friction. Add at the end of the experiment file:\n{lines}"
+    estimate = cause(causes=(text,), warnings=(text,), details=())
+    assert lines in printed(page_of(estimate), 200)
+    assert as_sentence(text).endswith(lines)
+    html = unescape(as_html(estimate)).replace("<br>", "\n")
+    assert f"{lines}</p>" in html
 
 
 def test_at_most_three_remarks_are_shown_before_verbose() -> None:

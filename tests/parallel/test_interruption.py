@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 import subprocess
 import sys
@@ -228,3 +229,64 @@ def test_two_presses_end_work_that_does_not_return() -> None:
     assert ended.returncode == module.INTERRUPTED_CODE, ended.stderr
     assert ended.stdout.splitlines() == [module.FIRST_SENTENCE, module.LAST_SENTENCE]
     assert not ended.stderr
+
+
+# A program whose work lets threads run, but calls no handler of Python until it ends after minutes,
+# as MuJoCo's compile of a large model. It begins a file before, and is pressed during an import, or
+# by another thread during the work.
+IN_C = """
+import hashlib
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import nullcontext
+
+from mjfim.files import replacing
+from mjfim.parallel import budget as interruption
+
+interruption.LAST_SECONDS = 0.3
+where, count = sys.argv[1], int(sys.argv[2])
+
+
+def press():
+    for _ in range(count):
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+with interruption.Interruption(lambda text: print(text, flush=True)), replacing("result.csv"):
+    if where == "importing":
+        import pressed
+    else:
+        threading.Thread(target=press).start()
+    with interruption.stop_on_interrupt() if where == "computing" else nullcontext():
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+"""
+
+
+@pytest.mark.parametrize(
+    ("where", "presses", "said"),
+    [
+        ("reading", 1, [module.NOTHING_SENTENCE]),
+        ("importing", 1, [module.NOTHING_SENTENCE]),
+        ("computing", 2, [module.FIRST_SENTENCE, module.LAST_SENTENCE]),
+    ],
+)
+def test_code_that_calls_no_handler_is_ended(
+    where: str, presses: int, said: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "pressed.py").write_text(PRESSED.replace("SIGINT", "SIGTERM"))
+    ended = subprocess.run(
+        [sys.executable, "-c", IN_C, where, str(presses)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+        check=False,
+        timeout=60.0,
+    )
+    assert (ended.returncode, ended.stderr) == (module.INTERRUPTED_CODE, "")
+    assert ended.stdout.splitlines() == said
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".csv"] == []

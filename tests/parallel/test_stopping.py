@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,11 @@ import pytest
 
 import mjfim
 from mjfim import parallel as workers
+from mjfim.cli.common import Run
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.parallel import dispatch
-from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.parallel.budget import Budget, Interruption, StopToken, stop_on_interrupt
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 from tests.support.cli import names, read, write_experiment
@@ -122,6 +124,24 @@ def test_the_work_of_a_killed_worker_is_done_again(tmp_path: Path) -> None:
         assert pool.submit(identity).result(timeout=30.0) != os.getpid()
 
 
+@pytest.mark.parametrize("is_stopped", [False, True])
+def test_a_run_that_is_stopped_blames_nobody_for_the_end_of_a_worker(
+    is_stopped: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A signal to the group ends the workers that wait for work, too."""
+    with Interruption(lambda _: None) as interruption:
+        interruption.keep()
+        with Run(output=tmp_path).workers(processes=2) as started:
+            process = started.submit(identity).result()
+            if is_stopped:
+                signal.raise_signal(signal.SIGTERM)
+            os.kill(process, signal.SIGTERM)
+            with suppress(BrokenExecutor):
+                while started.submit(identity).result() == process:
+                    time.sleep(0.1)
+    assert (workers.LOST_SENTENCE in capsys.readouterr().err) is not is_stopped
+
+
 @pytest.mark.slow
 def test_an_interrupted_design_keeps_the_results_of_its_workers(
     tmp_path: Path, pool: mjfim.Pool
@@ -212,6 +232,7 @@ def test_signals_on_the_command_line_reach_all_processes_and_leave_the_best(
                 os.killpg(p.pid, signal.SIGKILL)
     assert p.returncode == 1, told
     assert "Traceback" not in told
+    assert workers.LOST_SENTENCE not in told
     data = read(tmp_path / "out" / "design.json")
     assert data["status"] == "interrupted"
     assert "out" in names(tmp_path)

@@ -79,3 +79,11 @@ def test_table_must_cover_the_horizon(read: Read) -> None:
     assert len(read(columns, 30, 0.01)) == 30
     with pytest.raises(RecordingError, match="too few rows"):
         read(columns, 31, 0.01)
+
+
+def test_another_format_is_refused_by_its_name(tmp_path: Path) -> None:
+    """The bytes of an archive are no part of a message."""
+    path = tmp_path / "design.npz"
+    np.savez(path, ctrl=np.zeros((3, 1)))
+    with pytest.raises(RecordingError, match=r"design\.npz: not a CSV table; .* design\.csv$"):
+        read_control(path, np.zeros(1), 0.1, ("u",))

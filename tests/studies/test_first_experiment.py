@@ -14,7 +14,7 @@ from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.studies.check import check
-from mjfim.studies.first_candidates import Wishes
+from mjfim.studies.first_candidates import Wishes, candidates
 from mjfim.studies.first_experiment import (
     Proposal,
     experiment_text,
@@ -27,6 +27,7 @@ from mjfim.studies.first_motion import (
     _rate,
     choose_start,
     reach,
+    require_support,
     time_scale,
 )
 from tests.support.cli import MODELS
@@ -179,7 +180,10 @@ def proposed(path: Path, folder: Path, **options: object) -> tuple[Proposal, Exp
 def test_the_file_runs_as_it_stands_and_keeps_all_limits(name: str, tmp_path: Path) -> None:
     proposal, experiment = proposed(MODELS / f"{name}.xml", tmp_path)
     task = DesignTask.resolve(experiment)
-    assert verify(task, task.initial).is_feasible
+    margins = verify(task, task.initial).margins
+    # A design finds the way back to hovering.
+    found_later = {"end_position", "end_velocity"} if proposal.flies else set()
+    assert {kind for kind, margin in margins.items() if margin < 0.0} <= found_later
     assert {each.name for each in proposal.chosen} == set(experiment.parameters)
 
     found = check(experiment)
@@ -246,6 +250,13 @@ def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match="does not show a load at 'base'"):
         propose_experiment(path, tmp_path, Wishes(payload="base", groups=("friction",)))
 
+    # Without weight, the load is a share of the robot's mass, not only of the body's.
+    text = SERVO_ARM.format(floor="").replace("<option", '<option gravity="0 0 0"')
+    [load, *_] = candidates(
+        mujoco.MjModel.from_xml_string(text), (), "wrist", length=0.5, period=1.0, rate=100.0
+    )
+    assert load.scale == pytest.approx(0.05 * 0.92, rel=0.05)
+
     # The load of a light wrist follows from what the motors lift.
     path = written(tmp_path, SERVO_ARM.format(floor=""))
     found = propose_experiment(path, tmp_path, Wishes(payload="wrist"))
@@ -254,6 +265,28 @@ def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
     assert found.limits["floor"] == 0.0
     assert found.chosen[0].scale is not None
     assert 0.01 < found.chosen[0].scale < 1.0
+
+
+def test_a_hand_that_lies_at_the_height_of_its_base_has_no_floor(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        """
+    <mujoco>
+      <worldbody>
+        <body name="palm"><geom type="box" size="0.05 0.05 0.02"/>
+          <body name="finger" pos="0.1 0 0.02"><joint name="knuckle" axis="0 0 1" damping="0.1"/>
+            <geom type="capsule" fromto="0.02 0 0 0.1 0 0" size="0.02" mass="0.1"/>
+            <body name="tip" pos="0.15 0 0"><joint name="end" axis="0 0 1" damping="0.1"/>
+              <geom type="capsule" fromto="0.02 0 0 0.1 0 0" size="0.02" mass="0.1"/>
+      </body></body></body></worldbody>
+      <actuator><motor name="a" joint="knuckle" ctrlrange="-1 1"/>
+        <motor name="b" joint="end" ctrlrange="-1 1"/></actuator>
+    </mujoco>
+    """,
+    )
+    _, experiment = proposed(path, tmp_path)
+    assert experiment.limits.floor is None
+    assert experiment.limits.clearance is not None
 
 
 # Four equal servos, the last of which turns a light wrist; no joint has a damping.
@@ -297,9 +330,11 @@ def test_an_arm_with_servos_gets_a_file_that_a_person_would_play(tmp_path: Path)
     assert [target.path for target in experiment.parameters["kp"].targets] == [
         f"actuator/{name}:kp" for name in ("pan", "lift", "elbow", "roll")
     ]
+    # Its size is 5 % of the 20 N m of a servo, at the speed of a pendulum of the robot's length.
     [damping] = [each for each in proposal.others if each.name == "damping"]
-    assert damping.scale is not None
-    assert damping.scale > 0.0
+    expected = 0.05 * 20.0 * proposal.times.period / (2.0 * np.pi)
+    assert damping.scale == pytest.approx(expected, rel=0.01)
+    assert damping.bounds == pytest.approx((0.0, 10.0 * expected), rel=0.01)
 
     limits, boundary = experiment.limits, experiment.boundary
     assert limits.velocity == pytest.approx(np.sqrt(9.81 / 0.4), rel=0.2)
@@ -309,6 +344,39 @@ def test_an_arm_with_servos_gets_a_file_that_a_person_would_play(tmp_path: Path)
     assert (boundary.start, boundary.end) == ("rest", "rest")
     task = DesignTask.resolve(experiment)
     assert verify(task, task.initial).is_feasible
+
+
+TENDON = "<tendon><fixed name='t'><joint joint='c' coef='-3'/></fixed></tendon>"
+
+
+@pytest.mark.parametrize(
+    ("strong", "force"),
+    [
+        ('<motor joint="b" gear="-50" ctrlrange="-2 2"/>', 100.0),
+        ('<motor joint="b" gear="50" ctrlrange="-2 2" forcerange="-1 1"/>', 50.0),
+        ('<position joint="b" kp="1000" ctrlrange="-2 2" forcerange="-30 30"/>', 30.0),
+        ('<motor tendon="t" gear="2" ctrlrange="-9 9"/>', 54.0),
+    ],
+)
+def test_what_equal_joints_lack_has_the_size_of_the_strongest(strong: str, force: float) -> None:
+    """Four joints without friction, the second of which has the strongest actuator."""
+    body = '<body name="{0}" pos="0.1 0 0"><joint name="{0}" axis="0 1 0"/><geom size="0.1"/>{1}'
+    text = ""
+    for name in "dcba":
+        text = body.format(name, text) + "</body>"
+    weak = "<motor joint='a' ctrlrange='-1 1'/>"
+    text = f"<worldbody>{text}</worldbody>{TENDON}<actuator>{strong}{weak}</actuator>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{text}</mujoco>")
+    sizes = {"length": 0.4, "period": 1.0, "rate": 100.0}
+    found = {each.name: each for each in candidates(model, ("friction", "motors"), None, **sizes)}
+    expected = {
+        "frictionloss": 0.05 * force,
+        "damping": 0.05 * force / (2.0 * np.pi),
+        "armature": 0.05 * force / (2.0 * np.pi) ** 2,
+    }
+    for name, size in expected.items():
+        assert found[name].scale == pytest.approx(size, rel=0.05)
+        assert len(found[name].paths) == 4
 
 
 def test_faults_are_named(tmp_path: Path) -> None:
@@ -321,6 +389,103 @@ def test_faults_are_named(tmp_path: Path) -> None:
         propose_experiment(written(tmp_path, FREE_BODY), tmp_path)
     with pytest.raises(ModelError, match="no such model file"):
         propose_experiment(tmp_path / "absent.xml", tmp_path)
+
+    # A robot with legs whose file has no floor falls.
+    legged = written(tmp_path, WALKER.format(floor=""))
+    with pytest.raises(ExperimentError, match=r'nothing is below trunk, .* <geom type="plane"'):
+        propose_experiment(legged, tmp_path)
+    weightless = WALKER.format(floor="").replace("<mujoco>", '<mujoco><option gravity="0 0 0"/>')
+    require_support(mujoco.MjModel.from_xml_string(weightless), legged)
+    on_floor = WALKER.format(floor='<geom type="plane" size="0 0 1"/>')
+    require_support(mujoco.MjModel.from_xml_string(on_floor), legged)
+
+
+WALKER = """
+<mujoco>
+  <worldbody>{floor}
+    <body name="trunk" pos="0 0 0.5"><freejoint/><geom type="box" size="0.2 0.1 0.05" mass="3"/>
+      <body name="leg"><joint name="hip" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="0.5"/></body></body>
+  </worldbody>
+  <actuator><motor name="hip" joint="hip" ctrlrange="-9 9"/></actuator>
+</mujoco>
+"""
+
+# A free body with a thrust and three torques.
+FLYER = """
+<mujoco>
+  <option timestep="0.005" gravity="0 0 {gravity}"/>
+  <worldbody>
+    <body name="b" pos="0 0 1"><freejoint name="base"/>
+      <geom type="box" size="0.3 0.3 0.1" mass="2"/><site name="s"/></body>
+  </worldbody>
+  <actuator>
+    <motor name="up" site="s" gear="0 0 1 0 0 0" ctrlrange="-40 40"/>
+    <motor name="roll" site="s" gear="0 0 0 1 0 0" ctrlrange="-1 1"/>
+    <motor name="pitch" site="s" gear="0 0 0 0 1 0" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_a_robot_that_flies_gets_a_box_speeds_a_tilt_a_floor_and_feedback(tmp_path: Path) -> None:
+    """Speeds are sqrt(g l) and sqrt(g / l), with the radius of gyration l of the body."""
+    _, experiment = proposed(written(tmp_path, FLYER.format(gravity=-9.81)), tmp_path)
+    inertia = 2.0 / 3.0 * np.array([0.1, 0.1, 0.18])
+    length = np.sqrt(1.5 * inertia.mean() / 2.0)
+    limits = experiment.limits
+    velocity, turning = limits.velocity, limits.angular_velocity["base"]
+    assert velocity == pytest.approx(np.sqrt(9.81 * length), rel=0.05)
+    assert turning == pytest.approx(np.sqrt(9.81 / length), rel=0.05)
+    box = np.array(limits.position["base"])
+    centre, half = np.array([0.0, 0.0, 1.0]), 2.0 * length
+    assert box == pytest.approx(np.stack([centre - half, centre + half], axis=1), rel=0.01)
+    assert limits.tilt["base"] == 0.8
+    assert limits.floor == 0.0
+    assert experiment.rehearsal.feedback
+    assert (experiment.boundary.start, experiment.boundary.end) == ("rest", "rest")
+    task = DesignTask.resolve(experiment)
+    margins = verify(task, task.initial).margins
+    assert min(m for kind, m in margins.items() if not kind.startswith("end_")) >= 0.0
+
+
+def test_a_robot_without_weight_needs_no_floor_and_no_tilt(tmp_path: Path) -> None:
+    _, experiment = proposed(written(tmp_path, FLYER.format(gravity=0)), tmp_path)
+    assert "base" in experiment.limits.position
+    assert not experiment.limits.tilt
+    assert experiment.limits.floor is None
+    assert not experiment.rehearsal.feedback
+
+
+def test_joints_that_tendons_drive_have_limits_of_their_speed(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        """
+    <mujoco>
+      <option integrator="implicitfast"/>
+      <worldbody>
+        <body name="one"><joint name="a" axis="0 1 0" damping="0.05"/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.3"/>
+          <body name="two" pos="0 0 -0.2"><joint name="b" axis="0 1 0" damping="0.05"/>
+            <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.2"/></body></body>
+        <body name="cart" pos="1 0 0"><joint name="slide" type="slide" axis="1 0 0" damping="1"/>
+          <geom size="0.05" mass="1"/></body>
+      </worldbody>
+      <tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="0.5"/>
+        <joint joint="slide" coef="1"/></fixed></tendon>
+      <actuator><motor name="pull" tendon="t" ctrlrange="-1 1"/></actuator>
+    </mujoco>
+    """,
+    )
+    proposal, experiment = proposed(path, tmp_path)
+    natural = 2.0 * np.pi / proposal.times.period
+    velocity = experiment.limits.velocity
+    assert set(velocity) == {"a", "b", "slide"}
+    assert velocity["a"] == velocity["b"] == pytest.approx(natural, rel=0.05)
+    # Nothing stops the cart in the MJCF.
+    assert set(experiment.limits.position) == {"slide"}
+    task = DesignTask.resolve(experiment)
+    assert verify(task, task.initial).is_feasible
 
 
 def test_the_start_is_a_keyframe_that_a_control_holds_or_a_state_inside_the_ranges() -> None:
@@ -341,6 +506,71 @@ def test_the_start_is_a_keyframe_that_a_control_holds_or_a_state_inside_the_rang
         mujoco.MjModel.from_xml_string(text.replace('range="1 2"', 'range="60 120"'))
     )
     assert np.deg2rad(60.0) < start.qpos[0] < np.deg2rad(120.0)
+
+
+def test_a_pendulum_begins_hanging_where_the_file_shows_it_upright() -> None:
+    """A keyframe is what the user wants, also one that is not stable."""
+    text = """
+    <mujoco>
+      <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="1"/></body></worldbody>
+      <actuator><motor joint="hinge" ctrlrange="-9 9"/></actuator>
+      {keyframe}
+    </mujoco>
+    """
+    start = choose_start(mujoco.MjModel.from_xml_string(text.format(keyframe="")))
+    assert start.held
+    assert np.cos(start.qpos[0]) == pytest.approx(-1.0, abs=1e-6)
+    up = '<keyframe><key name="up" qpos="0"/></keyframe>'
+    start = choose_start(mujoco.MjModel.from_xml_string(text.format(keyframe=up)))
+    assert start.keyframe == "up"
+
+
+def test_a_keyframe_that_no_control_holds_is_where_a_robot_settles() -> None:
+    """A passive finger falls, while the driven arm stays where the keyframe shows it."""
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <compiler angle="radian"/>
+      <worldbody><body name="arm"><joint name="arm" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
+        <body name="finger" pos="0 0 -0.3"><joint name="finger" axis="0 1 0" damping="0.01"/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.01" mass="0.1"/></body></body>
+      </worldbody>
+      <actuator><position joint="arm" kp="500" kv="20"/></actuator>
+      <keyframe><key name="home" qpos="0.8 0.5" ctrl="0.8"/></keyframe>
+    </mujoco>
+    """)
+    start = choose_start(model)
+    assert start.held
+    assert start.qpos[0] == pytest.approx(0.8, abs=1e-6)
+    assert start.qpos.sum() == pytest.approx(0.0, abs=1e-4)
+    assert start.reason.endswith("from the keyframe 'home' of the MJCF")
+
+
+def test_what_the_file_says_about_starts_and_names(tmp_path: Path) -> None:
+    """A keyframe at a stop is no other keyframe; a weak motor at its end is named."""
+    path = written(
+        tmp_path,
+        """
+    <mujoco>
+      <compiler angle="radian" autolimits="true"/>
+      <worldbody><body name="arm" pos="0 0 1"><joint name="j" axis="0 1 0" range="-1 1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/>
+        <body pos="0 0 -0.5"><joint axis="0 1 0"/><geom size="0.03" mass="0.1"/></body>
+        <body pos="0 0 -0.5"><geom size="0.03" mass="0.1"/></body></body></worldbody>
+      <actuator><motor name="m" joint="j" ctrlrange="-1 1"/>
+        <motor name="weak" joint="j" ctrlrange="-0.1 0.1"/></actuator>
+      <keyframe><key name="down" qpos="1 0" ctrl="0 0"/><key name="up" qpos="0 3"/></keyframe>
+    </mujoco>
+    """,
+    )
+    proposal, experiment = proposed(path, tmp_path, keyframe="down")
+    text = Path(experiment.source).read_text(encoding="utf-8")
+    assert "# The start: the keyframe 'down' of the MJCF, with joints moved away" in text
+    assert "# Other keyframes: up." in text
+    assert "# Note: nothing is proposed for 2 bodies and 1 joint without a name" in text
+    [warning] = [text for text in proposal.remarks if text.startswith("Warning: the start holds")]
+    assert "m, weak at the end of the range" in warning
 
 
 def test_length_and_period_are_those_of_a_pendulum(tmp_path: Path) -> None:
@@ -561,7 +791,10 @@ def test_wishes_are_fulfilled(tmp_path: Path) -> None:
     ("wished", "message"),
     [
         ({"keyframe": "up"}, "unknown keyframe at rest 'up'; valid: hanging"),
-        ({"rate": 33.0}, "33 Hz is no whole number of timesteps of 0.01 s; rates nearby: 25, 33.3"),
+        (
+            {"rate": 33.0},
+            "33 Hz is no whole number of .* 0.01 s; rates nearby: 25, 50, 33.3",
+        ),
         ({"rate": 333.0}, "rates nearby: 50, 100$"),
         ({"horizon": 0.01, "rate": 100.0}, "less than two samples at 100 Hz.* at least 0.02 s"),
     ],

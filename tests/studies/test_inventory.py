@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cProfile
+import pstats
 from pathlib import Path
 
 import numpy as np
@@ -103,3 +105,23 @@ def test_selections_keep_what_is_wanted() -> None:
 def test_a_missing_model_is_named(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"absent\.xml: no such model file"):
         list_model(tmp_path / "absent.xml")
+
+
+def test_the_work_of_a_list_is_proportional_to_the_tendons(tmp_path: Path) -> None:
+    """A model of 5000 tendons with motors took 120 s."""
+    calls = []
+    for count in (100, 200):
+        tendons = "".join(
+            f'<fixed name="t{i}"><joint joint="arm" coef="1"/></fixed>' for i in range(count)
+        )
+        motors = "".join(f'<motor name="a{i}" tendon="t{i}"/>' for i in range(count))
+        path = tmp_path / f"{count}.xml"
+        path.write_text(
+            '<mujoco><worldbody><body><joint name="arm"/><geom size="0.1"/></body></worldbody>'
+            f"<tendon>{tendons}</tendon><actuator>{motors}</actuator></mujoco>"
+        )
+        profile = cProfile.Profile()
+        listed = profile.runcall(list_model, path)
+        assert len(listed.actuators) == count
+        calls.append(pstats.Stats(profile).total_calls)
+    assert calls[1] < 2.2 * calls[0]

@@ -258,6 +258,7 @@ def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
         "not_excited": (),
         "self_test": SelfTest(recursion=1e-8, slope=1e-6),
         "verdict": ("every identifiable parameter reaches its wanted sigma",),
+        "is_start": True,
     }
     return Check(**{**fields, **changes})  # type: ignore[arg-type]
 
@@ -368,7 +369,9 @@ def rehearsal(
         "speed": rows * np.array([0.5, 0.6]),
         "acceleration": rows * np.array([5.0, 6.0]),
         "end_speed": rows * np.array([0.001, 0.002]),
+        "travel": rows * np.array([0.3, 1.2]),
         "unlimited": ("slide",),
+        "unplaced": ("slide",),
         "lowest": 0.2 * rows[:, 0],
         "floor": 0.0,
         "has_floor": True,

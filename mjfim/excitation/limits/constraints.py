@@ -32,7 +32,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.model.clearance import GeomDistances, find_geom_pairs
 from mjfim.model.elements import is_rk4, model_length
 from mjfim.model.limited_elements import (
-    actuators_of_tendon,
+    actuators_of_tendons,
     quaternion_address,
     quaternion_joints,
     tilt_weights,
@@ -91,6 +91,7 @@ def observed_numbers(
 
     turns = [np.arange(x.index, x.index + 4) for x in chosen["turns"] for _ in range(x.count)]
     joints = {quaternion_address(model, joint): joint for joint in quaternion_joints(model)}
+    pulling = actuators_of_tendons(model)
     weights = [
         (tilt_weights if limit.kind == "tilt" else turn_weights)(model, joints[limit.index])
         for limit in chosen["turns"]
@@ -103,7 +104,7 @@ def observed_numbers(
         joint_forces=_addresses(chosen["joint_forces"]),
         turns=np.array(turns, dtype=np.intp).reshape(-1, 4),
         turn_weights=np.concatenate([np.zeros((0, 4)), *weights]),
-        tendon_forces=tuple(actuators_of_tendon(model, x.index) for x in chosen["tendon_forces"]),
+        tendon_forces=tuple(pulling[x.index] for x in chosen["tendon_forces"]),
         tendon_lengths=_addresses(chosen["tendon_lengths"]),
         derivative_substeps=(1,),
         timestep=float(model.opt.timestep),

@@ -40,6 +40,10 @@ from mjfim.records.trajectory import Trajectory
 # Deviation of a state up to which two simulations agree, relative to the sizes of the state.
 SAME_STATE_TOLERANCE = 1e-6
 
+# Excess up to which a control that holds a state is inside its limit, over half of the range: the
+# search for it leaves rounding errors.
+HELD_TOLERANCE = 1e-6
+
 # Limits that a state keeps or violates whatever the control is.
 STATE_KINDS = ("position", "tilt", "velocity", "angular_velocity", "tendon_length")
 
@@ -383,7 +387,8 @@ def _require_held(
         if limit.kind in FORCE_KINDS
     ]
     for limit, value in (*controls, *forces):
-        if not limit.lower <= value <= limit.upper:
+        gap = HELD_TOLERANCE * limit.scale
+        if not limit.lower - gap <= value <= limit.upper + gap:
             has_range = limit.kind in ("joint_force", "tendon_force")
             or_range = " or the MJCF's actuatorfrcrange" if has_range else ""
             raise ExperimentError(

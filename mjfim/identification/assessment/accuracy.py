@@ -12,7 +12,13 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from mjfim.arrays import NORMAL_95, Array, scaled_to_unit_diagonal
+from mjfim.arrays import (
+    NORMAL_95,
+    POORLY_KNOWN_SHARE,
+    UNDETERMINED_SHARE,
+    Array,
+    scaled_to_unit_diagonal,
+)
 from mjfim.identification.assessment.honest_covariance import between_covariance
 from mjfim.identification.assessment.residual_tests import FitQuality
 from mjfim.identification.assessment.robust_covariance import (
@@ -100,13 +106,6 @@ def prior_directions(
         parameters=tuple(parameters.names[j] for j in columns[is_prior].tolist()),
     )
 
-
-# Half width of an interval over the size of the value (an entry of a vector or tensor has the size
-# of the whole), above which a parameter is poorly known.
-POORLY_KNOWN_SHARE = 0.25
-
-# Half width of an interval over that size, from which on the recordings do not determine it.
-UNDETERMINED_SHARE = 0.5
 
 # Ratio of two standard deviations above which one of them counts as much larger.
 GROWN = 3.0
@@ -314,7 +313,11 @@ def _poorly_known(
             low, high = interval[j]
             span = f"{low:.3g} to {high:.3g} {parameters.parameters[j].unit}".rstrip()
             why = "; its effect on these motions is smaller than the noise"
-            if std[j] > GROWN * at_guess[j]:
+            if NORMAL_95 * std[j] < UNDETERMINED_SHARE * sizes[j]:
+                # White noise of this size would leave the parameter determined.
+                confounded = ""
+                why = "; the interval is wide because the model does not explain the recordings"
+            elif std[j] > GROWN * at_guess[j]:
                 why = "; the motion depends on it much less at the estimate than at the guess"
             elif max(abs(low), abs(high)) < abs(fit.task.start[j]):
                 why = "; it is smaller than the guess, and too small to be seen"

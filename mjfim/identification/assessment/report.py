@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import UNDETERMINED_SHARE, Array
 from mjfim.errors import first_ones, listed
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification.aligned_recording import changes_within_samples
-from mjfim.identification.assessment.accuracy import UNDETERMINED_SHARE, FitResult
+from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import with_honest_covariance
 from mjfim.identification.assessment.poor_fit import unpredictable_motion
 from mjfim.identification.assessment.recording_comparison import compare_recordings
@@ -364,11 +364,11 @@ def _causes(result: FitResult, tests: TermTests, *, is_selected: bool) -> Iterat
     if not solution.interrupted and (advice := unpredictable_motion(problem, solution.unknowns)):
         yield advice
     # A term that explains a good part of the residuals comes before what may not matter.
-    decide = "" if is_selected else f", or let `{SELECT}` decide"
-    terms = [(f"the model may lack {term}{decide}", term.share) for term in tests.named[:1]]
-    yield from (text for text, share in terms if share > TELLING_SHARE)
+    likely = list(_likely_terms(tests, is_selected=is_selected))
+    is_telling = bool(likely) and tests.likely[0].share > TELLING_SHARE
+    yield from likely if is_telling else ()
     yield from _remarks_on_rate(result)
-    yield from (text for text, share in terms if share <= TELLING_SHARE)
+    yield from () if is_telling else likely
     yield from _remarks_on_data(result)
     if quality.unexplained:
         yield (
@@ -378,14 +378,27 @@ def _causes(result: FitResult, tests: TermTests, *, is_selected: bool) -> Iterat
         )
 
 
+def _likely_terms(tests: TermTests, *, is_selected: bool) -> Iterator[str]:
+    """The term that the model most probably lacks, or some that are alike, and their cure."""
+    if not tests.likely:
+        return
+    terms = " or ".join(map(str, tests.likely))
+    alike = ", which the log hardly tells apart" if len(tests.likely) > 1 else ""
+    advice = "Add" if is_selected else f"Let `{SELECT}` decide, or add"
+    yield (
+        f"the model may lack {terms}{alike}. {advice} at the end of the experiment file:\n"
+        f"{tests.likely[0].recipe}"
+    )
+
+
 def _where_it_fails(result: FitResult, reasons: Sequence[str], tests: TermTests) -> Iterator[str]:
     """What a misfit is and where, and further terms that the model may lack."""
     if reasons:
         yield f"misfit: {'; '.join(reasons)}; the formal standard deviations are not the accuracy"
     if reasons and result.quality.worst_residual is not None:
         yield str(result.quality.worst_residual)
-    for term in tests.named[bool(reasons) :]:
-        yield f"the model may lack {term}"
+    for term in tests.named[len(tests.likely) if reasons else 0 :]:
+        yield f"the model may lack {term}; to estimate it, add:\n{term.recipe}"
     if tests.data is not None:
         found = (tests.data.untested_sentence, tests.data.impossible_sentence if reasons else "")
         yield from (f"terms that the model may lack: {each}" for each in found if each)
@@ -431,7 +444,7 @@ def _limits_of_search(
     result: FitResult, at_bound: Sequence[str], reasons: Sequence[str], *, interrupted: bool
 ) -> Iterator[str]:
     """Warnings about the start, the end, and what the recordings do not determine."""
-    yield from result.task.elsewhere
+    yield from map(str, result.task.elsewhere)
     if result.begun_instead:
         yield (
             f"the model diverges at the start ({values_of_start(result.task)}): the search began "
@@ -450,11 +463,8 @@ def _limits_of_search(
         yield f"at a bound: {listed(at_bound)}; formal standard deviations are not valid there"
     chi2, dof = result.quality.chi2, result.quality.dof
     ratio = np.sqrt(chi2 / dof)
-    is_judged = result.task.noise_is_stated and not reasons
-    if is_judged and is_smaller_than_noise(chi2, dof):
+    if result.task.noise_is_stated and not reasons and is_smaller_than_noise(chi2, dof):
         yield f"residuals are only {ratio:.2f} times the stated noise: the stated σ is too large"
-    if is_judged and is_larger_than_noise(chi2, dof):
-        yield f"the noise is {ratio:.2f} times what you stated; the intervals use it"
 
 
 def _contradictions(result: FitResult, comparison: RecordingComparison | None) -> Iterator[str]:

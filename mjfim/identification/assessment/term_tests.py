@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +33,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import of_subset
 from mjfim.identification.segments import KnownActivations, Segment, spread_over_data
 from mjfim.model.coordinates import state_names, tangent_names
+from mjfim.model.elements import free_name
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.terms import Term, TermNumber, TermTestData
 from mjfim.records.trajectory import Recording
@@ -199,9 +200,9 @@ MAX_TESTED = 100
 # Largest number of terms that an estimate names.
 MAX_NAMED_TERMS = 4
 
-# Terms whose significances differ by less than this share explain the residuals equally well. They
-# keep the order of the candidates, which rounding errors cannot change.
-EQUAL_SIGNIFICANCE = 1e-3
+# Terms whose significances differ by less than this share explain the residuals equally well. The
+# simplest one comes first, and then the first candidate, which rounding errors cannot change.
+EQUAL_SIGNIFICANCE = 1e-2
 
 # Smallest share of a term's information that remains after the parameters are eliminated. With
 # less, the term is not identifiable separately from the parameters.
@@ -253,6 +254,11 @@ class TermTests:
         A term at several joints stands for those of its single joints after it.
         """
         return _without_members(self.terms)[:MAX_NAMED_TERMS]
+
+    @property
+    def likely(self) -> tuple[Term, ...]:
+        """The named terms that explain the residuals best and equally well, simplest first."""
+        return _equal_to_best(self.named)
 
     def without(self, keys: Collection[str]) -> TermTests:
         """The tests without the terms that have some keys (`Term.key`)."""
@@ -307,8 +313,9 @@ def find_missing_terms(
     found, untested, moved = search.by_score(groups)
     screened = (search.screened(candidate) for candidate in candidates if candidate.screened)
     found += filter(None, screened)
+    names = problem.system.parameters.names
     return TermTests(
-        terms=first_terms(_by_significance(found)),
+        terms=tuple(with_names(term, names) for term in first_terms(_by_significance(found))),
         data=TermTestData(
             share=part.sample_count / problem.sample_count,
             recordings=len({segment.recording for segment in part.segments}),
@@ -318,6 +325,25 @@ def find_missing_terms(
             unseen=tuple(sorted(moved.items(), key=lambda each: -each[1][0])),
         ),
     )
+
+
+def with_names(found: Term, taken: Iterable[str]) -> Term:
+    """The term with names of its parameters, and with rounded sizes, which people read.
+
+    Args:
+        found: The term that tests have found.
+        taken: Names of the parameters that the model has already.
+    """
+    used = set(taken)
+    numbers = []
+    for number in found.numbers:
+        # Such as `pivot_damping` for `joint/pivot:damping`.
+        place, _, field = number.path.partition(":")
+        words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
+        name = free_name("_".join(words), used)
+        used.add(name)
+        numbers.append(replace(number, name=name, scale=float(f"{number.scale:.2g}")))
+    return replace(found, numbers=tuple(numbers))
 
 
 def first_terms(ordered: Sequence[Term]) -> tuple[Term, ...]:
@@ -344,13 +370,19 @@ def _without_members(ordered: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def _by_significance(terms: Sequence[Term]) -> list[Term]:
-    """Terms, most significant first; equal ones in their given order."""
+    """Terms, most significant first; of equal ones, those with fewest tables and numbers."""
     left, ordered = list(terms), []
     while left:
-        least = (1.0 - EQUAL_SIGNIFICANCE) * max(term.sigmas for term in left)
-        ordered += [term for term in left if term.sigmas >= least]
-        left = [term for term in left if term.sigmas < least]
+        equal = _equal_to_best(left)
+        ordered += sorted(equal, key=lambda term: (len(term.tables), len(term.numbers)))
+        left = [term for term in left if term not in equal]
     return ordered
+
+
+def _equal_to_best(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """The terms that are as significant as the most significant one, in their order."""
+    most = max((term.sigmas for term in terms), default=0.0)
+    return tuple(term for term in terms if term.sigmas >= (1.0 - EQUAL_SIGNIFICANCE) * most)
 
 
 def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
@@ -378,9 +410,10 @@ def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
 
 
 # Normal equations of the m tested numbers of some candidates after the parameters are eliminated:
-# (m, m) information and (m,) gradient, for columns of length 1, (m,) lengths of the columns, and
-# (q, m) moves of the common unknowns by each number, in their standard deviations.
-Linearisation = tuple[Array, Array, Array, Array]
+# (m, m) information and (m,) gradient, for columns of length 1, (m,) lengths of the columns, (q, m)
+# moves of the common unknowns by each number, in their standard deviations, and (q,) these standard
+# deviations [theta-unit].
+Linearisation = tuple[Array, Array, Array, Array, Array]
 
 
 def _score_test(
@@ -430,7 +463,7 @@ class _TermSearch:
         """Terms whose score tests are significant, and descriptions of those without a test.
 
         By parameter, the largest move by a single number that the tests may miss is returned as
-        well, in standard deviations, with the term.
+        well, as a share of the size of the parameter, with the term.
 
         Of variants of one term, the most significant one stands for it. Terms of one kind at
         several joints are tested together as well.
@@ -466,19 +499,26 @@ class _TermSearch:
         linearisation: Linearisation,
         candidates: Sequence[Candidate],
     ) -> None:
-        """Add the largest moves of parameters by numbers that the tests may miss."""
-        information, _, lengths, moves = linearisation
+        """Add the largest moves of parameters by numbers that the tests may miss.
+
+        A number for which parameters may stand has no test, and is left out.
+        """
+        information, _, lengths, moves, stds = linearisation
         effects = [(number, each.description) for each in candidates for number in each.tested]
-        known = np.maximum(np.diag(information), MIN_REMAINING_SHARE)
+        known = np.diag(information)
+        tested = np.flatnonzero(known > MIN_REMAINING_SHARE)
         # No term is larger than its natural size.
         natural = np.array([number.size for number, _ in effects]) / LINEARISATION_SIZE * lengths
-        missed = (self.threshold + scipy.special.ndtri(POWER)) / np.sqrt(known)
-        sizes = np.abs(moves) * np.minimum(missed, natural)
-        names = self.problem.system.parameters.names
-        for j, row in zip(self.problem.parameter_of_column.tolist(), sizes, strict=True):
-            largest = float(row.max()), effects[int(row.argmax())][1]
-            if largest[0] > LEAST_SAID_MOVE:
-                unseen[names[j]] = max(unseen.get(names[j], largest), largest)
+        missed = (self.threshold + scipy.special.ndtri(POWER)) / np.sqrt(known[tested])
+        sizes = np.abs(moves[:, tested]) * np.minimum(missed, natural[tested])
+        parameters = self.problem.system.parameters
+        of_value = np.maximum(parameters.sizes(self.at.theta), parameters.magnitude)
+        for j, std, row in zip(self.problem.parameter_of_column.tolist(), stds, sizes, strict=True):
+            if row.max(initial=0.0) > LEAST_SAID_MOVE:
+                words = effects[tested[row.argmax()]][1]
+                largest = float(row.max() * std / of_value[j]), words
+                name = parameters.names[j]
+                unseen[name] = max(unseen.get(name, largest), largest)
 
     def _linearised(
         self, candidates: Sequence[Candidate]
@@ -544,8 +584,10 @@ class _TermSearch:
         places = np.searchsorted(others, own)
         # A parameter that the data do not determine has no standard deviation.
         variances = np.diag(inverse)[places]
-        moves = response[places] / np.sqrt(np.where(variances > 0.0, variances, np.inf))[:, None]
-        return information, g[tested] - g[others] @ response, norms[tested], moves
+        stds = np.sqrt(np.where(variances > 0.0, variances, np.inf))
+        moves = response[places] / stds[:, None]
+        score = g[tested] - g[others] @ response
+        return information, score, norms[tested], moves, stds / norms[own]
 
     def _term(
         self,

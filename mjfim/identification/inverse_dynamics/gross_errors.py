@@ -23,6 +23,7 @@ from mjfim.errors import MjfimError, RecordingError, WrongLogError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.inverse_dynamics.equations import MotionEquations
+from mjfim.identification.inverse_dynamics.fit import try_fit_equations
 from mjfim.identification.segments import measured_states
 from mjfim.model.coordinates import ScalarJoint, actuator_names, scalar_joints
 from mjfim.model.variants import RELAXED, Relaxation
@@ -71,6 +72,9 @@ LEAST_FACTOR = 0.1
 
 # Difference of mean logarithms of mean squares within which two errors explain a log equally well.
 TIE = 0.3
+
+# What comes before the lines that cure an error.
+STATE = "State in [recording.columns]: "
 
 # Relative rounding of times.
 ROUNDING = 1e-9
@@ -221,6 +225,13 @@ class _Search:
         if not cures:
             return ""
         _, _, change = min(cures, key=lambda each: each[:2])
+        # Parameters that are far off make a good log look wrong.
+        recording = self.equations.recorded[0].motion.recording
+        other = try_fit_equations(self.system, [recording], self.start)
+        if other is not None:
+            elsewhere = replace(self, start=np.clip(other.theta, *self.bounds))
+            if not (elsewhere.fitted(none)[1] > GROSS_SHARE**2).any():
+                return ""
         cure = self._cure(change)
         return cure and f"{change.words}; without this error the model explains the motion. {cure}"
 
@@ -364,9 +375,21 @@ class _Search:
                 continue
             for column, name in zip(columns[k], columns[source], strict=False):
                 of = stated.get(name, ColumnSpec(column=name))
-                zero = f", offset = {of.offset * factor + offset:.4g}" if offset else ""
-                entries = f'column = "{of.column}", scale = {of.scale * factor:.4g}{zero}'
-                lines.append(f'"{column}" = {{ {entries} }}')
+                lines.append(column_line(column, of, factor, offset))
                 if offset:
                     break
-        return f"State in [recording.columns]: {'; '.join(lines)}" if lines else ""
+        return f"{STATE}{'; '.join(lines)}" if lines else ""
+
+
+def column_line(column: str, of: ColumnSpec, factor: float = 1.0, offset: float = 0.0) -> str:
+    """Write a line of `[recording.columns]` that changes what a column of a log means.
+
+    Args:
+        column: Name of the signal.
+        of: Where its values are until now.
+        factor: Factor on the signal.
+        offset: Constant that is added to it [unit of the signal].
+    """
+    zero = f", offset = {of.offset * factor + offset:.4g}" if offset else ""
+    entries = f'column = "{of.column}", scale = {of.scale * factor:.4g}{zero}'
+    return f'"{column}" = {{ {entries} }}'

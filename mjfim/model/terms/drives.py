@@ -19,7 +19,7 @@ import numpy as np
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
-    control_sizes,
+    control_size,
     element_name,
     is_rk4,
     model_length,
@@ -197,7 +197,7 @@ class BackEmf(Term):
             )
 
         time = period / LEAST_MOVE_PER_SAMPLE
-        control = float(control_sizes(model, time)[model.actuator_ctrladr[number]])
+        control = control_size(model, number, model.actuator_ctrladr[number], time)
         slides = force_unit(model, number) == FORCE_UNITS[LENGTH]
         length = model_length(model) if slides else 1.0
         size = control * time / (length * (abs(actuator_gear(model, number)) or 1.0))

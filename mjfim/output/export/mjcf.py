@@ -22,6 +22,7 @@ from mjfim.model.control_laws import remove_numbers
 from mjfim.model.elements import element_count, element_name
 from mjfim.model.inertia import body_inertia
 from mjfim.model.loading import ModelSource, compile_spec
+from mjfim.model.model_files import changed_files, elements_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS, POLYNOMIAL_ARRAYS
 from mjfim.model.targets import OutputBiasField, OutputDelayField, OutputScaleField, SpecField
@@ -346,8 +347,19 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
     Raises:
         ModelError: No MJCF expresses the values.
     """
+    # A floor that only the experiment states is no part of the model.
+    if system.experiment.limits.floor is not None:
+        bare = system.experiment.replace(limits={"floor": None})
+        system = System.resolve(bare, source=system.source.stated)
     wanted = system.model_at(theta, at_keyframe=False)
     urdfs, remarks = write_identified_urdfs(path, system, theta)
+    texts = {file.resolve() for file, _ in elements_of(system.model_path)}
+    changed = [x for x in changed_files(system.source.stated.contents) if x.resolve() not in texts]
+    if changed:
+        remarks.append(
+            f"{first_ones([file.name for file in changed])} changed while this ran; {path.name} "
+            "reads what is there now, but the parameters belong to what was loaded"
+        )
     try:
         xml = _edited(system, theta, wanted, urdfs)
         _save(xml, path, wanted, TOLERANCE)
@@ -355,7 +367,8 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
         try:
             _save(_printed(system, theta, wanted), path, wanted, PRINTED_TOLERANCE)
         except ModelError as reason:
-            raise ModelError(f"{path}: not written: {reason}") from None
+            why = "; ".join([str(reason), *remarks])
+            raise ModelError(f"{path}: not written: {why}") from None
         remarks.append(
             f"{path.name}: it is printed by MuJoCo, without comments and, where elements have no "
             f"name, with six digits: {error}"

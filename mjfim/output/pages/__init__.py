@@ -41,6 +41,7 @@ def page_of(
         experiment: Path of its experiment file, which commands name.
         design: Folder or file of the design that it is or is about, likewise.
         output: Its folder; the results of a command stand beside it, with the verb in their name.
+            Without one they are named after the experiment.
 
     Raises:
         MjfimError: If there is no page for this kind of record.
@@ -59,9 +60,10 @@ def page_of(
                 # A file in the folder is one word of the shell, too.
                 pattern = rf"(?<= )({word})(/[\w.]+)?(?=[ `])"
                 sentence = _with_path(sentence, pattern, str(place))
-        if output is None:
+        folder = output or (experiment and Path(experiment).stem)
+        if not folder:
             return sentence
-        beside = shlex.quote(str(output)).replace("\\", r"\\")
+        beside = shlex.quote(str(folder)).replace("\\", r"\\")
         return re.sub(r"mjfim (\w+)([^`]*) -o FOLDER", rf"mjfim \1\2 -o {beside}-\1", sentence)
 
     return replace(

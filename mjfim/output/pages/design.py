@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, Array
 from mjfim.errors import first_ones, listed
 from mjfim.output.page import (
     Emphasis,
@@ -37,7 +39,7 @@ from mjfim.output.words import (
 )
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup
 from mjfim.records.design import Design, ScaledStart
-from mjfim.records.rehearsal import MAX_BROKEN, Rehearsal, RehearsedLimit
+from mjfim.records.rehearsal import REST_SHARE, Rehearsal, RehearsedLimit
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
@@ -56,6 +58,13 @@ SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 # Smallest divisor of the improvement of an eigenvalue; avoids a division by zero.
 TINY = 1e-300
+
+# Steps that follow a motion which can be played.
+PLAY = (
+    "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o "
+    "DESIGN_FOLDER/player.py`.",
+    "Record it, then estimate: `mjfim identify EXPERIMENT RECORDING -o FOLDER`.",
+)
 
 
 def design_page(design: Design) -> Page:
@@ -128,29 +137,44 @@ def _verdict(design: Design) -> Verdict:
             f"of them. {seen}"
         )
         return Verdict(text, Level.DOUBTFUL)
-    reservation = _reservation(design)
+    reservation = _reservation(design) or _reservation_of_robots(rehearsal)
+    poorly = _with_interval(design, POORLY_KNOWN_SHARE)
+    if poorly and not reservation:
+        reservation = f"it hardly determines {_with_widest(design, poorly)}"
     if reservation:
         return Verdict(f"This motion can be played, but {reservation}. {seen}", Level.DOUBTFUL)
-    return Verdict(f"Ready to play: {_accuracy(design)}. {seen}", Level.GOOD)
+    equal = "It is no better than its start. " if design.is_start else ""
+    return Verdict(f"Ready to play: {_accuracy(design)}. {equal}{seen}", Level.GOOD)
 
 
 def _danger(rehearsal: Rehearsal) -> Verdict:
     """Say what happens to robots that must not happen, the worst first."""
+    return Verdict(f"Do not play this motion. {_faults_of(rehearsal)}.", Level.BAD)
+
+
+def _faults_of(rehearsal: Rehearsal) -> str:
+    """What happens to robots that must not happen, the worst first."""
     faults = first_ones(list(_faults(rehearsal)), "; ", MAX_FAULTS_TEXT)
-    return Verdict(f"Do not play this motion. Of {_robots(rehearsal)}, {faults}.", Level.BAD)
+    return f"Of {_robots(rehearsal)}, {faults}" if rehearsal.robots else capitalised(faults)
 
 
 def _robots(rehearsal: Rehearsal) -> str:
     return f"{rehearsal.robots} robots whose parameters are up to {100 * rehearsal.wrong:g} % off"
 
 
+def _that(count: int, verb: str) -> str:
+    """Say how many robots do something; the model does it where none of them does."""
+    of_one = f"{verb}{'es' if verb.endswith('s') else 's'}"
+    return f"{count} {verb if count > 1 else of_one}" if count else f"the model {of_one}"
+
+
 def _faults(rehearsal: Rehearsal) -> Iterator[str]:
     if rehearsal.diverged:
-        yield f"{rehearsal.diverged} diverge in the simulation"
+        yield f"{_that(rehearsal.diverged, 'diverge')} in the simulation"
     if rehearsal.passes_floor.any():
         floor = "the floor" if rehearsal.has_floor else "the plane under the robot"
         deepest = -np.nanmin(rehearsal.lowest)
-        yield f"{rehearsal.below_floor} pass through {floor}, by up to {deepest:.3g} m"
+        yield f"{_that(rehearsal.below_floor, 'pass')} through {floor}, by up to {deepest:.3g} m"
     worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
     order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
@@ -158,9 +182,9 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
         limit, count = rehearsal.limits[i], int((~rehearsal.kept[1:, i]).sum())
         excess = -np.nanmin(worst[:, i]) * limit.scale
         manner = f"by up to {excess:.3g} {limit.unit}".rstrip() if excess > 0.0 else "to its clamp"
-        yield f"{count} leave the limit on {_kind(limit)} of {limit.name}, {manner}"
+        yield f"{_that(count, 'leave')} the limit on {_kind(limit)} of {limit.name}, {manner}"
     for name, count in rehearsal.unbraked.items():
-        yield f"{count} end too fast to be braked before the limit of {name}"
+        yield f"{_that(count, 'end')} too fast to be braked before the limit of {name}"
 
 
 def _kind(limit: RehearsedLimit) -> str:
@@ -172,34 +196,63 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
     if str(rehearsal.steps):
         yield as_sentence(str(rehearsal.steps))
     if not rehearsal.limits:
-        yield "No limits were stated."
+        others = f"; {_robots(rehearsal)} were tried" if rehearsal.robots else ""
+        yield f"No limits were stated{others}."
     elif rehearsal.robots:
         yield f"{rehearsal.all_kept} of {_robots(rehearsal)} keep all limits."
     else:
-        yield "It keeps all limits."
-    peaks = np.nanmax(rehearsal.speed, axis=0)
-    free = [i for i, name in enumerate(rehearsal.joints) if name in rehearsal.unlimited]
-    free = [i for i in free if peaks[i] > 0.0]
-    if free:
-        fastest: dict[str, int] = {}
-        for i in sorted(free, key=lambda i: -peaks[i]):
-            fastest.setdefault(rehearsal.units[i], i)
-        shown = [f"{peaks[i]:.2g} {unit} ({rehearsal.joints[i]})" for unit, i in fastest.items()]
-        which = "1 speed has" if len(free) == 1 else f"{len(free)} speeds have"
-        yield f"{which} no limit, with a peak of {' and '.join(shown)}."
-    if not rehearsal.at_rest:
-        shares = rehearsal.end_speed[0] / np.where(peaks > 0.0, peaks, np.inf)
-        i = int(np.argmax(shares))
-        speed = f"{rehearsal.end_speed[0, i]:.2g} {rehearsal.units[i]}"
-        yield f"It ends in motion: {rehearsal.joints[i]} at {speed}."
+        yield "The model keeps all limits."
+    lengths = [unit.removesuffix("/s") for unit in rehearsal.units]
+    travel = _unlimited("position", rehearsal, rehearsal.unplaced, rehearsal.travel, lengths)
+    if travel:
+        yield f"{travel} from the start."
+    speeds = _unlimited("speed", rehearsal, rehearsal.unlimited, rehearsal.speed, rehearsal.units)
+    if speeds:
+        yield f"{speeds}."
+    ends = rehearsal.end_speed[0]
+    moving = np.flatnonzero(ends > REST_SHARE * rehearsal.speed[0]).tolist()
+    if moving:
+        moving.sort(key=lambda i: -ends[i] / rehearsal.speed[0, i])
+        named_ends = [
+            f"{rehearsal.joints[i]} at {ends[i]:.2g} {rehearsal.units[i]}" for i in moving
+        ]
+        yield f"It ends in motion: {first_ones(named_ends)}."
     else:
         yield "It ends at rest."
 
 
-def _undetermined(design: Design) -> list[int]:
-    """Numbers of the wanted parameters whose standard deviation exceeds their size."""
-    std, sizes = design.stated_std, design.sizes
-    return [j for j in design.wanted if not np.isfinite(std[j]) or 0.0 < sizes[j] < std[j]]
+def _unlimited(
+    what: str, rehearsal: Rehearsal, names: Sequence[str], values: Array, units: Sequence[str]
+) -> str:
+    """Say how far quantities go that nothing limits, with the largest of each unit.
+
+    Args:
+        what: Name of the quantity.
+        rehearsal: The rehearsal.
+        names: Names of the joints without a limit.
+        values: (n+1, j) values of all joints, of the model and of the robots.
+        units: (j,) their units.
+    """
+    most = np.nanmax(values, axis=0)
+    free = [i for i, name in enumerate(rehearsal.joints) if name in names and most[i] > 0.0]
+    if not free:
+        return ""
+    largest: dict[str, int] = {}
+    for i in sorted(free, key=lambda i: -most[i]):
+        largest.setdefault(units[i], i)
+    shown = [f"{most[i]:.2g} {unit} ({rehearsal.joints[i]})" for unit, i in largest.items()]
+    which = f"1 {what} has" if len(free) == 1 else f"{len(free)} {what}s have"
+    return f"{which} no limit, up to {' and '.join(shown)}"
+
+
+def _with_interval(design: Design, share: float) -> list[int]:
+    """Numbers of the wanted parameters whose predicted 95 % interval is wide.
+
+    Half its width is at least a share of their size.
+    """
+    widths, least = NORMAL_95 * design.stated_std, share * design.sizes
+    is_wide = ~np.isfinite(widths) | ((least > 0.0) & (widths >= least))
+    return [j for j in design.wanted if is_wide[j]]
 
 
 def _reservation(design: Design) -> str:
@@ -207,30 +260,42 @@ def _reservation(design: Design) -> str:
 
     A start outside the limits may tell more.
     """
-    found = _undetermined(design)
-    if not found and _tells_less(design):
+    undetermined = _with_interval(design, UNDETERMINED_SHARE)
+    if undetermined:
+        return f"it does not determine {_with_widest(design, undetermined)}"
+    if _tells_less(design):
         before, after = _least_eigenvalues(design)
         return (
             f"it tells less than its start (λ_min {before:.3g} → {after:.3g}), because the cost "
             "weighs the control or the tracking more than the information"
         )
-    rehearsal = design.rehearsal
-    if not found:
-        if rehearsal is None or rehearsal.at_clamp < max(MAX_BROKEN * rehearsal.robots, 1.0):
-            return ""
-        reached = np.flatnonzero(~rehearsal.kept.all(axis=0) & rehearsal.is_clamped).tolist()
-        limits = [rehearsal.limits[i] for i in reached]
-        names = first_ones([f"{_kind(limit)} of {limit.name}" for limit in limits])
-        who = f"{rehearsal.at_clamp} of {_robots(rehearsal)}"
-        return f"{who} reach the clamp on {names}, where σ does not hold"
+    return ""
+
+
+def _with_widest(design: Design, found: list[int]) -> str:
+    """Names of parameters, and the accuracy of that which is known worst."""
     std, sizes = design.stated_std, design.sizes
+    names = first_ones([design.parameters[j] for j in found])
     worst = max(found, key=lambda j: float(std[j] / sizes[j]) if np.isfinite(std[j]) else np.inf)
-    text = f"it does not determine {first_ones([design.parameters[j] for j in found])}"
     if not np.isfinite(std[worst]):
-        return text
-    share = relative(std[worst], sizes[worst])
-    of_one = f": σ is {share} of its size"
-    return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
+        return names
+    of_one = f": σ is {relative(std[worst], sizes[worst])} of its size"
+    return names + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
+
+
+def _reservation_of_robots(rehearsal: Rehearsal) -> str:
+    """Say what a safe rehearsal leaves open; empty where it leaves nothing open."""
+    if not rehearsal.robots:
+        return "no robot that differs from the model was rehearsed"
+    if not rehearsal.is_clamping:
+        return ""
+    reached = np.flatnonzero(~rehearsal.kept.all(axis=0) & rehearsal.is_clamped).tolist()
+    limits = [rehearsal.limits[i] for i in reached]
+    names = first_ones([f"{_kind(limit)} of {limit.name}" for limit in limits])
+    free = rehearsal.robots - rehearsal.at_clamp
+    return (
+        f"only {free} of {rehearsal.robots} robots reach no clamp ({names}); there σ does not hold"
+    )
 
 
 def _tells_less(design: Design) -> bool:
@@ -264,7 +329,6 @@ def _next_steps(design: Design) -> Iterator[str]:
         return
     if design.rehearsal is not None and not design.rehearsal.is_safe:
         yield from _cures(design.rehearsal)
-        yield "Design again: `mjfim design EXPERIMENT -o FOLDER`."
         return
     if not design.separable:
         groups = first_ones(design.combinations, "; ")
@@ -272,9 +336,9 @@ def _next_steps(design: Design) -> Iterator[str]:
             f"Remove or fix one parameter of each group, give it a prior, or measure another "
             f"output: {groups}."
         )
-    undetermined = _undetermined(design) if design.separable else []
-    if undetermined:
-        names = first_ones([design.parameters[j] for j in undetermined])
+    wide = _with_interval(design, POORLY_KNOWN_SHARE) if design.separable else []
+    if wide:
+        names = first_ones([design.parameters[j] for j in wide])
         yield (
             f"Determine {names} with a longer or larger motion, by measuring another output, or "
             "state what is known with `prior`."
@@ -284,45 +348,63 @@ def _next_steps(design: Design) -> Iterator[str]:
     if design.is_start and not design.status.success:
         yield "Allow more time or iterations in the table `[descent]` for a better design."
     if design.sound:
-        yield (
-            "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o "
-            "DESIGN_FOLDER/player.py`."
-        )
-        yield "Record it, then estimate: `mjfim identify EXPERIMENT RECORDING -o FOLDER`."
+        yield from PLAY
 
 
-def _cures(rehearsal: Rehearsal) -> Iterator[str]:
-    """Lines of the experiment file that keep such robots safe."""
-    if rehearsal.passes_floor.any():
+def _cures(rehearsal: Rehearsal, *, is_designed: bool = True) -> Iterator[str]:
+    """What keeps such robots safe, the causes first.
+
+    Args:
+        rehearsal: The rehearsal.
+        is_designed: Whether there is a design, which may be played with feedback.
+    """
+    if rehearsal.passes_floor.any() and rehearsal.has_floor:
         yield (
             "Keep the robot above the floor: state ranges of `position` in `[limits]` for what "
-            "moves down, or `clearance` to a floor in the model."
+            "moves down, or a `clearance`."
+        )
+    elif rehearsal.passes_floor.any():
+        yield (
+            'The MJCF has no floor. For a robot that stands on one, add `<geom type="plane" '
+            'size="0 0 1"/>` to its worldbody. Otherwise keep it up by ranges of `position` in '
+            "`[limits]`, or state `[rehearsal] floor` where it may go lower."
+        )
+    if rehearsal.is_unstable:
+        yield (
+            f"Small differences grow {rehearsal.growth:.2g}-fold along this motion. Begin in a "
+            "stable rest, such as hanging down (`[initial] qpos` or `keyframe`), or shorten "
+            "`horizon`."
         )
     if rehearsal.unbraked and not rehearsal.at_rest:
         yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
-    if rehearsal.reserve:
-        shares = ", ".join(f"{kind} = {share:g}" for kind, share in rehearsal.reserve.items())
+    reserve = {} if rehearsal.is_unstable else rehearsal.reserve
+    if reserve:
+        shares = ", ".join(f"{kind} = {share:g}" for kind, share in reserve.items())
         yield f"Design with a reserve for such robots: `[limits] reserve = {{ {shares} }}`."
+    yield (
+        "Say better what is known of the robot: a `prior` of each parameter, or a smaller "
+        "`[rehearsal] wrong`."
+    )
+    if is_designed and not rehearsal.feedback:
+        yield "Try it with feedback: `mjfim rehearse DESIGN_FOLDER --feedback`."
+    yield "Then design again: `mjfim design EXPERIMENT -o FOLDER`."
 
 
 def rehearsal_page(rehearsal: Rehearsal) -> Page:
     """Describe what a design does to robots that differ from the model."""
-    verdict = _danger(rehearsal)
-    steps = (
-        *_cures(rehearsal),
-        "Design again: `mjfim design EXPERIMENT -o FOLDER`.",
-    )
-    if rehearsal.is_safe:
-        verdict = Verdict(f"Safe to play. {' '.join(_observed(rehearsal))}", Level.GOOD)
-        steps = (
-            "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o "
-            "DESIGN_FOLDER/player.py`.",
-        )
+    seen = " ".join(_observed(rehearsal))
+    reservation = _reservation_of_robots(rehearsal)
+    if not rehearsal.is_safe:
+        verdict = _danger(rehearsal)
+    elif reservation:
+        verdict = Verdict(f"This motion can be played, but {reservation}. {seen}", Level.DOUBTFUL)
+    else:
+        verdict = Verdict(f"Safe to play. {seen}", Level.GOOD)
     control = "with feedback" if rehearsal.feedback else "open loop"
     return Page(
         kind="Rehearsal of a design",
         verdict=verdict,
-        next_steps=steps,
+        next_steps=PLAY if rehearsal.is_safe else tuple(_cures(rehearsal)),
         facts={
             "robots": str(rehearsal.robots),
             "error of the parameters": f"{100.0 * rehearsal.wrong:g} %",
@@ -332,10 +414,10 @@ def rehearsal_page(rehearsal: Rehearsal) -> Page:
     )
 
 
-def _rehearsal_parts(rehearsal: Rehearsal) -> Iterator[Part]:
+def _rehearsal_parts(rehearsal: Rehearsal, *, is_detail: bool = False) -> Iterator[Part]:
     yield Plot("rehearsal")
     if rehearsal.limits:
-        yield _margin_table(rehearsal)
+        yield replace(_margin_table(rehearsal), detail=is_detail)
     yield tabulated(
         "Largest speeds and accelerations of the model and of all robots",
         {
@@ -359,7 +441,8 @@ def _surroundings(rehearsal: Rehearsal) -> str:
     parts = []
     place = "the floor" if rehearsal.has_floor else "the plane under the robot"
     place = place if np.isfinite(rehearsal.floor) else "the origin of the world"
-    parts.append(f"lowest point {np.nanmin(rehearsal.lowest):.3g} m above {place}")
+    lowest = float(np.nanmin(rehearsal.lowest))
+    parts.append(f"lowest point {abs(lowest):.3g} m {'below' if lowest < 0.0 else 'above'} {place}")
     if np.isfinite(rehearsal.nearest).any():
         parts.append(f"smallest distance {np.nanmin(rehearsal.nearest):.3g} m")
     for share, name in ((rehearsal.in_contact, "in contact"), (rehearsal.at_stop, "at a stop")):
@@ -375,14 +458,16 @@ def _margin_table(rehearsal: Rehearsal) -> Table:
     limits = [rehearsal.limits[i] for i in order]
     scales = np.array([limit.scale for limit in limits])
     kept = rehearsal.kept[1:, order].sum(axis=0).tolist()
+    columns = {
+        "limit": [named(f"{_kind(each)} of {each.name}", each.unit) for each in limits],
+        "model": numbers(rehearsal.margins[0, order] * scales),
+    }
+    if rehearsal.robots:
+        columns["worst robot"] = numbers(least[order] * scales)
+        columns["robots that keep it"] = [f"{count} of {rehearsal.robots}" for count in kept]
     return tabulated(
         f"Margins of the limits on {rehearsal.robots} robots; negative: exceeded",
-        {
-            "limit": [named(f"{_kind(each)} of {each.name}", each.unit) for each in limits],
-            "model": numbers(rehearsal.margins[0, order] * scales),
-            "worst robot": numbers(least[order] * scales),
-            "robots that keep it": [f"{count} of {rehearsal.robots}" for count in kept],
-        },
+        columns,
         warned([count < rehearsal.robots for count in kept]),
     )
 
@@ -508,7 +593,10 @@ def check_page(check: Check) -> Page:
     """Describe predicted standard deviations, and inseparable parameters."""
     sections = [Section("Accuracy", list(_check_parts(check)))]
     if check.rehearsal is not None:
-        sections.append(Section("Rehearsal", list(_rehearsal_parts(check.rehearsal))))
+        # Nobody plays a start; its margins matter where it is dangerous.
+        is_detail = check.is_start and not check.is_dangerous
+        parts = list(_rehearsal_parts(check.rehearsal, is_detail=is_detail))
+        sections.append(Section("Rehearsal", parts))
     if check.worth is not None:
         sections.append(Section("What would help", worth_parts(check.worth, detail=True)))
     if check.violations:
@@ -519,7 +607,7 @@ def check_page(check: Check) -> Page:
         kind="Check of an experiment",
         verdict=_check_verdict(check),
         next_steps=tuple(_check_next(check)),
-        warnings=() if check.ok else tuple(as_sentence(each) for each in check.verdict[1:]),
+        warnings=tuple(_check_warnings(check)),
         facts={
             "checked": check.source,
             "duration": f"{check.horizon:g} s",
@@ -531,39 +619,57 @@ def check_page(check: Check) -> Page:
 
 
 def _check_verdict(check: Check) -> Verdict:
-    if check.rehearsal is not None and not check.rehearsal.is_safe:
-        return _danger(check.rehearsal)
+    rehearsal = check.rehearsal
+    if rehearsal is not None and check.is_dangerous:
+        if not check.is_start:
+            return _danger(rehearsal)
+        text = f"The start falls, and no limit keeps a design from it. {_faults_of(rehearsal)}."
+        return Verdict(text, Level.BAD)
     if check.ok:
         shares = {row.name: row.relative for row in check.rows if not row.nuisance}
         worst = max(shares, key=lambda name: shares[name])
         sigma = relative(shares[worst], 1.0)
-        if shares[worst] >= 1.0:
+        if NORMAL_95 * shares[worst] >= UNDETERMINED_SHARE:
             text = f"{check.source} does not determine {worst}: its σ is {sigma} of its size."
             return Verdict(text, Level.DOUBTFUL)
         text = (
             f"All parameters can be identified with {check.source}; the least accurate is {worst} "
             f"with a σ of {sigma}."
         )
-        return Verdict(text, Level.GOOD)
+        is_doubtful = rehearsal is not None and rehearsal.is_unstable
+        return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD)
     first = check.verdict[0] if check.verdict else "the check found a fault"
     return Verdict(as_sentence(first), Level.DOUBTFUL)
+
+
+def _check_warnings(check: Check) -> Iterator[str]:
+    """What stands below the verdict: what is wrong, and what the start itself does to robots."""
+    rehearsal = check.rehearsal
+    if check.is_start and rehearsal is not None and not (rehearsal.is_safe or check.is_dangerous):
+        cure = next(_cures(rehearsal, is_designed=False))
+        yield f"The start itself is not to be played. {_faults_of(rehearsal)}. {cure}"
+    if not check.ok:
+        yield from (as_sentence(each) for each in check.verdict[1:])
 
 
 def _check_next(check: Check) -> Iterator[str]:
     if check.refused or check.missing:
         return
-    if check.rehearsal is not None and not check.rehearsal.is_safe:
-        yield from _cures(check.rehearsal)
-    if check.not_separable:
+    if check.rehearsal is not None and check.is_dangerous:
+        yield from _cures(check.rehearsal, is_designed=not check.is_start)
+    elif check.not_separable:
         yield (
             "Remove or fix one parameter of each group that is identifiable only in combination, "
             "give it a prior, or measure another output."
         )
-        return
-    yield (
-        "Design a motion that tells more: `mjfim design EXPERIMENT -o FOLDER`. A design that was "
-        "made already is checked with `--design`."
-    )
+    elif not (check.ok and check.reaches_all):
+        yield "Design a motion that tells more: `mjfim design EXPERIMENT -o FOLDER`."
+    elif check.is_start:
+        yield "Design a motion that a robot can play: `mjfim design EXPERIMENT -o FOLDER`."
+    elif check.rehearsal is None:
+        yield "Estimate the parameters: `mjfim identify EXPERIMENT RECORDING -o FOLDER`."
+    else:
+        yield from PLAY
 
 
 def _check_parts(check: Check) -> Iterator[Part]:

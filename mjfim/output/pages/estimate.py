@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import Any
 
 import numpy as np
-import tomlkit
 
-from mjfim.arrays import NORMAL_95
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
 from mjfim.errors import first_ones, listed
-from mjfim.identification.assessment.accuracy import POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
 from mjfim.identification.assessment.residual_tests import is_larger_than_noise
 from mjfim.output.page import (
     IDENTIFIED,
@@ -39,7 +37,7 @@ from mjfim.output.pages.studies import equation_parts
 from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.robots import RecordingComparison, p_text
-from mjfim.records.terms import Decision, Selection, SelectionStep
+from mjfim.records.terms import Decision, Selection, SelectionStep, as_toml
 
 # Largest number of digits of an estimate.
 MAX_DIGITS = 9
@@ -82,8 +80,8 @@ def estimate_page(estimate: Estimate) -> Page:
     return Page(
         kind="Identification from recordings",
         verdict=_verdict(estimate),
-        next_steps=tuple(_next_steps(estimate)),
-        causes=tuple(cause.replace(" RECORDING ", f" {_files(estimate)} ") for cause in causes),
+        next_steps=tuple(_with_files(step, estimate) for step in _next_steps(estimate)),
+        causes=tuple(_with_files(cause, estimate) for cause in causes),
         warnings=tuple(each for each in estimate.warnings if each not in (*causes, *details)),
         details=details,
         facts={
@@ -97,10 +95,11 @@ def estimate_page(estimate: Estimate) -> Page:
     )
 
 
-def _files(estimate: Estimate) -> str:
-    """The fitted and the held-out recordings as arguments of a command."""
+def _with_files(sentence: str, estimate: Estimate) -> str:
+    """A sentence with the fitted and the held-out recordings as arguments of its command."""
     held_out = [("--held-out", each.name) for each in estimate.predictions if each.held_out]
-    return shlex.join([*(each.name for each in estimate.recordings), *chain(*held_out)])
+    files = shlex.join([*(each.name for each in estimate.recordings), *chain(*held_out)])
+    return sentence.replace(" RECORDING ", f" {files} ")
 
 
 # ---- verdict
@@ -141,7 +140,10 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         return Verdict(text, Level.DOUBTFUL)
     text = f"{model} explains the recordings: the residuals are {ratio:.2f} times the noise"
     if is_larger_than_noise(estimate.chi2, estimate.dof):
-        text = f"{model} explains the recordings: the noise is {ratio:.2f} times what you stated"
+        text = (
+            f"{model} explains the recordings: the noise is {ratio:.2f} times what you stated, "
+            "which the intervals use"
+        )
     return Verdict(f"{text}{_worst_estimate(estimate)}.", Level.GOOD)
 
 
@@ -166,7 +168,11 @@ def _worst_estimate(estimate: Estimate) -> str:
 
 
 def _next_steps(estimate: Estimate) -> Iterator[str]:
-    if estimate.sloppy:
+    # More data do not help a model that lacks something.
+    commands = re.findall(r"`mjfim [^`]*`", "".join(estimate.causes[:1]))
+    if estimate.misfit and commands:
+        yield f"Decide what the model lacks: {commands[0]}."
+    elif estimate.sloppy and not estimate.misfit:
         names = first_ones(estimate.sloppy)
         yield (
             f"Design an experiment that tells more about {names}: "
@@ -403,41 +409,14 @@ def _row(step: SelectionStep) -> Row:
 def _tables_to_keep(selection: Selection) -> Iterator[str]:
     """Yield the tables of the experiment file that state the selected model, as TOML."""
     for name, table in selection.library_terms.items():
-        yield _as_toml(table, "terms", name)
+        yield as_toml(table, "terms", name)
     for name, table in selection.parameters.items():
-        yield _as_toml(table, "parameters", name)
+        yield as_toml(table, "parameters", name)
     for pool in selection.pooled:
         members = listed([f"[parameters.{member}]" for member in pool.members])
-        yield _as_toml(pool.table, "parameters", pool.name, remark=f"in place of {members}")
+        yield as_toml(pool.table, "parameters", pool.name, remark=f"in place of {members}")
     if selection.fit_table:
-        yield _as_toml(selection.fit_table, "fit", remark="beside the other keys of this table")
-
-
-def _as_toml(table: Mapping[str, object], *name: str, remark: str = "") -> str:
-    """Write a table of an experiment file, with a line for each key."""
-    written = tomlkit.table()
-    if remark:
-        written.add(tomlkit.comment(remark))
-    for key, value in table.items():
-        written.add(key, _value(value))
-    for part in reversed(name[1:]):
-        outer = tomlkit.table(is_super_table=True)
-        outer.add(part, written)
-        written = outer
-    return tomlkit.dumps({name[0]: written}).strip()
-
-
-def _value(value: object) -> Any:
-    """A value; tables in it are written in one line, and lists of them with a line for each."""
-    if isinstance(value, Mapping):
-        inline = tomlkit.inline_table()
-        inline.update({key: _value(each) for key, each in value.items()})
-        return inline
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
-        array = tomlkit.array()
-        array.extend(_value(entry) for entry in value)
-        return array.multiline(True)
-    return value
+        yield as_toml(selection.fit_table, "fit", remark="beside the other keys of this table")
 
 
 # Largest number of rows of the table with the values of single recordings.

@@ -292,7 +292,7 @@ def pairs(
     size = np.where(known, std, np.nan)
     correlation = np.clip(covariance / np.outer(size, size), -1.0, 1.0)
     shown = _most_correlated(correlation)
-    offsets = np.full(len(std), np.inf) if guess is None else (guess - values) / std
+    offsets = np.full(len(std), np.inf) if guess is None else (guess - values) / size
     x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
     angle = np.linspace(0.0, 2.0 * np.pi, CURVE_POINTS)
 

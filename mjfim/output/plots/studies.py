@@ -15,6 +15,7 @@ from mjfim.output.page import (
     IDENTIFIED,
     INITIAL,
     MEASURED,
+    NOMINAL,
     OTHER,
     TRAJECTORY_TERMS,
     as_sentence,
@@ -566,13 +567,16 @@ def rehearsal(result: Rehearsal) -> Picture:
     panels = [_margins(result)] if result.limits else []
     panels.append(_speeds(result))
     control = "with the gains K(t)" if result.feedback else "open loop"
+    found = "some reach a clamp" if result.is_clamping else "safe to play"
     title = (
         f"{result.robots} robots, parameters up to {100 * result.wrong:g} % off, {control}: "
-        f"{'safe to play' if result.is_safe else 'do not play'}"
+        f"{found if result.is_safe else 'do not play'}"
     )
     note = "Dots are robots, bars the model."
     if not result.limits:
         note += " The experiment states no limits."
+    elif (result.margins > 1.0).any():
+        note += " Margins above 100 % are drawn there."
     height = max(2.6, 1.0 + 0.24 * max(len(result.limits), len(result.joints)))
     return Picture(
         title=title,
@@ -586,20 +590,21 @@ def rehearsal(result: Rehearsal) -> Picture:
 def _margins(result: Rehearsal) -> Panel:
     """Return a row per limit: margin of the model, and of every robot."""
     margins = np.where(np.isfinite(result.margins), result.margins, LEAST_MARGIN)
-    percent = 100.0 * np.maximum(margins, LEAST_MARGIN)
+    percent = 100.0 * np.clip(margins, LEAST_MARGIN, 1.0)
     low = min(-5.0, float(percent.min(initial=0.0)) - 5.0)
-    high = max(100.0, float(percent[0].max(initial=0.0)) + 5.0)
     marks = [vspan(low, 0.0, DESIGNED, opacity=0.1)]
     for i in range(len(result.limits)):
-        role, label = MEASURED, "robots, all keep the limit"
+        role, label = MEASURED, "robots"
         if not result.kept[:, i].all():
             role, label = DESIGNED, "robots, some exceed the limit"
+            if result.is_clamped[i]:
+                role, label = NOMINAL, "robots, some reach the clamp"
         marks += _row(percent[:, i], i, role, label)
     names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in result.limits]
     return Panel(
         title=f"{result.all_kept} of {result.robots} robots keep all limits",
         marks=marks,
-        x=Axis(label="margin over half of the range [%]", limits=(low, high)),
+        x=Axis(label="margin over half of the range [%]", limits=(low, 105.0)),
         y=row_axis(names),
     )
 
