@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from mjfim.records.robots import RobotComparison
     from mjfim.records.studies import Comparison, MonteCarloStudy
     from mjfim.records.trajectory import Recording, Trajectory
+    from mjfim.records.worth import Worth
     from mjfim.studies.campaign import run_campaign
     from mjfim.studies.check import check
     from mjfim.studies.compare import compare
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from mjfim.studies.robot_comparison import compare_estimates
     from mjfim.studies.selected_models import selected_experiment
     from mjfim.studies.selection import select_terms
+    from mjfim.studies.worth import worth
 
 __all__ = [
     "Budget",
@@ -69,6 +71,7 @@ __all__ = [
     "StopToken",
     "Trajectory",
     "Workers",
+    "Worth",
     "check",
     "compare",
     "compare_estimates",
@@ -91,6 +94,7 @@ __all__ = [
     "selected_experiment",
     "shortest_experiment",
     "simulate",
+    "worth",
 ]
 __version__ = "0.1.0"
 
@@ -129,6 +133,7 @@ MODULES = {
     "Recording": "mjfim.records.trajectory",
     "RobotComparison": "mjfim.records.robots",
     "Trajectory": "mjfim.records.trajectory",
+    "Worth": "mjfim.records.worth",
     "run_campaign": "mjfim.studies.campaign",
     "check": "mjfim.studies.check",
     "compare": "mjfim.studies.compare",
@@ -137,6 +142,7 @@ MODULES = {
     "compare_estimates": "mjfim.studies.robot_comparison",
     "select_terms": "mjfim.studies.selection",
     "selected_experiment": "mjfim.studies.selected_models",
+    "worth": "mjfim.studies.worth",
 }
 
 

@@ -78,6 +78,7 @@ SHOWN_TIME = 1.5
 CAPTIONS = {
     "check": "Predicted and wanted σ of every parameter, and the correlations of the estimates",
     "pairs": "Joint uncertainty of the estimates of pairs of parameters",
+    "worth": "What each sensor tells, and what limits cost",
     "accuracy_over_time": "σ of every parameter by the measurements up to each time",
     "accuracy": "Predicted, achieved and wanted σ of every parameter, and published values",
     "trajectories": "Motion and controls",

@@ -18,6 +18,7 @@ ORDER = (
     "validate",
     "check",
     "design",
+    "worth",
     "rehearse",
     "simulate",
     "identify",

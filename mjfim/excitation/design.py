@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
+from itertools import starmap
 from typing import TypeVar
 
 import numpy as np
@@ -35,6 +36,7 @@ from mjfim.excitation.release import design_release
 from mjfim.excitation.search.climb import Candidate
 from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
 from mjfim.excitation.search.search import Search, candidate_of
+from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
@@ -54,6 +56,7 @@ from mjfim.records.design import (
     without_motions,
 )
 from mjfim.records.events import DesignCallback, DesignEvent, shown_progress
+from mjfim.records.worth import Price
 
 T = TypeVar("T")
 
@@ -298,6 +301,11 @@ def _record(
 
     # After Ctrl-C a rehearsal would take too long.
     rehearsal = None if interrupted else rehearse_task(played, after)
+    worth = None
+    if not interrupted:
+        sensing = sensing_along(played, after.trajectory, identifiability)
+        worth = sensing.worth("the design", task.horizon)
+        worth = replace(worth, prices=tuple(starmap(Price.of_limit, winner.prices.items())))
     status = Status.INTERRUPTED if interrupted else winner.ended
     if task.is_limited and not found.is_feasible and not interrupted:
         status = Status.INFEASIBLE
@@ -339,6 +347,7 @@ def _record(
         motions=motions,
         improvement=improvement_per_iteration(history, stage.problem.size(final)),
         rehearsal=rehearsal,
+        worth=worth,
         reserve={} if reserve == "auto" else dict[str, float](reserve.items()),
     )
 

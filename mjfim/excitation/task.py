@@ -517,12 +517,18 @@ class DesignTask:
         stated = np.repeat(self.control, self.system.variant.sample_factor, axis=0)
         return self._along(stated, variant)
 
-    def with_horizon(self, horizon: float) -> DesignTask:
-        """This task with another horizon [s], on the same variant of the plant."""
+    def with_horizon(self, horizon: float, control: Array | None = None) -> DesignTask:
+        """This task with another horizon, on the same variant of the plant.
+
+        Args:
+            horizon: The horizon [s].
+            control: (n, nu) initial control at the stated sample rate; default: the stated one.
+        """
         experiment = self.experiment.replace(horizon=horizon)
         task = replace(self, system=replace(self.system, experiment=experiment))
         with named_file(experiment):
-            return task._along(stated_control(task.system), self.system.variant)
+            stated = stated_control(task.system) if control is None else control
+            return task._along(stated, self.system.variant)
 
     def _along(self, control: Array, variant: ModelVariant) -> DesignTask:
         """This task on another plant, along a control: (n, nu) at the stated sample rate."""

@@ -182,7 +182,7 @@ class IdentifiabilityTest:
         steps = _step_rows(self, trajectory)
 
         # One difference step is enough if all singular values are far larger than round-off.
-        quick = _null_space(self, [J], None, _hidden_from_steps(self, [steps]))
+        quick = null_space(self, [J], None, _hidden_from_steps(self, [steps]))
         if quick.smallest > CLEAR_SINGULAR_VALUE and not quick.count:
             return _with_groups(self, quick, quick)
 
@@ -257,7 +257,7 @@ def _identifiability(
         stop: Asked before each random motion.
     """
     hidden = _hidden_from_rows(test, _hidden_from_steps(test, [steps]), J, error)
-    along_trajectory = _null_space(test, [J], [error], hidden)
+    along_trajectory = null_space(test, [J], [error], hidden)
     if not along_trajectory.count or stop():
         return _with_groups(test, along_trajectory, along_trajectory)
 
@@ -274,7 +274,7 @@ def _identifiability(
                 stack.append(found[0])
                 errors.append(found[1])
 
-    along_all = _null_space(test, stack, errors, hidden)
+    along_all = null_space(test, stack, errors, hidden)
     return _with_groups(test, along_trajectory, along_all)
 
 
@@ -379,7 +379,7 @@ def _with_groups(
     )
 
 
-def _null_space(
+def null_space(
     test: IdentifiabilityTest,
     stack: Sequence[Array],
     errors: Sequence[Array] | None,

@@ -236,6 +236,20 @@ class Bounds:
         """
         return np.stack([change, -change]) / self.scale
 
+    def narrowing(self, r: Array, delta: float, weight: float) -> Array:
+        """Derivative of the barrier by the share of `scale` by which both bounds move inwards.
+
+        Args:
+            r: (..., w) numbers.
+            delta: Relative distance below which the barrier is relaxed.
+            weight: Factor of the barrier of every number.
+
+        Returns:
+            (w,) derivatives, summed over all rows of numbers; 0 without a bound.
+        """
+        first = relaxed_log_barrier(self.slacks(r), delta)[1]
+        return np.asarray(-weight * first.sum(axis=tuple(range(first.ndim - 1))))
+
     def barrier(
         self, r: Array, delta: float, weight: float, factors: Array | None = None
     ) -> BarrierDerivatives:

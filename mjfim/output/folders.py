@@ -154,8 +154,9 @@ DESIGN_FILES = (
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
-# Files that `mjfim check`, `mjfim compare-robots` and `mjfim rehearse` may write.
-CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png", "rehearsal.png")
+# Files that `mjfim check`, `mjfim worth`, `mjfim compare-robots` and `mjfim rehearse` may write.
+CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "worth.png", "rehearsal.png")
+WORTH_FILES = ("worth.json", "worth.npz", REPORT, "worth.png")
 ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png")
 REHEARSAL_FILES = ("rehearsal.json", "rehearsal.npz", REPORT, "rehearsal.png")
 

@@ -42,6 +42,7 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.worth import Worth
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -172,6 +173,7 @@ KINDS: tuple[type[ShownRecord], ...] = (
     MonteCarloStudy,
     Rehearsal,
     Check,
+    Worth,
 )
 
 # Longest list of recordings among the facts [characters].

@@ -12,6 +12,7 @@ from mjfim.errors import first_ones, shortened
 from mjfim.records.base import Record, ShownRecord, record
 from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal
+from mjfim.records.worth import Worth
 
 # A coefficient that differs from 1 by less than this number is not written.
 UNIT_COEFFICIENT_TOLERANCE = 1e-6
@@ -292,6 +293,7 @@ class Check(ShownRecord):
         self_test: Test of the derivatives.
         steps: Standard deviations by finite steps along one motion; None where they were not made.
         rehearsal: What the motion does to robots; None for recordings.
+        worth: What each sensor tells along one motion; None for recordings.
         is_start: Whether the motion is the initial control, at which a design begins.
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
@@ -316,6 +318,7 @@ class Check(ShownRecord):
     verdict: tuple[str, ...]
     steps: FiniteSteps | None = None
     rehearsal: Rehearsal | None = None
+    worth: Worth | None = None
     is_start: bool = False
     combined: tuple[CombinationAccuracy, ...] = ()
     missing: tuple[str, ...] = ()
@@ -344,6 +347,7 @@ class Check(ShownRecord):
         "self_test",
         "steps",
         "rehearsal",
+        "worth",
     )
     json_names = {
         "rows": "parameters",

@@ -12,6 +12,7 @@ from mjfim.arrays import Array, scaled_pseudo_inverse
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
+from mjfim.records.worth import Worth
 
 # Relative difference of two costs J, or of two σ, below which they count as equal.
 TIE_TOLERANCE = 2e-2
@@ -468,6 +469,8 @@ class Design(ShownRecord):
             relative to one nat per parameter. NaN where it is unknown.
         rehearsal: What the design does to the model and to simulated robots; None where it was
             interrupted before.
+        worth: What each sensor tells along the designed trajectory, and what each limit costs;
+            None where the search was interrupted.
         reserve: Key `limits.reserve` that the search kept, also where it was found automatically.
     """
 
@@ -497,6 +500,7 @@ class Design(ShownRecord):
     motions: IterateMotions | None = None
     improvement: float = float("nan")
     rehearsal: Rehearsal | None = None
+    worth: Worth | None = None
     reserve: dict[str, float] = field(default_factory=dict)
 
     file_stem = "design"
@@ -525,6 +529,7 @@ class Design(ShownRecord):
         "prior",
         "data",
         "rehearsal",
+        "worth",
         "reserve",
     )
     json_names = {"outcome": "message"}

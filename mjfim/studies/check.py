@@ -29,6 +29,7 @@ from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.rehearsal import rehearsed, steps_along
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.levels import regulator_for, require_coarse_factor
+from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import (
     LEAST_PROBE_AMPLITUDE,
     MOST_PROBE_AMPLITUDE,
@@ -65,6 +66,7 @@ from mjfim.records.check import (
 from mjfim.records.design import LimitViolation
 from mjfim.records.events import begin_stage, shown_progress
 from mjfim.records.trajectory import Recording, Sensitivity, Trajectory
+from mjfim.records.worth import DEFAULT_RELATIVE_STD
 
 # Steps along the tested curve, in units of the plant's difference steps. The smaller error of the
 # two counts.
@@ -245,9 +247,6 @@ def random_references(task: DesignTask, count: int) -> Iterator[Trajectory]:
         except SimulationDivergedError:
             continue
 
-
-# Target standard deviation where none is stated, relative to the size of the parameter.
-DEFAULT_RELATIVE_STD = 0.05
 
 # Number of repetitions above which a target accuracy counts as unreachable.
 MAX_REPETITIONS = 1_000_000_000
@@ -533,6 +532,11 @@ def _checked(
         rehearsal = rehearsed(task, played, gain, steps, growth)
         warning = growth_warning(growth) or ""
 
+    # What each sensor tells along one motion.
+    worth = None
+    if steps is not None and is_motion and point.trajectory is not None:
+        worth = sensing_along(task, point.trajectory, found).worth(source, duration)
+
     # Eigenvalues of the criterion, without combinations that no experiment can identify.
     criterion = replace(task.information, basis=found.basis)
     eigenvalues = criterion.evaluate(data + criterion.prior).eigenvalues
@@ -562,6 +566,7 @@ def _checked(
         self_test=tested,
         steps=steps,
         rehearsal=rehearsal,
+        worth=worth,
         is_start=is_start,
         verdict=(),
         combined=() if not_excited else found.combinations(information, values, total, total),

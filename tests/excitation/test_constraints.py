@@ -334,6 +334,29 @@ def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path)
     assert far.value(values, 0.1) > constraints.value(values, 0.1)
 
 
+@pytest.mark.parametrize("kind", [*ALONE][:6])
+def test_the_derivative_by_a_range_is_that_of_a_narrower_range(kind: str, tmp_path: Path) -> None:
+    task = arm_task(tmp_path, limits=EVERY)
+    constraints, delta, h = constraint_set_of(task), 0.01, 1e-6
+    values = along_control(task, constraints)
+    found = constraints.narrowing(values, delta, task.controls)
+    assert set(found) == {limit.title for limit in task.limits}
+    of_kind = [found[limit.title] for limit in task.limits if limit.kind == kind]
+    narrow, wide = (constraints.tightened({kind: s}).value(values, delta) for s in (h, -h))
+    assert sum(of_kind) == pytest.approx((narrow - wide) / (2.0 * h), rel=1e-5)
+
+
+def test_the_derivative_by_the_bound_of_a_speed_is_that_of_a_lower_speed(tmp_path: Path) -> None:
+    task = floating_task(tmp_path, limits={"velocity": 2.0, "angular_velocity": 6.0})
+    constraints, delta, h = constraint_set_of(task), 0.05, 1e-6
+    values = along_control(task, constraints)
+    found = constraints.narrowing(values, delta, task.controls)
+    for kind in {limit.kind for limit in task.limits if limit.is_magnitude}:
+        of_kind = [found[limit.title] for limit in task.limits if limit.kind == kind]
+        narrow, wide = (constraints.tightened({kind: s}).value(values, delta) for s in (h, -h))
+        assert sum(of_kind) == pytest.approx((narrow - wide) / (2.0 * h), rel=1e-5)
+
+
 def test_rates_at_both_ends_follow_the_boundary(tmp_path: Path) -> None:
     task = arm_task(tmp_path, limits={"control_rate": 9.0})
     rate, ctrl = constraint_set_of(task).rate, task.control

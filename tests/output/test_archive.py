@@ -88,6 +88,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
     with np.load(folder / "design.npz", allow_pickle=False) as data:
         shapes = {key: data[key].shape for key in data.files}
         robots = {key: shapes.pop(key) for key in data.files if key.startswith("rehearsal.")}
+        worth = {shapes.pop(key) for key in data.files if key.startswith("worth.")}
         motions = {key for key in data.files if key.startswith("motions.")}
         kinds = {data[key].dtype for key in {*data.files} - motions - {"record"}}
         kinds_of_motions = {data[key].dtype for key in motions}
@@ -116,6 +117,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         **{"labels.wanted": (P,), "labels.published": (P,), "labels.bounds": (P, 2)},
         "record": (),
     }
+    assert worth == {(P,)}
     assert robots["rehearsal.theta"] == (5, P) and robots["rehearsal.steps.std"] == (P,)
     assert robots["rehearsal.speed"] == (5, NV)
     assert kinds == {np.dtype("float64")}

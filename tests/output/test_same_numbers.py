@@ -18,6 +18,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.output import archive
 from mjfim.output.page import REPORT, number
 from mjfim.output.pages import page_of
+from mjfim.output.plots.pictures import pictures_of
 from mjfim.output.report import write_report
 from mjfim.output.words import relative
 from mjfim.records.base import ShownRecord
@@ -147,3 +148,29 @@ def test_an_estimate_states_the_same_accuracy_everywhere(
     half = 2.0 * np.array(honest) / np.abs(stored["theta"])
     assert share == relative(float(half.max()), 1.0)
     assert f"± {share}" in plain(report)
+
+
+def test_what_would_help_is_the_same_in_json_table_and_picture(check: Check) -> None:
+    stated = check.summary()["worth"]
+    target = stated["target"]
+
+    def ratio(std: dict[str, float]) -> float:
+        """Largest σ over its wanted value."""
+        return max(std[name] / target[name] for name in target)
+
+    now = ratio(stated["std"])
+    without = {each["name"]: ratio(each["without"]) for each in stated["sensors"]}
+    assert {"qpos:slide", "qvel:hinge", "all positions"} <= set(without)
+
+    table = next(each for each in page_of(check).tables if each.title == "Sensors")
+    for row in table.rows:
+        change = without[row.cells[0]] / now
+        word = row.cells[table.columns.index("σ without it")]
+        assert word.startswith("same" if change < 1.05 else f"× {change:.1f}")
+
+    panel = pictures_of(check)["worth"]().panels[0]
+    assert panel.y.names is not None
+    drawn = next(mark for mark in panel.marks if mark.label == "without it")
+    shown = [panel.y.names[int(place)] for place in drawn.y]
+    np.testing.assert_allclose(drawn.x, [without[name] for name in shown], rtol=1e-12)
+    assert shown

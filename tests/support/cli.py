@@ -31,6 +31,7 @@ DESIGN = {
     "trajectories.png",
     "accuracy_over_time.png",
     "accuracy.png",
+    "worth.png",
     "rehearsal.png",
 }
 

@@ -34,6 +34,7 @@ from mjfim.records.studies import (
 )
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Labels, Recording, Trajectory
+from mjfim.records.worth import Price, SensorWorth, Worth
 from tests.support.made_records import (
     bare_estimate,
     falling,
@@ -433,6 +434,46 @@ def robots(**changes: object) -> RobotComparison:
     return RobotComparison(**{**fields, **changes})  # type: ignore[arg-type]
 
 
+def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
+    """What two sensors of an experiment and an added one tell, and two prices."""
+    std = np.array([0.02, 0.01, 0.03])
+
+    def sensor(name: str, factor: float, *, is_added: bool = False) -> SensorWorth:
+        """A sensor without which σ is larger by a factor."""
+        present = std / factor if is_added else std
+        return SensorWorth(
+            name=name,
+            noise="0.05 rad",
+            is_added=is_added,
+            without=present * factor,
+            present=present,
+            alone=np.array([0.3, np.inf, 0.1]),
+            halved=present / 1.4,
+        )
+
+    fields = {
+        "source": "the design",
+        "horizon": 4.0,
+        "parameters": parameters,
+        "units": UNITS,
+        "target": 0.05 * THETA,
+        "std": std,
+        "repeated": std / np.sqrt(2.0),
+        "faster": std / np.sqrt(2.0),
+        "sensors": (
+            sensor(f"angle of {parameters[0]}", 1.0),
+            sensor("rate", 3.0),
+            sensor("gyro of bob", 2.0, is_added=True),
+        ),
+        "fewest": ("rate", "gyro of bob"),
+        "prices": (
+            Price(name="control of motor", step="10 % wider", predicted=-0.07, redesigned=-0.068),
+            Price(name="time", step="0.4 s more"),
+        ),
+    }
+    return Worth(**{**fields, **changes})  # type: ignore[arg-type]
+
+
 MAKERS = {
     "compare-robots": robots,
     "design": design,
@@ -441,5 +482,6 @@ MAKERS = {
     "compare": comparison,
     "montecarlo": study,
     "rehearse": rehearsal,
+    "worth": worth,
     "campaign": campaign,
 }

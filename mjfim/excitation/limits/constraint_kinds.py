@@ -62,6 +62,11 @@ class Magnitude:
         """
         return float(np.sin(0.5 * quantity)) if self.is_angle else quantity
 
+    def bounds(self, upper: float, scale: float) -> Bounds:
+        """Bounds of the norm, from the upper bound of the quantity and from that bound at first."""
+        highest, size = np.array([self.norm_at(upper)]), np.array([self.norm_at(scale)])
+        return Bounds(lower=-highest, upper=highest, scale=size)
+
     def barrier(
         self, observed: Array, upper: float, scale: float, *, delta: float, weight: float
     ) -> BarrierDerivatives:
@@ -74,15 +79,13 @@ class Magnitude:
             delta: Relative distance below which the barrier is relaxed.
             weight: Factor of the barrier of every vector.
         """
-        highest, size = np.array([self.norm_at(upper)]), np.array([self.norm_at(scale)])
-        bounds = Bounds(lower=-highest, upper=highest, scale=size)
-
         vectors = observed[..., self.columns]
         norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+        bounds = self.bounds(upper, scale)
         found = bounds.barrier(norm, delta, weight)
 
         # At zero, slope over norm tends to the curvature.
-        is_zero = norm <= NEARLY_ZERO * size
+        is_zero = norm <= NEARLY_ZERO * bounds.scale
         safe = np.where(is_zero, 1.0, norm)
         across = np.where(is_zero, found.curvature, found.slope / safe)
         direction = np.where(is_zero, 0.0, vectors / safe)
@@ -251,6 +254,11 @@ class Constraint(ABC):
         numbers, weight = self.quantity(values), self.weight(values)
         return self.number_bounds.barrier(numbers, delta, weight, factors)
 
+    def narrowing(self, values: ConstraintValues, delta: float) -> Array:
+        """Derivative of the barrier by the share of its scale by which each range narrows, (w,)."""
+        numbers, weight = self.quantity(values), self.weight(values)
+        return self.number_bounds.narrowing(numbers, delta, weight)
+
     def slacks(self, values: ConstraintValues) -> Array:
         """Relative distances of the numbers to both bounds, (2, ...); infinite without a bound."""
         return self.number_bounds.slacks(self.quantity(values))
@@ -372,6 +380,17 @@ class SubstepConstraint(Constraint):
         numbers = super().barrier(values, delta, factors)
         vectors = (each.value for _, each in self._vector_barriers(values, delta))
         return replace(numbers, value=numbers.value + sum(vectors))
+
+    def narrowing(self, values: ConstraintValues, delta: float) -> Array:
+        """See `Constraint.narrowing`; angles count as the norms from which they are computed."""
+        observed, weight = self._observed(values), self.weight(values)
+        found = np.zeros(len(self.columns))
+        found[self.numbers] = super().narrowing(values, delta)
+        for i, magnitude in self.magnitudes:
+            bounds = magnitude.bounds(float(self.bounds.upper[i]), float(self.bounds.scale[i]))
+            norm = np.linalg.norm(observed[..., magnitude.columns], axis=-1, keepdims=True)
+            found[i] = bounds.narrowing(norm, delta, weight)[0]
+        return found
 
     def add_expansion(
         self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None

@@ -22,7 +22,12 @@ from mjfim.excitation.limits.constraint_kinds import (
     ExpansionSums,
     SubstepConstraint,
 )
-from mjfim.excitation.limits.limits import Limit, derivative_substeps_of, has_constant_forces
+from mjfim.excitation.limits.limits import (
+    Limit,
+    derivative_substeps_of,
+    has_constant_forces,
+    limit_title,
+)
 from mjfim.excitation.task import DesignTask
 from mjfim.model.clearance import GeomDistances, find_geom_pairs
 from mjfim.model.elements import is_rk4, model_length
@@ -305,6 +310,28 @@ class ConstraintSet:
             delta: Relaxation of the barrier, a relative margin.
         """
         return float(sum(member.barrier(values, delta).value for member in self.members))
+
+    def narrowing(
+        self, values: ConstraintValues, delta: float, controls: Sequence[str]
+    ) -> dict[str, float]:
+        """Derivative of the barrier by the share of half of its range by which each limit narrows.
+
+        Args:
+            values: The constrained quantities along a trajectory.
+            delta: Relaxation of the barrier, a relative margin.
+            controls: Names of the nu controls.
+
+        Returns:
+            Derivatives by the `title` of each limit; tolerances of the end and clearances, which
+            are no ranges of one quantity, are left out.
+        """
+        within = map(limit_title, self.substeps.kinds, self.substeps.names)
+        found = dict(zip(within, self.substeps.narrowing(values, delta).tolist(), strict=True))
+        for member in (self.control, self.rate):
+            if member is not None:
+                titles = [limit_title(member.kind, name) for name in controls]
+                found |= zip(titles, member.narrowing(values, delta).tolist(), strict=True)
+        return found
 
     def expand(
         self, values: ConstraintValues, observation_jacobian: Array, delta: float

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mujoco
@@ -33,6 +33,11 @@ SOFT_SHARE = 0.05
 
 # Largest number of engine steps of a sample at which the barrier is evaluated with derivatives.
 MAX_DERIVATIVE_SUBSTEPS = 5
+
+
+def limit_title(kind: str, name: str) -> str:
+    """Name of a limit in results: `control rate of elbow`."""
+    return f"{kind.replace('_', ' ')} of {name}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +71,17 @@ class Limit:
                 f"limits.{self.kind}.{self.name}: [{self.lower:g}, {self.upper:g}] is inverted; "
                 "needs lower < upper"
             )
+
+    @property
+    def title(self) -> str:
+        """Its name in results."""
+        return limit_title(self.kind, self.name)
+
+    def widened(self, share: float) -> Limit:
+        """The limit with bounds that lie outwards by a share of `scale`."""
+        room = share * self.scale
+        lower = self.lower if self.is_magnitude else self.lower - room
+        return replace(self, lower=lower, upper=self.upper + room)
 
     @property
     def is_magnitude(self) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -44,6 +44,11 @@ from mjfim.records.events import DesignEvent
 TIGHTENING_MU = 4e-3
 REPEATED_MU = 1e-3
 MAX_REPEATED_STAGES = 3
+
+# Largest weight with which the multipliers of the barrier are those of the limits, and largest
+# slope of the merit over the weight. The error of a multiplier is about the root of this ratio.
+PRICED_MU = 1e-2
+PRICED_SLOPE = 0.01
 
 # A violation at the end of a stage tightens the limit by this many times the violation; a limit
 # that holds with a margin is released by this share of the margin.
@@ -107,6 +112,7 @@ class Candidate:
         status: Status of the last descent; None where its time was over.
         slope: Slope of the cost at the last iterate.
         history: Iterates.
+        prices: Exponents of the limits at the end of the last stage, see `InteriorProblem`.
         steps: Engine steps.
         has_left: A descent without a barrier has left the limits, or was misled by derivatives.
         is_held_up: Its steps were very short.
@@ -126,6 +132,7 @@ class Candidate:
     status: Status | None = None
     slope: float = np.inf
     history: tuple[HistoryRow, ...] = ()
+    prices: Mapping[str, float] = field(default_factory=dict)
     steps: int = 0
     has_left: bool = False
     is_held_up: bool = False
@@ -409,6 +416,10 @@ class Climb:
                 return
 
             point, status = step.iterate.point, step.iterate.status
+            weight = weights[number]
+            if weight <= PRICED_MU and step.iterate.slope <= PRICED_SLOPE * weight:
+                prices = problem.prices(point, ground.task.controls)
+                self.candidate = replace(self.candidate, prices=prices)
             margins = self._margins(step) if left == 1 else step.margins
             is_outside = min(margins.values(), default=0.0) < 0.0
             if left == 1 and not is_outside and status not in (None, Status.MAX_ITERATIONS):

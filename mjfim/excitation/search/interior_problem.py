@@ -7,6 +7,7 @@ outside the limits as well (Hauser & Saccon 2006).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,9 @@ from mjfim.optimize.projection_operator import Expansion
 # Largest weight mu of the barrier with which directions may follow its curvature along a step. With
 # larger weights it is so smooth that this is not worth the time.
 SHARP_MU = 4e-3
+
+# Smallest exponent of a limit that counts: 10 % more range change σ by a thousandth.
+LEAST_EXPONENT = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,6 +162,23 @@ class InteriorProblem:
         """Cost of D-optimality that corresponds to one e-fold of every eigenvalue."""
         count = 1 if point.criterion is None else len(point.criterion.eigenvalues)
         return self.base.information.weight * count
+
+    def prices(self, point: InteriorPoint, controls: Sequence[str]) -> dict[str, float]:
+        """Exponents e of the limits at the end of a stage: σ falls as `range^-e`.
+
+        There, `mu dB/d(bound)` is the multiplier of a limit, the derivative of the merit by its
+        bound. The merit is twice the logarithm of the σ that the criterion minimises.
+
+        Args:
+            point: Minimum of `log J + mu B`.
+            controls: Names of the nu controls.
+
+        Returns:
+            Exponents by the titles of the limits; those that hardly matter are left out.
+        """
+        slopes = self.constraints.narrowing(values_of(point), self.delta, controls)
+        exponents = {title: 0.5 * self.mu * slope for title, slope in slopes.items()}
+        return {title: each for title, each in exponents.items() if each > LEAST_EXPONENT}
 
     def value(self, point: InteriorPoint) -> float:
         """`log J + mu B` at a point."""

@@ -29,6 +29,7 @@ from mjfim.output.page import (
     tabulated,
     warned,
 )
+from mjfim.output.pages.worth import worth_parts
 from mjfim.output.words import (
     BEST_CASE,
     NOT_ALONE,
@@ -84,6 +85,8 @@ def design_page(design: Design) -> Page:
         sections.insert(2, Section("Limits", [Plot("limits"), table]))
     if design.rehearsal is not None:
         sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
+    if design.worth is not None:
+        sections.append(Section("What would help", worth_parts(design.worth, detail=True)))
     before, after = _least_eigenvalues(design)
     reserve = listed([f"{100 * share:.2g} % of {kind}" for kind, share in design.reserve.items()])
     return Page(
@@ -591,10 +594,6 @@ def _start_table(design: Design) -> Table:
     )
 
 
-# Number of eigenvalues of which a sentence lists only the smallest four and the largest two.
-MAX_LISTED_EIGENVALUES = 8
-
-
 def check_page(check: Check) -> Page:
     """Describe predicted standard deviations, and inseparable parameters."""
     sections = [Section("Accuracy", list(_check_parts(check)))]
@@ -603,6 +602,8 @@ def check_page(check: Check) -> Page:
         is_detail = check.is_start and not check.is_dangerous
         parts = list(_rehearsal_parts(check.rehearsal, is_detail=is_detail))
         sections.append(Section("Rehearsal", parts))
+    if check.worth is not None:
+        sections.append(Section("What would help", worth_parts(check.worth, detail=True)))
     if check.violations:
         title = "The motion of the initial control violates limits; a design looks for one inside:"
         items = tuple(str(violation) for violation in check.violations)
@@ -690,7 +691,6 @@ def _check_parts(check: Check) -> Iterator[Part]:
     yield from _groups(title, check.not_separable, check)
     yield from _groups("Not excited by this control, but by another one", check.not_excited, check)
     yield Text(BEST_CASE, Emphasis.WEAK)
-    yield Text(_about_eigenvalues(check), detail=True)
     yield Text(_about_self_test(check), detail=True)
 
 
@@ -722,16 +722,6 @@ def _groups(title: str, groups: tuple[ParameterGroup, ...], check: Check) -> Ite
         items.append("\n".join([members, *lines]) if lines else str(group))
     if items:
         yield Listing(f"{title}:", tuple(items), Emphasis.DERIVED)
-
-
-def _about_eigenvalues(check: Check) -> str:
-    """The eigenvalues of the information, of many the smallest and the largest ones."""
-    values, selection = check.eigenvalues, ""
-    if len(values) > MAX_LISTED_EIGENVALUES:
-        values = np.concatenate([values[:4], values[-2:]])
-        selection = " (smallest four, largest two)"
-    listed = ", ".join(f"{value:.3g}" for value in values)
-    return f"eigenvalues{selection}: {listed}; condition {check.condition:.3g}"
 
 
 def _about_self_test(check: Check) -> str:

@@ -17,14 +17,13 @@ from contextvars import ContextVar
 from functools import partial, singledispatch
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from mjfim.errors import MjfimError, unknown
 from mjfim.output.page import PictureFormat
 from mjfim.output.panels import Picture
 from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
 from mjfim.output.plots import estimate_studies, studies
+from mjfim.output.plots.worth import worth
 from mjfim.output.words import complete_labels
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
@@ -35,6 +34,7 @@ from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.worth import Worth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,6 +51,7 @@ DESIGN_PICTURES = (
     "convergence",
     "limits",
     "rehearsal",
+    "worth",
 )
 ESTIMATE_PICTURES = (
     "parameters",
@@ -147,6 +148,8 @@ def _(design: Design) -> Pictures:
         pictures["limits"] = partial(of_design.limits, design, labels)
     if design.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, design.rehearsal)
+    if design.worth is not None:
+        pictures["worth"] = partial(worth, design.worth)
     return pictures
 
 
@@ -224,9 +227,14 @@ def _(check: Check) -> Pictures:
     pictures: Pictures = {"check": partial(studies.check, check)}
     if check.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, check.rehearsal)
-    if estimate_studies.has_pairs(np.array([row.std for row in check.rows if not row.nuisance])):
-        pictures["pairs"] = partial(studies.check_pairs, check)
+    if check.worth is not None:
+        pictures["worth"] = partial(worth, check.worth)
     return pictures
+
+
+@pictures_of.register
+def _(result: Worth) -> Pictures:
+    return {"worth": partial(worth, result)}
 
 
 @pictures_of.register

@@ -45,7 +45,6 @@ from mjfim.output.panels import (
     words,
 )
 from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows, share_text
-from mjfim.output.plots.estimate_studies import Spread, pairs
 from mjfim.output.words import (
     BEST_CASE,
     format_number,
@@ -181,19 +180,6 @@ def _correlations(result: Check, rows: int) -> Panel:
         y=blank_rows(rows),
         remark=remark,
         place=(0, 1),
-    )
-
-
-def check_pairs(result: Check) -> Picture:
-    """Show the predicted joint uncertainty of the estimates of every pair of parameters."""
-    rows = [row for row in result.rows if not row.nuisance]
-    values = np.array([row.value for row in rows])
-    return pairs(
-        [row.name for row in rows],
-        [row.unit for row in rows],
-        [Spread(values, result.covariance, source_role(result), "predicted")],
-        title=f"Predicted joint uncertainty, {result.source} ({duration(result)})",
-        note=BEST_CASE,
     )
 
 
