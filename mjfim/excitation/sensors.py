@@ -248,6 +248,7 @@ class Sensing:
             parameters=p.names,
             units=self.task.system.units,
             target=target,
+            is_stated=any(each.wanted for each in p.parameters),
             std=self.std(present),
             repeated=self.std(present, 2),
             faster=self.std(2.0 * present),

@@ -80,6 +80,7 @@ class Worth(ShownRecord):
         target: (p,) wanted standard deviations, stated or 5 % of the size; NaN for nuisance
             parameters, for those that no sensor determines alone and, where some are stated, for
             those without one [theta-unit].
+        is_stated: Whether the experiment states these standard deviations.
         std: (p,) standard deviations with all sensors of the experiment [theta-unit].
         repeated: (p,) standard deviations after two repetitions [theta-unit].
         faster: (p,) standard deviations with twice as many samples a second [theta-unit].
@@ -94,6 +95,7 @@ class Worth(ShownRecord):
     parameters: tuple[str, ...]
     units: tuple[str, ...]
     target: Array
+    is_stated: bool
     std: Array
     repeated: Array
     faster: Array
@@ -103,6 +105,11 @@ class Worth(ShownRecord):
 
     file_stem = "worth"
     made_by = "`mjfim worth EXPERIMENT -o DIR`"
+
+    @property
+    def goal(self) -> str:
+        """What is wanted of a parameter, in words."""
+        return "the wanted σ" if self.is_stated else f"a σ of {100 * DEFAULT_RELATIVE_STD:g} %"
 
     @property
     def dearest(self) -> list[Price]:

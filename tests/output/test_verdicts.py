@@ -249,3 +249,13 @@ def test_at_most_three_remarks_are_shown_before_verbose() -> None:
     assert short.count("Warning:") == 2 and "Not shown here" in short
     assert complete.count("Warning:") == 10
     assert complete.count("Fix first:") == 2 and "Detail: largest residuals in q" in complete
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_worth_names_a_wanted_standard_deviation_only_where_one_is_stated(
+    *, is_stated: bool
+) -> None:
+    result = results.MAKERS["worth"](is_stated=is_stated)
+    said = " ".join(printed(page_of(result), 100, verbose=True).split())
+    assert ("the wanted σ" in said) is is_stated
+    assert ("a σ of 5 %" in said) is not is_stated

@@ -457,6 +457,7 @@ def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
         "parameters": parameters,
         "units": UNITS,
         "target": 0.05 * THETA,
+        "is_stated": True,
         "std": std,
         "repeated": std / np.sqrt(2.0),
         "faster": std / np.sqrt(2.0),

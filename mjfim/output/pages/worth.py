@@ -46,11 +46,11 @@ def worth_page(worth: Worth) -> Page:
 
 def headline(worth: Worth) -> str:
     """Say what helps most: a sensor, data or a limit."""
-    reached, now = "reaches every wanted σ", worth.ratio(worth.std)
+    reached, now = f"reaches {worth.goal} of every parameter", worth.ratio(worth.std)
     if np.isinf(now):
         reached = f"does not determine {worth.worst(worth.std)} alone"
     elif now > 1.0:
-        reached = f"misses the wanted σ of {worth.worst(worth.std)} by a factor of {now:.2g}"
+        reached = f"misses {worth.goal} of {worth.worst(worth.std)} by a factor of {now:.2g}"
     helps = []
     for added in (False, True):
         rows = [each for each in worth.single if each.is_added == added]
@@ -88,7 +88,7 @@ def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:
         "alone": [change(worth, each.alone) for each in present],
         "half its noise": [change(worth, each.halved) for each in present],
     }
-    note = "Change of the largest σ / wanted σ, and the parameter that then has it."
+    note = f"Change of the largest σ over {worth.goal}, and the parameter that then has it."
     marked = warned(not worth.ratio(each.without) < LARGE_INCREASE * now for each in present)
     table = tabulated("Sensors", columns, marked, spare=("noise",), note=note, detail=detail)
     parts: list[Part] = [*(Text(each) for each in _sentences(worth)), Plot("worth"), table]
@@ -107,10 +107,10 @@ def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:
 
 def _sentences(worth: Worth) -> Iterator[str]:
     if worth.fewest:
-        yield f"The smallest set that reaches every wanted σ: {listed(worth.fewest)}."
+        yield f"The smallest set that reaches {worth.goal} everywhere: {listed(worth.fewest)}."
     now = worth.ratio(worth.std)
     if 1.0 < now < np.inf:
-        yield f"Without priors, {int(np.ceil(now**2))} repetitions reach every wanted σ."
+        yield f"Without priors, {int(np.ceil(now**2))} repetitions reach {worth.goal}."
     needless = [
         each.name
         for each in worth.single

@@ -36,11 +36,10 @@ def worth(result: Worth) -> Picture:
     if result.prices:
         panels.append(_prices(result, max(len(rows), len(result.prices))))
         heights[0] = max(heights[0], 1.1 + 0.3 * len(result.prices))
-    note = f"Where no σ is wanted, 5 % of the size of the parameter. {BEST_CASE}"
     return Picture(
         title=headline(result).removesuffix("."),
         panels=panels,
-        note=note + share_note(rows, order, "sensors, those that change σ most"),
+        note=BEST_CASE + share_note(rows, order, "sensors, those that change σ most"),
         heights=heights,
         widths=[1.6, 1.0][: len(panels)],
     )
@@ -69,7 +68,7 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
     low, high = around(np.concatenate([without, better, [1.0, now]]), factor=2.0)
     without_or_end = np.where(np.isnan(without), high, without)
     marks: list[Mark] = [
-        vline(1.0, dash="--", label="wanted"),
+        vline(1.0, dash="--", label=result.goal),
         *([vline(now, "muted", label="now")] if np.isfinite(now) else []),
         *(
             line([better[k], without_or_end[k]], np.full(2, k), "band", width=5.0, front=1.0)
@@ -89,7 +88,7 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
     return Panel(
         title="Sensors",
         marks=marks,
-        x=Axis(label="largest σ / wanted σ [–]", limits=(low, high), log=True),
+        x=Axis(label=f"largest σ over {result.goal} [–]", limits=(low, high), log=True),
         y=row_axis([each.name for each in rows]),
         beside=[("without / with", "text", texts)],
     )
