@@ -568,8 +568,14 @@ class _RobotPlayer:
         still = np.zeros(len(directions))
         if np.abs(relative_rates(still)).max(initial=0.0) <= MAX_REST_MOVE:
             return stated
+        # A robot on the ground rests at many places; the nearest one is meant.
         found = scipy.optimize.least_squares(
-            relative_rates, still, xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=MAX_REST_STEPS
+            lambda move: np.concatenate([relative_rates(move), MAX_REST_MOVE * move]),
+            still,
+            xtol=1e-12,
+            ftol=1e-12,
+            gtol=1e-12,
+            max_nfev=MAX_REST_STEPS,
         )
         # Nobody balances a robot on an equilibrium that it leaves within the motion.
         growth = np.linalg.eigvals(found.jac[: space.nv, : space.nv]).real.max(initial=0.0)

@@ -597,3 +597,53 @@ def test_a_closed_chain_is_designed_and_never_worse_than_its_start() -> None:
         data.ctrl[:] = u
         mujoco.mj_step(model, data, substeps)
         assert_allclose(data.qpos, qpos, atol=1e-9)
+
+
+BOX_ON_GROUND = """<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom type="plane" size="0 0 1"/>
+    <body name="box" pos="0 0 0.1">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <joint name="tilt" axis="0 1 0"/>
+      <geom type="box" size="0.2 0.1 0.1" mass="5"/>
+      <body name="arm" pos="0 0 0.15">
+        <joint name="swing" axis="0 1 0" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.2" size="0.02" mass="0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="swing" ctrlrange="-2 2"/></actuator>
+</mujoco>"""
+
+
+def test_a_robot_on_the_ground_begins_where_it_stands(tmp_path: Path) -> None:
+    """It rests at every place of the ground, so that its equilibrium is the nearest one."""
+    path = tmp_path / "box.xml"
+    path.write_text(BOX_ON_GROUND, encoding="utf-8")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[3] = np.pi
+    mujoco.mj_step(model, data, 4000)
+    experiment = mjfim.Experiment(
+        model=str(path),
+        rate=50.0,
+        horizon=1.0,
+        noise={"state": 0.01},
+        parameters={
+            "mass": {"target": "body/box:mass"},
+            "damping": {"target": "joint/swing:damping"},
+        },
+        initial={
+            "qpos": data.qpos.tolist(),
+            "control": {"kind": "sine", "amplitude": 0.05, "frequency": 1.0},
+        },
+        limits={"position": {"x": [-0.05, 0.05]}},
+        boundary={"start": "rest"},
+        rehearsal={"robots": 20},
+    )
+    found = mjfim.check(experiment).rehearsal
+    assert found is not None
+    assert found.all_kept == 20
+    assert found.travel[:, 0].max() < 1e-3
