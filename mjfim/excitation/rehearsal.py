@@ -294,6 +294,13 @@ class _RobotPlayer:
         length = float(model_length(model))
         self.depth = PASSED_SHARE * length
         self.floor, self.has_floor = self._floor_of(model, trajectory.state[0])
+        # What touches the floor sinks in as far as its contact is soft, but not by half of itself.
+        is_plane = (model.geom_type == PLANE) & (model.body_weldid[model.geom_bodyid] == 0)
+        for plane in np.flatnonzero(is_plane & self.has_floor).tolist():
+            touch = model.geom_contype[self._geoms] & model.geom_conaffinity[plane]
+            touch |= model.geom_conaffinity[self._geoms] & model.geom_contype[plane]
+            halves = model.geom_aabb[self._geoms[touch != 0], 3:].min(axis=1)
+            self.depth = max(self.depth, float(halves.min())) if len(halves) else self.depth
         ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
         self._distances: GeomDistances | None = None
         with suppress(ExperimentError):

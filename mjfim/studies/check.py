@@ -523,8 +523,9 @@ def _checked(
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
 
-    # A motion that a robot could play is rehearsed without feedback.
+    # A motion that a robot could play is rehearsed without feedback; a start has no gains for it.
     rehearsal, warning = None, ""
+    is_motion = is_motion and not (is_start and task.experiment.rehearsal.feedback)
     if is_motion and steps is not None and point.trajectory is not None and not refused:
         begin_stage("rehearsing the motion")
         played, growth = point.trajectory, growth_along(task, point.trajectory)

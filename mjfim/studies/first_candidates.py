@@ -559,15 +559,18 @@ ProposedNoise = tuple[str, float, str]
 
 
 def proposed_noise(
-    model: Any, length: float, period: float, wanted: Mapping[str, float]
+    model: Any, length: float, period: float, wanted: Mapping[str, float], *, flies: bool
 ) -> list[ProposedNoise]:
     """Noise of the sensors whose noise the MJCF states; else of all joints, by their type.
+
+    The feedback that keeps a robot in the air needs its motion, so that both are measured there.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
         length: Length of the robot [m].
         period: Characteristic period of its motion [s].
         wanted: Standard deviations of joints that the user states, by kind; see `Wishes.sigmas`.
+        flies: Whether the robot flies.
     """
     typical = {
         "angle": ANGLE_SIGMA,
@@ -580,7 +583,8 @@ def proposed_noise(
         for name in names_of(model, "sensor")
     ]
     stated = [sensor for sensor in sensors if sensor[1] > 0.0]
-    return stated or list(_joints(model, {**typical, **wanted}))
+    joints = list(_joints(model, {**typical, **wanted}))
+    return [*stated, *joints] if flies or not stated else stated
 
 
 def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:

@@ -295,7 +295,7 @@ def propose_experiment(
             rounded(FIRST_FREQUENCY / times.period),
             rounded(LAST_FREQUENCY / times.period),
         ),
-        noise=proposed_noise(model, length, times.period, wishes.sigmas),
+        noise=proposed_noise(model, length, times.period, wishes.sigmas, flies=flies),
         chosen=found,
         others=absent,
         limits=limits,
@@ -751,8 +751,14 @@ def _about(proposal: Proposal) -> dict[str, list[str]]:
         "Standard deviations of the measurements. To measure them, hold the robot still for 10 s,",
         "record, and take the standard deviation of each column.",
     ]
-    if not proposal.noise[0][2]:
+    of_joints = [kind for _, _, kind in proposal.noise]
+    if not of_joints[0]:
         noise = ["Standard deviations of the sensors, as the MJCF states them."]
+    if not of_joints[0] and of_joints[-1]:
+        noise += [
+            "Those of `qpos` and `qvel` are those of what measures the flight, such as motion",
+            "capture, by which the feedback keeps the robot in the air.",
+        ]
 
     initial = [f"The release, at rest, away from {start.reason}."]
     if proposal.release is None:

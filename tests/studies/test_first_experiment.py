@@ -449,6 +449,13 @@ def test_a_robot_that_flies_gets_a_box_speeds_a_tilt_a_floor_and_feedback(tmp_pa
     assert min(m for kind, m in margins.items() if not kind.startswith("end_")) >= 0.0
 
 
+def test_the_motion_of_a_flight_is_measured_also_where_there_are_sensors(tmp_path: Path) -> None:
+    """The gains of the feedback read positions and velocities, which no sensor shows."""
+    _, experiment = proposed(MODELS / "quadrotor.xml", tmp_path)
+    assert experiment.rehearsal.feedback
+    assert {"imu_gyro", "qpos:base.pos", "qvel:base.rot"} <= set(experiment.noise)
+
+
 def test_a_robot_without_weight_needs_no_floor_and_no_tilt(tmp_path: Path) -> None:
     _, experiment = proposed(written(tmp_path, FLYER.format(gravity=0)), tmp_path)
     assert "base" in experiment.limits.position
