@@ -175,7 +175,9 @@ def test_prices_are_those_of_a_design_with_a_wider_limit(
     assert change < -0.05
     assert force.predicted == pytest.approx(change, rel=0.2)
     assert force.redesigned == pytest.approx(change, rel=0.1)
-    assert design.worth.prices[0].predicted == pytest.approx(change, rel=0.2)
+    # The design did not centre its barrier: its multipliers are a first estimate.
+    of_design = {price.name: price.predicted for price in design.worth.prices}
+    assert of_design["control of force"] == pytest.approx(change, rel=0.3)
     assert time.redesigned < -0.01
 
 
