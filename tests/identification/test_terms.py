@@ -307,3 +307,22 @@ def test_many_candidates_are_tested_in_groups(
     assert [term.path for term in in_groups[:-1]] == [term.path for term in whole[:-1]]
     for part, complete in zip(in_groups, whole, strict=True):
         assert part.sigmas == pytest.approx(complete.sigmas, rel=0.02)
+
+
+def test_a_joint_without_a_name_has_no_terms(tmp_path: Path) -> None:
+    """A path of the experiment file cannot name it."""
+    path = tmp_path / "model.xml"
+    path.write_text(
+        '<mujoco><worldbody><body><joint axis="0 1 0"/><geom size="0.1" mass="1"/>'
+        '<body pos="0 0 -0.3"><joint name="elbow" axis="0 1 0"/><geom size="0.1" mass="1"/></body>'
+        '</body></worldbody><actuator><motor name="motor" joint="elbow"/></actuator></mujoco>',
+        encoding="utf-8",
+    )
+    experiment = mjfim.Experiment(
+        model=str(path),
+        rate=50.0,
+        noise={"state": 0.01},
+        parameters={"damping": {"target": "joint/elbow:damping", "scale": 0.1}},
+    )
+    found, _ = candidates_of(System.resolve(experiment), np.ones(2))
+    assert {candidate.joint for candidate in found if candidate.joint} == {"elbow"}

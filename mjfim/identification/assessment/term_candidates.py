@@ -188,9 +188,13 @@ def _joint_terms(system: System) -> Iterator[Candidate]:
 
 
 def _stated_joints(system: System) -> tuple[ScalarJoint, ...]:
-    """Slides and hinges of the MJCF, without those that terms have added."""
+    """Slides and hinges of the MJCF with a name, without those that terms have added."""
     added = {c.address for c in system.source.coordinates.state if c.is_added}
-    return tuple(joint for joint in scalar_joints(system.model) if joint.q not in added)
+    return tuple(
+        joint
+        for joint in scalar_joints(system.model)
+        if joint.q not in added and element_name(system.model, "joint", joint.joint)
+    )
 
 
 def _period_of(system: System) -> float:
