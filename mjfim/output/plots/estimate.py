@@ -38,6 +38,7 @@ from mjfim.output.words import (
     format_number,
     format_with_uncertainty,
     predicted_data,
+    relative,
     share_note,
     shorten,
     without_zeros,
@@ -208,13 +209,13 @@ def accuracy(estimate: Estimate, labels: Labels) -> Picture:
     ]
     shown = [source for source in sources if np.isfinite(source.std).any()]
     sizes = np.where(estimate.theta == 0.0, np.nan, estimate.sizes)
+    note = "Honest σ: a quarter of the width of the 95 % interval."
+    if np.isfinite(labels.published).any():
+        note += " To published: distance of the estimate from the published value."
     return Picture(
-        title=capitalised("; ".join(_about_accuracy(estimate, labels)) or "accuracy of the fit"),
+        title=capitalised("; ".join(_about_accuracy(estimate, labels))),
         panels=[accuracy_panel(names, sizes, shown, labels.wanted)],
-        note=(
-            "Honest σ: a quarter of the width of the 95 % interval. To published: distance of the "
-            "estimate from the published value."
-        ),
+        note=note,
         heights=[height_of_rows(len(names))],
     )
 
@@ -223,11 +224,16 @@ def _about_accuracy(estimate: Estimate, labels: Labels) -> Iterator[str]:
     """Compare the honest σ with what was predicted, and the estimates with published values."""
     honest, names = estimate.honest_std, estimate.parameters
     with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(estimate.sizes > 0.0, honest / estimate.sizes, np.nan)
         ratio = honest / estimate.predicted_std
         distance = np.abs(labels.published - estimate.theta) / honest
     if np.isfinite(ratio).any():
         j = int(np.nanargmax(ratio))
         yield f"honest σ at most {format_number(ratio[j], 2)} times the predicted one ({names[j]})"
+    elif np.isfinite(share).any():
+        j = int(np.nanargmax(share))
+        most = relative(honest[j], estimate.sizes[j])
+        yield f"accuracy of the fit: honest σ is at most {most} ({names[j]})"
     if np.isfinite(distance).any():
         j = int(np.nanargmax(distance))
         distance_text = f"{format_number(distance[j], 2)} honest σ"
