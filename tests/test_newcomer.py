@@ -190,7 +190,7 @@ def test_a_walk_ends_with_the_parameters_of_the_robot(
     # The rehearsal says of robots what they do in plain MuJoCo.
     # Shares of 60 and of 100 robots differ by less than 0.2 in 98 of 100 cases.
     assert found.kept == pytest.approx(found.kept_in_mujoco, abs=0.2)
-    assert not found.safe
+    assert found.safe is (found.kept > 0.95)
     assert found.inside is not None
     assert found.parameters
 

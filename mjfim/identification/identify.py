@@ -293,6 +293,9 @@ def _refuse_other_zero(search: FitSearch, fit: FitResult) -> None:
     places = measured_states(system, fit.problem.recordings[0])
     positions = {system.outputs.names[j] for x, j in places.items() if x < system.space.nq}
     names = {name for begin in begins for name in begin.by}
+    paths = {target.path for each in system.parameters.parameters for target in each.targets}
+    if paths & {f"output/{name}:bias" for name in names}:
+        return
     if not names <= positions or len(begins) < len(task.recordings) + len(task.held_out):
         return
 

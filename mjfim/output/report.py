@@ -160,7 +160,7 @@ def _prose(text: str) -> Markup:
     from markupsafe import Markup, escape
 
     spaced = UNIT_SPACE.sub("\u00a0", str(escape(text)))
-    return Markup(CODE.sub(r"<code>\1</code>", spaced).replace("\n", "<br>"))
+    return Markup(CODE.sub(r"<code>\1</code>", spaced).replace("\n", "<br/>"))
 
 
 # Results that have a report; of several in a folder, the first one stands at the top.

@@ -108,7 +108,7 @@ def test_every_part_of_a_page_is_escaped() -> None:
     html = template("notebook.html.j2").render(page=page, styles=STYLES)
     found = texts(html)
     assert "<script" not in html
-    assert found.count(HOSTILE) == 14
+    assert found.count(HOSTILE) == 15
     assert f"Warning: {HOSTILE}" in found
     assert "<code>a&lt;b</code> or ` alone" in html
 

@@ -237,7 +237,7 @@ def test_the_lines_of_a_cure_stay_lines_everywhere() -> None:
     estimate = cause(causes=(text,), warnings=(text,), details=())
     assert lines in printed(page_of(estimate), 200)
     assert as_sentence(text).endswith(lines)
-    html = unescape(as_html(estimate)).replace("<br>", "\n")
+    html = unescape(as_html(estimate)).replace("<br/>", "\n")
     assert f"{lines}</p>" in html
 
 
