@@ -483,6 +483,6 @@ def clear(folder: Path, names: str) -> None:
         folder: The folder.
         names: Regular expression for whole names.
     """
-    for stale in list(folder.iterdir()):
+    for stale in list(folder.glob("*")):
         if re.fullmatch(names, stale.name):
             remove_earlier_result(stale)

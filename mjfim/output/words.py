@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence, Sized
+from collections.abc import Callable, Sequence, Sized
 from typing import Any
 
 import numpy as np
@@ -244,11 +244,12 @@ def improvement(before: float, after: float) -> str:
 MAX_NAMED, NOTABLE_SHARE = 3, 0.1
 
 
-def when_learnt(design: Design) -> str:
+def when_learnt(design: Design, write: Callable[[str], str] = str) -> str:
     """Say after which time each parameter is known, and which seconds tell nothing.
 
     Args:
         design: The design.
+        write: Writes the name of a parameter.
     """
     t = design.trajectory.t - design.trajectory.t[0]
     targets = design.targets
@@ -264,7 +265,7 @@ def when_learnt(design: Design) -> str:
         return f"One experiment does not reach {what} for {first_ones(missed)}."
 
     last = sorted(asked, key=lambda j: seconds[j])[-MAX_NAMED:]
-    named = [f"{design.parameters[j]} {seconds[j]:.3g} s" for j in last]
+    named = [f"{write(design.parameters[j])} {seconds[j]:.3g} s" for j in last]
     others = "" if len(last) == len(asked) else "others earlier, "
     end = float(seconds[last[-1]])
     reached = "Every wanted σ is reached" if is_stated else f"Every parameter reaches {goal}"

@@ -321,7 +321,7 @@ def accuracy_over_time(design: Design, labels: Labels) -> Picture:
     shown = sorted(last_first[: len(SERIES)])
     which = "parameters, those that are known last"
     return Picture(
-        title=when_learnt(design).removesuffix(".") or "Accuracy over time",
+        title=when_learnt(design, shorten).removesuffix(".") or "Accuracy over time",
         panels=[accuracy_over_time_panel(design, labels, shown)],
         note=f"Beside the names: σ at the end. {BEST_CASE}{share_note(shown, asked, which)}",
         heights=[3.4],

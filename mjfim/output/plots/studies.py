@@ -131,7 +131,7 @@ def check(result: Check) -> Picture:
         title=as_sentence(title),
         panels=panels,
         note=note,
-        heights=[1.0 + height_of_rows(len(names))],
+        heights=[1.8 + height_of_rows(len(names))],
         widths=[1.15, 1.0] if has_correlations else [1.0],
     )
 
