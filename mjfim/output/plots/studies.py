@@ -172,11 +172,13 @@ def _correlations(result: Check, rows: int) -> Panel:
     remark = f"correlation (red: positive, blue: negative); {far}"
     if np.isnan(correlation).any():
         remark += "; grey: not identifiable alone"
+    if not texts:
+        remark += "; columns in the order of the rows"
     cells = Cells(values=correlation, texts=texts, is_bold=confounded)
     return Panel(
         cells=cells,
         marks=marks,
-        x=Axis(ticks=range(count), names=result.wanted),
+        x=Axis(ticks=range(count), names=result.wanted) if texts else Axis(ticks=(), names=()),
         y=blank_rows(rows),
         remark=remark,
         place=(0, 1),
