@@ -303,7 +303,7 @@ def _record(
     rehearsal = None if interrupted else rehearse_task(played, after)
     worth = None
     if not interrupted:
-        sensing = sensing_along(played, after.trajectory, identifiability)
+        sensing = sensing_along(played, final, identifiability)
         worth = sensing.worth("the design", task.horizon)
         worth = replace(worth, prices=tuple(starmap(Price.of_limit, winner.prices.items())))
     status = Status.INTERRUPTED if interrupted else winner.ended

@@ -1,4 +1,4 @@
-"""What each sensor tells about the parameters along one motion, from one linearisation of it.
+"""What each sensor tells about the parameters along one motion, from its sensitivities.
 
 The noise of sensors is independent, so that their information adds. Without a sensor its matrix is
 missing from the sum; with half of its noise it counts four times.
@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError
+from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import shared
 from mjfim.information.identifiability import Identifiability, null_space
@@ -25,7 +25,7 @@ from mjfim.information.null_space import COARSER_STEP_FACTOR
 from mjfim.model.coordinates import ScalarJoint, output_label, split_unit
 from mjfim.model.units import per_second
 from mjfim.plant.plant import SENSITIVITY_STEP
-from mjfim.records.trajectory import Sensitivity, Trajectory
+from mjfim.records.trajectory import Sensitivity
 from mjfim.records.worth import DEFAULT_RELATIVE_STD, SensorWorth, Worth
 
 # Words for kinds of sensors, where they differ from MuJoCo's.
@@ -286,28 +286,24 @@ def _accelerations(
 
 def sensing_along(
     task: DesignTask,
-    trajectory: Trajectory,
+    point: DesignPoint,
     identifiability: Identifiability,
     added: Collection[str] = (),
     accelerations: Mapping[ScalarJoint, float] = MappingProxyType({}),
 ) -> Sensing:
-    """Linearise a motion and collect what each sensor shows.
+    """Collect what each sensor shows along a motion that can be simulated.
 
     Args:
         task: The task.
-        trajectory: The motion.
+        point: The motion with its sensitivities.
         identifiability: What the sensors of the task can identify.
         added: Names of sensors of the task that the user's model lacks.
         accelerations: Standard deviations of sensors of joint accelerations, by their joints.
-
-    Raises:
-        SimulationDivergedError: The motion diverges when the parameters change a little.
     """
-    differentiate = task.plant.derivatives.sensitivity
-    fine = differentiate(task.theta, trajectory)
-    if fine is None:
-        raise SimulationDivergedError("the motion diverges when the parameters change a little")
-    coarse = differentiate(task.theta, trajectory, COARSER_STEP_FACTOR * SENSITIVITY_STEP) or fine
+    fine = point.sensitivity
+    assert fine is not None and point.trajectory is not None
+    step = COARSER_STEP_FACTOR * SENSITIVITY_STEP
+    coarse = task.plant.derivatives.sensitivity(task.theta, point.trajectory, step) or fine
     sensors = (
         *sensors_along(task, fine, coarse, added),
         *_accelerations(task, fine, coarse, accelerations),

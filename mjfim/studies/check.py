@@ -536,7 +536,7 @@ def _checked(
     # What each sensor tells along one motion.
     worth = None
     if steps is not None and is_motion and point.trajectory is not None:
-        worth = sensing_along(task, point.trajectory, found).worth(source, duration)
+        worth = sensing_along(task, point, found).worth(source, duration)
 
     # Eigenvalues of the criterion, without combinations that no experiment can identify.
     criterion = replace(task.information, basis=found.basis)

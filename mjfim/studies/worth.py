@@ -116,7 +116,7 @@ def _worth(
         for joint in _at_joints(system, key)
     }
     identifiability = identifiability_along(task, point)
-    sensing = sensing_along(task, trajectory, identifiability, names, accelerations)
+    sensing = sensing_along(task, point, identifiability, names, accelerations)
     found = sensing.worth(source, task.horizon)
     if design is None or design.worth is None:
         return found

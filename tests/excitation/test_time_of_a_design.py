@@ -93,7 +93,7 @@ def far_outside(folder: Path, descent: dict[str, Any]) -> DesignTask:
 @pytest.mark.parametrize(
     ("make", "seconds"),
     [
-        (weights, 0.4),
+        (weights, 0.3),
         pytest.param(limits, 0.6, marks=pytest.mark.slow),
         pytest.param(starts, 0.4, marks=pytest.mark.slow),
         pytest.param(far_outside, 2.0, marks=pytest.mark.slow),
@@ -102,15 +102,17 @@ def far_outside(folder: Path, descent: dict[str, Any]) -> DesignTask:
 def test_a_design_uses_its_time_and_not_much_more(
     make: Any, seconds: float, clock: StepClock, tmp_path: Path
 ) -> None:
-    """Beyond its time, it ends the iteration, verifies the result, and asks what sensors tell."""
+    """Beyond its time, it ends the iteration and verifies the result."""
     task = make(tmp_path, {**ENDLESS, "seconds": seconds})
     # The rehearsal comes after the time of the search.
     task = task.restated(task.experiment.replace(rehearsal={"robots": 0}))
     begun = clock()
     design = design_task(task)
-    used = clock() - begun
+    # What sensors tell comes after it as well: the sensitivities with a longer difference step.
+    sensing = 2 * len(task.theta) * task.samples * task.system.grid.substeps
+    used = clock() - begun - sensing / STEPS_PER_SECOND
     assert design.status is Status.MAX_ITERATIONS
-    assert 0.9 * seconds < used < 1.25 * seconds
+    assert 0.9 * seconds < used < 1.2 * seconds
     assert design.sound
 
 
@@ -162,10 +164,10 @@ def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_frict
         assert design.status is Status.MAX_ITERATIONS
 
         # All random controls are counted. Beyond its time, the design ends the last of them, whose
-        # growth, sensors and report take as long as some evaluations.
+        # growth and report take as long as some evaluations.
         used = clock() - begun
-        assert design.steps > 0.45 * used * STEPS_PER_SECOND
-        assert used < seconds + 16.0 * evaluation
+        assert design.steps > 0.5 * used * STEPS_PER_SECOND
+        assert used < seconds + 15.0 * evaluation
 
     assert costs[0] < 0.3 * initial
     assert costs == sorted(costs, reverse=True)

@@ -19,6 +19,7 @@ from mjfim.identification.aligned_recording import align
 from mjfim.identification.inverse_dynamics import refuse_gross_error
 from mjfim.output.archive import write_recording
 from mjfim.records.trajectory import Recording
+from scripts.benchmarks.starts import PENDULUM
 from tests.support.cli import run
 from tests.support.paths import MODELS
 
@@ -26,16 +27,6 @@ from tests.support.paths import MODELS
 pytestmark = pytest.mark.slow
 
 MULTISINE = {"kind": "multisine", "amplitude": 6.0, "frequency": 0.3, "harmonics": 5}
-PENDULUM = """<mujoco>
-  <option timestep="0.005" integrator="RK4"/>
-  <worldbody>
-    <body name="pole">
-      <joint name="hinge" axis="0 1 0" damping="0.05"/>
-      <inertial pos="0 0 -0.4" mass="0.6" diaginertia="0.008 0.008 0.0004"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge"/></actuator>
-</mujoco>"""
 SHOULDER, ELBOW = ["qpos:shoulder", "qvel:shoulder"], ["qpos:elbow", "qvel:elbow"]
 
 
