@@ -6,7 +6,7 @@ The module knows arrays and two protocols, neither MuJoCo nor Fisher information
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -205,11 +205,13 @@ class Armijo:
         sigma: Smallest accepted share of the predicted decrease.
         beta: Largest factor by which a rejected step is shortened.
         trials: Largest number of steps that are tried.
+        is_over: Whether the time is over; no further step is tried then.
     """
 
     sigma: float = 1e-4
     beta: float = 0.5
     trials: int = 30
+    is_over: Callable[[], bool] = lambda: False
 
     def __post_init__(self) -> None:
         if not (0.0 < self.sigma < 0.5 and 0.0 < self.beta < 1.0 and self.trials > 0):
@@ -235,7 +237,8 @@ class Armijo:
             first: First step length.
 
         Returns:
-            The accepted point and its gamma, or None where even the shortest step does not lower J.
+            The accepted point and its gamma, or None where even the shortest step does not lower J
+            and where the time is over.
         """
         value = problem.value(point)
         gamma = first
@@ -248,6 +251,8 @@ class Armijo:
             new = problem.value(trial)
             if new <= value + self.sigma * gamma * slope:
                 return trial, gamma
+            if self.is_over():
+                return None
 
             # Minimum of the parabola. A diverged trial has none; its step is shortened as much as
             # possible.
@@ -346,7 +351,7 @@ def optimize(
         max_iterations: Largest number of accepted steps.
 
     Yields:
-        Every iterate; the last one carries a status.
+        Every iterate; the last one carries a status, unless the time ended the line search.
     """
     point, gamma, index = start, 0.0, 0
     expansion = problem.expand(point)
@@ -379,6 +384,9 @@ def optimize(
             if slope < 0.0:
                 first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)
                 found = armijo.search(problem, point, zeta, slope, K, first)
+
+        if found is None and armijo.is_over():
+            return
 
         # More accurate derivatives may show a further descent. Where there are none and no step
         # lowers J, the memory of the direction is cleared. If it is empty, the algorithm ends.

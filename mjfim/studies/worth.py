@@ -261,11 +261,13 @@ def _redesigned(
     if point.values is None:
         return np.nan, {}
     iterations = task.experiment.descent.max_iterations
-    for step in ground.stage(BARRIER, problem, point, ground.direction(), iterations):
-        if budget.exhausted is not None:
-            return np.nan, {}
-        if step.iterate.slope <= SETTLED * BARRIER.last:
+    for step in ground.stage(
+        BARRIER, problem, point, ground.direction(), iterations, budget
+    ):
+        if budget.exhausted is not None or step.iterate.slope <= SETTLED * BARRIER.last:
             break
+    if budget.exhausted is not None:
+        return np.nan, {}
     point = step.iterate.point
     # At the minimum, errors of the motion change the sum of merit and barrier least.
     return 0.5 * problem.value(point), problem.prices(point, task.controls)

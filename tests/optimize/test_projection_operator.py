@@ -372,6 +372,18 @@ def test_armijo_gives_up_on_an_ascent_direction_that_claims_to_descend() -> None
     assert found is None or problem.value(found[0]) < problem.value(point)
 
 
+def test_the_line_search_ends_with_its_time_and_the_descent_with_its_last_iterate() -> None:
+    problem = Pendulum()
+    point, expansion, K, zeta = begun(problem, METRIC)
+    up, slope = scaled(zeta, -1.0), expansion.slope(zeta)
+    asked = iter([False, False, True])
+    assert Armijo(is_over=lambda: next(asked)).search(problem, point, up, slope, K) is None
+    assert len(problem.values) == 4  # the start and three trials
+
+    iterates = run(Pendulum(), Upwards(), armijo=Armijo(is_over=lambda: True))
+    assert [iterate.status for iterate in iterates] == [None]
+
+
 def test_armijo_backtracks_from_trials_that_diverge() -> None:
     problem = Pendulum(wall=6.0)
     (trial, gamma), value, _ = searched(problem, 100.0, Armijo())

@@ -372,7 +372,9 @@ class Climb:
         is_limited, offset = self._grounds.is_limited, self.candidate.iterations
         done = offset - self._begin.iterations
         last = -1
-        for step in ground.descend_freely(controls, memory, done, is_limited=is_limited):
+        for step in ground.descend_freely(
+            controls, memory, done, self._budget, is_limited=is_limited
+        ):
             if step.iterate.index <= last and not step.iterate.status:
                 offset = self.candidate.iterations
             last = step.iterate.index
@@ -408,7 +410,9 @@ class Climb:
             problem = ground.problem(barrier, weights[number], tightening)
             iterations = int(np.ceil(max(self._iterations_left, 1) / left))
             offset = max(self.candidate.iterations - bool(number or repeated), 0)
-            for step in ground.stage(barrier, problem, point, direction, iterations):
+            for step in ground.stage(
+                barrier, problem, point, direction, iterations, self._budget
+            ):
                 yield from self._recorded(step, ground, offset)
                 if budget.exhausted is not None or self.candidate.is_held_up:
                     break

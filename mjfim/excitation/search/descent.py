@@ -176,7 +176,13 @@ class Ground(LimitedLevel):
     # ---- without a barrier
 
     def descend_freely(
-        self, controls: Sequence[Array], memory: FreeMemory, done: int, *, is_limited: bool
+        self,
+        controls: Sequence[Array],
+        memory: FreeMemory,
+        done: int,
+        budget: Budget,
+        *,
+        is_limited: bool,
     ) -> Iterator[Step]:
         """Run Algorithm 1 from the control of lowest cost.
 
@@ -186,6 +192,7 @@ class Ground(LimitedLevel):
             controls: (N, nu) controls at the stated sample rate [u-unit].
             memory: What a coarser level has learnt; it gets what this one learns.
             done: Number of iterations on coarser levels.
+            budget: Ends a line search.
             is_limited: The limits are checked.
         """
         rate, clamped = 1.0 / self.task.dt, 0
@@ -197,7 +204,7 @@ class Ground(LimitedLevel):
                 direction = memory.direction.refined(R, round(rate / memory.rate))
 
             status, eigenvalues = None, np.zeros(0)
-            for iterate in self._free_iterates(problem, controls, direction, done):
+            for iterate in self._free_iterates(problem, controls, direction, done, budget):
                 step = self._free_step(iterate, level.power)
                 if is_limited:
                     step, clamped = self._watched(step, clamped)
@@ -210,12 +217,17 @@ class Ground(LimitedLevel):
             done += iterate.index + 1 if len(eigenvalues) else 0
             memory.power = _next_power(level, eigenvalues, status)
             memory.direction, memory.rate = None, rate
-            if memory.power == level.power:
+            if memory.power == level.power or budget.exhausted is not None:
                 memory.direction = direction
                 return
 
     def _free_iterates(
-        self, problem: DesignProblem, controls: Sequence[Array], direction: Direction, done: int
+        self,
+        problem: DesignProblem,
+        controls: Sequence[Array],
+        direction: Direction,
+        done: int,
+        budget: Budget,
     ) -> Iterator[Iterate[DesignPoint]]:
         """Iterates of Algorithm 1 on this level; none where all controls diverge."""
         descent = self.task.experiment.descent
@@ -236,7 +248,7 @@ class Ground(LimitedLevel):
             start,
             direction,
             regulator_for(self.task),
-            Armijo(),
+            _line_search(budget),
             tolerance=tolerance,
             max_iterations=max(most - done, 0),
         )
@@ -313,7 +325,7 @@ class Ground(LimitedLevel):
             start,
             self.direction(),
             self._regulator,
-            Armijo(),
+            _line_search(budget),
             tolerance=STEERING_TOLERANCE,
             max_iterations=STEERING_ITERATIONS,
         )
@@ -345,6 +357,7 @@ class Ground(LimitedLevel):
         point: InteriorPoint,
         direction: StructuredBFGS,
         max_iterations: int,
+        budget: Budget,
     ) -> Iterator[Step]:
         """Minimise with one weight of the barrier until it converges or stagnates.
 
@@ -355,6 +368,7 @@ class Ground(LimitedLevel):
             direction: The direction, which all stages share: its curvature pairs do not depend on
                 the weight.
             max_iterations: Largest number of iterations.
+            budget: Ends a line search.
         """
         is_last = problem.mu <= barrier.last
         merits = []
@@ -363,7 +377,7 @@ class Ground(LimitedLevel):
             problem.reevaluate(point),
             direction,
             self._regulator,
-            Armijo(),
+            _line_search(budget),
             tolerance=min(barrier.tolerance, Barrier.tolerance),
             max_iterations=min(max_iterations, STAGE_ITERATIONS * (1 + is_last)),
         )
@@ -472,6 +486,11 @@ def _direction_for(level: DescentLevel) -> tuple[Direction, DesignProblem]:
     extended_Q = np.diag(np.concatenate([np.diag(Q), psi_weights]))
     direction = MetricDescent(extended_Q, R, extended_Q, weighs_psi=True)
     return direction, replace(level.problem, extends=True)
+
+
+def _line_search(budget: Budget) -> Armijo:
+    """A line search that ends with its time."""
+    return Armijo(is_over=lambda: budget.exhausted is not None)
 
 
 def _meet(level: DescentLevel, eigenvalues: Array, ratio: float) -> bool:
