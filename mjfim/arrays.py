@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,22 @@ UNDETERMINED_SHARE = 0.5
 
 # Lower bound of the diagonal entries by which a matrix is scaled; it avoids a division by zero.
 SMALLEST_DIAGONAL = 1e-300
+
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
+def record(kind: type[T]) -> type[T]:
+    """Make a frozen dataclass whose fields are keywords. One that holds arrays equals itself only.
+
+    `array_fields` of the class names the arrays, which the base class of saved records freezes.
+    """
+    hints = kind.__annotations__.items()
+    arrays = tuple(name for name, hint in hints if hint in ("Array", "Array | None"))
+    kind.array_fields = arrays  # type: ignore[attr-defined]
+    has_repr = kind.__repr__ is not object.__repr__
+    return dataclass(frozen=True, kw_only=True, eq=not arrays, repr=not has_repr)(kind)
 
 
 def freeze(record: object, *names: str) -> None:

@@ -25,7 +25,6 @@ from mjfim.excitation.evaluation import (
 )
 from mjfim.excitation.initial_controls import (
     GIVEN,
-    InitialControl,
     initial_controls_of,
     series_of,
 )
@@ -35,7 +34,7 @@ from mjfim.excitation.rehearsal import rehearse_task
 from mjfim.excitation.release import design_release
 from mjfim.excitation.search.climb import Candidate
 from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
-from mjfim.excitation.search.search import Search, candidate_of
+from mjfim.excitation.search.search import Search
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
@@ -206,7 +205,7 @@ def _searched(
     begun = budget.seconds_used
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     evaluation_seconds = budget.seconds_used - begun
-    begin, starts = first, list[InitialControl]()
+    begin, starts = first, list[Candidate]()
     if task.release is None:
         if initial_control is not None:
             initial_control = np.asarray(initial_control, dtype=np.float64)
@@ -240,8 +239,8 @@ def _searched(
         steps_before = task.plant.engine_steps - steps_before
         # A stated time that is left is used for series.
         rng = np.random.default_rng(task.experiment.descent.seed)
-        further = () if np.isinf(budget.seconds_left) else map(candidate_of, series_of(task, rng))
-        results = consume(search.run([candidate_of(each) for each in starts], further), callback)
+        further = () if np.isinf(budget.seconds_left) else series_of(task, rng)
+        results = consume(search.run(starts, further), callback)
         if not search.grounds.is_limited:
             results = _with_stops_evaluated(stage, results)
         winner, point = _chosen(search, results, [first, begin])
@@ -407,7 +406,7 @@ def _with_stops_evaluated(stage: DescentLevel, results: Sequence[Candidate]) -> 
 
 
 def _without_time(
-    task: DesignTask, starts: Sequence[InitialControl], results: Sequence[Candidate]
+    task: DesignTask, starts: Sequence[Candidate], results: Sequence[Candidate]
 ) -> tuple[str, ...]:
     """Say which initial controls were left out, because the time was too short for them."""
     begun = {result.name for result in results}

@@ -9,12 +9,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
+from mjfim.excitation.search.climb import Candidate
 from mjfim.excitation.search.levels import boundary_splines
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import fourier_basis, independent_curves
 from mjfim.experiment.packing import opened
 from mjfim.recordings.control_table import read_control
-from mjfim.records.base import record
 
 # Largest number of harmonics of a Fourier series.
 MAX_SERIES_HARMONICS = 15
@@ -44,26 +44,7 @@ MOST_RANDOM_AMPLITUDE = 6.0
 GIVEN = "given control"
 
 
-@record
-class InitialControl:
-    """A control from which an optimisation starts.
-
-    Attributes:
-        name: Its name in histories and messages.
-        control: (N / repeats, nu) control [u-unit].
-        basis: (N, M) curves of which the control is a sum in the first round of the optimisation;
-            None where the control is free.
-        repeats: Number of times that the control is played over the horizon. In the first round of
-            the optimisation one repetition is optimised alone.
-    """
-
-    name: str
-    control: Array
-    basis: Array | None = None
-    repeats: int = 1
-
-
-def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[InitialControl]:
+def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Candidate]:
     """Collect the controls from which a design starts.
 
     Args:
@@ -79,16 +60,16 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
         ExperimentError: A file, a frequency or a number of repeats cannot be used.
     """
     descent = task.experiment.descent
-    first = InitialControl(name="initial control", control=task.control)
+    first = Candidate(name="initial control", control=task.control)
     if given is not None:
-        first = InitialControl(name=GIVEN, control=given)
+        first = Candidate(name=GIVEN, control=given)
 
     found = [first]
     for path in dict.fromkeys(descent.previous):
         # A shorter design is repeated.
         with opened(task.experiment, path) as file:
             control = read_control(file, task.t, task.dt, task.controls, repeat=True)
-        found.append(InitialControl(name=f"previous design {path}", control=control))
+        found.append(Candidate(name=f"previous design {path}", control=control))
 
     # Fourier series and multisines share one source of random numbers, in this order.
     rng = np.random.default_rng(descent.seed)
@@ -97,11 +78,11 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
     for count in dict.fromkeys(descent.repeats):
         name = f"{count} times a design of {task.horizon / count:g} s"
         part = _first_part(task, count)
-        found.append(InitialControl(name=name, control=part, repeats=count))
+        found.append(Candidate(name=name, control=part, repeats=count))
 
     last = descent.starts - 1
     multisines = (
-        InitialControl(name=f"multisine {i} of {last}", control=_multisine(task, rng))
+        Candidate(name=f"multisine {i} of {last}", control=_multisine(task, rng))
         for i in range(1, last + 1)
     )
     return chain(found, multisines)
@@ -112,7 +93,7 @@ def _multisine(task: DesignTask, rng: np.random.Generator) -> Array:
     return task.random_control(rng, LEAST_RANDOM_AMPLITUDE, MOST_RANDOM_AMPLITUDE)
 
 
-def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator) -> InitialControl:
+def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator) -> Candidate:
     """Fit a Fourier series of a frequency [Hz] to a random multisine.
 
     Raises:
@@ -142,15 +123,15 @@ def _waves(task: DesignTask, frequency: float, harmonics: int = MAX_SERIES_HARMO
     return independent_curves(waves)
 
 
-def _in_curves(name: str, task: DesignTask, control: Array, curves: Array) -> InitialControl:
+def _in_curves(name: str, task: DesignTask, control: Array, curves: Array) -> Candidate:
     """The sum of curves, (N, M), that is nearest to a control."""
     coefficients = np.linalg.lstsq(curves, control - task.centre)[0]
-    return InitialControl(name=name, control=task.centre + curves @ coefficients, basis=curves)
+    return Candidate(name=name, control=task.centre + curves @ coefficients, curves=curves)
 
 
 def series_of(
     task: DesignTask, rng: np.random.Generator, harmonics: int | None = MAX_SERIES_HARMONICS
-) -> Iterator[InitialControl]:
+) -> Iterator[Candidate]:
     """Make series that are near the initial control, and then random ones.
 
     Args:
@@ -189,7 +170,7 @@ def series_of(
         coefficients = rng.normal(size=(basis.shape[1], len(task.centre)))
         deviation = basis @ coefficients * task.plant.sizes.control / np.sqrt(basis.shape[1])
         name = f"{kind} of {frequency:.3g} Hz, at random ({number})"
-        yield InitialControl(name=name, control=task.centre + deviation, basis=basis)
+        yield Candidate(name=name, control=task.centre + deviation, curves=basis)
 
 
 def _first_part(task: DesignTask, count: int) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task_parts import ParameterSamples
 from mjfim.information.criteria import Criterion
@@ -22,7 +22,6 @@ from mjfim.plant.mixed_derivatives import (
 )
 from mjfim.plant.plant import LumpedParameters, Plant
 from mjfim.plant.state_space import StateSpace
-from mjfim.records.base import record
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 

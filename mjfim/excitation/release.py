@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
@@ -31,7 +31,6 @@ from mjfim.parallel import ExecutorLike, Workers, results_on
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
-from mjfim.records.base import record
 from mjfim.records.design import HistoryRow, StartResult, Status, extended
 from mjfim.records.events import DesignCallback, DesignEvent
 from mjfim.records.trajectory import Trajectory
@@ -95,7 +94,7 @@ class Release:
         return (False, self.point.cost) if margin >= 0.0 else (True, -margin)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Releases:
     """Evaluates releases of a task.
 
@@ -222,7 +221,7 @@ def _made(
     return Releases(stage=DescentLevel(task, basis), space=space, plant=plant)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Order:
     """Order to evaluate some releases, or to follow one."""
 

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import TangentComponent, unknown_coordinate
 from mjfim.plant.state_space import StateSpace
-from mjfim.records.base import record
 
 # Distance from an end of a range, relative to its width, up to which a release is at that end.
 EDGE_SHARE = 1e-3

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import shared
@@ -41,7 +41,7 @@ KINDS = {
 MOST_SENSORS = 10
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Sensor:
     """The measurements of a sensor along a motion.
 
@@ -122,7 +122,7 @@ def _kind(model: mujoco.MjModel, name: str) -> str:
     return KINDS.get(stated, stated)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Sensing:
     """All sensors along a motion, any of which may be left out or be made more accurate.
 

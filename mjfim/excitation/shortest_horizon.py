@@ -11,14 +11,14 @@ that is shorter by the tolerance does not.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from mjfim import recordings
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import (
     ExperimentError,
     MjfimError,
@@ -36,7 +36,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
-from mjfim.records.base import SavedRecord, record
+from mjfim.records.base import SavedRecord
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent, shown_progress
@@ -284,7 +284,7 @@ class Tried:
         return f"{self.horizon:g} s: σ of {self.parameter} is {self.ratio:.3f} × its target"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ShortestExperiment(SavedRecord):
     """The shortest experiment and its design.
 

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
@@ -40,7 +40,6 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import ModelVariant, Relaxation, has_dry_friction, smoothing_speeds_of
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
-from mjfim.records.base import record
 from mjfim.records.trajectory import Trajectory
 
 # Harmonics of a random multisine.

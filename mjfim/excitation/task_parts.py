@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, RecordingError, listed, shortened, unknown
 from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.initial import generate
@@ -27,7 +27,6 @@ from mjfim.model.parameters import sample_parameters
 from mjfim.model.variants import Relaxation
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.control_table import read_control
-from mjfim.records.base import record
 from mjfim.records.trajectory import Trajectory
 
 

@@ -9,7 +9,7 @@ and records take the labels of its joints, controls, parameters and outputs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError, listed
 from mjfim.experiment.controllers import resolve_controllers
 from mjfim.experiment.initial import initial_state, keyframe
@@ -52,7 +52,7 @@ from mjfim.recordings.channels import Channels
 from mjfim.records.trajectory import Labels, Recording, Trajectory
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class System:
     """A model with unknown parameters, measured outputs, noise, and the plant that simulates it.
 
@@ -574,7 +574,7 @@ def simulate_system(
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class SystemOrder:
     """What a worker process needs to make a system again. It can be pickled.
 

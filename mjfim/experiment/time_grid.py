@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import NoiseSpec
@@ -17,7 +18,7 @@ MAX_SUBSTEPS = 100_000
 RATE_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TimeGrid:
     """Division of the time into samples, measurements and engine steps.
 

@@ -7,13 +7,13 @@ because that would colour their noise. Predictions are interpolated instead.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array, freeze
+from mjfim.arrays import Array, freeze, record
 from mjfim.errors import RecordingError, listed, unknown
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import MEASURED_SUMS, ControlLaw
@@ -108,7 +108,7 @@ SAMPLES_FOR_SIGN = 4
 SMALLEST_NORM = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class AlignedRecording:
     """A recording on the sample grid of an experiment.
 

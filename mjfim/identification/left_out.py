@@ -10,13 +10,13 @@ initial state of a predicted part is estimated from that part.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.arrays import Array, evenly_spread_indices, record
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import jackknife_std
@@ -81,7 +81,7 @@ MIN_STRETCHES = 2
 EQUAL_LOSS = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LeftOutPart:
     """A part of the data that is left out of a fit.
 
@@ -259,7 +259,7 @@ def of_parts(problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budge
 # ---- losses
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class HeldOutLosses:
     """Losses of predictions of left-out data.
 
@@ -314,7 +314,7 @@ class HeldOutLosses:
         return jackknife_std(self.estimates)
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Reduction:
     """Reduction of the mean loss of a value by another model.
 

@@ -7,12 +7,10 @@ where their pseudo-inertia is positive definite.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.inertia import (
     BARYCENTRIC_DERIVATIVES,
     INERTIA_PARAMETRISATIONS,
@@ -39,7 +37,7 @@ TO_BOUNDARY = 0.9
 HOLD_LOGARITHM = 10.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class UnknownBody:
     """A body whose whole inertia is unknown.
 
@@ -204,7 +202,7 @@ def _logcholesky(inertia: BodyInertia) -> Array | None:
         return None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LinearCoordinates:
     """The p parameters in linear coordinates x.
 
@@ -286,7 +284,7 @@ class LinearCoordinates:
         return slopes
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class CadPrior:
     """Priors on the inertias of some bodies.
 

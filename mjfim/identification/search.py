@@ -7,14 +7,14 @@ restarts in `starts` and the studies of models choose among them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.arrays import Array, evenly_spread_indices, record
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError, listed, unknown
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
@@ -48,7 +48,7 @@ Method = Literal["least_squares", "newton"]
 CLOCK_TOLERANCE = 0.01
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FitTask:
     """Everything that an identification needs.
 
@@ -325,7 +325,7 @@ def _from_start(problem: FitProblem, budget: Budget, *, begin: UnknownValues) ->
     return minimise(problem, begin, SHORT_SEARCH, budget)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FitSearch:
     """Searches of one identification, which share a budget and report their iterations.
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.segments import batches
@@ -46,7 +46,7 @@ class DivergedSegmentError(SimulationDivergedError):
     """A simulation of segments diverges, so that a batch has no result."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class SegmentRows:
     """Predictions of k rows of one segment.
 
@@ -66,7 +66,7 @@ class SegmentRows:
     jacobians: tuple[Array, ...]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class SegmentBatch:
     """Segments that are simulated together, and how they are differentiated.
 
@@ -87,7 +87,7 @@ class SegmentBatch:
     wanted: np.ndarray
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class SegmentSimulation(FitUnknowns):
     """Predicted outputs of all segments as functions of the unknowns.
 

@@ -13,7 +13,7 @@ initial velocity contains.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording, align
@@ -37,7 +37,7 @@ from mjfim.records.trajectory import Recording
 FRICTION_COLUMNS = slice(3, 6)
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Bristle:
     """The bristle of one passive device at a slide or hinge.
 
@@ -97,7 +97,7 @@ def bristles_of(model: Any) -> tuple[Bristle, ...]:
     return tuple(found)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class KnownActivations:
     """Activations that physical terms have added to a model.
 
@@ -213,7 +213,7 @@ SMALL_MOVE = 1e-3
 GOLDEN_RATIO = 0.6180339887498949
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Segment:
     """Consecutive samples of one recording that are simulated from a separate initial state.
 
@@ -258,7 +258,7 @@ def has_free_starts(system: System) -> bool:
     return is_measured or (bool(system.experiment.initial.free) and not moves)
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class OtherBegin:
     """A recording whose first rows contradict the stated initial state.
 

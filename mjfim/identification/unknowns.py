@@ -7,13 +7,13 @@ unknowns of the segments.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unknown_bodies
@@ -37,7 +37,7 @@ HALVINGS_TO_BOUND = 16
 SMALLEST_FRACTION = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FitUnknowns:
     """The p parameters among the c = s + K e common and the n private unknowns of a segment.
 

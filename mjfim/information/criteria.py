@@ -7,11 +7,11 @@ the Schur complement.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array, scaled_to_unit_diagonal
+from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 
 # An information matrix is singular if the ratio of its smallest to its largest eigenvalue is at
 # most this number.
@@ -25,7 +25,7 @@ NEGLIGIBLE_WEIGHT = 1e-9
 PSEUDO_INVERSE_CUTOFF = 1e-13
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Criterion:
     """Value of a criterion phi and its derivative `M = sum_r weights_r directions_r directions_r'`.
 

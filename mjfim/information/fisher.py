@@ -20,12 +20,12 @@ the r directions w instead of all p parameters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices, scaled_to_unit_diagonal
+from mjfim.arrays import Array, evenly_spread_indices, record, scaled_to_unit_diagonal
 from mjfim.information.criteria import (
     CRITERIA,
     NEGLIGIBLE_WEIGHT,
@@ -118,7 +118,7 @@ def _delay_term(bilinear: Bilinear, v: Array) -> Array:
     return np.concatenate([by_state, by_control], axis=1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FisherInformation:
     """Computes the Fisher information of sensitivities, its criterion and the gradient.
 

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
 from mjfim.information.criteria import SINGULAR_RATIO
 from mjfim.information.fisher import FisherInformation
@@ -50,7 +49,7 @@ SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
 CLEAR_EFFECT = 1e3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Identifiability:
     """Directions of the wanted parameters without effect on the measured outputs.
 
@@ -109,7 +108,7 @@ class Identifiability:
 RowsAndError = tuple[Array, Array]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class IdentifiabilityTest:
     """Test for combinations of parameters that the outputs of a plant do not depend on.
 

@@ -9,11 +9,10 @@ G with a difference step that is four times longer.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.records.check import Combination, ParameterGroup
 
 # Ratio of the second difference step to the first one; the change of G between them is its error.
@@ -59,7 +58,7 @@ LUMPING_SHARES = (0.05, 1e-3, 1e-6)
 LUMPING_ORDER = {"kg": 0, "kg m": 1, "kg m²": 2}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class NullSpace:
     """Directions of the t wanted parameters without any effect.
 

@@ -16,14 +16,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.model.elements import geom_labels, model_length, unique_names
 from mjfim.model.loading import ModelSource
@@ -123,7 +122,7 @@ def with_floor(source: ModelSource, height: float) -> ModelSource:
     return source.with_elements((FLOOR, height), lambda spec: spec.worldbody.add_geom(**plane))
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class GeomPair:
     """Two geoms that can come near each other.
 

@@ -8,12 +8,12 @@ finds those of each model in the model itself.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError
 from mjfim.model.loading import ModelSource
 from mjfim.model.targets import ModelField
@@ -59,7 +59,7 @@ Quantity = Literal["reference", "reference_velocity", "feedforward", "gain", "en
 CONTINUOUS: tuple[Quantity, ...] = ("reference", "reference_velocity", "feedforward")
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class LawField(ModelField):
     """One number of a control law, inside the custom numbers of the model.
 
@@ -75,7 +75,7 @@ class LawField(ModelField):
         return self.size
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class InputColumn:
     """One column of a log that drives a simulation.
 
@@ -90,7 +90,7 @@ class InputColumn:
     control: int | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ControlLaw:
     """The law with which the driver of one actuator computes its control.
 
@@ -137,7 +137,7 @@ class ControlLaw:
 MEASURED_SUMS = ("sum", "reference", "position", "share")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ControlLaws:
     """All control laws of an experiment, and the input columns that drive a simulation.
 

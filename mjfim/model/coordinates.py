@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 
+from mjfim.arrays import record
 from mjfim.errors import unknown
 from mjfim.model.elements import (
     element_name,
@@ -59,7 +60,7 @@ INDEXED_NAME = re.compile(r"^(?P<joint>.+)\[(?P<index>\d+)\]$")
 NAME_WITH_PART = re.compile(r"^(?P<joint>.+)\.(?P<part>\w+)$")
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ScalarJoint:
     """A joint with one degree of freedom.
 
@@ -88,7 +89,7 @@ class ScalarJoint:
         return f"qvel:{self.name}"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class StateComponent:
     """One number of qpos or qvel, which can be measured and recorded.
 
@@ -112,7 +113,7 @@ class StateComponent:
     is_added: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TangentComponent:
     """One number of a deviation of the state, in the tangent space (dq, dv, da).
 
@@ -130,7 +131,7 @@ class TangentComponent:
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class SensorComponent:
     """One number of a sensor with a name, which can be measured and recorded.
 
@@ -148,7 +149,7 @@ class SensorComponent:
     sigma: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ModelCoordinates:
     """All coordinates of a model by name, looked up once.
 

@@ -16,14 +16,13 @@ Wensing, Smooth parameterization of rigid-body inertia, RA-L 2022): `J = U U'` w
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 
 # Entries (row, column) of an inertia matrix in MJCF's order of `fullinertia`: xx yy zz xy xz yz.
 INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -36,7 +35,7 @@ INERTIA_ROWS, INERTIA_COLUMNS = np.array(INERTIA_ENTRIES).T
 DEGENERATE_RATIO = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class BodyInertia:
     """Mass, centre of mass and inertia of a rigid body, in the axes of the body frame.
 
@@ -198,7 +197,7 @@ def _steiner(mass: float, com: Array) -> Array:
     return mass * (squared * np.eye(3) - np.outer(com, com))
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class InertiaParametrisation:
     """Ten coordinates that describe the inertia of a body.
 
@@ -368,7 +367,7 @@ def is_positive_definite(pseudo_inertia: Array) -> bool:
 # ---- distance
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class InertiaDifference:
     """Logarithm of a pseudo-inertia relative to another one, as the residuals of a prior.
 

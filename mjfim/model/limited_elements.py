@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, Literal
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.coordinates import ROTATION_VECTOR, TRANSLATION, actuator_names, joint_names
 from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
@@ -65,7 +65,7 @@ JOINT_WORDS = {
 TILT_COMPONENTS = 2
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class LimitedElement:
     """One element that can have a limit of some kind.
 
@@ -90,7 +90,7 @@ class LimitedElement:
     is_part: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class LimitedElements:
     """All elements of a model that can have limits.
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.parallel.shared_value import SharedValue
 
@@ -29,7 +30,7 @@ URI_SEPARATOR = "://"
 PACKAGE = "package://"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class UrdfSource:
     """A URDF whose links and joints are bodies and joints of a model.
 
@@ -218,7 +219,7 @@ def _existing(name: str, places: set[Path], folders: set[Path]) -> list[Path]:
     return [Path(os.path.normpath(file)) for file in candidates if is_present(file)]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class PackedFiles:
     """Files by their paths, as bytes. They can be pickled.
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError
 from mjfim.model.control_laws import FIELDS as LAW_FIELDS
 from mjfim.model.elements import element_name
@@ -73,7 +73,7 @@ MAX_HALVINGS = 20
 MIN_SHARE_OF_VALUE = 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Target:
     """One number inside a model, which becomes `scale * theta_j + offset`.
 
@@ -99,7 +99,7 @@ class Target:
         return tuple(path for path, _ in self.term.numbers)
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Parameter:
     """One unknown. Values are in the unit of its targets.
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError, shortened, unknown
 from mjfim.model.control_laws import FIELDS as LAW_FIELDS
 from mjfim.model.control_laws import controllers_of, law_field, law_unit
@@ -119,7 +120,7 @@ KINDS = (*MODEL_ARRAYS, "controller", "term", "initial", "output")
 NO_TERMS: Mapping[str, Term] = MappingProxyType({})
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ParameterPath:
     """A parsed parameter path.
 

@@ -22,6 +22,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import LEAST_MOVE_PER_SAMPLE, element_name, position_sizes
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
@@ -37,7 +38,7 @@ SAME_FRAME_FLAGS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ModelField:
     """One number of an MjModel array.
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.model.elements import is_rk4
 from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource
@@ -47,7 +47,7 @@ LAYOUT = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ModelVariant:
     """Differences between the plant of a search and the user's model.
 
@@ -136,7 +136,7 @@ class MocapPlacement:
         model.body_quat[self.bodies] = places[:, 3:]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Relaxation:
     """Clamps, stops and dry friction that are changed in a private copy of the model.
 
@@ -210,7 +210,7 @@ class PlantModel:
     friction: bool
     timestep_factor: int = 1
     mocap: MocapPlacement | None = None
-    relaxation: Relaxation = Relaxation()
+    relaxation: Relaxation = field(default_factory=Relaxation)
 
     @cached_property
     def model(self) -> Any:

@@ -9,14 +9,14 @@ unknowns, and its solution is exact. Names and formulas of the robust losses are
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array, scaled_to_unit_diagonal
+from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 
 # Rows of one batch in the first pass of a tall QR decomposition; a batch stays in the cache.
 QR_BATCH_ROWS = 128
@@ -67,7 +67,7 @@ MIN_OUTLIER_THRESHOLD = 3.0
 SMALLEST_SQUARE = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Step:
     """Step of all unknowns.
 
@@ -87,7 +87,7 @@ class Step:
     private_length: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Condensed:
     """Linearised residuals of P segments in B blocks of rows.
 
@@ -505,7 +505,7 @@ def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Arr
     return d
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class RobustLoss:
     """Loss `scale^2 rho((r / scale)^2)` of a whitened residual r.
 

@@ -23,13 +23,13 @@ step where the smallest eigenvalues reach them, although the larger ones change 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from typing import Protocol
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.optimize.lq import TangentCurve, Weights
 
 # Smallest and largest factor of the curvature of the barrier in the model of a step.
@@ -59,7 +59,7 @@ MIN_NEWTON_FRACTION = 1e-8
 EQUAL_EIGENVALUES = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class BarrierDerivatives:
     """Value and derivatives of the barrier of numbers, or of norms of vectors: (..., w).
 
@@ -134,7 +134,7 @@ def curvature_factors(slacks: Array, changes: Array, factors: Array, delta: floa
     return np.where(bounded, found, 1.0)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Bounds:
     """Bounds of w numbers.
 
@@ -311,7 +311,7 @@ class StepCurvature(Protocol):
         """
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class BarrierExpansion:
     """Expansion of the barrier of all limits about a trajectory.
 
@@ -390,7 +390,7 @@ class BarrierExpansion:
         return Weights(Q=Q, S=H[:, nx:, :nx], R=R, W=W)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class EigenvalueModel:
     """The model about a point, in the m = r (r + 1) / 2 coordinates of B.
 
@@ -467,7 +467,7 @@ class EigenvalueModel:
         return here.gradient
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _ChangedLogs:
     """The model of a logarithm of the information that has changed.
 

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.optimize.condensed_least_squares import (
     Condensed,
     Step,
@@ -181,7 +181,7 @@ MIN_FRACTION = 1e-8
 SMALLEST_DECREASE = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class UnknownValues:
     """Values of all unknowns of a fit.
 
@@ -250,7 +250,7 @@ class Problem(Protocol):
         """
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Solution:
     """Result of a search.
 
@@ -281,7 +281,7 @@ class Solution:
     slow: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class SearchSettings:
     """Settings of a search.
 
@@ -360,7 +360,7 @@ def minimise(
     return _Search(problem, settings, budget or Budget(), callback, start, cost, condensed).run()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Trial:
     """A step and the point to which it leads.
 

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
     return RiccatiSolution.solve(A, B, Weights.constant(len(A), Q, R, terminal)).K
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class TangentCurve:
     """A tangent vector zeta = (z, v) of the trajectory manifold.
 
@@ -221,7 +221,7 @@ class TangentCurve:
     v: Array
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Weights:
     """A quadratic form on tangent curves (z, v).
 
@@ -303,7 +303,7 @@ class Weights:
         return a, b + weighted[..., :-1, :] - weighted[..., 1:, :]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RiccatiSolution:
     """Factored linear-quadratic problem with weights that vary over time.
 
@@ -434,7 +434,7 @@ def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array,
     return wide_A, wide_B, Weights(Q=Q, S=S, R=R, W=np.zeros_like(weights.W))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class CurveCoordinates:
     """Tangent curves in the curve coordinate `c = v + K z`.
 

@@ -7,12 +7,12 @@ The module knows arrays and two protocols, neither MuJoCo nor Fisher information
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.optimize.cost_models import BarrierExpansion, EigenvalueModel
 from mjfim.optimize.lq import (
     CurveCoordinates,
@@ -35,7 +35,7 @@ MIN_SHORTENING = 0.3
 MAX_PREDICTED_DECREASE = 2.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Expansion:
     """First-order model of the cost on the tangent space.
 
@@ -194,7 +194,7 @@ class Direction(Protocol):
         return False
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Armijo:
     """Backtracking line search until `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
 
@@ -265,7 +265,7 @@ class Armijo:
         return None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Iterate(Generic[P]):
     """One iterate of Algorithm 1.
 
@@ -286,7 +286,7 @@ class Iterate(Generic[P]):
     status: Status | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Regulator:
     """Linear-quadratic regulator along a trajectory, the gain K of the projection operator.
 

@@ -12,7 +12,7 @@ from functools import cached_property, partial
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.optimize.cost_models import BarrierExpansion
 from mjfim.optimize.directions import CurvaturePair, convex_pairs, inverse_hessian_product
 from mjfim.optimize.lq import (
@@ -66,7 +66,7 @@ MUCH_SHORTENED = 0.5
 SMALLEST_SQUARE = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class CurveMetric:
     """Metric on curve coordinates: a quadratic form on the tangent curves to which they lift.
 
@@ -159,7 +159,7 @@ def basis_matrix(basis: Array, response: Array, weights: Weights) -> Array:
     return np.asarray(0.5 * (H + H.T) + control.swapaxes(1, 2).reshape(M * nu, M * nu))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class BasisMetric:
     """Metric on the coefficients of a basis of controls, as a dense matrix.
 
@@ -194,7 +194,7 @@ class BasisMetric:
         return np.asarray(scipy.linalg.cho_solve(factor, columns).T.reshape(g.shape))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _LocalModel:
     """Gradients and metrics at a point.
 

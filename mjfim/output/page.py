@@ -24,6 +24,8 @@ from enum import StrEnum
 from itertools import zip_longest
 from typing import NamedTuple, Self
 
+from mjfim.arrays import record
+
 # Name of the report in a folder of results.
 REPORT = "report.html"
 
@@ -147,7 +149,7 @@ class Row(NamedTuple):
     emphasis: Emphasis = Emphasis.NORMAL
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Table:
     """A table of results.
 
@@ -215,7 +217,7 @@ class Section:
     parts: Sequence[Part]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Page:
     """A result in words, tables and names of pictures.
 

@@ -9,9 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.output.page import OTHER, TERMS
-from mjfim.records.base import record
 
 # Colours of roles that are no words of the vocabulary: text and reference lines, notes and curves
 # that stay in the background, bands.

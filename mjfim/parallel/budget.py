@@ -72,8 +72,6 @@ class StopReason(Enum):
 
     REQUESTED = "interrupted by the user"
     SECONDS = "the time is used up"
-    STEPS = "the engine steps are used up"
-    ITERATIONS = "the iterations are used up"
 
 
 class StopToken:
@@ -121,46 +119,23 @@ def measured_by(clock: Callable[[], float]) -> Iterator[None]:
 
 
 class Budget:
-    """Time, engine steps and iterations that a computation may use; it checks them in its loops.
+    """Time that a computation may use; it checks the budget in its loops.
 
     Args:
         seconds: Time from the creation of the budget [s]; infinite without a limit.
-        steps: Engine steps; None without a limit.
-        iterations: Iterations; None without a limit.
         stop: Token that ends the computation early.
     """
 
-    def __init__(
-        self,
-        *,
-        seconds: float = math.inf,
-        steps: float | None = None,
-        iterations: int | None = None,
-        stop: StopToken | None = None,
-    ) -> None:
+    def __init__(self, *, seconds: float = math.inf, stop: StopToken | None = None) -> None:
         self.stop = StopToken() if stop is None else stop
         self._now = _clock.get()
         self.begun = self._now()
         self.deadline = self.begun + seconds
-        self.max_steps = math.inf if steps is None else float(steps)
-        self.max_iterations = math.inf if iterations is None else float(iterations)
-        self.steps = 0.0
-        self.iterations = 0
-
-    def spend(self, *, steps: float = 0.0, iterations: int = 0) -> None:
-        """Count the engine steps and iterations since the last call."""
-        self.steps += steps
-        self.iterations += iterations
 
     @property
     def seconds_left(self) -> float:
         """Remaining time [s], never negative; infinite without a limit."""
         return max(self.deadline - self._now(), 0.0)
-
-    @property
-    def iterations_left(self) -> float:
-        """Remaining iterations, never negative; infinite without a limit."""
-        return max(self.max_iterations - self.iterations, 0)
 
     @property
     def seconds_used(self) -> float:
@@ -169,43 +144,27 @@ class Budget:
 
     @property
     def used(self) -> float:
-        """Used fraction of the limit that is closest to its end; 1 or more if it is exhausted."""
-        shares = [self.steps / self.max_steps, self.iterations / self.max_iterations]
+        """Used fraction of the time; 1 or more if it is used up, 0 without a limit."""
         total = self.deadline - self.begun
-        if math.isfinite(total):
-            shares.append(self.seconds_used / total if total > 0.0 else 1.0)
-
-        return max(shares)
+        return self.seconds_used / total if total > 0.0 else 1.0
 
     @property
     def exhausted(self) -> StopReason | None:
         """Reason to stop the computation; None while it may continue."""
         if self.stop.requested:
             return StopReason.REQUESTED
-        if self._now() >= self.deadline:
-            return StopReason.SECONDS
-        if self.steps >= self.max_steps:
-            return StopReason.STEPS
-        if self.iterations >= self.max_iterations:
-            return StopReason.ITERATIONS
-
-        return None
+        return StopReason.SECONDS if self._now() >= self.deadline else None
 
     def share(self, fraction: float = 1.0) -> Budget:
         """Make a budget for a part of the computation; both budgets share one token.
 
         Args:
-            fraction: Fraction of the remaining time and of the remaining engine steps.
+            fraction: Fraction of the remaining time.
 
         Returns:
             A budget that begins to count now.
         """
-        steps_left = max(self.max_steps - self.steps, 0.0)
-        return Budget(
-            seconds=fraction * self.seconds_left,
-            steps=fraction * steps_left if math.isfinite(steps_left) else None,
-            stop=self.stop,
-        )
+        return Budget(seconds=fraction * self.seconds_left, stop=self.stop)
 
     def with_stop(self, stop: StopToken) -> Budget:
         """Make a copy with another token.

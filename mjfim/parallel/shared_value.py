@@ -122,11 +122,6 @@ def require_values(values: Iterable[SharedValue[Any]]) -> None:
         raise AbsentValueError(*absent)
 
 
-def keep_value(shared: SharedValue[T], value: T) -> None:
-    """Keep a value in a worker that has made it itself instead of receiving it."""
-    _received.put({shared.digest: (value, shared.size)})
-
-
 def owned_value(digest: str) -> SentValue:
     """Return a value that this process has made, to send it to a worker."""
     shared = _owned.get(digest)

@@ -17,11 +17,11 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from mjfim.arrays import record
 from mjfim.errors import MAX_THREADS, ExperimentError, shortened
 from mjfim.files import read_json
 from mjfim.parallel.pool import Pool
@@ -235,7 +235,7 @@ class ExecutorKind(Enum):
     PYTHON = "python"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class StatedExecutor:
     """An executor as the user states it, which is not started yet.
 

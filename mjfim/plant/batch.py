@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.limited_elements import (
     QUATERNION_PLACE,
     quaternion_address,
@@ -79,7 +79,7 @@ def state_space(model: Any) -> StateSpace:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class SubstepObservations:
     """Quantities that are observed at the engine steps within a sample.
 
@@ -207,7 +207,7 @@ class SubstepObservations:
         return np.concatenate(parts, axis=-1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Rollouts:
     """Many simulated curves.
 

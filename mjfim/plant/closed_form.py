@@ -14,13 +14,12 @@ and every parameter. Whether the equation holds is checked at every engine step.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.equation_of_motion import (
@@ -83,7 +82,7 @@ OTHER_FORCES = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class SampleJacobians:
     """First derivatives of N samples.
 
@@ -143,7 +142,7 @@ def _any(holder: Any, names: Sequence[str]) -> bool:
     return any(np.any(getattr(holder, name)) for name in names)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ClosedForm:
     """Derivatives of samples in closed form.
 

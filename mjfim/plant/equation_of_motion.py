@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.parameters import Parameter
 from mjfim.model.targets import InertiaField, ModelField
 from mjfim.plant.batch import BatchSimulator
@@ -60,7 +60,7 @@ IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPL
 HELD_INERTIA = 1e9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class AffineForces:
     """Springs, dampers and actuators whose forces are affine in (q, v, u), with clamped forces.
 
@@ -280,7 +280,7 @@ def acts_on_joints(parameter: Parameter) -> bool:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ParameterChange:
     """Derivatives of a model by m parameters, or along m directions of them.
 
@@ -320,7 +320,7 @@ class ParameterChange:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class MotionPoints:
     """Points of a motion with their controls.
 
@@ -335,7 +335,7 @@ class MotionPoints:
     ctrl: Array
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class EquationTerms:
     """Terms of the equation of motion at n points.
 
@@ -353,7 +353,7 @@ class EquationTerms:
     actuator_force: Array
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class EquationOfMotion:
     """The equation of motion of a plant's models without constraints (`Relaxation.constraints`).
 

@@ -6,12 +6,12 @@ call.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.closed_form import (
@@ -38,7 +38,7 @@ TINY = 1e-300
 FIRST_DERIVATIVE_STEP = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class MovedSamples:
     """Samples of a trajectory that are moved along each coordinate of (x, u).
 

@@ -6,11 +6,9 @@ derivatives by state and control.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.plant.batch import SampleSteps, SubstepObservations
 from mjfim.plant.dynamics import Dynamics
 from mjfim.plant.first_derivatives import FirstDerivatives, MovedSamples, all_samples, tiled
@@ -18,7 +16,7 @@ from mjfim.plant.outputs import OutputDelay
 from mjfim.records.trajectory import Trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class DifferenceAccuracy:
     """Kind and steps of the differences for mixed second derivatives.
 
@@ -54,7 +52,7 @@ SHARED_ORIGIN_SHORT = DifferenceAccuracy(
 CENTRAL_DIFFERENCES = DifferenceAccuracy(central=True, coordinate_step=1e-4, direction_step=1e-3)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Bilinear:
     """First derivatives of F and h, and mixed second derivatives along r directions (psi w, w).
 

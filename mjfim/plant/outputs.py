@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,14 +15,14 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.plant.state_space import StateSpace, quaternion_product
 
 # Number of samples through which the cubic polynomial of the interpolation passes.
 NODES = 4
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Output:
     """One measured scalar: a component of the state or of the sensor data.
 
@@ -42,7 +41,7 @@ class Output:
     sensor: int | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Outputs:
     """The output map h without errors of the sensors and delay.
 
@@ -229,7 +228,7 @@ def _turned(quaternion: Array, rotation: Array) -> Array:
     return quaternion_product(quaternion, half_rotation)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Calibration:
     """Scale errors and biases of the ny outputs as functions of the p parameters.
 
@@ -298,7 +297,7 @@ class Calibration:
         return total + h[..., None] * self.scale if self.scales else total
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Noise:
     """Gaussian noise, white in time, correlated between the outputs of one sample.
 
@@ -426,7 +425,7 @@ class Noise:
         return rng.standard_normal((count, len(self.factor))) @ self.factor.T
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class OutputDelay:
     """Values `y(t - d)` from samples y_k, by cubic Lagrange interpolation.
 

@@ -9,13 +9,12 @@ parts. Combinations of parameters that have no effect save rollouts (`LumpedPara
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.dynamics import Dynamics
 from mjfim.plant.first_derivatives import TINY
@@ -46,7 +45,7 @@ ROUND_OFF = 1e-12
 LARGEST_REMAINDER = 1e-4
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Response:
     """Outputs of S curves over an interval of samples, and their derivatives.
 
@@ -389,7 +388,7 @@ def _columns(by_move: Array, is_moved: np.ndarray, lumped: LumpedParameters | No
     return full if lumped is None else lumped.expanded(full[..., lumped.base])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LumpedParameters:
     """Parameters that are lumped into others.
 

@@ -10,7 +10,6 @@ analytical derivatives of rigid-body dynamics using spatial vector algebra (RA-L
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +17,7 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS
 
 # Fields of MjData from which a motion is made.
@@ -28,7 +27,7 @@ MOTION_FIELDS = ("xanchor", "xaxis", "xipos", "ximat")
 CROSS_PRODUCTS = np.cross(np.eye(3), np.eye(3)[:, None]).reshape(3, 9)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RigidBodyMotion:
     """Rigid bodies in n states of motion.
 
@@ -369,7 +368,7 @@ def _moved_force(v: Array, force: Array) -> Array:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class JointTree:
     """Hinges and slides of a model, and the bodies that each of them moves.
 

@@ -24,13 +24,13 @@ velocities, velocities a straight line, so that they depend continuously on the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.control_laws import NUMBERS, ControlLaw, Quantity
 
 # Number of time constants after which a filter has forgotten its beginning to the last digit.
@@ -40,7 +40,7 @@ FORGOTTEN_AFTER = 37.0
 ON = 0.5
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LawNumbers:
     """Numbers of c laws in m simulations, each (m, c), with the unit u of the control.
 
@@ -109,7 +109,7 @@ def filter_shares(time_constant: Array, period: float) -> Array:
     return np.where(filtered, -np.expm1(-ratio), 1.0)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Ticks:
     """Times at which laws with one period are evaluated, in engine steps.
 
@@ -139,7 +139,7 @@ class Ticks:
         return steps / self.substeps
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LawCommands:
     """Commands of c laws for m curves at K evaluations, of which `before` precede the curves.
 
@@ -214,7 +214,7 @@ class LawCommands:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Columns:
     """Columns of a log that laws read, at any time.
 
@@ -341,7 +341,7 @@ def _with_differences(
     return np.where(differs, slopes, 0.0 if velocity is None else velocity)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LawMemory:
     """Memory of c laws with one period from one evaluation to the next, for m curves.
 
@@ -362,7 +362,7 @@ class LawMemory:
     velocities: Array
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class InputContext:
     """Inputs that a rollout with control laws needs beside those of its samples.
 

@@ -7,13 +7,12 @@ use the logarithm of quaternions in the body frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
     bristle_sizes,
@@ -27,7 +26,7 @@ from mjfim.records.trajectory import Trajectory
 SMALL_ANGLE = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class StateSpace:
     """Layout of states and of their tangent vectors.
 
@@ -200,7 +199,7 @@ def logarithm_derivative(rotation: Array) -> Array:
 NEGLIGIBLE_CONTROL = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class StateSizes:
     """Natural sizes of states and controls where no trajectory shows them.
 

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import mujoco
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, RecordingError, unknown
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import (
@@ -21,7 +21,6 @@ from mjfim.model.elements import identifier, names_of
 from mjfim.model.units import sensor_unit
 from mjfim.recordings.quantities import Unit, units_like
 from mjfim.recordings.section import LAW_PREFIXES, LogUnit, RecordingSpec
-from mjfim.records.base import record
 
 # Factor that converts each unit of a log to the model's unit.
 UNIT_FACTORS = {unit: Unit.parse(unit).factor for unit in get_args(LogUnit)}

@@ -30,11 +30,10 @@ import pyarrow.compute
 import pyarrow.csv
 import pyarrow.parquet
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import RecordingError, listed, shortened, unknown
 from mjfim.files import read_arrays, read_json
 from mjfim.recordings.section import INPUT_PREFIXES, RecordingSpec
-from mjfim.records.base import record
 
 # File that makes a folder a dataset, and the column that says to which episode a frame belongs.
 INFO_FILE = "meta/info.json"

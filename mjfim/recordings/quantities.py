@@ -23,8 +23,8 @@ from pydantic_core import (
     core_schema,
 )
 
+from mjfim.arrays import record
 from mjfim.errors import listed, shortened, unknown
-from mjfim.records.base import record
 
 # One turn [rad].
 TURN = 2.0 * math.pi

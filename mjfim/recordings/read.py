@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import RecordingError, closest, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.channels import (
@@ -38,7 +38,7 @@ from mjfim.recordings.checks import (
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
 from mjfim.recordings.quantities import TURN
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
-from mjfim.records.base import Record, record
+from mjfim.records.base import Record
 from mjfim.records.trajectory import Recording
 
 # Differences below this fraction of the column's largest value are rounding errors.

@@ -8,18 +8,19 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, ClassVar, Self, TypeVar, dataclass_transform
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from mjfim.arrays import freeze
+from mjfim.arrays import record as record
 from mjfim.errors import RecordingError
 from mjfim.files import read_arrays, write_arrays, write_json
 
@@ -38,21 +39,10 @@ MAX_ENTRIES = 4
 PRESENTATION = "mjfim.output.report"
 PICTURES = "mjfim.output.plots.pictures"
 
-T = TypeVar("T")
-
 
 def no_array(*shape: int) -> Any:
     """Field whose default is an array without entries, for what was not computed."""
     return field(default_factory=lambda: np.zeros(shape or (0,)))
-
-
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
-def record(kind: type[T]) -> type[T]:
-    """Make a frozen dataclass whose fields are keywords and whose arrays nobody can change."""
-    hints = kind.__annotations__.items()
-    arrays = tuple(name for name, hint in hints if hint in ("Array", "Array | None"))
-    kind.array_fields = arrays  # type: ignore[attr-defined]
-    return dataclass(frozen=True, kw_only=True, eq=not arrays, repr=False)(kind)
 
 
 class NamedEnum(Enum):

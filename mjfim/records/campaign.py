@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import first_ones
-from mjfim.records.base import NamedEnum, Record, ShownRecord, record
+from mjfim.records.base import NamedEnum, Record, ShownRecord
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import first_ones, shortened
-from mjfim.records.base import Record, ShownRecord, record
+from mjfim.records.base import Record, ShownRecord
 from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal
 from mjfim.records.worth import Worth

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, scaled_pseudo_inverse
-from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
+from mjfim.arrays import Array, record, scaled_pseudo_inverse
+from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
 from mjfim.records.worth import Worth

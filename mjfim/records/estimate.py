@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, Array
+from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.errors import first_ones
-from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array, record
+from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array
 from mjfim.records.check import Check, join_names
 from mjfim.records.design import Design
 from mjfim.records.estimate_parts import (

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
-from mjfim.records.base import Record, ShownRecord, no_array, record
+from mjfim.arrays import Array, record
+from mjfim.records.base import Record, ShownRecord, no_array
 from mjfim.records.check import join_names
 
 

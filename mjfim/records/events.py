@@ -6,15 +6,16 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, TypeVar
+
+from mjfim.arrays import record
 
 if TYPE_CHECKING:
     from mjfim.records.design import HistoryRow
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class DesignEvent:
     """One iterate of a design.
 
@@ -27,7 +28,7 @@ class DesignEvent:
     row: HistoryRow
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class FitEvent:
     """One iterate of an estimation.
 
@@ -46,7 +47,7 @@ class FitEvent:
     step: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class StudyEvent:
     """Progress of a study that consists of several parts.
 

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from mjfim.records.base import Record, record
+from mjfim.arrays import record
+from mjfim.records.base import Record
 from mjfim.records.estimate import ControlLawInLoop
 
 # Kinds of entries, the names of the fields of `Inventory` that hold them, and what names an entry.

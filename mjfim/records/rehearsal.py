@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import first_ones
-from mjfim.records.base import Record, ShownRecord, record
+from mjfim.records.base import Record, ShownRecord
 
 # Ratios of the effect of a finite step to that of the derivatives that confirm a standard
 # deviation.

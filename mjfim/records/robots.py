@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, Array
-from mjfim.records.base import Record, ShownRecord, record
+from mjfim.arrays import NORMAL_95, Array, record
+from mjfim.records.base import Record, ShownRecord
 from mjfim.records.check import join_names
 
 # Difference over the value it is compared with, up to which it is written in percent.

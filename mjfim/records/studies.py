@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
-from mjfim.records.base import NamedEnum, Record, ShownRecord, record
+from mjfim.arrays import Array, record
+from mjfim.records.base import NamedEnum, Record, ShownRecord
 from mjfim.records.design import TIE_TOLERANCE
 from mjfim.records.trajectory import Labels
 

@@ -10,9 +10,9 @@ from itertools import pairwise
 from math import isfinite, isnan
 from typing import Any
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import first_ones, listed
-from mjfim.records.base import NamedEnum, Record, record
+from mjfim.records.base import NamedEnum, Record
 
 
 @record

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import MjfimError, RecordingError
-from mjfim.records.base import Record, SavedRecord, no_array, record
+from mjfim.records.base import Record, SavedRecord, no_array
 
 # Bounds of a parameter without any.
 NO_BOUNDS = (-np.inf, np.inf)

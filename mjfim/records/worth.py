@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
-from mjfim.records.base import Record, ShownRecord, record
+from mjfim.arrays import Array, record
+from mjfim.records.base import Record, ShownRecord
 
 # Wanted standard deviation where none is stated, relative to the size of the parameter.
 DEFAULT_RELATIVE_STD = 0.05

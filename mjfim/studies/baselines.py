@@ -14,17 +14,16 @@ from functools import partial
 import numpy as np
 import scipy.signal
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.excitation.design import consume
 from mjfim.excitation.initial_controls import series_of
 from mjfim.excitation.search.inside import LimitedCost, largest_share
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis
-from mjfim.excitation.search.search import Search, candidate_of
+from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
-from mjfim.records.base import record
 from mjfim.records.events import DesignEvent
 
 # Largest number of harmonics of a parametric multisine.
@@ -387,8 +386,7 @@ def _optimise(
     rng = np.random.default_rng((search.seed, *search.part))
     part, parts = search.part
     starts = list(series_of(stated, rng, harmonics))[part::parts]
-    candidates = [candidate_of(start) for start in starts]
-    results = consume(optimiser.run(candidates), watch)
+    results = consume(optimiser.run(starts), watch)
     steps = optimiser.steps
     found = min(results, key=lambda each: (each.cost, each.rank), default=None)
     if found is None:

@@ -8,7 +8,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import (
     ExperimentError,
     NoResultError,
@@ -34,7 +34,6 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, carry_out
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import saturated_actuators
-from mjfim.records.base import record
 from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
 from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult

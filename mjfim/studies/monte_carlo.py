@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System, SystemOrder, labels_of_system
@@ -23,7 +23,6 @@ from mjfim.identification.identify import least_squares
 from mjfim.information.identifiability import require_visible
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.records.base import record
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.studies import MonteCarloStudy, TrialStatistics
 from mjfim.records.trajectory import Recording, Trajectory

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, Array, scaled_to_unit_diagonal
+from mjfim.arrays import NORMAL_95, Array, record, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, listed, unknown
 from mjfim.experiment.packing import model_of
 from mjfim.experiment.parameters import BARYCENTRIC_FIELDS, LOGCHOLESKY_FIELDS
@@ -32,7 +32,6 @@ from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.terms.library import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.records.base import record
 from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import PayloadEstimate
 from mjfim.records.events import begin_stage, shown_progress

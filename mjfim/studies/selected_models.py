@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
@@ -21,7 +21,6 @@ from mjfim.identification.left_out import HeldOutLosses
 from mjfim.model.elements import free_name
 from mjfim.model.parameters import Parameter, ParameterSet
 from mjfim.model.paths import ParameterPath
-from mjfim.records.base import record
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import (
     PooledParameter,

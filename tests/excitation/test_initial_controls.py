@@ -91,7 +91,7 @@ def test_a_fourier_series_comes_with_its_basis(begins: bool, ends: bool, tmp_pat
     for bandwidth, harmonics in ((None, 15), (7.0, 4)):
         limits = {"control": RANGE, **({"bandwidth": bandwidth} if bandwidth else {})}
         task = arm(tmp_path, boundary=boundary, limits=limits, descent={"fourier": (1.5,)})
-        series = list(initial_controls_of(task, None))[1].basis
+        series = list(initial_controls_of(task, None))[1].curves
         assert series is not None
         assert_array_equal(series, fourier_basis(task.t, 1.0, 1.5, harmonics, begins, ends))
 

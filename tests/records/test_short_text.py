@@ -7,8 +7,8 @@ from enum import Enum
 import numpy as np
 
 import mjfim
-from mjfim.arrays import Array
-from mjfim.records.base import Record, record
+from mjfim.arrays import Array, record
+from mjfim.records.base import Record
 from mjfim.records.trajectory import Trajectory
 
 

@@ -7,20 +7,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.model.clearance import GeomDistances
 from mjfim.optimize.cost_models import BarrierDerivatives, Bounds
 from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.state_space import StateSpace
-from mjfim.records.base import record
 from mjfim.records.trajectory import Trajectory
 
 # Norm over its bound below which the limits of the derivatives at zero hold; the error is the
@@ -185,7 +184,7 @@ class ExpansionSums:
         return ExpansionSums(a=np.zeros((N + 1, nx)), b=np.zeros((N, nu)), weights=weights)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Constraint(ABC):
     """Inequality constraints of one or several kinds: quantities between bounds.
 
@@ -268,7 +267,7 @@ class Constraint(ABC):
         return self.number_bounds.slack_changes(self.change(values, step))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class SubstepConstraint(Constraint):
     """Ranges of positions, velocities, accelerations, angles, speeds and forces.
 
@@ -430,7 +429,7 @@ class SubstepConstraint(Constraint):
             yield i, magnitude.barrier(observed, upper, scale, delta=delta, weight=weight)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ControlConstraint(Constraint):
     """Ranges of the controls.
 
@@ -459,7 +458,7 @@ class ControlConstraint(Constraint):
         sums.weights.R[:, diagonal, diagonal] += barrier.curvature
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ControlRateConstraint(Constraint):
     """Ranges of the rates of the controls.
 
@@ -544,7 +543,7 @@ class ControlRateConstraint(Constraint):
             W[-1] = 0.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class EndStateConstraint(Constraint):
     """Tolerances of the final state about a target.
 
@@ -601,7 +600,7 @@ class EndStateConstraint(Constraint):
         sums.weights.Q[-1] += J.T @ (barrier.curvature[:, None] * J)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class ClearanceConstraint(Constraint):
     """Distances between geoms that have to be at least a clearance.
 

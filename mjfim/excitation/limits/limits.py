@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError, first_ones, listed, shortened, unknown
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import TRANSLATION, control_names
@@ -40,7 +41,7 @@ def limit_title(kind: str, name: str) -> str:
     return f"{kind.replace('_', ' ')} of {name}"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Limit:
     """Range of one quantity.
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.objective import DesignPoint
@@ -29,7 +29,6 @@ from mjfim.parallel import (
 )
 from mjfim.parallel.budget import Budget, StopReason, StopToken
 from mjfim.parallel.shared_value import KeptPerThread, SharedValue
-from mjfim.records.base import record
 from mjfim.records.design import (
     HistoryRow,
     IterateMotion,
@@ -257,7 +256,7 @@ class Plan:
         return Grounds(task.with_variant(self.variant), self.combinations)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Move:
     """Order to let a candidate climb some rungs.
 
@@ -410,9 +409,7 @@ class Climb:
             problem = ground.problem(barrier, weights[number], tightening)
             iterations = int(np.ceil(max(self._iterations_left, 1) / left))
             offset = max(self.candidate.iterations - bool(number or repeated), 0)
-            for step in ground.stage(
-                barrier, problem, point, direction, iterations, self._budget
-            ):
+            for step in ground.stage(barrier, problem, point, direction, iterations, self._budget):
                 yield from self._recorded(step, ground, offset)
                 if budget.exhausted is not None or self.candidate.is_held_up:
                     break

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.constraints import FORCE_KINDS
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
@@ -27,7 +27,6 @@ from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
-from mjfim.records.base import record
 from mjfim.records.design import Status
 
 # Smallest tolerance on a coarse level. It is coarse, because the stated level refines the minimum.
@@ -131,7 +130,7 @@ class Step:
     has_left: bool = False
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Ground(LimitedLevel):
     """The level on which descents work, over one repetition of the control.
 

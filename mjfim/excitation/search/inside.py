@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH, growth_along
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues, EndStateConstraint
@@ -26,7 +25,6 @@ from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, moved_alike
 from mjfim.excitation.task import FADE_SHARE
 from mjfim.parallel.budget import Budget
-from mjfim.records.base import record
 from mjfim.records.design import ScaledStart
 
 # Shares of a control that are tried first; below the last one, each share is the same factor
@@ -66,7 +64,7 @@ SMALLER_TRIALS = 3
 LEAST_PROGRESS = 0.01
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LimitedLevel:
     """A level with its limits.
 
@@ -87,7 +85,7 @@ class LimitedLevel:
         return self.constraints.along(task.plant, task.theta, control)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class LimitedCost(LimitedLevel):
     """Cost of controls that keep all limits on the stated level.
 

@@ -17,7 +17,6 @@ from itertools import islice
 
 import numpy as np
 
-from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.climb import (
     Candidate,
@@ -704,13 +703,6 @@ class Search:
     def _plans(self) -> dict[int, SharedValue[Plan]]:
         """Plans by the threads of each move."""
         return {}
-
-
-def candidate_of(start: InitialControl) -> Candidate:
-    """The candidate of an initial control."""
-    return Candidate(
-        name=start.name, control=start.control, curves=start.basis, repeats=start.repeats
-    )
 
 
 def _named_stop(candidate: Candidate, budget: Budget) -> Candidate:

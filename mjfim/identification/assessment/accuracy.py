@@ -6,7 +6,6 @@ That is the formal covariance, robust intervals, and the poorly known parameters
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +16,7 @@ from mjfim.arrays import (
     POORLY_KNOWN_SHARE,
     UNDETERMINED_SHARE,
     Array,
+    record,
     scaled_to_unit_diagonal,
 )
 from mjfim.identification.assessment.honest_covariance import between_covariance
@@ -121,7 +121,7 @@ SMALLEST_RELATIVE_SIZE = 1e-3
 SMALLEST_VARIANCE = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Accuracy:
     """Accuracy of the p parameters, with the values of the first recording.
 
@@ -373,7 +373,7 @@ def std_at_start(fit: FitResult) -> Array:
     return std
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FitResult:
     """Result of the searches of one identification.
 

@@ -18,13 +18,13 @@ recordings are few.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePath
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array, scaled_to_unit_diagonal
+from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.robust_covariance import (
     Blocks,
@@ -43,7 +43,7 @@ MAX_NEWTON_STEPS = 60
 TAU_TOLERANCE = 1e-10
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RandomEffects:
     """Means of q quantities over recordings.
 
@@ -214,7 +214,7 @@ TOTAL_TOLERANCE, TOLERANCE = 1e-12, 1e-9
 UNKNOWN_SHARE = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RecordingViews:
     """Evidence of single recordings, in coordinates z in which all of them have unit information.
 

@@ -11,12 +11,11 @@ Three methods use the condensed blocks of the last linearisation, without anothe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import NORMAL_95, Array, scaled_pseudo_inverse, scaled_to_unit_diagonal
+from mjfim.arrays import NORMAL_95, Array, record, scaled_pseudo_inverse, scaled_to_unit_diagonal
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 
@@ -34,7 +33,7 @@ MIN_BLOCKS = 20
 OWN_TOLERANCE = 1e-14
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Blocks:
     """Normal equations of B blocks that count as independent, about c unknowns.
 

@@ -7,13 +7,13 @@ are numbers of the model and of the measurement.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint, scalar_joints
@@ -58,7 +58,7 @@ VECTOR_SENSORS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Effect:
     """A number whose effect is tested.
 
@@ -79,7 +79,7 @@ class Effect:
     positive: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Candidate:
     """A term to test.
 

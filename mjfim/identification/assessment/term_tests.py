@@ -15,13 +15,13 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.term_candidates import (
@@ -235,7 +235,7 @@ MAX_VALUES = 6
 MIN_REDUCTION = 25.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TermTests:
     """Result of the tests of all terms that a model may lack.
 
@@ -434,7 +434,7 @@ def _score_test(
     return step / linearisation[2][chosen], float(-score @ step), float(move)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _TermSearch:
     """Tests at the solution of a problem.
 

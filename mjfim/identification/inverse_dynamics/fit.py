@@ -14,19 +14,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array, scaled_to_unit_diagonal
+from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, MjfimError, RecordingError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.assessment.residual_tests import whiteness_of
-from mjfim.identification.inverse_dynamics.equations import MotionEquations
+from mjfim.identification.inverse_dynamics.equations import MotionEquations, residual_forces
 from mjfim.identification.inverse_dynamics.motion import measured_forces
-from mjfim.identification.inverse_dynamics.residual_forces import residual_forces
 from mjfim.identification.linear_coordinates import CadPrior, LinearCoordinates
 from mjfim.model.control_laws import LawField
 from mjfim.model.elements import model_length, translations
@@ -98,7 +97,7 @@ DETERMINED_SHARE = 0.5
 HOLD_SIGMA = 100.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class FoundEquations:
     """Where a search ended.
 
@@ -130,7 +129,7 @@ def _residual(rows: Array) -> Array:
     return np.asarray(rows[0] - rows[1])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class EquationSearch:
     """The least-squares problem of the equations.
 

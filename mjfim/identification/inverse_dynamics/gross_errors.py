@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import MjfimError, RecordingError, WrongLogError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
@@ -112,7 +112,7 @@ def refuse_gross_error(
         raise WrongLogError(f"{longest.name}: {found}")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Change:
     """The n signals of a log without an error: controls, and then joints of one coordinate.
 
@@ -142,7 +142,7 @@ class _Change:
         return replace(self, **changed)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class _Search:
     """Fits of the equations along changed logs.
 

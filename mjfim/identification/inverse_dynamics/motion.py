@@ -10,13 +10,13 @@ the integrators that are implicit in the velocity change the velocity first.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
@@ -55,7 +55,7 @@ MAX_OUTLIER_ROUNDS = 3
 FREQUENCIES = 400
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Readings:
     """Measured values of a curve, or of its slope.
 
@@ -72,7 +72,7 @@ class Readings:
     derivative: int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RegressionSpline:
     """A fitted spline.
 
@@ -249,7 +249,7 @@ REACH = 1.5
 FEWEST_READINGS = 8
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class MeasuredMotion:
     """Motion of a robot at n equidistant times.
 
@@ -489,7 +489,7 @@ ACTUATOR_FORCE = int(mujoco.mjtSensor.mjSENS_ACTUATORFRC)
 JOINT_FORCE = int(mujoco.mjtSensor.mjSENS_JOINTACTFRC)
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class MeasuredForce:
     """A measured force of actuators.
 

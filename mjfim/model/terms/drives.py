@@ -10,12 +10,12 @@ tendon over the joint and the deflection, and the actuators act on this tendon.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
@@ -98,7 +98,7 @@ NORDIN_2002 = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class ActuatorLag(Term):
     """First-order lag between the control of an actuator and its effect.
 
@@ -161,7 +161,7 @@ class ActuatorLag(Term):
         actuator.dynprm = dynamics
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class BackEmf(Term):
     """Back-EMF of a motor whose control is a voltage.
 
@@ -238,7 +238,7 @@ def _require_plain(model: Any, name: str, number: int, kind: str) -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class JointElasticity(Term):
     """A spring between the motor and the link of a joint.
 
@@ -396,7 +396,7 @@ class JointElasticity(Term):
         element.damping = with_first(element.damping, self.value("damping"))
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Backlash(JointElasticity):
     """A gap between the motor and the link of a joint, with stiff flanks.
 

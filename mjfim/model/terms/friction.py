@@ -19,13 +19,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
 import scipy
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name, is_rk4, model_length
 from mjfim.model.terms.term import (
@@ -134,7 +135,7 @@ GARCIA_2002 = (
 Fixed = tuple[tuple[str, float], ...]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class _PassiveDevice(Term):
     """A term that is one `dcmotor` without control at a joint.
 
@@ -227,7 +228,7 @@ class _PassiveDevice(Term):
             spec.joint(self.joint).frictionloss = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Stribeck(_PassiveDevice):
     """Friction that falls from its static to its Coulomb value with the speed."""
 
@@ -262,7 +263,7 @@ class Stribeck(_PassiveDevice):
         return fields, (("dynprm[5]", rounded(stiffness)),)
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class LuGre(_PassiveDevice):
     """Dynamic friction with a displacement before sliding, in place of the joint's dry friction.
 
@@ -327,7 +328,7 @@ class LuGre(_PassiveDevice):
         return fields, ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class AsymmetricFriction(_PassiveDevice):
     """A constant force beside the joint's dry friction, which then differs by direction."""
 
@@ -374,7 +375,7 @@ def _stribeck_speed(at: JointSizes) -> TermQuantity:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class LoadDependentFriction(Term):
     """Dry friction in proportion to the torque of a motor.
 

@@ -6,13 +6,14 @@ The terms of a base that is not level and of a payload are here.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 import scipy
 
+from mjfim.arrays import record
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import model_length
 from mjfim.model.terms import drives, friction
@@ -54,7 +55,7 @@ SWEVERS_2007 = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Tilt(Term):
     """Rotation of gravity in the frame of the world, which keeps its size.
 
@@ -111,7 +112,7 @@ class Tilt(Term):
         return np.asarray(turn.apply(self.gravity))
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Payload(Term):
     """A load that is fixed to a body, whose rotational inertia is equal about all axes.
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, unknown
 from mjfim.model.elements import (
     LEAST_MOVE_PER_SAMPLE,
@@ -60,7 +60,7 @@ class FieldDescription:
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TermQuantity:
     """A field of one term, resolved against its model.
 
@@ -80,7 +80,7 @@ class TermQuantity:
     numbers: tuple[tuple[str, float], ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TermTable:
     """A table `[terms.<name>]` of an experiment.
 
@@ -97,7 +97,7 @@ class TermTable:
     encoder: str = "motor"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Term(ABC):
     """A physical term that is added to a model.
 
@@ -256,7 +256,7 @@ def require_free_name(model: Any, kind: str, name: str) -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class JointSizes:
     """Natural sizes at a slide or hinge joint.
 
@@ -380,7 +380,7 @@ def with_first(polynomial: Any, value: float) -> np.ndarray:
     return numbers
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class StateLayout:
     """Addresses of the stated model's state in the state of the extended model.
 

@@ -23,7 +23,6 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +31,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.limits import limits_of
 from mjfim.experiment.system import System
@@ -41,7 +40,6 @@ from mjfim.model.coordinates import ScalarJoint, state_components
 from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
 from mjfim.output.archive import check_fits, reference_columns, simulate_playback
 from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, rosbags_module
-from mjfim.records.base import record
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Playback
 
@@ -73,7 +71,7 @@ class Drive:
     upper: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class RobotPlan:
     """A design with everything that the programs of a robot need.
 
@@ -371,7 +369,7 @@ DIGITS = 12
 REST = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class JointTrajectory:
     """The contents of a message `trajectory_msgs/JointTrajectory`.
 

@@ -23,7 +23,6 @@ from mjfim.output.panels import Picture
 from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
 from mjfim.output.plots import estimate_studies, studies
-from mjfim.output.plots.worth import worth
 from mjfim.output.words import complete_labels
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
@@ -149,7 +148,7 @@ def _(design: Design) -> Pictures:
     if design.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, design.rehearsal)
     if design.worth is not None:
-        pictures["worth"] = partial(worth, design.worth)
+        pictures["worth"] = partial(of_design.worth, design.worth)
     return pictures
 
 
@@ -228,13 +227,13 @@ def _(check: Check) -> Pictures:
     if check.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, check.rehearsal)
     if check.worth is not None:
-        pictures["worth"] = partial(worth, check.worth)
+        pictures["worth"] = partial(of_design.worth, check.worth)
     return pictures
 
 
 @pictures_of.register
 def _(result: Worth) -> Pictures:
-    return {"worth": partial(worth, result)}
+    return {"worth": partial(of_design.worth, result)}
 
 
 @pictures_of.register

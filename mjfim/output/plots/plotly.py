@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.output.panels import Axis, Cells, Mark, Panel, Picture
 from mjfim.output.words import shorten
-from mjfim.records.base import record
 
 # An object for Plotly, of values that JSON can hold.
 Plotly = dict[str, Any]
