@@ -32,6 +32,7 @@ import tomlkit
 import mjfim
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.files import read_json
 from mjfim.model.parameter_writer import ParameterWriter
 from scripts.verbs import call_verb
 
@@ -252,7 +253,7 @@ def _judge_estimate(found: Walk, folder: Path) -> None:
     file = folder / "fit" / "estimate.json"
     if not file.is_file():
         return
-    estimate = _read(file)
+    estimate = read_json(file)
     robot = tomllib.loads((folder / ROBOT).read_text(encoding="utf-8"))["parameters"]
     stated = [j for j, name in enumerate(estimate["parameters"]) if name in robot]
     true = np.array([robot[estimate["parameters"][j]]["true"] for j in stated])
@@ -265,7 +266,7 @@ def _judge_estimate(found: Walk, folder: Path) -> None:
 
 def _judge_design(found: Walk, folder: Path) -> None:
     """Compare the design with its start, and its claim with plain MuJoCo."""
-    design = _read(folder / "design" / "design.json")
+    design = read_json(folder / "design" / "design.json")
     smallest = [design[name]["eigenvalues"][0] for name in ("initial", "final")]
     found.gain = smallest[1] / smallest[0] if smallest[0] > 0.0 else None
     found.feasible_start = not design["limits"]["initial"]
@@ -329,12 +330,6 @@ def _judge_deviations(found: Walk, folder: Path) -> None:
     ratios = [scatter[name] / stated[name] for name in scatter if np.isfinite(stated[name])]
     found.stated = len(ratios)
     found.agree = sum(abs(ratio - 1.0) < AGREEMENT for ratio in ratios)
-
-
-def _read(file: Path) -> dict[str, Any]:
-    """Read a JSON file that holds one object."""
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return found
 
 
 def violations(

@@ -10,11 +10,12 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
 from rerun.experimental import ViewerClient
+
+from mjfim.arrays import record
 
 # Time that the viewer needs to load a recording and to arrange its views, and longest time that it
 # needs to start [s].
@@ -24,7 +25,7 @@ SETTLE, START = 3.0, 20.0
 SIZE = (1920, 1080)
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Shot:
     """View of a recording in a picture.
 

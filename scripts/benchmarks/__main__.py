@@ -12,10 +12,7 @@ import sys
 # The benchmarks, each with the question that it answers.
 BENCHMARKS = {
     "golden": "what does a user get from 70 command lines, and what has changed since?",
-    "start_up": "how long do the command line and the first command of the README take?",
     "benchmark": "where does the time of a design go?",
-    "benchmark_hour": "how long do reading and fitting an hour of data at 1 kHz take?",
-    "casadi_peer": "what do CasADi's solvers find on the hand-derived cart-pendulum?",
     "anytime": "is the design better than its baselines at every budget?",
     "arms_table": "is the design of two arms better than Fourier series in equal time?",
     "mjx_oracle": "do the derivatives agree with those of MJX by automatic differentiation?",

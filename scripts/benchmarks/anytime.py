@@ -13,11 +13,10 @@ The exit code is 1 where a baseline is better than the design at any budget.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
+from mjfim.arrays import record
 from mjfim.errors import MjfimError
 from mjfim.experiment.schema import Experiment
 from mjfim.output.page import DESIGNED, OTHER
@@ -35,6 +35,7 @@ from mjfim.parallel.budget import measured_by, stop_on_interrupt
 from mjfim.records.studies import DESIGN
 from mjfim.studies.baselines import TITLES
 from scripts.benchmarks import arms
+from scripts.benchmarks.child import new_table, options_of
 
 # Folder of the examples.
 EXAMPLES = Path(__file__).resolve().parents[2] / "models"
@@ -52,7 +53,7 @@ TIE = 1e-3
 HORIZON = 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Found:
     """Result of one method within one budget.
 
@@ -153,12 +154,9 @@ class Results:
 
 def table(results: list[Results], budgets: list[float]) -> Table:
     """Print J of the design and of the best baseline for every budget."""
-    made = Table(title="J within the same seconds of the processor, one thread")
-    made.add_column("experiment")
-    made.add_column("method")
-    for seconds in budgets:
-        made.add_column(f"{seconds:g} s", justify="right")
-
+    title = "J within the same seconds of the processor, one thread"
+    headings = ("experiment", "method", *[f"{seconds:g} s" for seconds in budgets])
+    made = new_table(title, *headings, texts=2)
     for each in results:
         made.add_row(each.case, "design", *[_cell(each, seconds) for seconds in budgets])
         best = [each.best_baseline(seconds) for seconds in budgets]
@@ -249,9 +247,7 @@ def _beside(costs: np.ndarray, lowest: float) -> np.ndarray:
 
 def main() -> int:
     """Run what is missing, print the table and draw the picture; 1 if a baseline is better."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seconds", nargs="+", type=float, default=list(SECONDS))
     parser.add_argument("--examples", nargs="*", help="names of examples; default: all")
@@ -308,7 +304,3 @@ def _compute(
     for row in rows:
         print(f"{case}, {seconds:g} s: {row.method} {row.cost:.6g} ({row.used:.1f} s)", flush=True)
     file.write_text(json.dumps([asdict(row) for row in rows]), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

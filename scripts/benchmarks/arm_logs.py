@@ -28,18 +28,14 @@ often `misfit` is raised. At last it takes the time of whole identifications of 
 
 from __future__ import annotations
 
-import argparse
 import copy
-import json
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from enum import Enum
 from functools import cache
 from itertools import product
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +43,11 @@ import mujoco
 import numpy as np
 import scipy
 from rich.console import Console
-from rich.progress import track
 
 import mjfim
-from mjfim.arrays import NORMAL_95, Array
+from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.experiment.system import System
-from mjfim.files import replacing
+from mjfim.files import write_json
 from mjfim.identification.assessment.residual_tests import misfit_reasons
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import fit_task, identify_system
@@ -61,9 +56,10 @@ from mjfim.identification.search import FitSearch, FitTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
 from mjfim.parallel.budget import Budget
-from mjfim.records.estimate import Estimate, Whiteness
+from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording
 from scripts.benchmarks.arm_models import LAWS, TIMESTEP, Arm, panda, ur5e
+from scripts.benchmarks.child import in_processes, options_of
 
 # Samples of the controller per measurement, and the longest delay of the measurements [samples].
 STRIDE = 4
@@ -117,7 +113,7 @@ class Fit(Enum):
     SELECTED = "--select"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Job:
     """One run of the study.
 
@@ -142,7 +138,7 @@ class Job:
     whole: bool
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Outcome:
     """Outcome of one run; shares are from 0 to 1.
 
@@ -152,8 +148,6 @@ class Outcome:
         fit: How it is identified.
         base: Share of the base parameters inside their intervals.
         base_formal: Share inside the formal intervals.
-        base_scaled: Share inside the formal intervals, scaled by the size and the correlation of
-            the residuals.
         torque: Share of the torques along another trajectory inside their intervals.
         measured: Share of the measured held-out torques inside their intervals.
         ratio: Residual held-out torque over that of the true model, root mean square over joints.
@@ -172,7 +166,6 @@ class Outcome:
     fit: str
     base: float
     base_formal: float
-    base_scaled: float
     torque: float
     measured: float
     ratio: float
@@ -318,7 +311,7 @@ def reference(arm: Arm, seconds: float, rng: np.random.Generator) -> Array:
     return np.asarray(arm.home + q * (ramp**2 * (3.0 - 2.0 * ramp))[:, None])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Log:
     """A log and what the robot really did.
 
@@ -476,7 +469,7 @@ def motion_of(log: Log, count: int) -> Array:
 # ---- runs
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Fitted:
     """Estimate of one fit, with its uncertainty and judgement.
 
@@ -490,8 +483,6 @@ class Fitted:
         equations: (p,) the fit to the equation of motion; None where it is not asked for.
         misfit: Whether a misfit is raised.
         success: Whether the search converged.
-        inflation: Mean square of the residuals over that of the noise, times the longest
-            autocorrelation time of an output [rows].
         terms: Terms that a selection added, in words.
     """
 
@@ -503,7 +494,6 @@ class Fitted:
     equations: Array | None
     misfit: bool
     success: bool
-    inflation: float
     terms: tuple[str, ...] = ()
 
 
@@ -533,7 +523,6 @@ def fitted(arm: Arm, system: System, recordings: list[Recording], job: Job) -> F
         equations=result.inverse_dynamics.theta,
         misfit=bool(reasons),
         success=result.solution.success,
-        inflation=quality.inflation,
     )
 
 
@@ -556,14 +545,8 @@ def _of_estimate(system: System, estimate: Estimate, torques: Sequence[str]) -> 
         equations=None if by_equation is None else by_equation.theta,
         misfit=estimate.misfit,
         success=estimate.success,
-        inflation=_inflation(estimate.chi2 / estimate.dof, estimate.whiteness),
         terms=tuple(term.description for term in added),
     )
-
-
-def _inflation(spread: float, whiteness: Sequence[Whiteness]) -> float:
-    """Factor by which variances are larger than the formal ones, if residuals are stationary."""
-    return max(spread, 1.0) * max(max(test.time for test in whiteness), 1.0)
 
 
 def run(job: Job) -> Outcome:
@@ -634,7 +617,6 @@ def run(job: Job) -> Outcome:
             fit=job.fit.value,
             base=_inside(error, by_theta @ covering @ by_theta.T),
             base_formal=_inside(error, by_theta @ formal @ by_theta.T),
-            base_scaled=_inside(error, found.inflation * by_theta @ formal @ by_theta.T),
             torque=float((np.abs(predicted - true) <= NORMAL_95 * np.sqrt(variance)).mean()),
             measured=float(within[is_measured].mean()),
             ratio=_ratio(residual[:, count:], of_truth),
@@ -735,33 +717,16 @@ def _median(rows: list[Outcome], key: str) -> float:
     return float(np.median([getattr(each, key) for each in rows]))
 
 
-def study(jobs: list[Job], processes: int, output: Path | None) -> list[Outcome]:
-    """Outcomes of runs, on some processes; a file has those of all runs so far."""
-    found: list[Outcome] = []
-    if not jobs:
-        return found
-    context = get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        for outcome in track(pool.map(run, jobs), total=len(jobs), description="runs"):
-            found.append(outcome)
-            write(output, found, [])
-    return found
-
-
 def write(output: Path | None, runs: list[Outcome], timed: list[Outcome]) -> None:
     """Write outcomes to a JSON file, if one is wanted."""
-    if output is None:
-        return
-    found = {"runs": [asdict(each) for each in runs], "timed": [asdict(each) for each in timed]}
-    with replacing(output) as temporary:
-        temporary.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    if output is not None:
+        found = {"runs": runs, "timed": timed}
+        write_json(output, {key: [asdict(each) for each in of] for key, of in found.items()})
 
 
 def main() -> int:
     """Run the study and print its tables; return 1 where a wanted number is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("--runs", type=int, default=50, help="runs in all")
     parser.add_argument("--seconds", type=float, default=18.0, help="data of a run [s]")
     parser.add_argument("--selected", type=int, default=4, help="runs by a selection of terms")
@@ -804,7 +769,10 @@ def main() -> int:
     lacking = [job for job in jobs if job.lacks]
     jobs += [replace(job, fit=Fit.RICHER) for job in lacking]
     jobs += [replace(job, fit=Fit.SELECTED) for job in lacking[: args.selected]]
-    outcomes = study(jobs, args.processes, args.output)
+    outcomes: list[Outcome] = []
+    for outcome in in_processes(run, jobs, args.processes):
+        outcomes.append(outcome)
+        write(args.output, outcomes, [])
     if outcomes:
         console.print(summary(outcomes), soft_wrap=True)
 

@@ -7,13 +7,12 @@ cylinders. Both have position servos, rotor inertias and sensors of the torques 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 
 # Folder of the models that others wrote, beside the repository.
 MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
@@ -22,7 +21,7 @@ MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
 TIMESTEP = 0.002
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Arm:
     """An arm of the study.
 

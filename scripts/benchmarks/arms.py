@@ -25,7 +25,6 @@ and at least as large as that of every single parameter. The scale of a paramete
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,12 +59,6 @@ HARMONICS = 5
 
 # Frequency of the first harmonic of the starting motion [Hz].
 FUNDAMENTAL = 0.2
-
-# Timestep that is the reference for all others [s].
-FINE = 2.5e-4
-
-# Largest distance that MuJoCo computes [m]; larger ones do not matter.
-MAX_DISTANCE = 10.0
 
 # Position in the frame of a body [m].
 Point = tuple[float, float, float]
@@ -216,9 +209,7 @@ ARMS = {
 }
 
 
-def model_file(
-    arm: Arm, name: str, friction: bool, folder: Path, timestep: float | None = None
-) -> Path:
+def model_file(arm: Arm, name: str, friction: bool, folder: Path) -> Path:
     """Write the MJCF of an arm.
 
     Args:
@@ -226,7 +217,6 @@ def model_file(
         name: Name of the arm, from which the name of the file is made.
         friction: Whether the joints have dry friction.
         folder: Folder that receives the file.
-        timestep: Timestep of the engine [s]; that of the arm by default.
 
     Returns:
         Path of the file.
@@ -237,7 +227,7 @@ def model_file(
 
     spec = mujoco.MjSpec.from_file(str(source))
     _state_gains(spec, spec.compile())
-    spec.option.timestep = timestep or arm.timestep
+    spec.option.timestep = arm.timestep
 
     for joint in spec.joints:
         joint.damping[0] = arm.damping
@@ -253,8 +243,7 @@ def model_file(
 
     folder.mkdir(parents=True, exist_ok=True)
     variant = "_dry" if friction else ""
-    step = f"_{1e3 * timestep:g}ms" if timestep else ""
-    path = folder / f"{name}{variant}{step}.xml"
+    path = folder / f"{name}{variant}.xml"
     path.write_text(spec.to_xml(), encoding="utf-8")
     return path
 
@@ -363,7 +352,6 @@ def experiment(
     horizon: float,
     friction: bool,
     model_folder: str | Path,
-    timestep: float | None = None,
 ) -> Experiment:
     """Make the experiment of an arm, from rest to rest at home, under hard limits.
 
@@ -372,14 +360,13 @@ def experiment(
         horizon: Duration [s].
         friction: Whether the joints have dry friction, which is then unknown.
         model_folder: Folder that receives the model and the starting control.
-        timestep: Timestep of the engine [s]; that of the arm by default.
 
     Returns:
         The experiment.
     """
     arm = ARMS[name]
     folder = Path(model_folder)
-    path = model_file(arm, name, friction, folder, timestep)
+    path = model_file(arm, name, friction, folder)
 
     hold = np.array(mujoco.MjModel.from_xml_path(str(path)).key("home").ctrl)
     control = folder / f"{path.stem}_{horizon:g}s.csv"
@@ -419,10 +406,6 @@ def write_control(path: Path, names: tuple[str, ...], control: Array) -> None:
         names: Names of the actuators.
         control: (N, nu) control.
     """
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(["t", *names])
-
-        for k, row in enumerate(control):
-            values = [f"{u:.12g}" for u in row]
-            rows.writerow([f"{k / RATE:.4f}", *values])
+    rows = np.column_stack([np.arange(len(control)) / RATE, control])
+    header = ",".join(["t", *names])
+    np.savetxt(path, rows, fmt="%.12g", delimiter=",", header=header, comments="")

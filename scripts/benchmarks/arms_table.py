@@ -27,6 +27,7 @@ from mjfim.parallel import cores
 from mjfim.parallel.budget import stop_on_interrupt
 from mjfim.records.studies import Comparison, MethodResult
 from scripts.benchmarks import arms
+from scripts.benchmarks.child import options_of
 
 # Methods with five and with fifteen harmonics.
 FEW, MANY = ("fourier5",), ("fourier15",)
@@ -180,9 +181,7 @@ def markdown_row(case: Case) -> str:
 
 def main() -> None:
     """Run the cases that are missing and print the table; exit code 1 if a case fails."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seconds", type=float, default=600.0, help="time of every method")
     parser.add_argument("--arms", nargs="+", choices=list(arms.ARMS), default=list(arms.ARMS))

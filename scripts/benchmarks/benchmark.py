@@ -14,7 +14,6 @@ All comparisons are made within one run:
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Iterable
@@ -32,7 +31,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from mjfim.records.design import Design
-from scripts.benchmarks.child import ROOT, run_code
+from scripts.benchmarks.child import ROOT, new_table, options_of, run_code
 
 # Experiment of the study.
 EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"
@@ -198,14 +197,6 @@ def peer_runs(cases: Iterable[str], repeats: int) -> list[Run]:
     return runs
 
 
-def new_table(title: str, *headings: str) -> Table:
-    """Make an empty table whose first two columns are text."""
-    table = Table(title=title, title_justify="left")
-    for i, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if i < 2 else "right")
-    return table
-
-
 def engine_table(designs: list[tuple[Run, Design]], threads: int) -> Table:
     """Compare designs with the time of the engine, table (a).
 
@@ -217,7 +208,9 @@ def engine_table(designs: list[tuple[Run, Design]], threads: int) -> Table:
         Table with one row for each run.
     """
     title = "(a) design over bare engine time (target 1.3)"
-    table = new_table(title, "case", "descent", "steps", "mj_step", "engine", "wall", "ratio")
+    table = new_table(
+        title, "case", "descent", "steps", "mj_step", "engine", "wall", "ratio", texts=2
+    )
 
     for run, design in designs:
         step = step_seconds(DesignTask.resolve(experiment(run.case)), design.trajectory)
@@ -265,6 +258,7 @@ def peer_table(runs: list[Run]) -> Table:
         "to 1e-6",
         "mjfim is",
         "before the first iterate",
+        texts=2,
     )
 
     for case, group in by_case(runs).items():
@@ -305,7 +299,7 @@ def metric_table(pairs: list[tuple[Run, Run]]) -> Table:
         Table with two rows for each case.
     """
     title = "(c) beside the paper's metric descent, to the same J"
-    table = new_table(title, "case", "descent", "iterations", "seconds", "J")
+    table = new_table(title, "case", "descent", "iterations", "seconds", "J", texts=2)
 
     for pair in pairs:
         goal = best_cost(list(pair))
@@ -330,7 +324,7 @@ def monte_carlo_table(design: Design, trials: int) -> Table:
         Table with one row for each trajectory.
     """
     title = f"(d) {trials} Monte-Carlo trials at 100 Hz (target 15 s)"
-    table = new_table(title, "trajectory", "failed", "seconds")
+    table = new_table(title, "trajectory", "failed", "seconds", texts=2)
 
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     study = mjfim.monte_carlo(experiment("b"), curves, trials=trials, seed=0)
@@ -360,9 +354,7 @@ def compare_descents(cases: list[str], flat: list[tuple[Run, Design]]) -> Table:
 
 def main() -> None:
     """Run all comparisons and print their tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("--quick", action="store_true", help="case a only, 100 trials, one repeat")
     args = parser.parse_args()
 

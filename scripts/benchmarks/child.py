@@ -1,17 +1,22 @@
-"""Commands of mjfim, and Python code, in new processes whose time and memory are measured."""
+"""What several benchmarks need: options, jobs in processes, and code in a process of its own."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from rich.progress import track
+from rich.table import Table
+
+from mjfim.parallel import cores
 
 # Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
@@ -20,60 +25,44 @@ ROOT = Path(__file__).resolve().parents[2]
 MARK = "RESULT "
 
 
-@dataclass(frozen=True, kw_only=True)
-class CommandRun:
-    """A command that has ended.
-
-    Attributes:
-        wall: Wall time [s].
-        processor: Time of the processors of the process and of all that it has started [s].
-        gigabytes: Largest memory of the process, or of one that it has started [GiB]. Linux counts
-            the memory that the calling process had when it started this one, so that it is never
-            less.
-        code: Exit code.
-        messages: Text on stderr.
-    """
-
-    wall: float
-    processor: float
-    gigabytes: float
-    code: int
-    messages: str
+Job = TypeVar("Job")
+Found = TypeVar("Found")
 
 
-def run_command(words: Sequence[str]) -> CommandRun:
-    """Run `mjfim` in the top folder of the repository, and measure it.
-
-    The files of modules are compiled at their first import, as by an installation.
-    """
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    environment["PYTHONPATH"] = str(ROOT)
-
-    # Messages go to a file, because the process is awaited by a call that reads no pipe.
-    with tempfile.TemporaryFile() as messages:
-        clock = time.perf_counter()
-        process = subprocess.Popen(
-            [sys.executable, "-m", "mjfim", *words],
-            cwd=ROOT,
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=messages,
-        )
-        _, status, used = os.wait4(process.pid, 0)
-        wall = time.perf_counter() - clock
-        process.returncode = os.waitstatus_to_exitcode(status)
-
-        messages.seek(0)
-        text = messages.read().decode(errors="replace")
-
-    # Linux states the memory in KiB.
-    return CommandRun(
-        wall=wall,
-        processor=used.ru_utime + used.ru_stime,
-        gigabytes=used.ru_maxrss / 2**20,
-        code=process.returncode,
-        messages=text,
+def options_of(description: str | None) -> argparse.ArgumentParser:
+    """Parser of the options of a benchmark, whose help is the docstring of its module."""
+    return argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+
+
+def new_table(title: str, *headings: str, texts: int = 1) -> Table:
+    """Make an empty table.
+
+    Args:
+        title: Its title.
+        *headings: Headings of the columns.
+        texts: Number of the first columns, which hold text; the others hold numbers.
+    """
+    table = Table(title=title, title_justify="left")
+    for i, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if i < texts else "right")
+    return table
+
+
+def in_processes(
+    function: Callable[[Job], Found], jobs: Sequence[Job], processes: int | None = None
+) -> Iterator[Found]:
+    """Yield the results of a function for all jobs, in their order, with a bar of progress.
+
+    Args:
+        function: Function at the top of a module.
+        jobs: The jobs.
+        processes: Number of processes; default: one for each core.
+    """
+    context = get_context("spawn")
+    with ProcessPoolExecutor(processes or cores(), mp_context=context) as pool:
+        yield from track(pool.map(function, jobs), "runs", total=len(jobs))
 
 
 def run_code(code: str, *arguments: object) -> Any:

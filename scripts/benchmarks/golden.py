@@ -12,7 +12,6 @@ seconds of the processors and the largest memory. `compare` prints the cases tha
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shlex
@@ -29,10 +28,8 @@ from typing import Any
 
 import numpy as np
 
+from scripts.benchmarks.child import ROOT, options_of
 from scripts.benchmarks.golden_cases import CASES
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
 
 # Times differ between runs; states are the only texts that are compared.
 TIMES = frozenset({"seconds", "times", "wall", "elapsed", "created"})
@@ -189,9 +186,7 @@ def differences(old: dict[str, Any], new: dict[str, Any], tolerance: float) -> l
 
 def main() -> int:
     """Run the cases, or compare two files of results; the exit code is 1 if any case differs."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     run = verbs.add_parser("run")
     run.add_argument("out", type=Path)
@@ -224,7 +219,3 @@ def main() -> int:
         print("".join(f"    {line}\n" for line in found), end="")
     print(f"{differing} of {len(old.keys() & new.keys())} cases differ")
     return int(differing > 0)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -12,32 +12,29 @@ in docs/benchmarks.md.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 import mjfim
+from mjfim.arrays import record
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.benchmarks.child import ROOT, new_table, options_of
 
 # Constants of the servo as published: kt [N m/A], R [Ohm].
 SERVO_KT = 0.32321
 SERVO_R = 4.76365
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class MeasuredSet:
     """Recordings of one robot.
 
@@ -115,7 +112,7 @@ SETS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@record
 class Result:
     """Result of one identification of a set.
 
@@ -197,19 +194,14 @@ def row_of(measured: MeasuredSet, result: Result, is_selecting: bool) -> list[st
 
 def main() -> int:
     """Identify every set with and without selection, and print what was found."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--only", choices=sorted({each.name for each in SETS}), help="one robot")
     args = parser.parse_args()
 
-    table = Table(title="Measured data of other groups", title_justify="left", show_lines=True)
-    for heading in ("set", "identified", "what changed"):
-        table.add_column(heading)
-    for heading in ("held-out / published", "median interval", "misfit", "seconds", "passes"):
-        table.add_column(heading, justify="right")
-
+    headings = "set, identified, what changed, held-out / published, median interval, misfit"
+    headings = f"{headings}, seconds, passes"
+    table = new_table("Measured data of other groups", *headings.split(", "), texts=3)
     for measured in SETS:
         if args.only not in (None, measured.name):
             continue
@@ -228,7 +220,3 @@ def main() -> int:
 
     Console(width=200).print(table)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

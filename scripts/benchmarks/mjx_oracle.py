@@ -18,14 +18,12 @@ The errors that are printed for each model are relative to the largest number of
 "Closed" are the derivatives in closed form, which a design takes instead where there are enough
 joints; there are none for RK4.
 
-Usage:  python -m scripts.benchmarks mjx_oracle [MODEL...]
+Usage:  python -m scripts.benchmarks mjx_oracle [--models NAME...]
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +32,17 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.plant.closed_form import closed_form_tree
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
+from scripts.benchmarks.child import options_of
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Entry:
     """A number of the model that a parameter sets.
 
@@ -58,7 +57,7 @@ class Entry:
     factor: float = 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Case:
     """An experiment, and where its parameters stand in the model.
 
@@ -73,7 +72,7 @@ class Case:
     tables: Mapping[str, Any]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Derivatives:
     """Derivatives of a trajectory.
 
@@ -90,7 +89,7 @@ class Derivatives:
     mixed: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Agreement:
     """Relative differences between mjfim and MJX.
 
@@ -136,8 +135,6 @@ CASES = (
             "c": _entry("dof_damping", 1),
         },
         tables={
-            "rate": 100.0,
-            "horizon": 1.0,
             "initial": {
                 "keyframe": "hanging",
                 "control": {"kind": "sine", "amplitude": 4.0, "frequency": 0.9},
@@ -161,8 +158,6 @@ CASES = (
             "damping": _entry("dof_damping", 0),
         },
         tables={
-            "rate": 100.0,
-            "horizon": 1.0,
             "initial": {
                 "keyframe": "hanging",
                 "control": {"kind": "multisine", "amplitude": 3.0, "harmonics": 3},
@@ -190,8 +185,6 @@ CASES = (
             ),
         },
         tables={
-            "rate": 100.0,
-            "horizon": 1.0,
             "initial": {
                 "keyframe": "settled",
                 "control": {"kind": "sine", "amplitude": 0.1, "frequency": 0.9},
@@ -214,7 +207,9 @@ def agreement(case: Case) -> Agreement:
     Args:
         case: The experiment.
     """
-    stated = Experiment(model=str(MODELS / f"{case.model}.xml"), **case.tables)
+    stated = Experiment(
+        model=str(MODELS / f"{case.model}.xml"), rate=100.0, horizon=1.0, **case.tables
+    )
     task = DesignTask.resolve(stated, threads=1)
     theta, trajectory, nx = task.theta, task.initial, task.space.nx
     w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
@@ -366,18 +361,8 @@ def table(rows: Sequence[Agreement]) -> str:
 def main() -> int:
     """Compare the models that are named, or all."""
     names = [case.model for case in CASES]
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("models", nargs="*", help=f"of {', '.join(names)}; default: all")
-    wanted = parser.parse_args().models or names
-    unknown = sorted(set(wanted) - set(names))
-    if unknown:
-        parser.error(f"unknown model {unknown[0]}; there are {', '.join(names)}")
-
+    parser = options_of(__doc__)
+    parser.add_argument("--models", nargs="+", choices=names, default=names)
+    wanted = parser.parse_args().models
     print(table([agreement(case) for case in CASES if case.model in wanted]))
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -20,16 +20,13 @@ does not have. It is 4, 6 and 8 of its standard deviations, and theory says how 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 import tomllib
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -38,10 +35,10 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.arrays import NORMAL_95, Array
+from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
-from mjfim.files import replacing
+from mjfim.files import write_json
 from mjfim.identification.assessment.term_candidates import candidates_of
 from mjfim.identification.assessment.term_tests import SIGNIFICANCE, find_missing_terms
 from mjfim.identification.identify import identify_system
@@ -50,12 +47,7 @@ from mjfim.parallel import cores
 from mjfim.parallel.budget import Budget
 from mjfim.records.trajectory import Recording
 from mjfim.studies.first_experiment import experiment_text, propose_experiment
-
-Job = TypeVar("Job")
-Found = TypeVar("Found")
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.benchmarks.child import ROOT, in_processes, new_table, options_of
 
 # Timestep of the robot [s].
 STEP = 0.0005
@@ -233,7 +225,7 @@ def study(runs: int, seed: int, friction: float) -> list[Outcome]:
     Returns:
         Outcomes of all runs.
     """
-    return in_parallel(run, [(seed, number, friction) for number in range(runs)])
+    return list(in_processes(run, [(seed, number, friction) for number in range(runs)]))
 
 
 def coverage_table(names: Sequence[str], found: list[Outcome]) -> Table:
@@ -247,11 +239,8 @@ def coverage_table(names: Sequence[str], found: list[Outcome]) -> Table:
         Table with one row for each unknown.
     """
     title = f"Truth inside the 95 % interval, {len(found)} recordings (at least 90 % wanted)"
-    table = Table(title=title, title_justify="left")
-    table.add_column("unknown")
-    for heading in ("interval", "formal interval", "rms error [formal σ]"):
-        table.add_column(heading, justify="right")
-
+    headings = ("unknown", "interval", "formal interval", "rms error [formal σ]")
+    table = new_table(title, *headings)
     inside = 100.0 * np.mean([outcome.inside for outcome in found], axis=0)
     formally = 100.0 * np.mean([outcome.formally for outcome in found], axis=0)
     rms = np.sqrt(np.mean([outcome.error**2 for outcome in found], axis=0))
@@ -274,7 +263,7 @@ TILT, PROBE = "option:gravity[0]", 0.02
 MAX_POWER_ERROR = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Tilted:
     """The cart-pendulum on a base that is tilted.
 
@@ -357,7 +346,7 @@ def power_study(runs: int, seed: int) -> dict[str, dict[str, float]]:
     shares = {}
     for distance in DISTANCES:
         jobs = [(seed, number, distance * per_sigma) for number in range(runs)]
-        found = in_parallel(tested, jobs)
+        found = list(in_processes(tested, jobs))
         theory = scipy.special.ndtr(distance - least) + scipy.special.ndtr(-distance - least)
         shares[f"{distance:g}"] = {
             "found": share_of([is_found for is_found, _ in found]),
@@ -380,7 +369,7 @@ WRONG = 0.2
 MAX_FALSE_ALARMS = 0.01
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class CleanLog:
     """What was said about a log that the model explains.
 
@@ -462,15 +451,13 @@ def clean_study(runs: int, seed: int, zoo: Path) -> list[CleanLog]:
         seed: Seed of the study.
         zoo: Folder of MJCF files.
     """
-    return in_parallel(identified, [(seed, number, zoo) for number in range(runs)])
+    return list(in_processes(identified, [(seed, number, zoo) for number in range(runs)]))
 
 
 def clean_table(found: Sequence[CleanLog]) -> Table:
     """Make a table of the false alarms of each robot."""
-    table = Table(title=f"False alarms in {len(found)} clean logs", title_justify="left")
-    table.add_column("robot")
-    for heading in ("logs", "misfit", "poor data", "not fitted", "seconds"):
-        table.add_column(heading, justify="right")
+    headings = ("robot", "logs", "misfit", "poor data", "not fitted", "seconds")
+    table = new_table(f"False alarms in {len(found)} clean logs", *headings)
     for robot in dict.fromkeys(each.robot for each in found):
         logs = [each for each in found if each.robot == robot]
         counts = [
@@ -485,18 +472,6 @@ def clean_table(found: Sequence[CleanLog]) -> Table:
 # ---- all studies
 
 
-def in_parallel(function: Callable[[Job], Found], jobs: Sequence[Job]) -> list[Found]:
-    """Results of a function for all jobs, on all cores.
-
-    Args:
-        function: Function of a job, at the top of this module.
-        jobs: The jobs.
-    """
-    context = get_context("spawn")
-    with ProcessPoolExecutor(cores(), mp_context=context) as pool:
-        return list(pool.map(function, jobs, chunksize=max(len(jobs) // (4 * cores()), 1)))
-
-
 def share_of(flags: list[bool]) -> float:
     """Return the share of true values."""
     return float(np.mean(flags))
@@ -504,9 +479,7 @@ def share_of(flags: list[bool]) -> float:
 
 def main() -> int:
     """Run a study and print its shares; return 1 where one is not as it should be."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("--study", choices=("coverage", "power", "clean"), default="coverage")
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--zoo", type=Path, default=Path("/work/zoo"), help="folder of MJCF files")
@@ -518,8 +491,7 @@ def main() -> int:
     summary, is_good = studies[args.study](args, Console(width=100))
     print(f"{time.perf_counter() - clock:.0f} s on {cores()} cores")
     if args.output is not None:
-        with replacing(args.output) as temporary:
-            temporary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        write_json(args.output, summary)
     return 0 if is_good else 1
 
 

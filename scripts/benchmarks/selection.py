@@ -14,32 +14,26 @@ chosen where none is missing, and how often the 95 % intervals hold the true val
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
-from multiprocessing import get_context
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 import mjfim
+from mjfim.arrays import record
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
-from mjfim.files import replacing
+from mjfim.files import write_json
 from mjfim.parallel import cores
 from mjfim.records.estimate import Estimate
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.benchmarks.child import ROOT, in_processes, new_table, options_of
 
 # Recordings of each robot, and their duration [s].
 RECORDINGS = 4
@@ -57,7 +51,7 @@ WANTED_WITHOUT_MISFIT = 0.90
 WANTED_NOTHING = 0.95
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Kind:
     """A kind of term that the model lacks.
 
@@ -127,7 +121,7 @@ KINDS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Outcome:
     """Outcome of one run.
 
@@ -157,7 +151,7 @@ class Outcome:
     passes: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Job:
     """One run of the study.
 
@@ -256,25 +250,22 @@ def _inside(found: Estimate, true: np.ndarray) -> tuple[bool, ...]:
     return tuple(((low <= true) & (true <= high)).tolist())
 
 
-def study(jobs: Sequence[Job], title: str) -> list[Outcome]:
+def study(jobs: Sequence[Job]) -> list[Outcome]:
     """Run many robots on all cores, and print each outcome, so that a study may be stopped.
 
     Args:
         jobs: The runs.
-        title: Title of the bar of progress.
 
     Returns:
         Outcomes of all runs.
     """
-    context = get_context("spawn")
-    with ProcessPoolExecutor(cores(), mp_context=context) as pool:
-        found = []
-        for outcome in track(pool.map(run, jobs), title, total=len(jobs)):
-            chosen = ", ".join(outcome.chosen) or "nothing"
-            after = "misfit" if outcome.misfit else "no misfit"
-            print(f"{outcome.kind or 'complete'}: {chosen}; {after}", flush=True)
-            found.append(outcome)
-        return found
+    found = []
+    for outcome in in_processes(run, jobs):
+        chosen = ", ".join(outcome.chosen) or "nothing"
+        after = "misfit" if outcome.misfit else "no misfit"
+        print(f"{outcome.kind or 'complete'}: {chosen}; {after}", flush=True)
+        found.append(outcome)
+    return found
 
 
 def kinds_table(found: Sequence[Outcome]) -> Table:
@@ -286,12 +277,9 @@ def kinds_table(found: Sequence[Outcome]) -> Table:
     Returns:
         Table with one row for each kind, and one for all.
     """
-    table = Table(title="Robots with a term that the model lacks", title_justify="left")
-    table.add_column("missing term")
-    headings = ("runs", "right first", "named as alternative", "misfit before", "misfit after")
-    for heading in (*headings, "inside before", "inside after", "chosen instead"):
-        table.add_column(heading, justify="right")
-
+    headings = "missing term, runs, right first, named as alternative, misfit before, misfit after"
+    headings = f"{headings}, inside before, inside after, chosen instead"
+    table = new_table("Robots with a term that the model lacks", *headings.split(", "))
     for words in [*dict.fromkeys(outcome.kind for outcome in found), "all"]:
         group = [outcome for outcome in found if words in (outcome.kind, "all")]
         wrong = Counter(o.chosen[0] if o.chosen else "none" for o in group if not o.is_right)
@@ -323,9 +311,7 @@ def _percent(flags: Sequence[bool]) -> str:
 
 def main() -> int:
     """Run both studies and print the shares; return 1 where a share is too small."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("--runs", type=int, default=100, help="robots of each of both studies")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--output", type=Path, help="JSON file with the shares")
@@ -336,8 +322,8 @@ def main() -> int:
     clock = time.perf_counter()
     numbers = range(args.runs)
     jobs = [Job(seed=args.seed, number=i, kind=KINDS[i % len(KINDS)]) for i in numbers]
-    lacking = study(jobs, "a term is missing")
-    complete = study([Job(seed=args.seed, number=i, kind=None) for i in numbers], "none is missing")
+    lacking = study(jobs)
+    complete = study([Job(seed=args.seed, number=i, kind=None) for i in numbers])
 
     right = share([outcome.is_right for outcome in lacking])
     without_misfit = share([not outcome.misfit for outcome in lacking])
@@ -374,8 +360,7 @@ def main() -> int:
             "seconds": seconds,
             "passes": passes,
         }
-        with replacing(args.output) as temporary:
-            temporary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        write_json(args.output, summary)
 
     is_good = (
         right >= WANTED_RIGHT

@@ -15,16 +15,12 @@ from the true parameters by at most 1/2: it is within one standard deviation of 
 
 from __future__ import annotations
 
-import argparse
 import io
-import json
 import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,23 +28,20 @@ import numpy as np
 import scipy
 from mujoco import sysid
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 import mjfim
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import MjfimError
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.system import System
-from mjfim.files import replacing
+from mjfim.files import write_json
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
 from mjfim.output.export.sysid import silenced, sysid_problem
 from mjfim.parallel import cores
 from mjfim.records.trajectory import Recording
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.benchmarks.child import ROOT, in_processes, new_table, options_of
 
 # Factors by which starts are wrong, and bounds of the parameters over their true values.
 FACTORS = (3.0, 10.0)
@@ -112,7 +105,7 @@ FURUTA = """<mujoco model="furuta">
 """
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Robot:
     """A robot of the study.
 
@@ -239,7 +232,7 @@ def robots() -> tuple[Robot, ...]:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Outcome:
     """Outcome of one run.
 
@@ -287,7 +280,7 @@ class Timed:
         return found
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class Job:
     """One run of the study.
 
@@ -470,11 +463,8 @@ def by_sysid(system: System, recording: Recording, start: Array, seconds: float)
 def table_of(outcomes: Sequence[Outcome]) -> Table:
     """Share of right fits, by robot and method."""
     title = "Fits at the optimum, from starts wrong by factors of 3 to 10 in every parameter"
-    table = Table(title=title, title_justify="left")
     headings = ("robot", "runs", "mjfim", "scipy", "mujoco.sysid", "restarted", "seconds")
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "robot" else "right")
-
+    table = new_table(title, *headings)
     names = dict.fromkeys(outcome.robot for outcome in outcomes)
     for name in [*names, "all"]:
         chosen = [outcome for outcome in outcomes if name in (outcome.robot, "all")]
@@ -497,18 +487,9 @@ def share_of(outcomes: Sequence[Outcome], method: str) -> float:
     return float("nan") if np.isnan(excess).any() else float(np.mean(excess <= SAME_OPTIMUM))
 
 
-def save(outcomes: Sequence[Outcome], file: Path) -> None:
-    """Write the runs so far to a JSON file."""
-    with replacing(file) as temporary:
-        text = json.dumps([asdict(outcome) for outcome in outcomes], indent=2)
-        temporary.write_text(text + "\n", encoding="utf-8")
-
-
 def main() -> int:
     """Print the table; return 1 where mjfim finds the optimum too rarely."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     known = [robot.name for robot in robots()]
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
@@ -525,17 +506,12 @@ def main() -> int:
         for name in args.robots
     ]
     outcomes = []
-    with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
-        for outcome in track(pool.map(run, jobs), "fitting", total=len(jobs)):
-            outcomes.append(outcome)
-            if args.output is not None:
-                save(outcomes, args.output)
+    for outcome in in_processes(run, jobs, args.workers):
+        outcomes.append(outcome)
+        if args.output is not None:
+            write_json(args.output, {"runs": [asdict(each) for each in outcomes]})
 
     console = Console(width=100)
     console.print(table_of(outcomes))
     console.print("restarted: fits that mjfim repeated (of these, from the equation of motion)")
     return 0 if share_of(outcomes, "mjfim") >= WANTED else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
