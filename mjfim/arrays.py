@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class Stored:
-    """How pydantic reads an array: by the name under which an archive holds it."""
+    """Reader of arrays for pydantic: by the name under which an archive holds an array."""
 
     @staticmethod
     def __get_pydantic_core_schema__(source: Any, handler: Any) -> Any:

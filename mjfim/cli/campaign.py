@@ -110,7 +110,7 @@ def campaign(
 
 @dataclass(kw_only=True)
 class _Lab:
-    """Where the rounds of a campaign are written.
+    """Folder and state of the rounds of a campaign.
 
     Attributes:
         task: The task as stated.

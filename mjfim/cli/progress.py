@@ -87,7 +87,7 @@ def lose_what_cannot_be_written() -> None:
 
 
 def lost_text() -> str:
-    """Why text for stdout was lost; empty if it was not."""
+    """Cause of text for stdout that was lost; empty if none was."""
     sys.stdout.flush()
     return _faults.pop("stdout", "")
 

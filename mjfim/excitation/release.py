@@ -341,7 +341,7 @@ class ReleaseSearch:
         return grid if stated is None else [stated, *grid]
 
     def _carried_out(self, orders: list[_Order], budget: Budget) -> Iterator[_Tried]:
-        """What the orders have tried, in their order, here or on the workers."""
+        """Results of the orders, in their order, here or on the workers."""
         own = self._releases.plant
         before = own.engine_steps
         for tried in results_on(self._releases, self._plan, _tried, orders, self._workers, budget):
@@ -390,7 +390,7 @@ class ReleaseSearch:
         return rows
 
     def _plan(self, threads: int) -> Callable[[], Releases]:
-        """What makes the evaluation in a worker that has a number of threads."""
+        """The evaluation, as a worker with a number of threads makes it."""
         releases, task = self._releases, self._releases.stage.task
         return partial(
             _made,

@@ -233,7 +233,7 @@ class Sensing:
         return masks if len(masks) > 1 else {}
 
     def worth(self, source: str, horizon: float) -> Worth:
-        """What would help to determine the parameters along the motion.
+        """Judge what would help to determine the parameters along the motion.
 
         Args:
             source: The motion, in words.

@@ -180,7 +180,7 @@ class _Units:
 
     @cached_property
     def elements(self) -> dict[str, dict[str, LimitedElement]]:
-        """What the model can limit, by kind and name."""
+        """Elements that the model can limit, by kind and name."""
         controls = self.source.coordinates.controls
         period = 1.0 / self.experiment.rate
         return limited_elements(self.source.model, controls, period).by_kind

@@ -576,7 +576,7 @@ def simulate_system(
 
 @record
 class SystemOrder:
-    """What a worker process needs to make a system again. It can be pickled.
+    """Data from which a worker process makes a system again. It can be pickled.
 
     Attributes:
         experiment: The experiment, with its files.

@@ -198,7 +198,7 @@ class FitWorkers:
         return known[threads]
 
     def _sent(self, recording: AlignedRecording) -> tuple[_SharedRecording, int]:
-        """What is sent of a recording, and its size; a large one is a file on this computer.
+        """The part of a recording that is sent, and its size; a large one is a file here.
 
         The files are removed with this object.
         """

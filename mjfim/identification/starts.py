@@ -207,7 +207,7 @@ def divergence_at_start(task: FitTask, problem: FitProblem, extreme: str) -> Exc
 
 
 def _why_diverged(problem: FitProblem, theta: Array) -> str:
-    """Why the simulation of a segment from its start diverges, as a clause for a message."""
+    """Cause of the divergence of a segment from its start, as a clause for a message."""
     plant = problem.system.plant
     if plant.laws is not None:
         return UNSTABLE_LOOP

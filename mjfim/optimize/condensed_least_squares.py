@@ -381,7 +381,7 @@ class Condensed:
 
     @property
     def true_deviation(self) -> float:
-        """How many times larger the standard deviations are than the formal ones.
+        """Ratio of the standard deviations to the formal ones.
 
         The scatter of the gradients of long stretches of rows shows it (sandwich covariance; White,
         1982). Autocorrelated residuals tell as much as fewer white ones. It is the ratio of the

@@ -135,7 +135,7 @@ class OutputGuard:
 
 
 def _entries(folder: Path) -> Entries:
-    """What the manifest of a folder lists; nothing where there is no usable one."""
+    """Entries of the manifest of a folder; none where there is no usable one."""
     with suppress(RecordingError, LookupError, TypeError, AttributeError):
         files = read_json(folder / MANIFEST)["files"]
         return {name: list(entries) for name, entries in files.items()}

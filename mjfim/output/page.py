@@ -81,7 +81,7 @@ class Term(str):
         return term
 
     def __reduce__(self) -> tuple[type[Term], tuple[str, ...]]:
-        """What a copy is made of."""
+        """Parts of which a copy is made."""
         return Term, (str(self), self.colour, self.colour_on_dark, self.colour_name)
 
     @property
@@ -116,7 +116,7 @@ def shown_word(key: str) -> str:
 
 
 class Emphasis(StrEnum):
-    """How much a row or a sentence stands out; the value is the class in HTML."""
+    """Emphasis of a row or a sentence; the value is the class in HTML."""
 
     NORMAL = ""
     STRONG = "strong"
@@ -128,7 +128,7 @@ class Emphasis(StrEnum):
 
 
 class Level(StrEnum):
-    """How good a result is."""
+    """Quality of a result."""
 
     GOOD = "good"
     DOUBTFUL = "doubtful"

@@ -339,7 +339,7 @@ def _pictures(record: ShownRecord, page: Page) -> dict[str, list[Picture]]:
 
 
 def _limit_of(pictures: Sequence[Sequence[Picture]], library: int, media: Media) -> int:
-    """How many points a curve may have, so that the file is small enough."""
+    """Number of points that a curve may have, so that the file is small enough."""
     taken = library + TEXT_SIZE
     if media.video is not None:
         taken += 4 * len(media.video.data) // 3
@@ -394,7 +394,7 @@ def _origin(record: ShownRecord, stated: Mapping[str, str]) -> dict[str, str]:
 
 
 def _name(folder: Path, record: ShownRecord, stated: Mapping[str, str]) -> str:
-    """What a result is named after: the experiment, else the recordings or the folder."""
+    """Name of a result: that of the experiment, else of the recordings or the folder."""
     if "experiment" in stated:
         return PurePosixPath(stated["experiment"]).stem
     if isinstance(record, Estimate):

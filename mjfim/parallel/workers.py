@@ -167,7 +167,7 @@ class Workers(Executor):
 
     @property
     def probable_fault(self) -> str:
-        """Why processes of the workers have ended, in words: what is probable."""
+        """Probable reason why processes of the workers have ended, in words."""
         words = "its process was ended from outside, perhaps because the memory was full"
         if self.pool is None or self.has_answered:
             return words
@@ -328,7 +328,7 @@ class StatedExecutor:
             )
 
     def _error(self, words: str) -> ExperimentError:
-        """What is wrong with the stated executor, and what would be right."""
+        """Error that says what is wrong with the stated executor, and what would be right."""
         return ExperimentError(f"executor: {shortened(repr(self.text))}: {words}")
 
     # ---- Dask

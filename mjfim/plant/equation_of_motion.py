@@ -426,7 +426,7 @@ class EquationOfMotion:
         return moments
 
     def constrained(self, model: Any, points: MotionPoints) -> np.ndarray:
-        """Where contacts, stops or equalities act, the forces of which no measurement shows.
+        """Points at which contacts, stops or equalities act, whose forces no measurement shows.
 
         Args:
             model: A model at parameter values.

@@ -374,7 +374,7 @@ def _kind(values: Any) -> Any:
 
 
 def _fault(values: Any) -> str:
-    """Why an arrow array holds no numbers, with its first text that is none; empty if it does."""
+    """Fault of an arrow array without numbers, with the first text that is none; else empty."""
     if any(is_number(_kind(values)) for is_number in NUMERIC):
         return ""
     texts = enumerate(values[:MAX_SEARCHED_ROWS].to_pylist(), start=1)

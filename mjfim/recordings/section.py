@@ -115,7 +115,7 @@ class Section(BaseModel):
 
     @classmethod
     def _words(cls, fault: Any) -> str:
-        """What is wrong with one value of this table, and what would be right."""
+        """Sentence on one value of this table: what is wrong, and what would be right."""
         kind, place = fault["type"], fault["loc"]
         field = cls.model_fields.get(str(place[0])) if len(place) == 1 else None
         if kind == "extra_forbidden":

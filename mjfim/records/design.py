@@ -546,7 +546,7 @@ class Design(ShownRecord):
 
     @property
     def outcome(self) -> str:
-        """How the optimisation ended, in a sentence; at its budget, with the last improvement."""
+        """The end of the optimisation in a sentence; at its budget, with the last improvement."""
         sentence = self.status.value
         if self.status is not Status.MAX_ITERATIONS or not np.isfinite(self.improvement):
             return sentence

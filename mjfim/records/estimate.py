@@ -199,7 +199,7 @@ NAMES_TEXT = 120
 
 @record
 class PriorDirections(Record):
-    """How many combinations of the inertial parameters the recordings determine.
+    """Number of combinations of the inertial parameters that the recordings determine.
 
     The others are determined by the prior that the inertias of the model are (`cad_prior`). No
     motion of a fixed-base arm shows them, for example the mass of its first link.

@@ -13,7 +13,7 @@ from mjfim.records.check import join_names
 
 @record
 class EquationFit(Record):
-    """How well the fitted model explains one equation.
+    """Agreement of the fitted model with one equation.
 
     Attributes:
         name: Degree of freedom, or `law of` an actuator whose force was measured.
@@ -230,7 +230,7 @@ MOST = 0.9
 
 @record
 class InformationInTime(Record):
-    """Which seconds of the recordings decide each of q parameters, by B blocks of rows.
+    """The seconds of the recordings that decide each of q parameters, by B blocks of rows.
 
     Information about a parameter counts with all other unknowns unknown. That of all blocks and of
     the priors adds to 1/σ².

@@ -105,7 +105,7 @@ class ListedLimit(Record):
 
     @property
     def path(self) -> str:
-        """What names the limit in a list."""
+        """Name of the limit in a list."""
         return f"{self.quantity}/{self.name}"
 
 

@@ -217,7 +217,7 @@ class RecordingComparison(Record):
 
     @property
     def finding(self) -> str:
-        """What the recordings do together, as the end of a sentence."""
+        """Finding on all recordings together, as the end of a sentence."""
         by_more = "by more than their noise explains"
         if self.joint_p <= SIGNIFICANCE and not self.apart:
             return f"differ in combinations of the parameters {by_more} ({p_text(self.joint_p)})"

@@ -19,7 +19,7 @@ PRICED_SHARE = 0.1
 
 @record
 class SensorWorth(Record):
-    """What one sensor, or all sensors of a kind, tell about p parameters.
+    """Worth of one sensor, or of all sensors of a kind, for p parameters.
 
     Attributes:
         name: Name of the sensor.
@@ -42,7 +42,7 @@ class SensorWorth(Record):
 
 @record
 class Price(Record):
-    """What one restriction of a design costs.
+    """Price of one restriction of a design.
 
     Attributes:
         name: What restricts the design: the title of a limit, `time` or `end state`.
@@ -108,7 +108,7 @@ class Worth(ShownRecord):
 
     @property
     def goal(self) -> str:
-        """What is wanted of a parameter, in words."""
+        """The wanted accuracy of a parameter, in words."""
         return "the wanted σ" if self.is_stated else f"a σ of {100 * DEFAULT_RELATIVE_STD:g} %"
 
     @property

@@ -583,7 +583,7 @@ def _checked(
 def _refusals(
     task: DesignTask, identifiability: Identifiability
 ) -> tuple[tuple[str, ...], tuple[LimitViolation, ...]]:
-    """Why a design refuses its initial control, in its own words, and the limits it violates."""
+    """Reasons of a design to refuse its initial control, and the limits that this violates."""
     refused: list[str] = []
     is_kept = True
     for require in (

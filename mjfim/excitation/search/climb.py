@@ -238,7 +238,7 @@ class Grounds:
 
 @record
 class Plan:
-    """What all moves of a design share, for workers."""
+    """Data that all moves of a design share, for workers."""
 
     experiment: Experiment
     variant: ModelVariant

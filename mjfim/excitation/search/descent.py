@@ -456,7 +456,7 @@ class Ground(LimitedLevel):
 
 @dataclass(kw_only=True, eq=False)
 class FreeMemory:
-    """What a descent without a barrier leaves for the next level.
+    """Data that a descent without a barrier leaves for the next level.
 
     Attributes:
         direction: Direction with its memory; None without one.

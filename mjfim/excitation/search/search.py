@@ -686,7 +686,7 @@ class Search:
         return _named_stop(found, self.budget)
 
     def _plan(self, threads: int) -> SharedValue[Plan]:
-        """What all moves share."""
+        """The plan that all moves share."""
         if threads not in self._plans:
             task = self.grounds.stated.task
             plan = Plan(

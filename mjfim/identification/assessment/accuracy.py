@@ -251,7 +251,7 @@ def _accuracy_of(fit: FitResult) -> Accuracy:
 
 
 def _information_in_time(fit: FitResult, covariance: Array, std: Array) -> InformationInTime | None:
-    """Which seconds decide the parameters that have a standard deviation: (p,); None without any.
+    """The seconds that decide the parameters with a standard deviation: (p,); None without any.
 
     When a parameter moves and all other unknowns follow at their optimum, they move along its
     column of the covariance: (c, c).

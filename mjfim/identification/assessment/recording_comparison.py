@@ -143,7 +143,7 @@ def between_variance(values: Array, variances: Array) -> Array:
 
 
 def with_scatter(parts: Array, tau2: Array) -> Array:
-    """What recordings that scatter say about their mean.
+    """Evidence of recordings that scatter about their mean.
 
     The information is `(A^-1 + T)^-1 = A (1 + T A)^-1`, which exists for a singular A as well.
 

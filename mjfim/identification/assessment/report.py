@@ -314,7 +314,7 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
 
 
 def _residual_forces(result: FitResult) -> tuple[ResidualForce, ...]:
-    """What the model does not explain at each joint; none where no log shows it.
+    """Forces that the model does not explain at each joint; none where no log shows them.
 
     Of much data, the first rows of every recording are enough for a picture.
     """
@@ -414,7 +414,7 @@ def _likely_terms(tests: TermTests, *, is_selected: bool) -> Iterator[str]:
 
 
 def _where_it_fails(result: FitResult, reasons: Sequence[str], tests: TermTests) -> Iterator[str]:
-    """What a misfit is and where, and further terms that the model may lack."""
+    """Kind and place of a misfit, and further terms that the model may lack."""
     if reasons:
         yield f"misfit: {'; '.join(reasons)}; the formal standard deviations are not the accuracy"
     if reasons and result.quality.worst_residual is not None:

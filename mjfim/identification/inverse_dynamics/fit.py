@@ -99,7 +99,7 @@ HOLD_SIGMA = 100.0
 
 @record
 class FoundEquations:
-    """Where a search ended.
+    """The point at which a search ended.
 
     Attributes:
         x: (p,) linear coordinates.

@@ -359,7 +359,7 @@ class _Search:
                 yield replace(none.with_entries("order", [i, k], [k, i]), words=words)
 
     def _cure(self, change: _Change) -> str:
-        """What to write into the experiment file; empty for a trifle."""
+        """Lines for the experiment file; empty for a trifle."""
         columns = [[f"ctrl:{name}"] for name in actuator_names(self.system.model)]
         found = measured_states(self.system, self.equations.recorded[0].motion.recording)
         for joint in self.joints:

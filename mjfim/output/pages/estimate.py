@@ -280,7 +280,7 @@ def _correlation_tables(estimate: Estimate) -> Iterator[Table]:
 
 
 def _seconds_parts(found: InformationInTime | None) -> Sequence[Part]:
-    """How few seconds hold most of the information on each parameter."""
+    """The few seconds that hold most of the information on each parameter."""
     if found is None:
         return ()
     columns = {
@@ -296,7 +296,7 @@ def _seconds_parts(found: InformationInTime | None) -> Sequence[Part]:
 
 
 def _prediction_parts(predictions: Sequence[Prediction]) -> Sequence[Part]:
-    """How much better than the nominal model the identified model predicts."""
+    """Predictions of the identified model beside those of the nominal one."""
     if not predictions:
         return ()
     note = "" if all(prediction.held_out for prediction in predictions) else FITTED_NOTE
@@ -362,7 +362,7 @@ WORDS = {
 
 
 def selection_parts(selection: Selection) -> Sequence[Part]:
-    """Which terms were added, the steps that led to them, and what they depend on."""
+    """Terms that were added, the steps that led to them, and what they depend on."""
     steps = Table(
         title="Terms that were tried: error of data that were left out of the fit",
         columns=("term", "decision", "terms", "error [σ]", "reduction [σ²]", "± standard error"),
@@ -450,7 +450,7 @@ MAX_VALUES = 60
 
 
 def horizon_parts(study: HorizonStudy | None) -> Sequence[Part]:
-    """Which length of segments was chosen, and which estimates depend on it."""
+    """The chosen length of segments, and the estimates that depend on it."""
     if study is None:
         return ()
     cautions = study.findings if study.is_used else (study.about_use, *study.findings)
@@ -547,7 +547,7 @@ def _value_table(comparison: RecordingComparison) -> Table:
 
 
 def sample_parts(estimate: Estimate) -> Iterator[Part]:
-    """Which robots were drawn, where they are, and what they do not cover."""
+    """Robots that were drawn, where they are, and what they do not cover."""
     draws = estimate.draws
     if draws is None:
         return

@@ -519,7 +519,7 @@ def equation_parts(fit: InverseDynamicsFit) -> Iterator[Part]:
 
 
 def residual_parts(found: Sequence[ResidualForce]) -> Sequence[Part]:
-    """What the model does not explain at each joint: a table and a picture."""
+    """Forces that the model does not explain at each joint: a table and a picture."""
     if not found:
         return ()
     frictions = np.array([each.friction for each in found])
