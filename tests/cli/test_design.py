@@ -190,17 +190,6 @@ def test_disk_full(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert re.search(r"^mjfim: .*design\.npz.*No space left on device", result.stderr, re.MULTILINE)
 
 
-def test_start_that_excites_nothing(tmp_path: Path) -> None:
-    """Upright at rest without control, no parameter changes the motion."""
-    nothing = '{ kind = "constant", amplitude = 0.0 }'
-    path = write_experiment(tmp_path, start=nothing, keyframe='"upright"')
-    xml = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
-    xml = xml.replace("<keyframe>", '<keyframe><key name="upright" qpos="0 0"/>')
-    (tmp_path / "cart_pendulum.xml").write_text(xml, encoding="utf-8")
-    misused(run("design", path, "-o", tmp_path / "out"), "the initial control does not excite: ")
-    assert "out" not in names(tmp_path)
-
-
 def test_parameter_that_does_nothing(tmp_path: Path) -> None:
     """The message names this parameter alone."""
     path = write_experiment(tmp_path)

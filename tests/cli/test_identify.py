@@ -99,20 +99,7 @@ def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:
             [header.replace("ctrl:force", "force"), *rows],
             "'ctrl:force' is missing",
         ),
-        "short.csv": ([header, *rows[:2]], "too few rows (2)"),
         "gap.csv": ([header, *rows[:20], *rows[30:]], "a gap of 0.11 s after data row 20"),
-        "text.csv": (
-            [header, *rows[:5], "0.05,0,0,high,0,0", *rows[6:]],
-            "'qpos:hinge' is not numeric",
-        ),
-        "hole.csv": (
-            [header, "0,,0,0,0,0", *rows[1:]],
-            "'ctrl:force') has no value in the first row",
-        ),
-        "unmeasured.csv": (
-            [header.replace("qpos", "q").replace("qvel", "v"), *rows],
-            "no measured column",
-        ),
     }
     for name, (lines, said) in cases.items():
         (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-8")

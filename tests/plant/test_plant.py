@@ -10,7 +10,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
 
 import mjfim
 from mjfim.errors import ExperimentError, SimulationDivergedError
@@ -684,38 +683,6 @@ def test_a_scale_error_multiplies_its_output(tmp_path) -> None:
     moves = scaled.theta + np.outer([h_step, -h_step], np.eye(5)[4])
     moved, _ = scaled.plant.measure(moves, scaled.control)
     assert relative_error(G[..., 4], (moved[0] - moved[1]) / (2 * h_step)) < 1e-7
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.004, 0.0237])
-def test_a_delay_shifts_all_outputs(delay: float, tmp_path) -> None:
-    delayed = {"late": {"target": "output:delay", "guess": delay, "scale": 0.01}}
-    parameters = CART_PARAMETERS | delayed
-    late, plain = (
-        cart_task(tmp_path, **OUTSIDE, parameters=parameters),
-        cart_task(tmp_path, **OUTSIDE),
-    )
-    (y, G), (exact, exact_G) = (
-        s.plant.derivatives.predict(s.theta, s.control) for s in (late, plain)
-    )
-    t, states = (
-        np.arange(51) * 0.01,
-        slice(0, 4),
-    )  # smooth states; accelerations follow the steps of the control
-    for i in range(4):
-        moved = CubicSpline(t, exact[:, i])
-        np.testing.assert_allclose(
-            y[5:, i], moved(t[5:] - delay), rtol=0, atol=1e-4 * np.ptp(exact[:, i])
-        )
-        slope = -moved(t[5:-3] - delay, 1)
-        np.testing.assert_allclose(G[5:-3, i, 3], slope, rtol=0, atol=1e-2 * np.abs(slope).max())
-    if not delay:
-        np.testing.assert_allclose(y, exact, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(G[:, states, :3], exact_G[:, states], rtol=0, atol=1e-12)
-    h = 1e-6
-    moved, _ = late.plant.measure(late.theta + np.outer([h, -h], np.eye(4)[3]), late.control)
-    if delay:  # at a knot of the interpolation the two sides differ
-        assert relative_error(G[..., 3], (moved[0] - moved[1]) / (2 * h)) < 1e-5
-    assert relative_error(late.plant.derivatives.sensitivity(late.theta, late.initial).G, G) < 1e-6
 
 
 def test_parameters_of_little_effect_get_longer_difference_steps_and_others_keep_theirs(
