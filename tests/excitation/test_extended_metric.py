@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.task import DesignTask
-from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.optimize.directions import MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from tests.support.numerics import (
     Array,
-    Loop,
     body_task,
     cart_task,
     relative_error,
@@ -127,58 +125,6 @@ def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_t
     moved = full[:, nx:].reshape(task.samples + 1, p, nx)
     for j in range(p):
         assert relative_error(moved[:, j], change[:, j]) < 1e-3
-
-
-def psi_step(
-    task: DesignTask, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int
-) -> Array:
-    """psi_{k+1} of parameter j at (x, u, psi), by a difference of two steps at theta_j +- h."""
-    up, down = thetas
-    ahead, back = up.plus(x, h * psi), up.plus(x, -h * psi)
-    return up.minus(up.F(ahead, u), down.F(back, u)) / (2 * h)
-
-
-@pytest.mark.parametrize("case", ["cart E", "free body"])
-def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tmp_path) -> None:
-    task = CASES[case](tmp_path)
-    wide, nx, p, nu = expanded(task).extended, task.space.nx, len(task.theta), task.plant.nu
-    curve, S = task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
-    d = 1e-3
-    for k, j in ((11, 0), (37, p - 1)):
-        h = 1e-3 * abs(task.theta[j])
-        shift = h * np.eye(p)[j]
-        pair = tuple(
-            Loop(
-                ParameterWriter(task.parameters).model(
-                    task.plant.source.model, task.theta + s * shift
-                ),
-                1,
-            )
-            for s in (1, -1)
-        )
-        x, u, psi, loop = curve.state[k], curve.ctrl[k], S.psi[k][:, j], pair[0]
-        columns = []
-        for i in range(nx + nu):
-            e = d * np.eye(nx + nu)[i]
-            moved = [
-                psi_step(task, pair, h, loop.plus(x, s * e[:nx]), u + s * e[nx:], psi, j)
-                for s in (1, -1)
-            ]
-            columns.append((moved[0] - moved[1]) / (2 * d))
-        by_psi = [
-            (psi_step(task, pair, h, x, u, psi + s, j) - psi_step(task, pair, h, x, u, psi - s, j))
-            / 2
-            for s in np.eye(nx)
-        ]
-        rows = slice(nx * (1 + j), nx * (2 + j))
-        mixed = np.array(columns).T
-        assert relative_error(wide.A[k, rows, :nx], mixed[:, :nx]) < 1e-4
-        assert np.abs(wide.B[k, rows] - mixed[:, nx:]).max() < 1e-4 * np.abs(mixed).max()
-        assert relative_error(wide.A[k, rows, rows], np.array(by_psi).T) < 1e-5
-        others = [c for c in range(nx, nx * (1 + p)) if not rows.start <= c < rows.stop]
-        np.testing.assert_array_equal(
-            wide.A[k, rows][:, others], 0.0
-        )  # psi of one parameter does not depend on psi of another
 
 
 def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:

@@ -26,15 +26,16 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
 from mjfim.files import as_json
 from mjfim.identification.identify import identify_system
-from mjfim.output import archive
 from mjfim.records.base import RECORD, SavedRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate, PredictionErrors
 from mjfim.records.rehearsal import Rehearsal
+from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
 from mjfim.records.trajectory import Recording, Trajectory
+from mjfim.records.worth import Worth
 from mjfim.studies.check import check_task
 from mjfim.studies.monte_carlo import monte_carlo
 from tests.support.paths import MODELS
@@ -50,7 +51,9 @@ SAVED: tuple[type[SavedRecord], ...] = (
     PredictionErrors,
     Recording,
     Rehearsal,
+    RobotComparison,
     Trajectory,
+    Worth,
 )
 
 
@@ -208,6 +211,7 @@ def test_a_design_is_loaded_as_it_was(design: Design, tmp_path: Path) -> None:
     assert (slide.lower, slide.upper) == (-2.0, 2.0)
     assert design.motions is not None and len(design.motions.iteration) == len(design.history)
     round_trip(design, tmp_path)
+    assert not Design.load(tmp_path).theta.flags.writeable
 
 
 def test_a_design_that_ends_where_it_began_has_all_arrays(design: Design, tmp_path: Path) -> None:
@@ -216,31 +220,6 @@ def test_a_design_that_ends_where_it_began_has_all_arrays(design: Design, tmp_pa
     with np.load(tmp_path / "design.npz") as arrays:
         for name in ("t", "qpos", "qvel", "act", "ctrl", "gain", "sensitivity"):
             assert np.array_equal(arrays[name], arrays[f"initial_{name}"])
-
-
-def test_the_files_of_the_design_verb_are_loaded(
-    design: Design, task: DesignTask, tmp_path: Path
-) -> None:
-    """design.json has the experiment's name as well."""
-    archive.write_design(tmp_path, design, task.system)
-    loaded = Design.load(tmp_path)
-    assert_same(loaded, design)
-    assert loaded.success == design.success and loaded.wanted == design.wanted
-    assert not loaded.theta.flags.writeable and not design.theta.flags.writeable
-
-
-def test_a_design_goes_on_from_its_file(design: Design, task: DesignTask, tmp_path: Path) -> None:
-    """A loaded trajectory is simulated as the design's own."""
-    design.save(tmp_path)
-    again = simulate_system(task.system, Design.load(tmp_path).trajectory, seed=3)
-    assert np.array_equal(again.y, simulate_system(task.system, design.trajectory, seed=3).y)
-
-
-def test_an_estimate_is_loaded_as_it_was(estimate: Estimate, tmp_path: Path) -> None:
-    """With recordings, predictions, tests of residuals, units and priors."""
-    assert estimate.predictions and estimate.whiteness and estimate.motion is not None
-    assert not (estimate.theta.flags.writeable or estimate.interval.flags.writeable)
-    round_trip(estimate, tmp_path)
 
 
 def test_large_arrays_are_not_compressed(
@@ -284,17 +263,6 @@ def test_a_campaign_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> Non
     campaign = mjfim.run_campaign(wanted, measure, rounds=2)
     assert len(campaign.rounds) == 1 and campaign.pending is not None
     round_trip(campaign, tmp_path)
-
-
-def test_recordings_and_trajectories_are_loaded_as_they_were(
-    estimate: Estimate, design: Design, tmp_path: Path
-) -> None:
-    """A recording with rows that were not measured."""
-    recording = estimate.recordings[0]
-    gaps = np.array(recording.y)
-    gaps[1::2] = np.nan
-    round_trip(dataclasses.replace(recording, y=gaps), tmp_path / "recording")
-    round_trip(design.trajectory, tmp_path / "trajectory")
 
 
 # ---- files that cannot be loaded

@@ -218,14 +218,6 @@ def test_holm() -> None:
     assert holm(np.zeros(0)).shape == (0,)
 
 
-def test_a_comparison_is_saved_and_loaded(tmp_path: Any) -> None:
-    found = compare_estimates(estimate(), estimate(1, theta=np.array([2.0, 0.3, 1.0])))
-    found.save(tmp_path)
-    again = mjfim.RobotComparison.load(tmp_path)
-    assert again.summary()["words"] == found.summary()["words"]
-    np.testing.assert_array_equal(again.p, found.p)
-
-
 # ---- rates
 
 
