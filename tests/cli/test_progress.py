@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-import mjfim
 from mjfim.cli import progress as module
 from mjfim.cli.common import say_written
 from mjfim.cli.progress import ProgressDisplay, clock, progress, say
@@ -19,7 +18,7 @@ from mjfim.output.progress_text import design_stage, design_text
 from mjfim.records.design import HistoryRow
 from mjfim.records.events import DesignEvent, StudyEvent, begin_stage, stages_observed_by
 from mjfim.studies.check import check_task
-from tests.support.paths import MODELS
+from tests.support.cart_pendulum import cart_pendulum
 
 
 def an_iterate(**changes: float) -> DesignEvent:
@@ -104,7 +103,7 @@ def test_the_report_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_a_check_names_its_stages() -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     task = DesignTask.resolve(experiment.replace(horizon=0.2))
     begun: list[tuple[str, int, int]] = []
     with stages_observed_by(lambda *stage: begun.append(stage)):

@@ -14,9 +14,9 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import spline_basis
-from mjfim.experiment.schema import Experiment
 from mjfim.output.pages import page_of
 from mjfim.records.design import Design, Status
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.limits import ARM, HARD, cart_inside, distances_of_arm, played
 from tests.support.numerics import (
     CART_PARAMETERS,
@@ -34,7 +34,7 @@ from tests.support.paths import MODELS
 @pytest.mark.slow
 def test_the_study_of_the_paper_under_hard_limits_beats_a_general_solver() -> None:
     """At its true values, within 5 N and 1 m, without other weights."""
-    experiment = Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     hard = {"control": {"force": [-5.0, 5.0]}, "position": {"slide": [-1.0, 1.0]}}
     paper = mjfim.design(experiment.replace(cost={"control": 0.0, "tracking": {}}, limits=hard))
     assert paper.status is Status.CONVERGED

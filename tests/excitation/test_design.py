@@ -15,13 +15,14 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.records.design import Status
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import CART_PARAMETERS, cart_task
 from tests.support.paths import ROOT
 
 
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
-    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    return cart_pendulum()
 
 
 @pytest.fixture(scope="module")

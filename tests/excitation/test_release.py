@@ -23,9 +23,9 @@ from mjfim.output.plots.design import convergence, trajectories
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
 from mjfim.studies.monte_carlo import monte_carlo
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import run
 from tests.support.limits import played
-from tests.support.paths import MODELS
 from tests.support.swing_down import swing_down
 
 HINGE = {"free": {"qpos:hinge": (0.1, 3.1)}}
@@ -187,7 +187,7 @@ def test_rotations_of_a_free_body_are_relative_to_the_stated_state(tmp_path: Pat
 
 @pytest.mark.slow
 def test_with_actuators_the_stated_control_is_played(tmp_path: Path) -> None:
-    experiment = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+    experiment = cart_pendulum(
         horizon=0.5,
         cost={"tracking": {}},
         initial={"free": {"qvel:hinge": (-1.0, 1.0)}},

@@ -25,10 +25,11 @@ from mjfim.output.words import when_learnt
 from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, StudyEvent
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import run
 from tests.support.paths import MODELS
 
-STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+STUDY = cart_pendulum(
     horizon=1.5,
     initial={"control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}},
     descent={"starts": 1, "tolerance": 1e-3, "max_iterations": 15},
@@ -143,7 +144,7 @@ def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> Non
     (tmp_path / "half.csv").write_text(
         "\n".join(["t,ctrl:force", *text[1:61], "0.60,"]) + "\n", encoding="utf-8"
     )
-    table = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").model_dump(exclude_unset=True)
+    table = cart_pendulum().model_dump(exclude_unset=True)
     table = {**table, "horizon": 0.4, "initial": {"keyframe": "hanging", "control": "half.csv"}}
     hard = mjfim.Experiment(**table, directory=tmp_path).replace(
         parameters={"m": {"wanted": 1e-4}},

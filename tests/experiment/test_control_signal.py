@@ -10,8 +10,8 @@ import pytest
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import generate
-from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import MODELS
 
 NAMES = ("left", "right")
@@ -119,7 +119,7 @@ def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path)
     held = model.replace('name="hanging"', 'name="hanging" ctrl="1.5"')
     assert held != model
     (tmp_path / "held.xml").write_text(held, encoding="utf-8")
-    e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+    e = cart_pendulum(
         model=str(tmp_path / "held.xml"),
         horizon=1.0,
         initial={"control": {"kind": "sine", "amplitude": 0.5}},

@@ -22,7 +22,15 @@ from mjfim.model.coordinates import (
     scalar_joints,
     state_components,
 )
-from tests.support.numerics import FREE_BODY, Array, Loop, body_task, cart_task, make_task
+from tests.support.numerics import (
+    FREE_BODY,
+    Array,
+    Loop,
+    body_task,
+    cart_task,
+    make_task,
+    sensitivity_of,
+)
 
 FREE = [f"qpos:float.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
 BALL = [f"qpos:ball.q{part}" for part in "wxyz"]
@@ -102,7 +110,7 @@ def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: P
     sigma.
     """
     task = body_task(tmp_path, noise={"qpos:ball": 0.05})
-    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    found = sensitivity_of(task)
     psi = found.psi[1:, 6:9] / 0.05
     wanted = np.einsum("kip,kiq->pq", psi, psi)
     np.testing.assert_allclose(
@@ -162,7 +170,7 @@ def test_every_output_has_its_rate(tmp_path: Path) -> None:
 def test_information_of_rates_is_the_sum_over_the_measured_samples(tmp_path: Path) -> None:
     """Output by output from G; twice the rate is not twice a weight."""
     task = cart_task(tmp_path, noise={"qpos:hinge": {"sigma": 0.05, "rate": 20.0}, "rate": 0.2})
-    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    found = sensitivity_of(task)
     G = found.G
     assert task.system.outputs.names == ("qpos:hinge", "rate")
     wanted = sum(np.outer(G[k, 0], G[k, 0]) / 0.05**2 for k in range(5, 51, 5))

@@ -25,6 +25,7 @@ from tests.support.numerics import (
     independent_noise,
     relative_error,
     richardson,
+    sensitivity_of,
 )
 
 SIGMA = np.array([0.1, 0.5, 2.0])
@@ -294,7 +295,7 @@ def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_
 
 def test_information_of_a_real_experiment_is_the_sum_with_its_noise_and_scale(tmp_path) -> None:
     task = cart_task(tmp_path, noise={"angle": 0.01, "acc": 0.3}, measure_rate=50.0)
-    S = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    S = sensitivity_of(task)
     sigma = np.array([0.01, 0.3, 0.3, 0.3])
     total = sum(S.G[k].T @ np.diag(sigma**-2) @ S.G[k] for k in range(2, 51, 2))
     evaluation = evaluate_task(task, task.initial)

@@ -19,7 +19,7 @@ from mjfim.information.identifiability import (
     Identifiability,
     require_visible,
 )
-from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task
+from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task, sensitivity_of
 
 PRODUCT = {
     "gear": {"target": "actuator/force:gear[0]"},
@@ -61,9 +61,7 @@ def two_task(folder: Path, **tables: Any) -> DesignTask:
 
 def look(task: DesignTask) -> Identifiability:
     """Identifiability along the initial control."""
-    return task.identifiability_test.along(
-        task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
-    )
+    return task.identifiability_test.along(task.initial, sensitivity_of(task))
 
 
 def test_an_experiment_that_shows_everything_needs_no_random_controls(
@@ -130,10 +128,7 @@ def test_the_null_space_of_all_controls_is_that_of_the_initial_one(tmp_path) -> 
     assert (seen.along_trajectory.count, seen.along_all.count) == (1, 1)
     assert seen.basis.shape == (3, 2)
     require_designable(task, seen)  # a combination can be designed for
-    J = (
-        task.identifiability_test.rows(task.plant.derivatives.sensitivity(task.theta, task.initial))
-        * task.parameters.scale
-    )
+    J = task.identifiability_test.rows(sensitivity_of(task)) * task.parameters.scale
     hidden = np.linalg.qr(seen.basis, mode="complete")[0][:, 2]
     assert np.linalg.norm(J @ hidden) < 1e-6 * np.linalg.norm(J)
 
@@ -234,11 +229,7 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
             initial=initial,
         )
         assert np.sum(task.initial.qpos[:, 0] < 0.1) <= 2
-        assert (
-            np.abs(task.plant.derivatives.sensitivity(task.theta, task.initial).G[..., 0]).max()
-            * 40000.0
-            > 0.1
-        )
+        assert np.abs(sensitivity_of(task).G[..., 0]).max() * 40000.0 > 0.1
         assert look(task).along_trajectory.count == 0
 
 
@@ -275,7 +266,7 @@ def test_the_seed_decides_the_random_controls(tmp_path) -> None:
 
 def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> None:
     task = cart_task(tmp_path, parameters=PRODUCT)
-    curve, found = task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
+    curve, found = task.initial, sensitivity_of(task)
 
     def diverges(theta: Array, ctrl: Array) -> None:
         raise SimulationDivergedError("too fast")
@@ -297,9 +288,7 @@ def test_data_must_show_every_parameter_even_nuisances_and_those_with_a_prior(tm
     sure = {**PRODUCT, "gear": {**PRODUCT["gear"], "nuisance": True, "prior": 1e-6}}
     for parameters in (PRODUCT, sure):
         task = cart_task(tmp_path, parameters=parameters)
-        J = task.identifiability_test.rows(
-            task.plant.derivatives.sensitivity(task.theta, task.initial)
-        )
+        J = task.identifiability_test.rows(sensitivity_of(task))
         with pytest.raises(UnidentifiableError, match="gear and gain only as gear"):
             require_visible(task.parameters, task.prior, J)
 

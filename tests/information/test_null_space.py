@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.information.null_space import NullSpace, find_null_space, parameter_groups
-from tests.support.numerics import Array, make_task
+from tests.support.numerics import Array, make_task, sensitivity_of
 
 SIZES = np.array([1e-6, 1e-3, 1.0, 1e3, 1e6])
 
@@ -230,9 +230,7 @@ def double_pendulum(folder: Path, coordinates: str) -> DesignTask:
 
 def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     task = double_pendulum(tmp_path, "barycentric")
-    seen = task.identifiability_test.along(
-        task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
-    )
+    seen = task.identifiability_test.along(task.initial, sensitivity_of(task))
     assert (seen.along_trajectory.count, seen.along_all.count) == (14, 14)
     assert seen.basis.shape == (20, 6)
     lumped, silent = seen.groups_along_all
@@ -254,9 +252,7 @@ def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_mot
     tmp_path,
 ) -> None:
     task = double_pendulum(tmp_path, "logcholesky")
-    seen = task.identifiability_test.along(
-        task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
-    )
+    seen = task.identifiability_test.along(task.initial, sensitivity_of(task))
     assert seen.basis.shape == (20, 6)
     # a step along an invisible direction moves nothing measured, to second order
     for n in (seen.along_all.directions / np.linalg.norm(seen.along_all.directions, axis=0)).T:

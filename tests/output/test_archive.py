@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import mjfim
 from mjfim.errors import RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
@@ -26,6 +25,7 @@ from mjfim.recordings import read as logs
 from mjfim.records.design import MAX_MOTIONS, MOTION_SAMPLES, Design
 from mjfim.records.trajectory import Recording
 from tests.support import results
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import MODELS
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ N, NQ, NV, NU, P = 40, 2, 2, 1, 3
 @pytest.fixture(scope="module")
 def task() -> DesignTask:
     """The cart-pendulum for 0.4 s, measured at every second sample."""
-    e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    e = cart_pendulum()
     return DesignTask.resolve(
         e.replace(
             horizon=0.4,
@@ -176,7 +176,7 @@ def test_json_holds_the_documented_keys(folder: Path, design: Design) -> None:
 @pytest.mark.slow
 def test_json_names_nuisance_parameters_and_priors(tmp_path: Path) -> None:
     """The information contains the prior, which is also written so that it can be subtracted."""
-    e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    e = cart_pendulum()
     table = {"m": {"prior": 0.5}, "c": {"nuisance": True}}
     known = DesignTask.resolve(
         e.replace(

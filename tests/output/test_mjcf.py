@@ -16,6 +16,7 @@ from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.export.mjcf import same_dynamics, write_identified
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.examples import design_file
 from tests.support.numerics import shared_model
 from tests.support.paths import MODELS, SHARED_MODELS
@@ -554,7 +555,7 @@ def test_only_the_identified_values_differ(limits: dict[str, float], tmp_path: P
 
     A floor that only the experiment states is no part of the model.
     """
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     system = System.resolve(experiment.replace(limits=limits))
     stated = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
     path = tmp_path / "deep" / "identified.xml"

@@ -16,7 +16,7 @@ from mjfim.output import progress_text
 from mjfim.output.progress_text import NotebookProgress
 from mjfim.records import events
 from mjfim.records.events import Event, FitEvent, StudyEvent
-from tests.support.paths import MODELS
+from tests.support.cart_pendulum import cart_pendulum
 
 
 class Shown(list[str]):
@@ -48,7 +48,7 @@ def places(monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
 @pytest.fixture(scope="module")
 def experiment() -> mjfim.Experiment:
     """The cart-pendulum for 0.4 s."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     return experiment.replace(horizon=0.4, descent={"max_iterations": 2}, rehearsal={"robots": 2})
 
 

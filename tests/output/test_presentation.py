@@ -23,8 +23,8 @@ from mjfim.output.panels import Picture
 from mjfim.output.plots.pictures import Pictures
 from mjfim.output.report import STYLES, template
 from tests.support import results
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.pages import page_with
-from tests.support.paths import MODELS
 
 # Many figures are drawn: these tests run in `.ci/run` only.
 pytestmark = pytest.mark.slow
@@ -117,7 +117,7 @@ def test_every_part_of_a_page_is_escaped() -> None:
 
 
 def test_a_fit_keeps_its_segments_and_the_nominal_model() -> None:
-    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.4)
+    stated = cart_pendulum(horizon=0.4)
     estimate = mjfim.identify(
         stated, [mjfim.simulate(stated, DesignTask.resolve(stated).initial, seed=0)]
     )

@@ -22,7 +22,7 @@ from mjfim.output.page import Text
 from mjfim.output.pages.estimate import sample_parts
 from mjfim.records.estimate import Estimate, PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
-from tests.support.paths import MODELS
+from tests.support.cart_pendulum import cart_pendulum
 
 # A robot of which one link stands in an included file, and one in a URDF.
 MAIN = """
@@ -59,7 +59,7 @@ def drawn(system: System, covariance: Any, count: int) -> Estimate:
 
 @pytest.fixture(scope="module")
 def system() -> System:
-    return System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+    return System.resolve(cart_pendulum())
 
 
 def test_every_model_is_the_one_in_memory(system: System, tmp_path: Path) -> None:

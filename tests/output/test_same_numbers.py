@@ -25,14 +25,14 @@ from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.pages import printed
-from tests.support.paths import MODELS
 
 
 @pytest.fixture(scope="module")
 def task() -> DesignTask:
     """The cart-pendulum for 2 s."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     return DesignTask.resolve(
         experiment.replace(horizon=1.0, descent={"max_iterations": 2}, rehearsal={"robots": 4})
     )

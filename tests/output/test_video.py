@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import NoVideoError, RecordingError
 from mjfim.excitation.task import DesignTask
@@ -21,7 +20,7 @@ from mjfim.output.film import Film, film_of, film_of_motions, film_speed, positi
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED
 from mjfim.output.video import Video, render, report_video, require_format
 from mjfim.records.trajectory import Trajectory
-from tests.support.paths import MODELS
+from tests.support.cart_pendulum import cart_pendulum
 
 SWING = """
 <mujoco>
@@ -169,7 +168,7 @@ class TestVideo:
 
     def test_a_report_says_why_it_has_no_video(self) -> None:
         """Nothing is drawn while tests run, see `tests/conftest.py`."""
-        system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+        system = System.resolve(cart_pendulum())
         resting = motion(np.array([0.0, 1.0]), np.zeros((2, 2)))
         assert report_video(system, resting) == (
             None,
@@ -185,7 +184,7 @@ class TestVideo:
     @pytest.mark.parametrize(("seconds", "follow"), [(3.0, 1.0), (4.0, 0.0)])
     def test_the_rest_of_a_recording_is_said(self, seconds: float, follow: float) -> None:
         """An estimate may hold the motion of a part of its recording."""
-        task = DesignTask.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+        task = DesignTask.resolve(cart_pendulum())
         recording = simulate_system(task.system, task.initial, 0)
         whole = task.initial
         rows = round(seconds / task.dt)

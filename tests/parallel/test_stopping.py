@@ -25,9 +25,10 @@ from mjfim.parallel import dispatch
 from mjfim.parallel.budget import Budget, Interruption, StopToken, stop_on_interrupt
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import names, read, write_experiment
 from tests.support.limits import HARD, cart_inside
-from tests.support.paths import MODELS, ROOT
+from tests.support.paths import ROOT
 
 
 def identity() -> int:
@@ -289,6 +290,6 @@ def test_seconds_end_a_design(tmp_path: Path, limits: dict[str, object]) -> None
 @pytest.mark.parametrize("threads", [0, -1, 1_000_000, 1.5, True])
 def test_impossible_numbers_of_threads_are_refused(threads: Any) -> None:
     """The message states the bounds, before anything is allocated."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     with pytest.raises(ExperimentError, match=rf"threads: {threads} .* from 1 to 1024"):
         mjfim.check(experiment, threads=threads)

@@ -30,6 +30,7 @@ from tests.support.numerics import (
     filtered_task,
     make_task,
     relative_error,
+    sensitivity_of,
     shared_model,
 )
 from tests.support.specs import write_spec
@@ -156,7 +157,7 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     tolerance = (
         1e-5 if make is furuta else 1e-6
     )  # its dampings are 1e-6, hardly above the round-off of a step
-    L, S = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial)
+    L, S = linear(task), sensitivity_of(task)
     psi = [np.zeros((task.space.nx, len(task.theta)))]
     for A, E in zip(L.A, L.E, strict=True):
         psi.append(A @ psi[-1] + E)
@@ -175,7 +176,7 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
 )
 def test_bilinear_derivatives_contain_A_B_C_D(make, accuracy, tmp_path) -> None:
     task = make(tmp_path)
-    L, psi = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial).psi
+    L, psi = linear(task), sensitivity_of(task).psi
     w = np.abs(task.theta)[None] * np.linspace(0.5, 1.0, len(task.theta))
     found = task.plant.derivatives.bilinear(task.theta, task.initial, psi, w, accuracy)
     tolerance = 1e-5 if accuracy.central else 1e-3
@@ -610,7 +611,7 @@ START = {"initial": {"qpos:hinge": True, "qvel:slide": True}}
 
 def test_an_unknown_initial_state_is_the_initial_value_of_its_sensitivity(tmp_path) -> None:
     task = cart_task(tmp_path, **OUTSIDE, nuisance=START)
-    L, S = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial)
+    L, S = linear(task), sensitivity_of(task)
     start = np.eye(4)[:, [1, 2]]  # (dq, dv): the hinge's angle, the slide's speed
     np.testing.assert_allclose(S.psi[0][:, 3:], start, rtol=0, atol=1e-9)
     for j in (0, 1):
@@ -621,7 +622,7 @@ def test_an_unknown_initial_state_is_the_initial_value_of_its_sensitivity(tmp_pa
 
 def test_an_unknown_initial_orientation_moves_in_its_tangent_space(tmp_path) -> None:
     task = body_task(tmp_path, nuisance={"initial": {"qpos:ball.rz": True, "qvel:float.ry": True}})
-    S = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    S = sensitivity_of(task)
     np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
     loop, h = Loop(task.plant.model(task.theta), 1), 1e-4
     ends = []
@@ -635,7 +636,7 @@ def test_an_unknown_initial_orientation_moves_in_its_tangent_space(tmp_path) -> 
 
 def test_each_bias_adds_to_its_output_only(tmp_path) -> None:
     task = cart_task(tmp_path, **OUTSIDE, nuisance={"bias": {"angle": True, "acc[2]": 0.1}})
-    S = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    S = sensitivity_of(task)
     names = list(task.system.outputs.names)
     for j, name in ((3, "angle"), (4, "acc[2]")):
         expected = np.zeros(len(names))
@@ -695,7 +696,7 @@ def test_parameters_of_little_effect_get_longer_difference_steps_and_others_keep
     assert (relative >= 1.0).all() and (relative <= 100.0).all()
     np.testing.assert_array_equal(relative[1:3], 1.0)
     # A longer step reduces round-off and leaves the derivative unchanged.
-    S = task.plant.derivatives.sensitivity(task.theta, task.initial).psi[..., 0]
+    S = sensitivity_of(task).psi[..., 0]
     far = task.plant.derivatives.sensitivity(task.theta, task.initial, 1e-4).psi[..., 0]
     assert relative_error(S, far) < 1e-6
 
@@ -791,7 +792,7 @@ def test_mocap_bodies_stand_where_the_keyframe_puts_them(function: bool, tmp_pat
 def test_parameters_move_mocap_bodies_without_a_keyframe(tmp_path) -> None:
     place = {"x": {"target": "body/near:pos[0]", "scale": 1.0}}
     task = make_task(CARRIED, tmp_path, parameters=place)
-    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    found = sensitivity_of(task)
     assert found is not None
     ends = [task.plant.simulate(task.theta + h, task.control).state[-1] for h in (1e-4, -1e-4)]
     slope = (ends[0] - ends[1]) / 2e-4

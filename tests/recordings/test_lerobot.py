@@ -13,6 +13,7 @@ from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment import System
 from mjfim.recordings import RecordingSpec, read_recording, recording_paths
 from mjfim.recordings.formats import read_columns
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import misused, run
 from tests.support.lerobot import write_dataset
 from tests.support.paths import MODELS
@@ -36,7 +37,7 @@ def episodes(count: int = 2, rows: int = 40) -> list[dict[str, np.ndarray]]:
 
 def cart(**recording: Any) -> System:
     """The cart-pendulum with a table `[recording]`."""
-    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    stated = cart_pendulum()
     return System.resolve(stated.replace(recording=recording))
 
 
@@ -173,7 +174,7 @@ def test_keys_that_do_not_fit(tmp_path: Path) -> None:
 
 def test_the_verbs_read_all_episodes(tmp_path: Path) -> None:
     """Each episode of a folder is a recording of the check; a wrong folder is one sentence."""
-    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    stated = cart_pendulum()
     folder = write_dataset(tmp_path / "set", episodes(2), NAMES)
     done = run("check", stated.source, folder, "--json")
     assert done.exit_code in (0, 1), done.stderr

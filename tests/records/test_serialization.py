@@ -38,7 +38,7 @@ from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.records.worth import Worth
 from mjfim.studies.check import check_task
 from mjfim.studies.monte_carlo import monte_carlo
-from tests.support.paths import MODELS
+from tests.support.cart_pendulum import cart_pendulum
 
 SAVED: tuple[type[SavedRecord], ...] = (
     Campaign,
@@ -166,7 +166,7 @@ def test_awkward_values_survive(
 @pytest.fixture(scope="module")
 def task() -> DesignTask:
     """The cart-pendulum for 0.4 s with limits."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     return DesignTask.resolve(
         experiment.replace(
             horizon=0.4,

@@ -36,6 +36,7 @@ from mjfim.records.design import Design, Status
 from mjfim.records.trajectory import Recording
 from mjfim.studies import campaign as campaign_module
 from mjfim.studies.campaign import restate_experiment
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import PROCESS, misused, read, run
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
@@ -311,7 +312,7 @@ def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: DesignTask
 
 
 def test_messages_about_faulty_requests_name_valid_values(tmp_path: Path) -> None:
-    plain = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    plain = cart_pendulum()
     with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
         mjfim.run_campaign(plain, never)
     with pytest.raises(ExperimentError, match="recordings alone"):

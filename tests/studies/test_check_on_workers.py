@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.studies.check import check_task
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.executors import LosingThreads
-from tests.support.paths import MODELS
 
 
 def at_rest() -> DesignTask:
     """The cart-pendulum without a control, so that only random controls show its parameters."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = cart_pendulum()
     still = experiment.replace(
         horizon=0.2, initial={"control": {"kind": "constant", "amplitude": 0.0}}
     )

@@ -16,7 +16,7 @@ from mjfim.records.events import Event, StudyEvent
 from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies import monte_carlo as monte_carlo_module
 from mjfim.studies.monte_carlo import _statistics, monte_carlo
-from tests.support.paths import ROOT
+from tests.support.cart_pendulum import cart_pendulum
 
 # Table III of the paper, diagonal, initial trajectory, 25 Hz
 PAPER_BOUND = np.array([1.04e-3, 2.26e-3, 4.57e-2])
@@ -24,7 +24,7 @@ PAPER_BOUND = np.array([1.04e-3, 2.26e-3, 4.57e-2])
 
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
-    stated = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    stated = cart_pendulum()
     return stated.replace(rehearsal={"robots": 4})
 
 

@@ -15,6 +15,7 @@ from mjfim.parallel.budget import StopToken
 from mjfim.records.terms import Decision
 from mjfim.records.trajectory import Recording
 from mjfim.studies import selection as selection_study
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import ROOT
 
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
@@ -22,7 +23,7 @@ CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics":
 
 def stated(segments: str | None = None, **tables: object) -> mjfim.Experiment:
     """The cart-pendulum under a multisine."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    base = cart_pendulum()
     fit = {"bootstrap": 0} if segments is None else {"bootstrap": 0, "segments": segments}
     return base.replace(initial={"control": CONTROL}, fit=fit, **tables)
 

@@ -15,6 +15,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.records.terms import Decision, PooledParameter
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import possible_pools, selected_experiment, simplified_experiment
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import ROOT
 
 
@@ -108,7 +109,7 @@ def test_held_parameters_are_added_to_those_that_the_user_holds() -> None:
 @pytest.mark.slow
 def test_a_selection_holds_what_the_recordings_hardly_determine(tmp_path: Path) -> None:
     """The damping of the hinge is determined; that of a slow slide is not."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    base = cart_pendulum()
     control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
     experiment = base.replace(
         horizon=2.0,
@@ -138,7 +139,7 @@ def test_a_selection_holds_what_the_recordings_hardly_determine(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_selected_model_is_fitted_to_held_out_recordings() -> None:
-    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    base = cart_pendulum()
     control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
     stated = base.replace(horizon=2.0, initial={"control": control}, fit={"bootstrap": 0})
     friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.6, "scale": 1.0}}

@@ -13,8 +13,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import StudyEvent
 from mjfim.studies import monte_carlo as studies
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.executors import LosingThreads
-from tests.support.paths import MODELS
 
 # Trials of each trajectory, in two chunks.
 TRIALS = 6
@@ -27,7 +27,7 @@ SHORT: dict[str, Any] = {"horizon": 0.2, "noise": {"state": 0.0005}}
 @pytest.fixture(scope="module")
 def experiment() -> mjfim.Experiment:
     """The cart-pendulum for a short time."""
-    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**SHORT)
+    return cart_pendulum(**SHORT)
 
 
 @pytest.fixture(scope="module")

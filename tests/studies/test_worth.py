@@ -15,7 +15,7 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.records.worth import PRICED_SHARE
-from tests.support.numerics import Array
+from tests.support.numerics import Array, sensitivity_of
 from tests.support.paths import MODELS
 
 CART = MODELS / "cart_pendulum.toml"
@@ -117,7 +117,7 @@ def test_the_smallest_set_is_that_of_all_sets() -> None:
     stated = {name: {"wanted": value} for name, value in wanted.items()}
     experiment = cart().replace(parameters=stated)
     task = DesignTask.resolve(experiment)
-    fine = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    fine = sensitivity_of(task)
     rows = fine.G[1:] / np.array(list(NOISE.values()))[:, None]
     matrices = np.einsum("kyi,kyj->yij", rows, rows)
     names, enough = list(NOISE), []

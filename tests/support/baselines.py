@@ -9,8 +9,8 @@ import numpy as np
 
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
-from tests.support.paths import MODELS
 
 
 def pendulum(bandwidth: float | None = None, **tables: Any) -> Experiment:
@@ -29,7 +29,7 @@ def pendulum(bandwidth: float | None = None, **tables: Any) -> Experiment:
         },
         "cost": {"control": 0.0, "tracking": {}},
     }
-    return Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**{**hard, **tables})
+    return cart_pendulum(**{**hard, **tables})
 
 
 def played(experiment: Experiment, control: Array) -> tuple[Array, Array, Array]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.plant.outputs import Noise
+from mjfim.records.trajectory import Sensitivity
 from tests.support.paths import SHARED_MODELS
 
 Array = NDArray[np.float64]
@@ -122,6 +123,11 @@ def shared_model(relative: str) -> Path:
     if not path.is_file():
         pytest.skip(f"the shared model {relative} is not here")
     return path
+
+
+def sensitivity_of(task: DesignTask) -> Sensitivity:
+    """Sensitivities along the initial trajectory, at the guess."""
+    return task.plant.derivatives.sensitivity(task.theta, task.initial)
 
 
 def make_task(model: str | Path, folder: Path, **tables: Any) -> DesignTask:

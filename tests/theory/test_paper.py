@@ -17,6 +17,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Status
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import ROOT
 
 EIGENVALUES = {
@@ -38,9 +39,7 @@ def experiment(case: str = "b", **descent: Any) -> Experiment:
     """The cart-pendulum at the weights of one case."""
     control, slide, place, _ = CASES[case]
     cost = {"control": control, "tracking": {"slide": slide}, "linearize_at": place}
-    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(
-        cost=cost, descent=descent, rehearsal={"robots": 4}
-    )
+    return cart_pendulum(cost=cost, descent=descent, rehearsal={"robots": 4})
 
 
 @cache
