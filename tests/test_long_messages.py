@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mjfim.errors import ExperimentError, UnidentifiableError
-from mjfim.excitation.design import _require_common_parameters
-from mjfim.excitation.evaluation import require_designable
+import mjfim
+from mjfim.errors import ExperimentError, MjfimError, UnidentifiableError
 from mjfim.excitation.shortest_horizon import require_reachable
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.assessment.report import _limits_of_search
-from mjfim.identification.search import _start
 from mjfim.identification.starts import divergence_at_start
 from mjfim.output.campaign_folder import accuracy_sentence
 from mjfim.records.campaign import missed_targets
 from mjfim.records.check import (
     Combination,
-    ConfoundedPair,
     ParameterGroup,
-    SelfTest,
     groups_in_words,
-    verdict_of_check,
 )
 from mjfim.records.rehearsal import FiniteSteps
 
@@ -34,7 +28,7 @@ from mjfim.records.rehearsal import FiniteSteps
 LONGEST_MESSAGE = 600
 
 # Number of joints of a model.
-MANY = 60
+MANY = 40
 
 # Names of many parameters, of which a message shows the first ones.
 NAMES = tuple(f"inertia_of_link_{i}" for i in range(300))
@@ -51,13 +45,6 @@ def test_warnings_about_many_parameters_list_the_first_ones_and_count_the_others
     (warning,) = _limits_of_search(result, NAMES, (), interrupted=False)
     assert len(warning) < LONGEST_MESSAGE
     assert "inertia_of_link_0" in warning and " more" in warning
-
-
-def test_a_start_of_wrong_length_lists_the_first_parameters() -> None:
-    system = SimpleNamespace(parameters=SimpleNamespace(guess=np.zeros(300), names=NAMES))
-    with pytest.raises(ExperimentError) as raised:
-        _start(system, "least_squares", np.zeros(2))
-    assert len(str(raised.value)) < LONGEST_MESSAGE
 
 
 # ---- other messages about many parameters, joints, sensors or bodies
@@ -90,34 +77,6 @@ def test_groups_of_parameters_are_short_in_messages_and_whole_in_files() -> None
     require_short(groups_in_words([GROUP, SILENT, SHORT]))
     assert SHORT.short == str(SHORT) == "mass and gravity only as mass + 2 gravity"
     assert groups_in_words([SHORT, SHORT]) == f"{SHORT}; {SHORT}"
-
-
-def test_the_verdict_of_a_check_is_short() -> None:
-    row = SimpleNamespace(
-        nuisance=False, stated=True, std=1.0, wanted=0.5, unit="kg", repetitions=4, seconds=8.0
-    )
-    known = [SimpleNamespace(**{**vars(row), "name": name}) for name in NAMES]
-    pairs = [
-        ConfoundedPair(first=first, second=second, correlation=0.99)
-        for first, second in itertools.pairwise(NAMES)
-    ]
-    findings = {
-        "not_separable": (GROUP, SILENT),
-        "not_excited": (GROUP, SILENT),
-        "confounded": pairs,
-        "refused": (),
-        "violations": (),
-        "self_test": SelfTest(recursion=0.0, slope=0.0),
-        "source": "the initial control",
-        "missing": (),
-        "steps": None,
-        "rehearsal": None,
-    }
-    for rows in (known, known[:1]):
-        check = SimpleNamespace(rows=rows, **findings)
-        sentences = list(verdict_of_check(check))
-        assert max(map(len, sentences)) < LONGEST_MESSAGE
-        assert sum(" more" in sentence for sentence in sentences) == 3
 
 
 def test_the_causes_of_an_approximation_are_short() -> None:
@@ -158,34 +117,6 @@ def test_targets_out_of_reach_are_short(combinations: tuple[str, ...]) -> None:
     require_short(str(raised.value))
 
 
-def test_jointly_designed_experiments_with_different_parameters_are_named_shortly() -> None:
-    tasks = [
-        SimpleNamespace(parameters=SimpleNamespace(names=names)) for names in (NAMES, NAMES[:-1])
-    ]
-    with pytest.raises(ExperimentError) as raised:
-        _require_common_parameters(tasks)
-    require_short(str(raised.value))
-
-
-def test_a_design_that_cannot_begin_says_why_shortly() -> None:
-    parameters = [SimpleNamespace(name=name, group=None) for name in NAMES]
-    task = SimpleNamespace(
-        parameters=SimpleNamespace(parameters=parameters, interest=np.arange(300)),
-        contrast=None,
-        release=None,
-    )
-    silent = SimpleNamespace(silent=range(300))
-    unexcited = {
-        "along_all": SimpleNamespace(silent=(), basis=np.eye(300), count=0),
-        "along_trajectory": SimpleNamespace(count=300),
-        "groups_along_trajectory": (GROUP, SILENT, SHORT),
-    }
-    for found in (SimpleNamespace(along_all=silent), SimpleNamespace(**unexcited)):
-        with pytest.raises(UnidentifiableError) as raised:
-            require_designable(task, found)
-        require_short(str(raised.value))
-
-
 def test_a_diverging_start_lists_the_first_values() -> None:
     system = SimpleNamespace(
         parameters=SimpleNamespace(names=NAMES), channels=SimpleNamespace(control_columns=())
@@ -198,7 +129,7 @@ def test_a_diverging_start_lists_the_first_values() -> None:
 
 @pytest.fixture
 def many_joints(tmp_path: Path) -> Path:
-    """An experiment with 60 ball joints and the damping of each as a parameter."""
+    """An experiment with many ball joints and the damping of each as a parameter."""
     bodies = "".join(
         f'<body name="link_{i}" pos="{i} 0 0"><joint name="ball_{i}" type="ball"/>'
         f'<geom size="0.1" mass="1" contype="0"/></body>'
@@ -244,3 +175,21 @@ def test_faults_of_an_experiment_with_many_joints_are_short(
         DesignTask.resolve(Experiment.from_file(many_joints))
     message = str(raised.value)
     assert len(message) < LONGEST_MESSAGE and named in message, message
+
+
+def test_what_verbs_say_about_many_parameters_is_short(many_joints: Path) -> None:
+    """Most joints never move, so that a check and a design have to say which do not."""
+    experiment = Experiment.from_file(many_joints)
+    fewer = experiment.model_copy(update={"parameters": dict([*experiment.parameters.items()][1:])})
+    log = mjfim.simulate(experiment, DesignTask.resolve(experiment).initial, seed=0)
+    said = [max(mjfim.check(experiment).verdict, key=len)]
+    for call in (
+        lambda: mjfim.design(experiment),
+        lambda: mjfim.identify(experiment, [log], start=np.zeros(2)),
+        lambda: mjfim.design_jointly([experiment, fewer]),
+    ):
+        with pytest.raises(MjfimError) as raised:
+            call()
+        said.append(str(raised.value))
+    for message in said:
+        assert len(message) < LONGEST_MESSAGE and " more" in message, message

@@ -34,28 +34,6 @@ def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
     return total + weights.W[-1] @ before**2
 
 
-@pytest.mark.parametrize("sizes", [(1, 1), (7, 1), (1, 3), (30, 4)])
-def test_recursions_are_plain_loops(sizes: tuple[int, int]) -> None:
-    """They leave their inputs alone and can be used again."""
-    N, n = sizes
-    rng = np.random.default_rng(N)
-    A, c, z0 = rng.normal(size=(N, n, n)), rng.normal(size=(N, n)), rng.normal(size=n)
-    a = rng.normal(size=(N + 1, n))
-    z, costate = [z0], [a[N]]
-    for k in range(N):
-        z.append(A[k] @ z[-1] + c[k])
-    for k in range(N - 1, -1, -1):
-        costate.insert(0, A[k].T @ costate[0] + a[k])
-
-    recursion, kept = LinearRecursion(A), [v.copy() for v in (A, c, a)]
-    for _ in range(2):
-        for found, wanted in ((recursion.forward(z0, c), z), (recursion.adjoint(a), costate)):
-            atol = 1e-12 * np.abs(wanted).max()
-            assert_allclose(found, wanted, rtol=1e-12, atol=atol)
-    for now, before in zip((A, c, a), kept, strict=True):
-        assert_array_equal(now, before)
-
-
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
 @pytest.mark.parametrize("feedback", [False, True])
 def test_many_tangent_curves_at_once_are_those_one_by_one(steps: bool, feedback: bool) -> None:
