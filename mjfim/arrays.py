@@ -54,6 +54,7 @@ def record(kind: type[T]) -> type[T]:
     """Make a frozen dataclass whose fields are keywords. One that holds arrays equals itself only.
 
     `array_fields` of the class names the arrays, which the base class of saved records freezes.
+    Modules that `mjfim --help` loads use `dataclass`, because this one imports NumPy.
     """
     hints = kind.__annotations__.items()
     arrays = tuple(name for name, hint in hints if hint in ("Array", "Array | None"))

@@ -7,7 +7,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
@@ -17,7 +17,6 @@ import typer
 from typer.core import TyperCommand
 
 import mjfim
-from mjfim.arrays import record
 from mjfim.cli.progress import lost_text, out, progress, say, say_from_program
 from mjfim.errors import (
     MAX_THREADS,
@@ -163,7 +162,7 @@ LiveView = Annotated[
 ]
 
 
-@record
+@dataclass(frozen=True, kw_only=True)
 class Run:
     """One run of a verb with a folder of results: the options that these verbs share."""
 

@@ -24,8 +24,6 @@ from enum import StrEnum
 from itertools import zip_longest
 from typing import NamedTuple, Self
 
-from mjfim.arrays import record
-
 # Name of the report in a folder of results.
 REPORT = "report.html"
 
@@ -149,7 +147,7 @@ class Row(NamedTuple):
     emphasis: Emphasis = Emphasis.NORMAL
 
 
-@record
+@dataclass(frozen=True, kw_only=True)
 class Table:
     """A table of results.
 
@@ -217,7 +215,7 @@ class Section:
     parts: Sequence[Part]
 
 
-@record
+@dataclass(frozen=True, kw_only=True)
 class Page:
     """A result in words, tables and names of pictures.
 

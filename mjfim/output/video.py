@@ -7,12 +7,12 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjfim.arrays import record
 from mjfim.errors import NoVideoError, RecordingError
 from mjfim.files import replacing
 
@@ -54,7 +54,7 @@ GIF_COLOURS = 96
 MEASURED_FRAMES = 2
 
 
-@record
+@dataclass(frozen=True, kw_only=True)
 class Video:
     """A video of a motion.
 

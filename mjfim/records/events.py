@@ -6,16 +6,15 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, TypeVar
-
-from mjfim.arrays import record
 
 if TYPE_CHECKING:
     from mjfim.records.design import HistoryRow
 
 
-@record
+@dataclass(frozen=True, kw_only=True)
 class DesignEvent:
     """One iterate of a design.
 
@@ -28,7 +27,7 @@ class DesignEvent:
     row: HistoryRow
 
 
-@record
+@dataclass(frozen=True, kw_only=True)
 class FitEvent:
     """One iterate of an estimation.
 
@@ -47,7 +46,7 @@ class FitEvent:
     step: float
 
 
-@record
+@dataclass(frozen=True, kw_only=True)
 class StudyEvent:
     """Progress of a study that consists of several parts.
 
