@@ -30,7 +30,7 @@ from mjfim.excitation.initial_controls import (
 )
 from mjfim.excitation.limits.verification import all_violations_of, require_feasible_start, verify
 from mjfim.excitation.objective import DesignPoint
-from mjfim.excitation.rehearsal import rehearse_task
+from mjfim.excitation.rehearsal import rehearse_task, with_cures_tried
 from mjfim.excitation.release import design_release
 from mjfim.excitation.search.climb import Candidate
 from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
@@ -175,9 +175,13 @@ def design_task(
             break
         if best.trajectory.ctrl.shape == task.control.shape:
             initial_control = best.trajectory.ctrl
-        reserve |= {kind: max(share, reserve.get(kind, 0.0)) for kind, share in needed.items()}
+        reserve |= needed
     # A later design knows what the robots need; after Ctrl-C it is not rehearsed.
-    return max(reversed(found), key=lambda each: each.rehearsal is not None and each.sound)
+    best = max(reversed(found), key=lambda each: each.rehearsal is not None and each.sound)
+    if best.rehearsal is None:
+        return best
+    played = task.released_as(best.trajectory.state[0])
+    return replace(best, rehearsal=with_cures_tried(played, best.final, best.rehearsal))
 
 
 def _searched(
@@ -316,7 +320,6 @@ def _record(
         parameters.recording_specific,
     )
     history, motions = without_motions(winner.history)
-    reserve = task.experiment.limits.reserve
     return Design(
         status=status,
         parameters=parameters.names,
@@ -347,7 +350,6 @@ def _record(
         improvement=improvement_per_iteration(history, stage.problem.size(final)),
         rehearsal=rehearsal,
         worth=worth,
-        reserve={} if reserve == "auto" else dict[str, float](reserve.items()),
     )
 
 

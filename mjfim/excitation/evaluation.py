@@ -77,11 +77,10 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
     ):
         raise SimulationDivergedError("the trajectory diverges")
 
-    A, B, _, _ = task.plant.derivatives.jacobians(task.theta, point.trajectory)
-    weights = regulator_for(task)
+    gain, growth = regulation_along(task, point.trajectory)
     return Evaluation(
         trajectory=point.trajectory,
-        gain=regulator(A, B, weights.Q, weights.R, weights.terminal),
+        gain=gain,
         sensitivity=point.sensitivity.psi,
         information=point.information,
         eigenvalues=point.criterion.eigenvalues,
@@ -89,17 +88,19 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
         std_over_time=information.accumulated_std(point.sensitivity),
         criterion=point.criterion.value,
         cost=point.cost,
-        growth=largest_amplification(A, task.sizes[: task.space.nx]),
+        growth=growth,
     )
 
 
 # ---- growth of disturbances
 
 
-def growth_along(task: DesignTask, trajectory: Trajectory) -> float:
-    """Largest open-loop amplification of a small deviation along a trajectory."""
-    A = task.plant.derivatives.jacobians(task.theta, trajectory)[0]
-    return largest_amplification(A, task.sizes[: task.space.nx])
+def regulation_along(task: DesignTask, trajectory: Trajectory) -> tuple[Array, float]:
+    """Gains (N, nu, nx) about a trajectory, and the open-loop growth of a small deviation."""
+    A, B, _, _ = task.plant.derivatives.jacobians(task.theta, trajectory)
+    weights = regulator_for(task)
+    gain = regulator(A, B, weights.Q, weights.R, weights.terminal)
+    return gain, largest_amplification(A, task.sizes[: task.space.nx])
 
 
 def growth_warning(growth: float) -> str | None:
@@ -109,8 +110,7 @@ def growth_warning(growth: float) -> str | None:
 
     return (
         f"a small disturbance grows up to {growth:.1e}-fold along this trajectory when its control "
-        "is played open loop; the predicted σ assumes that there is no disturbance. Play it "
-        "with the gains of design.npz, or raise cost.control"
+        "is played open loop; the predicted σ assumes that there is no disturbance"
     )
 
 

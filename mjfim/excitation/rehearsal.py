@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import mujoco
@@ -62,6 +62,10 @@ LATENCY = 5e-3
 # Number of instants of each robot at which heights, distances and contacts are measured.
 INSTANTS = 64
 
+# Number of smaller errors of the parameters, each half of the one before, with which a motion that
+# is not safe is tried.
+SMALLER_ERRORS = 3
+
 # Relative difference of two sample periods up to which they are equal.
 SAME_PERIOD = 1e-6
 
@@ -97,6 +101,8 @@ def rehearse(experiment: Experiment, design: Design, *, threads: int | None = No
         ExperimentError: The experiment is faulty, or no physical robot can be drawn.
         RecordingError: The design does not fit the experiment.
     """
+    if experiment.limits.reserve == "auto" and design.rehearsal is not None:
+        experiment = experiment.replace(limits={"reserve": design.reserve})
     task = DesignTask.resolve(experiment, threads=threads)
     planned = design.trajectory
     found = (planned.qpos.shape[1], planned.qvel.shape[1], planned.ctrl.shape[1])
@@ -106,13 +112,41 @@ def rehearse(experiment: Experiment, design: Design, *, threads: int | None = No
             f"the design has (nq, nv, nu) = {found} at {1.0 / planned.dt:g} Hz, but the experiment "
             f"{wanted} at {1.0 / task.dt:g} Hz; give the experiment of the design"
         )
-    return rehearse_task(task.released_as(planned.state[0]), design.final)
+    task = task.released_as(planned.state[0])
+    return with_cures_tried(task, design.final, rehearse_task(task, design.final))
 
 
 def rehearse_task(task: DesignTask, final: Evaluation) -> Rehearsal:
     """Rehearse the trajectory of an evaluation in a resolved task. See `rehearse`."""
     steps = steps_along(task, final.trajectory, final.information, final.std)
     return rehearsed(task, final.trajectory, final.gain, steps, final.growth)
+
+
+def with_cures_tried(task: DesignTask, final: Evaluation, found: Rehearsal) -> Rehearsal:
+    """A rehearsal with what makes a motion safe as it is: smaller errors, and feedback.
+
+    Args:
+        task: The task, released as the trajectory is.
+        final: The evaluation of the trajectory.
+        found: Its rehearsal.
+    """
+    # Where the model itself fails, another motion has to be designed.
+    if found.is_safe or not found.robots or not found.inside[0] or found.passes_floor[0]:
+        return found
+
+    def is_safe_with(**changes: Any) -> bool:
+        experiment = task.experiment.replace(rehearsal=changes)
+        changed = replace(task, system=replace(task.system, experiment=experiment))
+        return rehearsed(changed, final.trajectory, final.gain, found.steps, found.growth).is_safe
+
+    smaller = (found.wrong / 2**k for k in range(1, SMALLER_ERRORS + 1))
+    safe_wrong = next((wrong for wrong in smaller if is_safe_with(wrong=wrong)), np.nan)
+    is_fed_back = False
+    if task.controls and not found.feedback:
+        # The gains may need what is not measured.
+        with suppress(ExperimentError):
+            is_fed_back = is_safe_with(feedback=True)
+    return replace(found, safe_wrong=safe_wrong, safe_with_feedback=is_fed_back)
 
 
 def steps_along(
@@ -153,11 +187,12 @@ def rehearsed(
     most = max(MAX_VALUES // (steps_of_one * values), 1)
     blocks = [theta[:1], *(theta[i : i + most] for i in range(1, len(theta), most))]
     parts = [part for block in blocks for part in player.play(block, rng)]
-    measured = {
+    measured: dict[str, Any] = {
         each.name: np.array([getattr(part, each.name) for part in parts])
         for each in fields(_Played)
         if each.name != "unbraked"
     }
+    reserve = task.experiment.limits.reserve
     return Rehearsal(
         parameters=task.parameters.names,
         wrong=spec.wrong,
@@ -175,6 +210,8 @@ def rehearsed(
         unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
         steps=steps,
         growth=growth,
+        kept_reserve=None if reserve == "auto" else dict[str, float](reserve.items()),
+        end=task.experiment.boundary.end,
         **measured,
     )
 

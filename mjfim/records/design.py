@@ -183,10 +183,7 @@ class Status(NamedEnum):
         "stalled: no step along the descent direction lowers the cost any more, "
         "within the accuracy of the finite differences"
     )
-    MAX_ITERATIONS = (
-        "stopped at its budget (max_iterations or seconds) before convergence; for a better "
-        "result, raise it or start from this one"
-    )
+    MAX_ITERATIONS = "stopped at its budget (max_iterations or seconds) before convergence"
     BEST_SEEN = (
         "ended without convergence: this is the best trajectory that was found; later ones cost "
         "more or left the limits"
@@ -471,7 +468,6 @@ class Design(ShownRecord):
             interrupted before.
         worth: What each sensor tells along the designed trajectory, and what each limit costs;
             None where the search was interrupted.
-        reserve: Key `limits.reserve` that the search kept, also where it was found automatically.
     """
 
     status: Status
@@ -501,7 +497,6 @@ class Design(ShownRecord):
     improvement: float = float("nan")
     rehearsal: Rehearsal | None = None
     worth: Worth | None = None
-    reserve: dict[str, float] = field(default_factory=dict)
 
     file_stem = "design"
     made_by = "`mjfim design EXPERIMENT -o DIR`"
@@ -538,6 +533,12 @@ class Design(ShownRecord):
         if not len(self.sizes):
             object.__setattr__(self, "sizes", np.abs(self.theta))
         super().__post_init__()
+
+    @property
+    def reserve(self) -> dict[str, float]:
+        """Key `limits.reserve` that the search kept, also where it was found automatically."""
+        kept = None if self.rehearsal is None else self.rehearsal.kept_reserve
+        return kept or {}
 
     @property
     def wanted(self) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ follow.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,9 @@ CONFIRMED = (0.7, 1.4)
 
 # Share of the robots that may break a limit in a motion that is safe to play.
 MAX_BROKEN = 0.05
+
+# Share of a reserve that a design keeps where it can.
+KEPT_SHARE = 0.9
 
 # Excursion of a robot over that of the model up to which a reserve makes room for it.
 MAX_EXCURSION = 2.0
@@ -156,6 +160,12 @@ class Rehearsal(ShownRecord):
         growth: Largest growth of a small deviation along the motion without feedback; NaN where it
             is unknown.
         steps: Standard deviations by finite steps.
+        kept_reserve: Key `limits.reserve` that the design kept, also where it was found
+            automatically; None where a design is still to find it.
+        end: Key `boundary.end` of the design.
+        safe_wrong: Largest of the smaller errors that were tried with which this motion is safe;
+            NaN where it is safe anyway, or with none of them; None where none was tried.
+        safe_with_feedback: Whether feedback makes this motion safe; None where it was not tried.
     """
 
     parameters: tuple[str, ...]
@@ -184,6 +194,10 @@ class Rehearsal(ShownRecord):
     unbraked: dict[str, int]
     steps: FiniteSteps
     growth: float = float("nan")
+    kept_reserve: dict[str, float] | None = field(default_factory=dict)
+    end: str = "free"
+    safe_wrong: float | None = None
+    safe_with_feedback: bool | None = None
 
     file_stem = "rehearsal"
     made_by = "`mjfim rehearse DESIGN_FOLDER -o DIR`"
@@ -202,8 +216,11 @@ class Rehearsal(ShownRecord):
         "unplaced",
         "growth",
         "steps",
+        "kept_reserve",
+        "safe_wrong",
+        "safe_with_feedback",
     )
-    json_names = {"is_safe": "safe", "all_kept": "all_limits_kept"}
+    json_names = {"is_safe": "safe", "all_kept": "all_limits_kept", "kept_reserve": "reserve"}
 
     @property
     def robots(self) -> int:
@@ -301,11 +318,12 @@ class Rehearsal(ShownRecord):
 
     @property
     def reserve(self) -> dict[str, float]:
-        """Key `limits.reserve` for robots that leave limits: share of half of each range by kind.
+        """Larger reserve for robots that leave limits: share of half of each range by kind.
 
         The excursion of a robot is taken to be in proportion to that of the model. It is at most
         halved at once. Clamps come first: where one acts, everything else follows from it. A joint
-        that cannot be braked needs room in its position.
+        that cannot be braked needs room in its position. No larger reserve helps where the design
+        could not keep the present one, because the start or the end is too near.
         """
         found: dict[str, float] = {}
         if self.is_safe and not self.is_clamping:
@@ -313,8 +331,11 @@ class Rehearsal(ShownRecord):
         late = [each.kind == "position" and each.name in self.unbraked for each in self.limits]
         broken = np.flatnonzero(~self.kept.all(axis=0) | np.array(late, dtype=bool)).tolist()
         clamped = [i for i in broken if self.is_clamped[i]]
+        kept = self.kept_reserve or {}
         for i in clamped or broken:
             kind, margins = self.limits[i].kind, self.margins[:, i]
+            if margins[0] < KEPT_SHARE * kept.get(kind, 0.0):
+                continue
             used = 1.0 - margins[0]
             growth = max(self.excursions[i], 1.0 + self.wrong * late[i])
             growth = 1.0 + self.wrong if clamped else min(growth, MAX_EXCURSION)
@@ -322,7 +343,7 @@ class Rehearsal(ShownRecord):
             if kind == "clearance":
                 share = margins[0] - np.min(margins[np.isfinite(margins)], initial=0.0)
             share = np.ceil(100.0 * share) / 100.0
-            if 0.0 < share < 1.0:
+            if kept.get(kind, 0.0) < share < 1.0:
                 found[kind] = max(float(share), found.get(kind, 0.0))
         return found
 

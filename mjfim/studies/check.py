@@ -18,8 +18,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError
 from mjfim.excitation.evaluation import (
-    growth_along,
     growth_warning,
+    regulation_along,
     require_designable,
     require_evaluated,
 )
@@ -523,14 +523,12 @@ def _checked(
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
 
-    # A motion that a robot could play is rehearsed without feedback; a start has no gains for it.
+    # A motion that a robot could play is rehearsed as that of a design is.
     rehearsal, warning = None, ""
-    is_motion = is_motion and not (is_start and task.experiment.rehearsal.feedback)
     if is_motion and steps is not None and point.trajectory is not None and not refused:
         begin_stage("rehearsing the motion")
-        played, growth = point.trajectory, growth_along(task, point.trajectory)
-        gain = np.zeros((played.samples, len(task.controls), task.space.nx))
-        rehearsal = rehearsed(task, played, gain, steps, growth)
+        gain, growth = regulation_along(task, point.trajectory)
+        rehearsal = rehearsed(task, point.trajectory, gain, steps, growth)
         warning = growth_warning(growth) or ""
 
     # What each sensor tells along one motion.

@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,10 @@ BEFORE_VIOLATION = 0.9
 # Smallest share of the amplitudes with which an arm ends at rest, and the time over which its
 # motion fades [characteristic periods].
 SMALLEST_ENDED = 0.1
-FADE = 0.5
+FADE = 1.0
+
+# Factors by which each amplitude grows by itself, as long as the motion has room.
+GROWTHS = (4.0, 4.0, 4.0, 2.0)
 
 # Significant digits of the initial state: the loops of closed chains stay closed.
 STATE_DIGITS = 9
@@ -426,14 +430,25 @@ class _Refinement:
         return self._with_parameters(moved, remarks)
 
     def _kept_amplitudes(self, system: System, draft: Proposal, amplitudes: Array) -> Array | None:
-        """(nu,) largest amplitudes that keep all limits, if possible with some room; or None."""
+        """(nu,) largest amplitudes that keep all limits, if possible with some room; or None.
+
+        One joint that is near a limit does not keep the others from moving: after a common share,
+        each amplitude grows by itself.
+        """
         task = self._task(system, _with_amplitudes(draft, amplitudes))
-        room = cache(lambda share: self._room(task, share))
+        room = cache(lambda trial: self._room(task, SHRINKING**trial))
         for least in (ROOM, 0.0):
-            if room(SHRINKING**TRIALS) >= least:
-                # A smaller motion has more room.
-                trial = bisect_left(range(TRIALS), least, key=lambda k: room(SHRINKING**k))
-                return two_digits(amplitudes * SHRINKING**trial)
+            if room(TRIALS) < least:
+                continue
+            # A smaller motion has more room.
+            trial = bisect_left(range(TRIALS), least, key=room)
+            shares = np.full(len(amplitudes), SHRINKING**trial)
+            for factor, actuator in product(GROWTHS, range(len(shares))):
+                larger = shares.copy()
+                larger[actuator] = min(factor * shares[actuator], 1.0)
+                if larger[actuator] > shares[actuator] and self._room(task, larger) >= least:
+                    shares = larger
+            return two_digits(amplitudes * shares)
         return None
 
     def _within_limits(
@@ -539,18 +554,16 @@ class _Refinement:
         except MjfimError:
             return False
 
-    def _room(self, task: DesignTask, share: float) -> float:
+    def _room(self, task: DesignTask, shares: Array | float) -> float:
         """Smallest distance of the motion of a task from the limits in any engine step.
 
         It is relative to half of the range, and negative where a limit is broken. The control
-        differs from rest by a share of what the task states.
+        differs from rest by shares, (nu,), of what the task states.
         """
         # A chirp begins at rest.
         rest = task.control[:1]
         try:
-            motion = task.initial
-            if share != 1.0:
-                motion = task.plant.simulate(task.theta, rest + share * (task.control - rest))
+            motion = task.plant.simulate(task.theta, rest + shares * (task.control - rest))
             found = verify(task, motion)
         except SimulationDivergedError:
             return -np.inf

@@ -31,6 +31,9 @@ SAMPLES_PER_PERIOD = 100
 # Characteristic periods in the horizon.
 PERIODS = 3.0
 
+# Characteristic periods for which a stable state stays where it is.
+LEAST_PERIODS = 1.5
+
 # Largest ratio of the chosen to the wanted rate; within it a round number is preferred.
 RATE_RANGE = 1.6
 
@@ -215,8 +218,15 @@ DIFFERENCE = 1e-4
 # Controls below this share of their range are written as zero.
 READABLE_SHARE = 1e-6
 
-# Share of the range of a joint that the start keeps away from its ends.
+# Share of the range of a joint that the start keeps away from its ends, and where it begins instead
+# of nearer ones: beside an end, the first motion of all joints would be small.
 MARGIN = 0.05
+MOVED_SHARE = 0.25
+
+# Share of its range at which a control begins that can only pull or push, such as a muscle, where
+# others balance it. At the end of its range it would have no room to move.
+# The largest of these tensions in which the state is stable is taken, each half of the one before.
+TENSION, TENSIONS = 0.25, 6
 
 # End of the sentence about a start that was changed.
 MOVED_INSIDE = ", with joints moved away from the ends of their ranges"
@@ -326,18 +336,23 @@ def require_support(model: Any, path: Path) -> None:
 
 
 def _is_stable(model: Any, start: Start) -> bool:
-    """Whether a state that a control holds stays where it is after a small disturbance."""
+    """Whether a state that a control holds stays there long enough after a small disturbance."""
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
-    return not time_scale(model, data).unstable
+    times = time_scale(model, data)
+    return times.horizon >= LEAST_PERIODS * times.period
 
 
 def _candidates(model: Any) -> Iterator[Start]:
     """Starts in the order of preference."""
     stated = [_start_in_keyframe(model, model.key(name).id) for name in resting_keyframes(model)]
     if not stated:
-        resting = _resting_control(model, _inside_ranges(model, model.qpos0))
-        stated = [_start(model, model.qpos0, resting, "the reference positions of the MJCF")]
+        reason = "the reference positions of the MJCF"
+        # Tension gives muscles room to move, but too much of it makes a state unstable.
+        shares = [*TENSION * SHRINKING ** np.arange(TENSIONS), 0.0]
+        guesses = [_resting_control(model, each) for each in shares]
+        different = {guess.tobytes(): guess for guess in guesses}.values()
+        stated = [_start(model, model.qpos0, guess, reason) for guess in different]
     yield from stated
 
     first, driven = stated[0], driven_dofs(model)
@@ -370,6 +385,7 @@ def _start(
     """
     near, inside = keyframe or "", _inside_ranges(model, qpos) if moves_inside else qpos
     if not np.array_equal(inside, qpos):
+        guess = guess + np.nan_to_num(_commands(model, inside) - _commands(model, qpos))
         qpos, keyframe, reason = inside, None, reason + MOVED_INSIDE
     data = mujoco.MjData(model)
     control = _holding_control(model, data, qpos, guess)
@@ -401,26 +417,38 @@ def _inside_ranges(model: Any, qpos: Array) -> Array:
         if not model.jnt_limited[joint] or joint_dofs(model, joint) != 1:
             continue
         low, high = model.jnt_range[joint]
-        margin = MARGIN * (high - low)
         q = model.jnt_qposadr[joint]
-        inside[q] = np.clip(inside[q], low + margin, high - margin)
+        if min(inside[q] - low, high - inside[q]) < MARGIN * (high - low):
+            moved = MOVED_SHARE * (high - low)
+            inside[q] = np.clip(inside[q], low + moved, high - moved)
     return inside
 
 
-def _resting_control(model: Any, qpos: Array) -> Array:
-    """(nu,) first guess of a holding control: zero, or the nearest control inside the range."""
-    control = np.zeros(model.nu)
-    limited = model.actuator_ctrllimited.astype(bool)
-    low, high = model.actuator_ctrlrange.T
-    control[limited] = np.clip(0.0, low[limited], high[limited])
-
-    # A position servo is commanded to where its joint is.
+def _commands(model: Any, qpos: Array) -> Array:
+    """(nu,) controls of position servos with their joints at qpos, (nq,); NaN for others."""
+    control = np.full(model.nu, np.nan)
     for actuator in range(model.nactuator):
         joint = commanded_joint(model, actuator)
         if joint is not None:
             position = qpos[model.jnt_qposadr[joint]]
             control[model.actuator_ctrladr[actuator]] = actuator_gear(model, actuator) * position
     return control
+
+
+def _resting_control(model: Any, share: float) -> Array:
+    """(nu,) first guess of a holding control: zero, or inside a range with 0 at or beyond its end.
+
+    The share of the range is the distance from this end.
+    """
+    control = np.zeros(model.nu)
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = model.actuator_ctrlrange[limited].T
+    room = share * (high - low)
+    control[limited] = np.where(low * high < 0.0, 0.0, np.clip(0.0, low + room, high - room))
+
+    # A position servo is commanded to where its joint is.
+    commands = _commands(model, model.qpos0)
+    return np.where(np.isnan(commands), control, commands)
 
 
 def influence_of_controls(model: Any, start: Start) -> Array:
@@ -462,7 +490,8 @@ def _holding_control(model: Any, data: Any, qpos: Array, guess: Array) -> Array:
         # Controls are scaled by their width, so that their units do not matter.
         room_low = np.minimum((low - control) / width, -np.finfo(float).tiny)
         room_high = np.maximum((high - control) / width, np.finfo(float).tiny)
-        step = scipy.optimize.lsq_linear(J * width, -base, (room_low, room_high)).x
+        ends = (room_low, room_high)
+        step = scipy.optimize.lsq_linear(J * width, -base, ends, method="bvls").x
         control = np.clip(control + step * width, low, high)
     return np.asarray(control)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -134,6 +136,19 @@ def test_robots_agree_with_a_plain_loop(plain: Played) -> None:
     assert not found.has_floor and not found.passes_floor.any()
     # The slide has a range, the hinge has none.
     assert found.unplaced == ("hinge",) and found.growth == design.final.growth
+
+
+def test_a_check_rehearses_the_start_as_a_design_does(plain: Played) -> None:
+    """A design of no iteration is its start; the gains are those of the design, too."""
+    experiment, design = plain
+    for feedback in (False, True):
+        stated = experiment.replace(rehearsal={"feedback": feedback})
+        found, again = mjfim.check(stated).rehearsal, mjfim.rehearse(stated, design)
+        assert found is not None and found.feedback is feedback
+        for name in ("theta", "margins", "speed", "end_speed", "travel", "lowest", "nearest"):
+            assert_allclose(getattr(found, name), getattr(again, name), rtol=1e-9, atol=1e-12)
+        assert_allclose(found.steps.stated, again.steps.stated, rtol=1e-9)
+        assert found.growth == again.growth and found.is_safe is again.is_safe
 
 
 WALLED = """
@@ -272,6 +287,71 @@ def test_an_automatic_reserve_keeps_robots_inside(tmp_path: Path) -> None:
     )
     assert again.rehearsal is not None and again.rehearsal.margins[0].min() > 0.0
     assert again.reserve == found.reserve
+
+
+def cart_with(folder: Path, reserve: dict[str, float]) -> Any:
+    """The cart, whose speed has a limit that is smaller than the model would choose."""
+    experiment, _ = played(folder, reach=1.0, speed=0.21)
+    return experiment.replace(
+        descent={"max_iterations": 8},
+        limits={"enforce": True, "reserve": reserve},
+        rehearsal={"robots": 30},
+    )
+
+
+def arm_with(folder: Path, reserve: dict[str, float]) -> Any:
+    """The arm without its wall, whose speed has a limit."""
+    (folder / "arm.xml").write_text(WALLED.format(wall=9.0), encoding="utf-8")
+    (folder / "arm.toml").write_text(WALLED_TABLES, encoding="utf-8")
+    return mjfim.Experiment.from_file(folder / "arm.toml").replace(
+        descent={"max_iterations": 8},
+        limits={"enforce": True, "reserve": reserve, "velocity": {"hinge": 1.0}},
+        rehearsal={"robots": 30},
+    )
+
+
+def servos_with(folder: Path, reserve: dict[str, float]) -> Any:
+    """The shipped arm of position servos, whose speeds have limits."""
+    return mjfim.Experiment.from_file(MODELS / "servo_arm.toml").replace(
+        descent={"max_iterations": 4, "starts": 1},
+        limits={"enforce": True, "reserve": reserve, "velocity": 1.0},
+        rehearsal={"robots": 30},
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stated", "reserve"),
+    [
+        (cart_with, {}),
+        (cart_with, {"velocity": 0.05}),
+        (arm_with, {}),
+        (arm_with, {"velocity": 0.02}),
+        (servos_with, {"velocity": 0.02}),
+    ],
+)
+def test_the_first_cure_keeps_other_robots_safe(
+    stated: Any, reserve: dict[str, float], tmp_path: Path
+) -> None:
+    """300 robots of another seed are played after what the advice says is really done."""
+    experiment = stated(tmp_path, reserve)
+    design = mjfim.design(experiment, threads=1, progress=False)
+    assert design.rehearsal is not None and not design.rehearsal.is_safe
+    assert design.rehearsal.kept_reserve == reserve
+    cure = page_of(design, experiment="arm.toml", design=tmp_path).next_steps[0]
+    robots: dict[str, Any] = {"robots": 300, "seed": 5}
+    if found := re.search(r"reserve = (\{.*\})", cure):
+        advised = tomllib.loads(f"it = {found[1]}")["it"]
+        assert all(advised[kind] > share for kind, share in reserve.items())
+        experiment = experiment.replace(limits={"reserve": advised})
+        design = mjfim.design(experiment, threads=1, progress=False)
+    elif found := re.search(r"wrong = ([0-9.]+)", cure):
+        robots["wrong"] = float(found[1])
+    else:
+        assert "--feedback" in cure
+        robots["feedback"] = True
+    tried = mjfim.rehearse(experiment.replace(rehearsal=robots), design)
+    assert tried.robots == 300 and tried.is_safe, (cure, tried.all_kept)
 
 
 @pytest.mark.slow

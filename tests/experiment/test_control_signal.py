@@ -51,6 +51,18 @@ def test_sine_has_its_frequency() -> None:
     assert np.allclose(u[:, 1], 3.0 * np.sin(1.17 * np.pi * T), rtol=0, atol=1e-12)
 
 
+def test_a_signal_that_fades_rests_in_the_second_half_of_this_time() -> None:
+    faded, whole = (
+        generate(Signal(kind="sine", amplitude=3.0, frequency=0.5, fade=fade), T, NAMES, REST)
+        for fade in (2.0, None)
+    )
+    left = T[-1] - T
+    before, after = left > 2.0, left < 1.0
+    np.testing.assert_allclose(faded[before], whole[before], atol=1e-12)
+    np.testing.assert_allclose(faded[after], np.broadcast_to(REST, faded[after].shape), atol=1e-12)
+    assert np.abs(np.diff(faded, axis=0)).max() < 1.5 * np.abs(np.diff(whole, axis=0)).max()
+
+
 def test_chirp_sweeps_its_frequencies() -> None:
     """Starts at zero, its frequency grows linearly to the end; the next actuator sweeps 17 %
     higher.

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from html import unescape
+from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mjfim.output.page import Level, as_sentence
+from mjfim.output.page import Level, Page, as_sentence
 from mjfim.output.pages import page_of
 from mjfim.output.plots.pictures import pictures_of
 from mjfim.output.report import as_html
 from mjfim.output.words import relative
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.check import verdict_of_check
+from mjfim.records.design import Status
 from mjfim.records.studies import DESIGN
 from tests.support import results
 from tests.support.pages import printed
@@ -194,6 +198,116 @@ def test_a_campaign_that_waits_with_a_missed_target_has_no_green_box() -> None:
         page = page_of(results.campaign(wanted=wanted * THETA, **waiting))
         assert page.verdict.level is level
         assert ("wanted" in page.verdict.text) == (level is Level.DOUBTFUL)
+
+
+# ---- what stands together
+
+# Robots that keep all limits, that leave the position, and that cannot be braked at the end.
+LEAVING = np.vstack([[0.31, 0.31], np.full((20, 2), [-0.2, 0.31])])
+ROBOTS: dict[str, dict[str, Any]] = {
+    "safe": {},
+    "leaving": {"margins": LEAVING},
+    "unbraked": {"unbraked": {"hinge": 20}, "end_speed": np.full((21, 2), 0.4)},
+}
+# The reserve that the design kept, which is to be found, or which could not be kept.
+RESERVES: dict[str, dict[str, float] | None] = {
+    "none": {},
+    "kept": {"position": 0.3},
+    "to be found": None,
+    "not kept": {"position": 0.6},
+}
+# Whether smaller errors and feedback make the motion safe; None where they were not tried.
+TRIED = {"not tried": (None, None), "helps": (0.1, True), "does not": (np.nan, False)}
+SAME = results.evaluation(0.1, 50)
+SEARCHES: dict[str, dict[str, Any]] = {
+    "converged": {},
+    "stopped": {"status": Status.MAX_ITERATIONS, "improvement": 0.048},
+}
+
+# Sentences that contradict each other.
+CONTRADICTIONS = [
+    ("Do not play", "Ready to play"),
+    ("not to be played", "mjfim export"),
+    ("not to be played", "nothing more is needed"),
+    ("Do not play", "nothing more is needed"),
+    ("Do not play", "can be played"),
+    ("Do not play", "mjfim export"),
+    ("Do not play", "Allow more time"),
+    ("Do not play", "keep all limits"),
+    ("Do not play", "better result"),
+    ("no better than", "times smaller than with the initial motion"),
+    ("ends at rest", "ends in motion"),
+    ("ends at rest", "Let the motion end at rest"),
+    ("Converged", "Stopped at its budget"),
+    ("with a reserve", "with a larger reserve"),
+    ("With feedback, this motion is safe", "Try it with feedback"),
+    ("Say better what is known", "where you know yours so well"),
+]
+
+
+def whole(page: Page) -> str:
+    """All that a page says, in which no two sentences contradict each other."""
+    text = " ".join([*printed(page, verbose=True).split(), *page.next_steps])
+    for one, other in CONTRADICTIONS:
+        assert not (one in text and other in text), (one, other, text)
+    return text
+
+
+@pytest.mark.parametrize("robots", ROBOTS)
+@pytest.mark.parametrize("reserve", RESERVES)
+@pytest.mark.parametrize("end", ["free", "rest"])
+@pytest.mark.parametrize("tried", TRIED)
+def test_sentences_about_a_design_fit_together(
+    robots: str, reserve: str, end: str, tried: str
+) -> None:
+    """In every state of its robots, reserve, end, σ, gain and search."""
+    kept, (wrong, feedback) = RESERVES[reserve], TRIED[tried]
+    rehearsal = results.rehearsal(
+        **ROBOTS[robots],
+        kept_reserve=kept,
+        end=end,
+        safe_wrong=None if robots == "safe" else wrong,
+        safe_with_feedback=None if robots == "safe" else feedback,
+    )
+    for is_exact, is_better, search in product((True, False), (True, False), SEARCHES):
+        final = results.evaluation(1.0, 50) if is_better else SAME
+        std = final.std if is_exact else 3.0 * final.std
+        steps = replace(results.finite_steps(predicted=final.std), std=std)
+        design = results.design(
+            final=final, rehearsal=replace(rehearsal, steps=steps), **SEARCHES[search]
+        )
+        page = page_of(design, experiment="arm.toml", design=Path("made"))
+        text = whole(page)
+        is_safe = robots == "safe"
+        assert ("Do not play" in text, page.verdict.level is Level.BAD) == (not is_safe,) * 2
+        assert ("σ is approximate" in text) is (is_safe and not is_exact)
+        assert ("no better than its start" in text) is (is_safe and not is_better)
+        assert ("Allow more time" in text) is (is_safe and not is_better and search == "stopped")
+        assert ("improving by 4.8 %" in text) is (search == "stopped")
+
+        # A cure is named where it is known to help, and where it is not in force already.
+        assert ("Let the motion end at rest" in text) is (robots == "unbraked" and end == "free")
+        advised = re.search(r"reserve = \{ position = ([0-9.]+) \}", text)
+        assert bool(advised) is (not is_safe and reserve in ("none", "kept"))
+        assert advised is None or float(advised[1]) > (kept or {}).get("position", 0.0)
+        assert ("larger reserve" in text) is (not is_safe and reserve == "kept")
+        assert ("`[rehearsal] wrong = 0.1`" in text) is (not is_safe and tried == "helps")
+        assert ("With feedback, this motion is safe" in text) is (not is_safe and tried == "helps")
+        assert ("Try it with feedback" in text) is (not is_safe and tried == "not tried")
+        assert page.next_steps and (is_safe or "mjfim design" not in page.next_steps[0])
+
+    # The rehearsal alone, and checks of the design and of a start that moves like this.
+    for result in (
+        rehearsal,
+        results.check(rehearsal=rehearsal, is_start=False),
+        results.check(rehearsal=rehearsal),
+    ):
+        text = whole(page_of(result, experiment="arm.toml", design=Path("made")))
+        is_start = "The start itself is not to be played" in text
+        assert ("Do not play" in text or is_start) is (robots != "safe")
+        if not is_start:
+            advises_rest = "Let the motion end at rest" in text
+            assert advises_rest is (robots == "unbraked" and end == "free")
 
 
 # ---- causes

@@ -43,7 +43,7 @@ def test_it_stands_in_the_sentence_of_a_design_that_ended_at_its_budget() -> Non
     assert "before convergence" in budget.outcome
     improving = replace(budget, improvement=0.002)
     assert improving.outcome.startswith(
-        "stopped at its budget (max_iterations or seconds), still improving by 0.2 % per iteration;"
+        "stopped at its budget (max_iterations or seconds), still improving by 0.2 % per iteration"
     )
     assert improving.summary()["message"] == improving.outcome
     assert "hardly improving any more" in replace(budget, improvement=1e-6).outcome

@@ -201,6 +201,41 @@ def test_commented_parameters_are_valid_when_they_are_uncommented(tmp_path: Path
     assert names == {each.name for each in (*proposal.chosen, *proposal.others)}
 
 
+def test_muscles_have_room_to_move(tmp_path: Path) -> None:
+    """Without a keyframe, they begin under tension; the robot of plain MuJoCo moves."""
+    spec = mujoco.MjSpec.from_file(str(MODELS / "muscle_arm.xml"))
+    spec.delete(spec.keys[0])
+    proposal, experiment = proposed(written(tmp_path, spec.to_xml()), tmp_path)
+    assert proposal.start.held and min(proposal.amplitudes.values()) > 0.02
+    motion = DesignTask.resolve(experiment).initial
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.act[:] = motion.qpos[0], motion.act[0]
+    places = []
+    for row in motion.ctrl:
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, round(motion.dt / model.opt.timestep))
+        places.append(data.qpos.copy())
+    assert (np.ptp(places, axis=0) > 0.2).all()
+
+
+@pytest.mark.parametrize(
+    "actuator", ["<motor ", '<position kp="1000" ctrlrange="-1 2" forcerange="-20 20" ']
+)
+def test_a_start_at_the_end_of_a_range_moves_where_there_is_room(
+    actuator: str, tmp_path: Path
+) -> None:
+    """Servos are commanded along, so that those with little force hold the start as well."""
+    text = pendulum(tmp_path, length=1.0, mass=1.0).read_text(encoding="utf-8")
+    text = text.replace("<joint ", '<joint range="-1 90" limited="true" ')
+    key = '<keyframe><key name="home" qpos="0" ctrl="0"/></keyframe></mujoco>'
+    text = text.replace("<motor ", actuator).replace("</mujoco>", key)
+    proposal, _ = proposed(written(tmp_path, text), tmp_path)
+    low, high = np.deg2rad([-1.0, 90.0])
+    place = (proposal.start.qpos[0] - low) / (high - low)
+    assert proposal.start.held and place == pytest.approx(0.25)
+
+
 @pytest.mark.parametrize(("length", "mass"), [(1e-3, 1e-6), (1e3, 1e6)])
 def test_proposals_scale_with_the_size_of_the_robot(
     length: float, mass: float, tmp_path: Path

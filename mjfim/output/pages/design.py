@@ -142,9 +142,10 @@ def _verdict(design: Design) -> Verdict:
     poorly = _with_interval(design, POORLY_KNOWN_SHARE)
     if poorly and not reservation:
         reservation = f"it hardly determines {_with_widest(design, poorly)}"
-    if reservation:
-        return Verdict(f"This motion can be played, but {reservation}. {seen}", Level.DOUBTFUL)
     equal = "It is no better than its start. " if design.is_start else ""
+    if reservation:
+        text = f"This motion can be played, but {reservation}. {equal}{seen}"
+        return Verdict(text, Level.DOUBTFUL)
     return Verdict(f"Ready to play: {_accuracy(design)}. {equal}{seen}", Level.GOOD)
 
 
@@ -353,12 +354,20 @@ def _next_steps(design: Design) -> Iterator[str]:
 
 
 def _cures(rehearsal: Rehearsal, *, is_designed: bool = True) -> Iterator[str]:
-    """What keeps such robots safe, the causes first.
+    """What keeps such robots safe, the causes first, and the command to design again.
 
     Args:
         rehearsal: The rehearsal.
         is_designed: Whether there is a design, which may be played with feedback.
     """
+    found = list(_known_cures(rehearsal, is_designed=is_designed))
+    yield from found or [
+        "Shorten `horizon`: robots differ less from the model in a shorter motion."
+    ]
+    yield "Then design again: `mjfim design EXPERIMENT -o FOLDER`."
+
+
+def _known_cures(rehearsal: Rehearsal, *, is_designed: bool) -> Iterator[str]:
     if rehearsal.passes_floor.any() and rehearsal.has_floor:
         yield (
             "Keep the robot above the floor: state ranges of `position` in `[limits]` for what "
@@ -376,19 +385,35 @@ def _cures(rehearsal: Rehearsal, *, is_designed: bool = True) -> Iterator[str]:
             "stable rest, such as hanging down (`[initial] qpos` or `keyframe`), or shorten "
             "`horizon`."
         )
-    if rehearsal.unbraked and not rehearsal.at_rest:
+    if rehearsal.unbraked and rehearsal.end == "free" and not rehearsal.at_rest:
         yield 'Let the motion end at rest: `[boundary] end = "rest"`.'
-    reserve = {} if rehearsal.is_unstable else rehearsal.reserve
-    if reserve:
-        shares = ", ".join(f"{kind} = {share:g}" for kind, share in reserve.items())
-        yield f"Design with a reserve for such robots: `[limits] reserve = {{ {shares} }}`."
-    yield (
-        "Say better what is known of the robot: a `prior` of each parameter, or a smaller "
-        "`[rehearsal] wrong`."
-    )
-    if is_designed and not rehearsal.feedback:
+    reserve = list(_more_reserve(rehearsal))
+    yield from () if rehearsal.kept_reserve else reserve
+    if rehearsal.safe_with_feedback:
+        yield "With feedback, this motion is safe: `mjfim rehearse DESIGN_FOLDER --feedback`."
+    if rehearsal.safe_wrong is None and rehearsal.kept[0].all():
+        yield (
+            "Say better what is known of the robot: a `prior` of each parameter, or a smaller "
+            "`[rehearsal] wrong`."
+        )
+    elif rehearsal.safe_wrong is not None and np.isfinite(rehearsal.safe_wrong):
+        yield (
+            f"It is safe on robots that are up to {100.0 * rehearsal.safe_wrong:g} % off: where "
+            f"you know yours so well, state `[rehearsal] wrong = {rehearsal.safe_wrong:g}`."
+        )
+    yield from reserve if rehearsal.kept_reserve else ()
+    if is_designed and rehearsal.safe_with_feedback is None and not rehearsal.feedback:
         yield "Try it with feedback: `mjfim rehearse DESIGN_FOLDER --feedback`."
-    yield "Then design again: `mjfim design EXPERIMENT -o FOLDER`."
+
+
+def _more_reserve(rehearsal: Rehearsal) -> Iterator[str]:
+    """The reserve that robots need, where the design has less and is not to find it by itself."""
+    kept, needed = rehearsal.kept_reserve, rehearsal.reserve
+    if kept is None or rehearsal.is_unstable or not needed:
+        return
+    shares = ", ".join(f"{kind} = {share:g}" for kind, share in (kept | needed).items())
+    kind = "larger reserve" if kept else "reserve"
+    yield f"Design with a {kind} for such robots: `[limits] reserve = {{ {shares} }}`."
 
 
 def rehearsal_page(rehearsal: Rehearsal) -> Page:
@@ -651,7 +676,7 @@ def _check_warnings(check: Check) -> Iterator[str]:
     """What stands below the verdict: what is wrong, and what the start itself does to robots."""
     rehearsal = check.rehearsal
     if check.is_start and rehearsal is not None and not (rehearsal.is_safe or check.is_dangerous):
-        cure = next(_cures(rehearsal, is_designed=False))
+        cure = next(_known_cures(rehearsal, is_designed=False), "A design looks for a better one.")
         yield f"The start itself is not to be played. {_faults_of(rehearsal)}. {cure}"
     if not check.ok:
         yield from (as_sentence(each) for each in check.verdict[1:])
