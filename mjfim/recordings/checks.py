@@ -114,9 +114,7 @@ def check_clock(where: str, t: Array, numbers: np.ndarray, unit: str, gap: float
         )
     median = np.median(steps)
     if not MIN_MEDIAN_STEP <= median <= MAX_MEDIAN_STEP:
-        # Logarithms neither vanish nor overflow where a step is extremely short or long.
-        size = np.log(median) - np.log(SECONDS[unit] * TYPICAL_STEP)
-        likely = min(SECONDS, key=lambda other: abs(size + np.log(SECONDS[other])))
+        likely = likely_unit(float(np.log(median) - np.log(SECONDS[unit])))
         raise RecordingError(
             f"{where}: the median step is {median:g} s, which is unlikely for a robot's log; "
             f'should it be recording.time_unit = "{likely}"?'
@@ -130,6 +128,16 @@ def check_clock(where: str, t: Array, numbers: np.ndarray, unit: str, gap: float
             f"({t[row] - t[0]:g} s after the first one); gaps longer than {limit:g} s are not "
             "bridged: exclude this gap by recording.window, or raise recording.gap"
         )
+
+
+def likely_unit(log_step: float) -> str:
+    """Guess the unit of time stamps.
+
+    Args:
+        log_step: Logarithm of their typical step, which neither vanishes nor overflows.
+    """
+    size = log_step - np.log(TYPICAL_STEP)
+    return min(SECONDS, key=lambda unit: abs(size + np.log(SECONDS[unit])))
 
 
 def longest_bridged_gap(t: Array, gap: float) -> float:
@@ -259,7 +267,7 @@ def check_angles(
         RecordingError: A column is probably in degrees.
     """
     for name, why in (
-        *_doubtful_angles(channels.model, t, columns),
+        *doubtful_angles(channels.model, t, columns),
         *_doubtful_references(channels, columns),
     ):
         if name not in stated:
@@ -271,10 +279,19 @@ def check_angles(
             )
 
 
-def _doubtful_angles(
+def doubtful_angles(
     model: mujoco.MjModel, t: Array, columns: Mapping[str, Array]
 ) -> Iterator[tuple[str, str]]:
-    """Columns of hinge joints that look like degrees, and why."""
+    """Find columns of hinge joints that look like degrees.
+
+    Args:
+        model: The compiled model.
+        t: (M,) times [s].
+        columns: (M,) columns of the recording by name.
+
+    Yields:
+        Name of each such column, and why.
+    """
     for j, joint in enumerate(joint_names(model)):
         if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
             continue

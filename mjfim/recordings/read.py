@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError, RecordingWarning, closest, listed, unknown
+from mjfim.errors import RecordingError, RecordingWarning, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.channels import (
     ANY,
@@ -42,6 +42,7 @@ from mjfim.recordings.checks import (
     in_order,
 )
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
+from mjfim.recordings.proposal import proposed_recording
 from mjfim.recordings.quantities import TURN, Unit
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
 from mjfim.records.base import Record, record
@@ -150,9 +151,6 @@ OTHER_NAMES = (
     (r"action:(.+?)(?:\.pos|\.vel|\.effort)?", ("ctrl:", "reference:")),
 )
 
-# What a message proposes where no column of a log has a similar name.
-ANY_COLUMN = "<name of the column in the log>"
-
 # Tolerance of the beginning and the end of the window [s].
 WINDOW_TOLERANCE = 1e-9
 
@@ -192,8 +190,8 @@ def read_log(path: Path, channels: Channels) -> Log:
     check_spec(channels)
     spec = channels.spec
     table = read_columns(path, spec)
-    if "time" not in spec.model_fields_set:
-        _require_default(table, "time", spec.time, key="[recording] time")
+    if "time" not in spec.model_fields_set and spec.time not in table.names:
+        raise _unfit(table, channels, f"column {spec.time!r} is missing")
     sources = _sources(table, channels)
     measured = tuple(name for name in sources if name not in channels.control_columns)
 
@@ -281,12 +279,10 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     }
     # The look-up of a missing column raises the error that explains it.
     for name, source in controls.items():
-        if name not in stated:
-            key = f'[recording.columns] "{name}"'
-            off = f"; if the motor was off or its control constant, state the value: {key} = 0.0"
-            if not name.startswith("ctrl:"):
-                off = f"; where it is constant, state the value, for example {key} = 1.0"
-            _require_default(table, name, source.column, key=key, otherwise=off)
+        if name not in stated and source.column not in table.names:
+            value = "0.0" if name.startswith("ctrl:") else "1.0"
+            constant = f'; where it is constant, state the value: "{name}" = {value}'
+            raise _unfit(table, channels, f"column {name!r} is missing", constant)
         table.column(source.column)
 
     measured = {name: source for name, source in stated.items() if name not in controls}
@@ -301,37 +297,18 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     used = {channels.spec.time, *(source.column for source in controls.values())}
     found = [*measured] or [name for name in table.names if name not in used]
     fault = unknown("column", listed(found), channels.outputs)
-    pairs = [(name, _similar(name, found)) for name in channels.outputs]
-    name, column = next((pair for pair in pairs if pair[1] != ANY_COLUMN), pairs[0])
-    advice = (
-        ""
-        if measured
-        else (
-            ". Columns with other names are stated in the experiment file, for example "
-            f'[recording.columns] "{name}" = "{column}"'
-        )
+    if measured:
+        raise RecordingError(f"{table.source}: no measured column; {fault}")
+    raise _unfit(table, channels, f"no measured column; {fault}")
+
+
+def _unfit(table: Table, channels: Channels, fault: str, otherwise: str = "") -> RecordingError:
+    """The error of a log whose columns do not fit, with a table that may read it."""
+    proposal = proposed_recording(table, channels).replace("\n", "\n  ")
+    return RecordingError(
+        f"{table.source}: {fault}; found: {listed(table.names)}. Other names are stated in "
+        f"{channels.source}{otherwise}. Proposed, to be checked:\n  {proposal}"
     )
-    raise RecordingError(f"{table.source}: no measured column; {fault}{advice}")
-
-
-def _similar(name: str, columns: Sequence[str]) -> str:
-    """The column whose name is most similar; those of other programs have no prefix `ctrl:`."""
-    plain = {own.lower(): own for own in columns}
-    short = name.rpartition(":")[2]
-    near = closest(name.lower(), list(plain)) or closest(short.lower(), list(plain))
-    return plain[near] if near else ANY_COLUMN
-
-
-def _require_default(
-    table: Table, name: str, column: str, *, key: str, otherwise: str = ""
-) -> None:
-    """Raise RecordingError if the log lacks a column that the experiment file does not state."""
-    if column not in table.names:
-        raise RecordingError(
-            f"{table.source}: column {column!r} is missing; found: {listed(table.names)}. If "
-            "another column holds it, state its name in the experiment file: "
-            f'{key} = "{_similar(name, table.names)}"{otherwise}'
-        )
 
 
 def _check_names(table: Table, channels: Channels) -> None:

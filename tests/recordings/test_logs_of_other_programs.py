@@ -10,11 +10,13 @@ import gzip
 import io
 import json
 import struct
+import tomllib
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pyarrow
 import pyarrow.parquet
@@ -25,7 +27,12 @@ from numpy.typing import NDArray
 from mjfim.errors import RecordingError, RecordingWarning
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.model.coordinates import measurable_columns
+from mjfim.recordings.channels import Channels
+from mjfim.recordings.formats import read_columns
+from mjfim.recordings.proposal import proposed_recording
 from mjfim.recordings.read import Log, read_log
+from mjfim.recordings.section import RecordingSpec
 
 Array = NDArray[np.float64]
 
@@ -476,3 +483,151 @@ def test_a_memo_far_away(read: Callable[..., Log]) -> None:
     table = b"}r\xff\xff\xff\x7f(" + TIME + b"u"
     with pytest.raises(RecordingError, match=r"column 'torque' is missing; found: time"):
         read("log.pt", torch_archive(table), **TENSORS)
+
+
+# ---- what is proposed
+
+ARM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body>
+      <joint name="arm_shoulder" axis="0 1 0" damping="0.1" range="-1 1" limited="true"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+      <body pos="0 0 -0.3">
+        <joint name="arm_elbow" axis="0 1 0" damping="0.1" range="-1 1" limited="true"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+        <site name="tip" pos="0 0 -0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>{actuators}</actuator>
+  <sensor><force name="cell" site="tip"/></sensor>
+</mujoco>
+"""
+SERVOS = """
+    <position name="shoulder" joint="arm_shoulder" kp="9"/>
+    <position name="elbow" joint="arm_elbow" kp="9"/>
+"""
+MOTORS = SERVOS.replace("position", "motor").replace(' kp="9"', "")
+P = np.round(0.3 * np.cos(4.0 * T), 6)
+V = np.gradient(Q, T)
+
+
+def proposal(columns: dict[str, Any], actuators: str, folder: Path) -> dict[str, Any]:
+    """Tables that are proposed for a log of the arm, read from their TOML."""
+    np.savez(folder / "log.npz", **columns)
+    model = mujoco.MjModel.from_xml_string(ARM.format(actuators=actuators))
+    channels = Channels(
+        model=model,
+        controls=("shoulder", "elbow"),
+        laws=None,
+        outputs=measurable_columns(model),
+        sigma=np.zeros(0),
+        spec=RecordingSpec(),
+        source="arm.toml",
+    )
+    table = read_columns(folder / "log.npz", channels.spec)
+    return tomllib.loads(proposed_recording(table, channels))["recording"]
+
+
+def named(*columns: str | dict[str, str], kinds: str = "ctrl qpos") -> dict[str, Any]:
+    """A mapping of the columns of the shoulder and of the elbow, one pair for each kind."""
+    prefix = {"ctrl": "ctrl:", "qpos": "qpos:arm_", "qvel": "qvel:arm_"}
+    names = [f"{prefix[kind]}{joint}" for kind in kinds.split() for joint in ("shoulder", "elbow")]
+    return dict(zip(names, columns, strict=True))
+
+
+DEG = {"unit": "deg"}
+LEROBOT = ["action:shoulder.pos", "action:elbow.pos"]
+PROPOSALS: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
+    "names": (
+        {"time": T, "tau_elbow": P, "tau_shoulder": U, "elbowPosition": P, "shoulderPosition": Q},
+        MOTORS,
+        {
+            "time": "time",
+            "columns": named("tau_shoulder", "tau_elbow", "shoulderPosition", "elbowPosition"),
+        },
+    ),
+    "order from 0 (UR RTDE)": (
+        {
+            "timestamp": T,
+            "target_q_0": P,
+            "target_q_1": Q,
+            "actual_q_0": Q,
+            "actual_q_1": P,
+            "actual_qd_0": V,
+            "actual_qd_1": V,
+            "target_moment_0": U,
+            "target_moment_1": P,
+        },
+        MOTORS,
+        {
+            "time": "timestamp",
+            "columns": named(
+                "target_moment_0",
+                "target_moment_1",
+                "actual_qd_0",
+                "actual_qd_1",
+                "actual_q_0",
+                "actual_q_1",
+                kinds="ctrl qvel qpos",
+            ),
+        },
+    ),
+    "matrices of a servo robot (Isaac Lab)": (
+        {"time": T, "des_dof_pos": np.column_stack([P, Q]), "dof_pos": np.column_stack([Q, P])},
+        SERVOS,
+        {
+            "time": "time",
+            "columns": named("des_dof_pos[0]", "des_dof_pos[1]", "dof_pos[0]", "dof_pos[1]"),
+        },
+    ),
+    "degrees and milliseconds (LeRobot)": (
+        {
+            "timestamp": 1e3 * T,
+            "observation.state:shoulder.pos": 57.3 * Q,
+            "observation.state:elbow.pos": 57.3 * P,
+            "action:shoulder.pos": 57.3 * Q,
+            "action:elbow.pos": 57.3 * P,
+        },
+        SERVOS,
+        {
+            "time": "timestamp",
+            "time_unit": "ms",
+            "columns": named(
+                *({"column": name, **DEG} for name in LEROBOT),
+                *(
+                    {"column": f"observation.state:{joint}.pos", **DEG}
+                    for joint in ("shoulder", "elbow")
+                ),
+            ),
+        },
+    ),
+    "measured, not filtered": (
+        {"t": T, "u1": U, "u2": P, "pos_filt1": V, "pos_filt2": V, "pos_meas1": Q, "pos_meas2": P},
+        MOTORS,
+        {"time": "t", "columns": named("u1", "u2", "pos_meas1", "pos_meas2")},
+    ),
+    "a sensor, no command": (
+        {"t": T, "cell[0]": P, "q1": Q, "q2": P, "goal_q1": Q, "goal_q2": P},
+        MOTORS,
+        {"time": "t", "columns": named("q1", "q2", kinds="qpos") | {"cell[0]": "cell[0]"}},
+    ),
+    "nothing that fits": ({"x": Q, "y": P, "z": V}, MOTORS, {"columns": {}}),
+}
+
+
+@pytest.mark.parametrize("case", PROPOSALS)
+def test_proposals(case: str, tmp_path: Path) -> None:
+    columns, actuators, expected = PROPOSALS[case]
+    assert proposal(columns, actuators, tmp_path) == expected
+
+
+def test_a_proposal_reads_the_log(read: Callable[..., Log]) -> None:
+    """What the message of a log that does not fit proposes, pasted as it is, reads the log."""
+    text, _ = TEXTS["rostopic echo -p"]
+    with pytest.raises(RecordingError, match="column 't' is missing") as refused:
+        read("log.csv", text.encode())
+    pasted = str(refused.value).partition("\n")[2]
+    assert is_whole(read("log.csv", **tomllib.loads(pasted)["recording"]), tolerance=1e-14)
