@@ -47,6 +47,10 @@ class ModelWarning(UserWarning):
     """MuJoCo loads the model, but leaves out or changes something that the file states."""
 
 
+class RecordingWarning(UserWarning):
+    """A log is read, but without some of its rows."""
+
+
 class UndrawnWarning(UserWarning):
     """A fault of the program kept a picture or a page from being drawn; the result stands."""
 

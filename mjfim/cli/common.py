@@ -26,6 +26,7 @@ from mjfim.errors import (
     NoResultError,
     NoVideoError,
     RecordingError,
+    RecordingWarning,
     UndrawnWarning,
     UnfinishedError,
     WrongLogError,
@@ -523,13 +524,13 @@ def _told(error: Exception) -> typer.Exit:
 
 @contextmanager
 def _worded_warnings() -> Iterator[None]:
-    """Print warnings about models and drawings as sentences, without the place in the code."""
+    """Print warnings about models, logs and drawings as sentences, without a place in code."""
     with warnings.catch_warnings():
         usual = warnings.showwarning
 
         def show(message: Warning | str, category: type[Warning], *place: Any, **to: Any) -> None:
             """Print a warning."""
-            if issubclass(category, (ModelWarning, UndrawnWarning)):
+            if issubclass(category, (ModelWarning, RecordingWarning, UndrawnWarning)):
                 say(f"warning: {message}")
             else:
                 usual(message, category, *place, **to)

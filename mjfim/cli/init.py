@@ -58,6 +58,13 @@ def init(
             "proposed; answers may come from a file or a pipe, one a line.",
         ),
     ] = False,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG",
+            help="Log of another program; its columns are proposed as the table [recording].",
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Write a first experiment file for a model, with a comment for every choice."""
@@ -85,6 +92,8 @@ def init(
 
     proposal = propose(ask_for(propose, wishes) if ask else wishes)
     text = experiment_text(proposal)
+    if log is not None:
+        text += f"\n# Read {log.name}: check what was guessed.\n{_recording(log, proposal)}\n"
 
     if proposal.companion is not None:
         with replacing(companion) as temporary:
@@ -96,7 +105,32 @@ def init(
     say(f"wrote {file}")
     for remark in proposal.remarks:
         say(remark)
-    out.print(f"next: mjfim check {file}", soft_wrap=True)
+    after = f"check {file}" if log is None else f"identify {file} {log}"
+    out.print(f"next: mjfim {after}", soft_wrap=True)
+
+
+def _recording(log: Path, proposal: Proposal) -> str:
+    """The table `[recording]` that is proposed for a log."""
+    import numpy as np
+
+    from mjfim.model.coordinates import measurable_columns
+    from mjfim.recordings.channels import Channels
+    from mjfim.recordings.formats import read_columns
+    from mjfim.recordings.proposal import proposed_recording
+    from mjfim.recordings.read import recording_paths
+    from mjfim.recordings.section import RecordingSpec
+
+    channels = Channels(
+        model=proposal.compiled,
+        controls=tuple(proposal.amplitudes),
+        laws=None,
+        outputs=measurable_columns(proposal.compiled),
+        sigma=np.zeros(0),
+        spec=RecordingSpec(),
+        source=proposal.model,
+    )
+    table = read_columns(recording_paths([log], channels)[0], channels.spec)
+    return proposed_recording(table, channels)
 
 
 def _groups(text: str) -> list[Group]:

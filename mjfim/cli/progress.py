@@ -107,10 +107,15 @@ out = Console(highlight=False, width=width_of_results(), markup=False, emoji=Fal
 
 
 def say(sentences: str) -> None:
-    """Print sentences on stderr; a terminal breaks them between words, and paths stay whole."""
+    """Print sentences on stderr; a terminal breaks them between words, and paths stay whole.
+
+    A line that begins with a space is to be copied, and stays as it is.
+    """
     if errors.is_terminal:
         sentences = "\n".join(
-            fill(line, errors.width, break_long_words=False, break_on_hyphens=False)
+            line
+            if line.startswith(" ")
+            else fill(line, errors.width, break_long_words=False, break_on_hyphens=False)
             for line in sentences.split("\n")
         )
     errors.print(sentences, soft_wrap=True)

@@ -88,7 +88,7 @@ def check_spec(channels: Channels) -> None:
         ExperimentError: A column does not exist in the model, or has a unit that does not fit.
     """
     where = f"{channels.source}: recording.columns"
-    units = _units_of(channels)
+    units = units_of(channels)
     for name in channels.spec.columns:
         if name not in units:
             require_law(where, name, channels)
@@ -115,8 +115,12 @@ def check_spec(channels: Channels) -> None:
             )
 
 
-def _units_of(channels: Channels) -> dict[str, str]:
-    """Unit in the model of every column that a recording may hold; `ANY` where it is not known."""
+def units_of(channels: Channels) -> dict[str, str]:
+    """Unit in the model of every column that a recording may hold; `ANY` where it is not known.
+
+    Args:
+        channels: The signals of the experiment.
+    """
     model = channels.model
     units = {component.name: component.unit for component in state_components(model)}
     for name in names_of(model, "sensor"):

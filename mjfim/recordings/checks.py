@@ -18,6 +18,7 @@ from mjfim.errors import RecordingError
 from mjfim.model.coordinates import joint_names, scalar_joints
 from mjfim.model.units import ANGLE
 from mjfim.recordings.channels import Channels
+from mjfim.recordings.formats import SECONDS
 from mjfim.records.trajectory import Recording
 
 # Smallest number of rows of a usable log.
@@ -34,15 +35,16 @@ MIN_GAP_STEPS = 5.0
 # A measured column with at least this number of values, all equal, is a dead channel.
 DEAD_CHANNEL_ROWS = 10
 
+# Share of the rows that are left out where their times repeat or are out of order. More of them are
+# a fault of the log.
+MAX_DISORDER = 0.01
+
 # A clock that jumps back to less than this fraction of the elapsed time has restarted. After a
 # smaller jump back, the rows are out of order.
 RESTART_SHARE = 0.1
 
 # Largest number whose square is finite in float64.
 LARGEST_VALUE = float(np.sqrt(np.finfo(np.float64).max))
-
-# Seconds per unit of time.
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 # Degrees per radian, and the relative tolerance for this ratio and for a joint's range.
 DEGREES = 180.0 / np.pi
@@ -62,13 +64,31 @@ MAX_RANGE_RATIO = 3.0
 MAX_PLAUSIBLE_ANGLE, MAX_PLAUSIBLE_SPEED = 50.0, 200.0
 
 
-def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None:
+def in_order(t: Array) -> np.ndarray:
+    """Find the rows that have to be left out, so that the times of the others increase.
+
+    Args:
+        t: (M,) times [s].
+
+    Returns:
+        (M,) True for the rows that stay. All stay where more than a few would be left out, or a
+        time is not finite.
+    """
+    # A row is late after a time that is not smaller, or early before one that is not larger.
+    earlier = np.concatenate([[-np.inf], np.maximum.accumulate(t)[:-1]])
+    later = np.concatenate([np.minimum.accumulate(t[::-1])[-2::-1], [np.inf]])
+    stays = max((t > earlier, t < later), key=np.count_nonzero)
+    few = np.count_nonzero(~stays) <= MAX_DISORDER * len(t) and np.isfinite(t).all()
+    return stays if few else np.ones(len(t), dtype=bool)
+
+
+def check_clock(where: str, t: Array, numbers: np.ndarray, unit: str, gap: float) -> None:
     """Refuse times that cannot be the clock of a robot's log.
 
     Args:
         where: File and column, for messages.
         t: (M,) times inside the window [s].
-        first: Number of rows before the window, for the row numbers in messages.
+        numbers: (M,) places of the rows in the log from 0, for messages.
         unit: Unit of time that the experiment file states.
         gap: Longest accepted gap [s].
 
@@ -83,20 +103,18 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
     if not np.isfinite(t).all():
         row = np.argmax(~np.isfinite(t))
         fault = "NaN" if np.isnan(t[row]) else "an infinite time"
-        raise RecordingError(f"{where} holds {fault} in data row {first + row + 1}")
+        raise RecordingError(f"{where} holds {fault} in data row {numbers[row] + 1}")
 
     steps = np.diff(t)
     if np.any(steps <= 0.0):
         row = np.argmax(steps <= 0.0)
         raise RecordingError(
-            f"{where} does not increase in data row {first + row + 2}: {t[row]:.9g} s, then "
+            f"{where} does not increase in data row {numbers[row + 1] + 1}: {t[row]:.9g} s, then "
             f"{t[row + 1]:.9g} s {_why_not_later(t, steps, row)}"
         )
     median = np.median(steps)
     if not MIN_MEDIAN_STEP <= median <= MAX_MEDIAN_STEP:
-        # Logarithms neither vanish nor overflow where a step is extremely short or long.
-        size = np.log(median) - np.log(SECONDS[unit] * TYPICAL_STEP)
-        likely = min(SECONDS, key=lambda other: abs(size + np.log(SECONDS[other])))
+        likely = likely_unit(float(np.log(median) - np.log(SECONDS[unit])))
         raise RecordingError(
             f"{where}: the median step is {median:g} s, which is unlikely for a robot's log; "
             f'should it be recording.time_unit = "{likely}"?'
@@ -106,10 +124,20 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
     row = np.argmax(steps)
     if steps[row] > limit:
         raise RecordingError(
-            f"{where}: a gap of {steps[row]:g} s after data row {first + row + 1} "
+            f"{where}: a gap of {steps[row]:g} s after data row {numbers[row] + 1} "
             f"({t[row] - t[0]:g} s after the first one); gaps longer than {limit:g} s are not "
             "bridged: exclude this gap by recording.window, or raise recording.gap"
         )
+
+
+def likely_unit(log_step: float) -> str:
+    """Guess the unit of time stamps.
+
+    Args:
+        log_step: Logarithm of their typical step, which neither vanishes nor overflows.
+    """
+    size = log_step - np.log(TYPICAL_STEP)
+    return min(SECONDS, key=lambda unit: abs(size + np.log(SECONDS[unit])))
 
 
 def longest_bridged_gap(t: Array, gap: float) -> float:
@@ -133,17 +161,17 @@ def _why_not_later(t: Array, steps: Array, row: np.intp) -> str:
     return "(rows out of order); sort them by time"
 
 
-def check_finite(where: str, values: Array, first: int) -> None:
+def check_finite(where: str, values: Array, numbers: np.ndarray) -> None:
     """Refuse a column with a value that is infinite or whose square is; NaN is an empty field.
 
     Raises:
-        RecordingError: There is such a value; the message names its row, after `first` others.
+        RecordingError: There is such a value; the message names its row by `numbers`, from 0.
     """
     too_large = np.abs(values) > LARGEST_VALUE
     if too_large.any():
         at = np.argmax(too_large)
         raise RecordingError(
-            f"{where} is {values[at]:g} in data row {first + at + 1}, which is too large to be a "
+            f"{where} is {values[at]:g} in data row {numbers[at] + 1}, which is too large to be a "
             "measured number; leave the field empty if there is no number"
         )
 
@@ -239,7 +267,7 @@ def check_angles(
         RecordingError: A column is probably in degrees.
     """
     for name, why in (
-        *_doubtful_angles(channels.model, t, columns),
+        *doubtful_angles(channels.model, t, columns),
         *_doubtful_references(channels, columns),
     ):
         if name not in stated:
@@ -251,10 +279,19 @@ def check_angles(
             )
 
 
-def _doubtful_angles(
+def doubtful_angles(
     model: mujoco.MjModel, t: Array, columns: Mapping[str, Array]
 ) -> Iterator[tuple[str, str]]:
-    """Columns of hinge joints that look like degrees, and why."""
+    """Find columns of hinge joints that look like degrees.
+
+    Args:
+        model: The compiled model.
+        t: (M,) times [s].
+        columns: (M,) columns of the recording by name.
+
+    Yields:
+        Name of each such column, and why.
+    """
     for j, joint in enumerate(joint_names(model)):
         if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
             continue

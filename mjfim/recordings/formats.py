@@ -1,7 +1,7 @@
 """Reader of log files of all formats: their columns by name, which become numbers when needed.
 
 The ending of the name says the format; folders are ROS 2 bags or LeRobot datasets. No content of a
-file is executed or unpickled.
+file is executed. Nothing is unpickled but tables of tensors, by a reader that knows nothing else.
 
 A LeRobot dataset of format v2.x or v3.0 is a folder with `meta/info.json` and Parquet files, whose
 rows are the frames of all episodes. One episode is one recording.
@@ -12,14 +12,17 @@ needed. Messages of several topics or publishers are merged by their time stamps
 
 from __future__ import annotations
 
-import gzip
+import csv
+import io
 import json
+import pickle
 import re
+import zipfile
 import zlib
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -27,12 +30,14 @@ from typing import Any
 import numpy as np
 import pyarrow
 import pyarrow.compute
-import pyarrow.csv
 import pyarrow.parquet
+import scipy
 
 from mjfim.arrays import Array, record
 from mjfim.errors import RecordingError, listed, shortened, unknown
 from mjfim.files import read_arrays, read_json
+from mjfim.recordings.delimited import read_delimited
+from mjfim.recordings.quantities import Unit, name_and_unit
 from mjfim.recordings.section import INPUT_PREFIXES, RecordingSpec
 
 # File that makes a folder a dataset, and the column that says to which episode a frame belongs.
@@ -224,6 +229,13 @@ MAX_QUOTATION = 200
 # Largest number of rows of a column of text in which one is looked for that is no number.
 MAX_SEARCHED_ROWS = 100_000
 
+# Seconds per unit of time, and the seconds after which a clock begins again.
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+DAY = 86400.0
+
+# A time of day, also with a fraction of a second, which pyarrow does not know.
+CLOCK = r"^\s*(?P<h>\d\d):(?P<m>\d\d):(?P<s>\d\d(?:\.\d+)?)\s*$"
+
 # Fault of a column that holds text or objects.
 NOT_NUMERIC = "is not numeric"
 
@@ -240,11 +252,13 @@ class Table:
         source: The file, for messages.
         contents: What the file holds by the name of a column: an arrow array, or the words that
             say why it cannot be used.
+        units: Units of the columns whose titles state one, such as `q [deg]`; their names are `q`.
         unit_hint: How to state units that the file does not name; it ends messages about them.
     """
 
     source: Path
     contents: dict[str, Any]
+    units: dict[str, str]
     unit_hint: str = ""
 
     @classmethod
@@ -280,7 +294,17 @@ class Table:
                 # A control is held from each row to the next one, so the last row may have none.
                 is_input = name in inputs or key.startswith(("ctrl", *INPUT_PREFIXES))
                 columns[name] = _of_length(part, rows, spec.time, is_input)
-        return cls(source=source, contents=columns, unit_hint=unit_hint)
+
+        # Columns that differ in their units alone keep their titles as names.
+        titles = {title: name_and_unit(title) for title in columns}
+        count = Counter(name for name, _ in titles.values())
+        keys = {title: name if count[name] == 1 else title for title, (name, _) in titles.items()}
+        return cls(
+            source=source,
+            contents={keys[title]: values for title, values in columns.items()},
+            units={keys[title]: unit for title, (_, unit) in titles.items() if unit},
+            unit_hint=unit_hint,
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -291,7 +315,7 @@ class Table:
         """Return one column.
 
         Args:
-            name: Its name.
+            name: Its name, or its title with the unit.
 
         Returns:
             (M,) numbers, NaN where the file holds none.
@@ -299,11 +323,7 @@ class Table:
         Raises:
             RecordingError: There is no such column, or it holds no numbers.
         """
-        if name not in self.contents:
-            found = listed(self.names)
-            raise RecordingError(f"{self.source}: column {name!r} is missing; found: {found}")
-
-        values = self.contents[name]
+        values = self._values(name)
         fault = values if isinstance(values, str) else _fault(values)
         if fault:
             raise RecordingError(f"{self.source}: column {name!r} {fault}")
@@ -315,13 +335,85 @@ class Table:
         Raises:
             RecordingError: As `column`, or the column holds truth values.
         """
-        values = self.contents.get(name)
+        values = self._values(name)
         if not isinstance(values, str) and types.is_boolean(_kind(values)):
             raise RecordingError(
                 f"{self.source}: column {name!r} holds truth values (true and false), which are no "
                 "measurement; name a column of numbers, or write 1 and 0 if these are the numbers"
             )
         return self.column(name)
+
+    def seconds(self, name: str, unit: str | None) -> Array:
+        """Return one column of time stamps.
+
+        Args:
+            name: Its name, or its title with the unit.
+            unit: Unit of the stamps, as a key of `SECONDS`; None for that in the title, or seconds.
+
+        Returns:
+            (M,) times [s]. Integers, and times of a calendar or of a clock, count from the first
+            row; the clock may pass midnight.
+
+        Raises:
+            RecordingError: As `measurement`.
+        """
+        values = self._values(name)
+        factor = 1.0 if unit is None else SECONDS[unit]
+        stated = self.unit(name)
+        if unit is None and stated and Unit.parse(stated).measures(Unit.parse("s")):
+            factor = Unit.parse(stated).factor
+        if not isinstance(values, str) and types.is_string(values.type):
+            values = _stamps(values)
+        if isinstance(values, str) or not (
+            types.is_integer(values.type) or types.is_temporal(values.type)
+        ):
+            return factor * self.measurement(name)
+
+        is_clock = types.is_time(values.type)
+        if not types.is_integer(values.type):
+            zone = getattr(values.type, "tz", None)
+            kind = pyarrow.time64("ns") if is_clock else pyarrow.timestamp("ns", zone)
+            values, factor = values.cast(kind), SECONDS["ns"]
+        # A float64 does not hold nanoseconds since 1970 exactly.
+        integers = values.cast(pyarrow.int64(), safe=False)
+        if len(integers):
+            integers = pyarrow.compute.subtract(integers, integers[0])
+        times = factor * integers.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False)
+        return np.unwrap(times, period=DAY) if is_clock else times
+
+    def unit(self, name: str) -> str:
+        """Unit that the title of a column states; empty without one."""
+        return self.units.get(self.key(name), "")
+
+    def key(self, name: str) -> str:
+        """Name of a column that is called by its name or by its title with the unit."""
+        return name if name in self.contents else name_and_unit(name)[0]
+
+    def _values(self, name: str) -> Any:
+        """What the file holds of a column."""
+        if self.key(name) not in self.contents:
+            found = listed(self.names)
+            raise RecordingError(f"{self.source}: column {name!r} is missing; found: {found}")
+        return self.contents[self.key(name)]
+
+
+def _stamps(values: Any) -> Any:
+    """Texts as times of a calendar (ISO 8601) or of a clock; other texts stay."""
+    texts = pyarrow.compute.replace_substring(values, ",", ".")
+    parts = pyarrow.compute.extract_regex(texts, CLOCK)
+    if parts.null_count < len(values):
+        hours, minutes, seconds = (
+            pyarrow.compute.struct_field(parts, [i]).cast(pyarrow.float64()).to_numpy()
+            for i in range(3)
+        )
+        nanoseconds = np.rint(NANOSECONDS * (3600.0 * hours + 60.0 * minutes + seconds))
+        return pyarrow.array(nanoseconds, pyarrow.int64(), from_pandas=True).cast(
+            pyarrow.time64("ns")
+        )
+    for zone in (None, "UTC"):
+        with suppress(pyarrow.ArrowInvalid):
+            return texts.cast(pyarrow.timestamp("ns", zone))
+    return values
 
 
 def _has_rows(values: Any) -> bool:
@@ -343,6 +435,12 @@ def _parts(values: Any) -> dict[str, Any]:
         except (pyarrow.ArrowException, OverflowError):
             return {"": NOT_NUMERIC}
 
+    first = values[0].as_py() if types.is_string(values.type) and len(values) else None
+    if first is not None and first.lstrip().startswith("["):
+        # Lists in the cells of a CSV table.
+        with suppress(ValueError, pyarrow.ArrowException, RecursionError):
+            cells = ",".join(cell or "null" for cell in values.to_pylist())
+            values = pyarrow.array(json.loads(f"[{cells}]"))
     if not any(is_list(values.type) for is_list in LISTS):
         return {"": values}
     column = values.combine_chunks() if isinstance(values, pyarrow.ChunkedArray) else values
@@ -577,7 +675,10 @@ def _read_json(path: Path, spec: RecordingSpec) -> Table:
         RecordingError: The file is damaged, or it holds no records, or several lists of them.
     """
     with _reading(path, "readable JSON (damaged or truncated?)"):
-        content = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if path.suffix.lower() == ".jsonl":
+            text = f"[{','.join(line for line in text.split(chr(10)) if line.strip())}]"
+        content = json.loads(text)
 
     lists = dict(_lists_of_records(content))
     outside = dict(leaves(content)) if isinstance(content, Mapping) else {}
@@ -664,15 +765,13 @@ def read_table(path: Path) -> dict[str, Array]:
     if READERS.get(path.suffix.lower(), _read_csv) is not _read_csv:
         raise RecordingError(f"{path}: not a CSV table; a design keeps its control in design.csv")
     table = _read_csv(path, RecordingSpec())
-    return {name: table.column(name) for name in table.names}
+    columns = {name: table.column(name) for name in table.names}
+    return columns | {n: Unit.parse(unit).factor * columns[n] for n, unit in table.units.items()}
 
 
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
-    with _reading(path, "a readable CSV table"):
-        packed = path.suffix.lower() == ".gz"
-        # A thread of pyarrow that reads from Python can abort the process at its end.
-        source = pyarrow.BufferReader(gzip.decompress(path.read_bytes())) if packed else str(path)
-        return _table(path, pyarrow.csv.read_csv(source), spec)
+    with _reading(path, "a readable CSV table", (*UNREADABLE, csv.Error)):
+        return _table(path, read_delimited(path), spec)
 
 
 def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
@@ -692,17 +791,113 @@ def _table(path: Path, rows: Any, spec: RecordingSpec) -> Table:
 
 def _read_npz(path: Path, spec: RecordingSpec) -> Table:
     """Read the numbers, vectors and matrices of an archive; nothing is unpickled."""
-    contents = {}
-    for name, values in read_arrays(path, "log").items():
-        if values.ndim == 2 and values.size:
-            flat = pyarrow.array(values.ravel())
-            contents[name] = pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    return _table_of_arrays(path, read_arrays(path, "log"), spec)
+
+
+def _read_npy(path: Path, spec: RecordingSpec) -> Table:
+    """Read a matrix, whose columns are called `[0]`, `[1]` and so on, or an array with fields."""
+    # A damaged header can cause any exception in the reader.
+    with _reading(path, "a readable array of numbers (npy without pickles)", (Exception,)):
+        values = np.load(path, allow_pickle=False)
+        fields = values.dtype.names
+        arrays = (
+            {name: values[name] for name in fields} if fields else {"": np.atleast_2d(values.T).T}
+        )
+        return _table_of_arrays(path, arrays, spec)
+
+
+def _read_mat(path: Path, spec: RecordingSpec) -> Table:
+    """Read the numbers, vectors, matrices and structures of a MATLAB file."""
+    kind = "a readable MATLAB file (damaged? Save it by '-v7', because '-v7.3' is HDF5)"
+    # The reader assumes an intact file; a damaged one can cause any exception inside it.
+    with _reading(path, kind, (Exception,)):
+        contents = scipy.io.loadmat(path, simplify_cells=True)
+        own = {name: values for name, values in contents.items() if name[:2] != "__"}
+        return _table_of_arrays(path, own, spec)
+
+
+def _table_of_arrays(path: Path, arrays: Mapping[str, Any], spec: RecordingSpec) -> Table:
+    """Columns of numbers, vectors, and matrices, which may lie on their side.
+
+    Args:
+        path: The file.
+        arrays: Arrays, or tables of arrays, whose names are joined by dots.
+        spec: Table `[recording]`, which names the time.
+    """
+    found = {name: np.asarray(values) for name, values in leaves(arrays)}
+    count = found[spec.time].size if spec.time in found else None
+    contents: dict[str, Any] = {}
+    for name, values in found.items():
+        if values.ndim == 2 and values.size and values.dtype != object:
+            upright = values.T if values.shape[1] == count != values.shape[0] else values
+            flat = pyarrow.array(upright.ravel())
+            contents[name] = pyarrow.FixedSizeListArray.from_arrays(flat, upright.shape[1])
         elif values.ndim < 2:
             contents[name] = values if values.ndim else values.item()
     return Table.of(path, contents, spec)
 
 
+# Types of the numbers of a torch storage, by the name of its class.
+STORAGES = {
+    "DoubleStorage": "<f8",
+    "FloatStorage": "<f4",
+    "HalfStorage": "<f2",
+    "LongStorage": "<i8",
+    "IntStorage": "<i4",
+    "ShortStorage": "<i2",
+    "ByteStorage": "u1",
+    "BoolStorage": "?",
+}
+
+
+# The unpickler in C allocates as many places for memos as a file asks for; this one does not.
+class _TensorReader(pickle._Unpickler):
+    """Reader of the table of tensors in a torch archive; it knows no name that could do harm."""
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        """Open the table; the archive must be stored without packing, as torch does."""
+        if any(each.compress_type for each in archive.infolist()):
+            raise ValueError("its files are packed")
+        name = next((n for n in archive.namelist() if n.endswith("/data.pkl")), "data.pkl")
+        super().__init__(io.BytesIO(archive.read(name)))
+        self._archive, self._folder = archive, name.removesuffix(".pkl")
+
+    def find_class(self, module: str, name: str) -> Any:
+        """What stands for a name of the file."""
+        known: dict[str, Any] = {f"torch.{key}": kind for key, kind in STORAGES.items()}
+        known["torch._utils._rebuild_tensor_v2"] = _tensor
+        known["collections.OrderedDict"] = dict
+        if f"{module}.{name}" not in known:
+            raise ValueError(f"it holds {module}.{name}, which is no table of tensors")
+        return known[f"{module}.{name}"]
+
+    def persistent_load(self, place: Any) -> Any:
+        """The numbers of a storage."""
+        return np.frombuffer(self._archive.read(f"{self._folder}/{place[2]}"), dtype=place[1])
+
+
+def _tensor(storage: Array, offset: int, size: Any, stride: Any, *_: Any) -> Array:
+    """A tensor that lies in a storage."""
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    if min(offset, *size, *stride) < 0 or last >= len(storage) or np.prod(size) > len(storage):
+        raise ValueError("a tensor is larger than its storage")
+    steps = [step * storage.itemsize for step in stride]
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False)
+
+
+def _read_torch(path: Path, spec: RecordingSpec) -> Table:
+    """Read a table of tensors, as `torch.save` writes it; nothing of the file is executed."""
+    kind = "a table of tensors as torch.save writes it (a zip archive)"
+    with _reading(path, kind, (Exception,)), zipfile.ZipFile(path) as archive:
+        tensors = _TensorReader(archive).load()
+        arrays = tensors if isinstance(tensors, Mapping) else {"": tensors}
+        return _table_of_arrays(path, arrays, spec)
+
+
 Reader = Callable[[Path, RecordingSpec], Table]
+
+# Further endings of tables that are written as text.
+TEXT = ("tsv", "txt", "dat")
 
 # Reader of a log file by the ending of its name in lower case.
 READERS: dict[str, Reader] = {
@@ -711,6 +906,11 @@ READERS: dict[str, Reader] = {
     ".parquet": _read_parquet,
     ".npz": _read_npz,
     ".json": _read_json,
+    ".jsonl": _read_json,
+    ".npy": _read_npy,
+    ".mat": _read_mat,
+    ".pt": _read_torch,
     ".mcap": read_bag,
     ".db3": read_bag,
+    **dict.fromkeys((f".{kind}{packed}" for kind in TEXT for packed in ("", ".gz")), _read_csv),
 }

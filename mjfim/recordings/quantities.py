@@ -52,6 +52,11 @@ SYMBOLS: dict[str, tuple[float, Exponents]] = {
     "T": (1.0, (0, 0, 1, -2, -1)),
 }
 
+# Other spellings, as programs write them.
+SPELLINGS = {"degree": "deg", "radian": "rad", "sec": "s", "second": "s", "RPM": "rpm"}
+for _word, _symbol in SPELLINGS.items():
+    SYMBOLS[_word] = SYMBOLS[f"{_word}s"] = SYMBOLS[_symbol]
+
 # Symbols that may have a prefix, and the prefixes.
 WITH_PREFIX = ("rad", "m", "g", "s", "Hz", "N", "Nm", "Pa", "T")
 PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
@@ -126,6 +131,27 @@ class Unit:
         if self.exponents[MASS]:
             return self.exponents[1:] == other.exponents[1:]
         return self.exponents == other.exponents
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text, such as "rad/s", is a unit of the table."""
+    try:
+        return bool(Unit.parse(text))
+    except ValueError:
+        return False
+
+
+def name_and_unit(title: str) -> tuple[str, str]:
+    """Split the title of a column, such as "q1 [rad]" or "q1 (deg)", into its name and its unit.
+
+    Args:
+        title: The title. What is in its brackets may also be an index.
+
+    Returns:
+        The name and the unit; the title and an empty text where it states no known unit.
+    """
+    found = re.fullmatch(r"(.*?\S)\s*[\[(]\s*([^\d\[\]()][^\[\]()]*?)\s*[\])]", title)
+    return (found[1], found[2]) if found and is_unit(found[2]) else (title, "")
 
 
 def units_like(unit: str) -> list[str]:

@@ -12,31 +12,38 @@ are removed from the values.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow
 
 from mjfim.arrays import Array, record
-from mjfim.errors import RecordingError, closest, listed, unknown
+from mjfim.errors import RecordingError, RecordingWarning, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.channels import (
+    ANY,
     UNIT_FACTORS,
     Channels,
     check_spec,
     require_law,
     require_one_source,
+    units_of,
 )
 from mjfim.recordings.checks import (
-    SECONDS,
+    MIN_ROWS,
     check_angles,
     check_clock,
     check_finite,
     check_held,
     check_measured,
+    in_order,
 )
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
-from mjfim.recordings.quantities import TURN
+from mjfim.recordings.proposal import proposed_recording
+from mjfim.recordings.quantities import TURN, Unit
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
 from mjfim.records.base import Record
 from mjfim.records.trajectory import Recording
@@ -144,9 +151,6 @@ OTHER_NAMES = (
     (r"action:(.+?)(?:\.pos|\.vel|\.effort)?", ("ctrl:", "reference:")),
 )
 
-# What a message proposes where no column of a log has a similar name.
-ANY_COLUMN = "<name of the column in the log>"
-
 # Tolerance of the beginning and the end of the window [s].
 WINDOW_TOLERANCE = 1e-9
 
@@ -186,20 +190,23 @@ def read_log(path: Path, channels: Channels) -> Log:
     check_spec(channels)
     spec = channels.spec
     table = read_columns(path, spec)
-    if "time" not in spec.model_fields_set:
-        _require_default(table, "time", spec.time, key="[recording] time")
+    if "time" not in spec.model_fields_set and spec.time not in table.names:
+        raise _unfit(table, channels, f"column {spec.time!r} is missing")
     sources = _sources(table, channels)
     measured = tuple(name for name in sources if name not in channels.control_columns)
 
-    stamps, rows = _window(table, spec)
-    check_clock(f"{path}: column {spec.time!r}", stamps[rows], rows.start, spec.time_unit, spec.gap)
+    sources = _in_units_of_titles(table, sources, channels)
+    table, stamps = _merged(table, sources, _stamps(table, spec))
+    rows = _rows(table, channels, sources, stamps)
+    numbers = np.arange(len(stamps))[rows]
+    check_clock(f"{path}: column {spec.time!r}", stamps[rows], numbers, spec.time_unit, spec.gap)
     columns = _columns(table, sources, stamps, rows, spec)
 
     # The recording begins at time 0.
-    t = stamps[rows] - stamps[rows.start]
+    t = stamps[rows] - stamps[numbers[0]]
     for name in measured:
         check_measured(f"{path}: column {sources[name].column!r}", t, columns[name], spec.gap)
-    stated = {name for name, source in sources.items() if source.unit is not None}
+    stated = {name for name, s in sources.items() if s.unit is not None or table.unit(s.column)}
     if table.unit_hint:
         _check_units_of_controls(table, sources)
     check_angles(str(path), channels, t, columns, stated, table.unit_hint)
@@ -272,12 +279,10 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     }
     # The look-up of a missing column raises the error that explains it.
     for name, source in controls.items():
-        if name not in stated:
-            key = f'[recording.columns] "{name}"'
-            off = f"; if the motor was off or its control constant, state the value: {key} = 0.0"
-            if not name.startswith("ctrl:"):
-                off = f"; where it is constant, state the value, for example {key} = 1.0"
-            _require_default(table, name, source.column, key=key, otherwise=off)
+        if name not in stated and source.column not in table.names:
+            value = "0.0" if name.startswith("ctrl:") else "1.0"
+            constant = f'; where it is constant, state the value: "{name}" = {value}'
+            raise _unfit(table, channels, f"column {name!r} is missing", constant)
         table.column(source.column)
 
     measured = {name: source for name, source in stated.items() if name not in controls}
@@ -292,37 +297,18 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     used = {channels.spec.time, *(source.column for source in controls.values())}
     found = [*measured] or [name for name in table.names if name not in used]
     fault = unknown("column", listed(found), channels.outputs)
-    pairs = [(name, _similar(name, found)) for name in channels.outputs]
-    name, column = next((pair for pair in pairs if pair[1] != ANY_COLUMN), pairs[0])
-    advice = (
-        ""
-        if measured
-        else (
-            ". Columns with other names are stated in the experiment file, for example "
-            f'[recording.columns] "{name}" = "{column}"'
-        )
+    if measured:
+        raise RecordingError(f"{table.source}: no measured column; {fault}")
+    raise _unfit(table, channels, f"no measured column; {fault}")
+
+
+def _unfit(table: Table, channels: Channels, fault: str, otherwise: str = "") -> RecordingError:
+    """The error of a log whose columns do not fit, with a table that may read it."""
+    proposal = proposed_recording(table, channels).replace("\n", "\n  ")
+    return RecordingError(
+        f"{table.source}: {fault}; found: {listed(table.names)}. Other names are stated in "
+        f"{channels.source}{otherwise}. Proposed, to be checked:\n  {proposal}"
     )
-    raise RecordingError(f"{table.source}: no measured column; {fault}{advice}")
-
-
-def _similar(name: str, columns: Sequence[str]) -> str:
-    """The column whose name is most similar; those of other programs have no prefix `ctrl:`."""
-    plain = {own.lower(): own for own in columns}
-    short = name.rpartition(":")[2]
-    near = closest(name.lower(), list(plain)) or closest(short.lower(), list(plain))
-    return plain[near] if near else ANY_COLUMN
-
-
-def _require_default(
-    table: Table, name: str, column: str, *, key: str, otherwise: str = ""
-) -> None:
-    """Raise RecordingError if the log lacks a column that the experiment file does not state."""
-    if column not in table.names:
-        raise RecordingError(
-            f"{table.source}: column {column!r} is missing; found: {listed(table.names)}. If "
-            "another column holds it, state its name in the experiment file: "
-            f'{key} = "{_similar(name, table.names)}"{otherwise}'
-        )
 
 
 def _check_names(table: Table, channels: Channels) -> None:
@@ -370,11 +356,86 @@ def _matrices(channels: Channels) -> dict[str, list[str]]:
 # ---- values
 
 
-def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
-    """(M,) times of all rows [s], and the rows inside the window."""
-    t = table.measurement(spec.time) * SECONDS[spec.time_unit]
+def _in_units_of_titles(
+    table: Table, sources: Mapping[str, ColumnSpec], channels: Channels
+) -> dict[str, ColumnSpec]:
+    """The rules with the units of the columns' titles, where a rule states no unit and no scale."""
+    converted = dict(sources)
+    for name, source in sources.items():
+        unit, wanted = table.unit(source.column), units_of(channels)[name]
+        if not unit or source.unit is not None or source.scale != 1.0:
+            continue
+        if wanted not in (ANY, "") and not Unit.parse(unit).measures(Unit.parse(wanted)):
+            raise RecordingError(
+                f"{table.source}: the title of column {source.column!r} says {unit}, but {name!r} "
+                f"is in {wanted}; name another column, or state its unit or scale in "
+                "[recording.columns]"
+            )
+        converted[name] = source.model_copy(update={"scale": Unit.parse(unit).factor})
+    return converted
+
+
+def _stamps(table: Table, spec: RecordingSpec) -> Array:
+    """(M,) times of all rows [s]."""
+    is_stated = "time_unit" in spec.model_fields_set
+    return table.seconds(spec.time, spec.time_unit if is_stated else None)
+
+
+def _merged(table: Table, sources: Mapping[str, ColumnSpec], t: Array) -> tuple[Table, Array]:
+    """The table with one row for rows of one time t: (M,) that do not contradict each other.
+
+    Programs that write one row for each message leave the columns of other messages empty.
+    """
+    starts = np.flatnonzero(np.diff(t, prepend=np.nan) != 0.0)
+    if len(starts) == len(t):
+        return table, t
+    used = {name for s in sources.values() for name in (s.column, *s.multiply_by)}
+    contents = dict(table.contents)
+    for name in used:
+        column = table.column(name)
+        values = np.fmax.reduceat(column, starts)
+        if not np.array_equal(values, np.fmin.reduceat(column, starts), equal_nan=True):
+            return table, t
+        contents[table.key(name)] = pyarrow.array(values)
+    return replace(table, contents=contents), t[starts]
+
+
+def _rows(
+    table: Table, channels: Channels, sources: Mapping[str, ColumnSpec], t: Array
+) -> slice | np.ndarray:
+    """Rows that are used, of M with the times t: (M,) [s]; the others are counted in a warning."""
+    rows = _window(table.source, t, channels.spec)
+    if rows.stop - rows.start < MIN_ROWS:
+        return rows
+    begin = rows.start
+    for name in channels.control_columns:
+        if name not in sources:
+            continue
+        is_set = np.isfinite(table.column(sources[name].column))
+        first = _first_true(is_set)
+        # A control that is sent more seldom than rows are written begins within its own period.
+        if rows.start < first < len(t) and t[first] - t[rows.start] <= _period(t[is_set]):
+            begin = max(begin, first)
+    stays = in_order(t[begin : rows.stop])
+    left_out = {
+        "before the first value of a control": begin - rows.start,
+        "whose time repeats or is out of order": np.count_nonzero(~stays),
+    }
+    said = [f"{count} {why}" for why, count in left_out.items() if count]
+    if said:
+        warnings.warn(f"{table.source}: rows left out: {', '.join(said)}", RecordingWarning, 2)
+    return slice(begin, rows.stop) if stays.all() else begin + np.flatnonzero(stays)
+
+
+def _period(t: Array) -> float:
+    """Median step of times t: (M,) [s]; 0 of a single one."""
+    return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+
+
+def _window(source: Path, t: Array, spec: RecordingSpec) -> slice:
+    """Rows inside the window, of M with the times t: (M,) [s]."""
     if spec.window is None or not len(t):
-        return t, slice(0, len(t))
+        return slice(0, len(t))
     since = t - t[0]
     begin = _first_true(since >= spec.window[0] - WINDOW_TOLERANCE)
     # The window ends at the first time after its end. Only rows after its beginning are searched,
@@ -382,10 +443,10 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
     end = begin + _first_true(since[begin:] > spec.window[1] + WINDOW_TOLERANCE)
     if end == begin:
         raise RecordingError(
-            f"{table.source}: recording.window: no row between {spec.window[0]:g} and "
+            f"{source}: recording.window: no row between {spec.window[0]:g} and "
             f"{spec.window[1]:g} s; the log lasts {t[-1] - t[0]:g} s"
         )
-    return t, slice(begin, end)
+    return slice(begin, end)
 
 
 def _first_true(condition: np.ndarray) -> int:
@@ -394,16 +455,20 @@ def _first_true(condition: np.ndarray) -> int:
 
 
 def _columns(
-    table: Table, sources: Mapping[str, ColumnSpec], t: Array, rows: slice, spec: RecordingSpec
+    table: Table,
+    sources: Mapping[str, ColumnSpec],
+    t: Array,
+    rows: slice | np.ndarray,
+    spec: RecordingSpec,
 ) -> dict[str, Array]:
-    """Converted columns inside the window, by the name of the recording's column."""
-    columns = {}
+    """Converted columns of the rows that are used, by the name of the recording's column."""
+    columns, numbers = {}, np.arange(len(t))[rows]
     for name, source in sources.items():
         # Truth values may switch a control or a factor on and off.
         if not name.startswith(INPUT_PREFIXES):
             table.measurement(source.column)
         for raw in (source.column, *source.multiply_by):
-            check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], rows.start)
+            check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], numbers)
         values = _converted(table, source)
         if name.startswith(INPUT_PREFIXES):
             # Empty rows hold the last value before them.
@@ -414,7 +479,7 @@ def _columns(
             check_held(where, t[rows][:-1], values[rows][:-1], age[rows][:-1], spec.gap)
         # Finite raw numbers may become infinite by the conversion.
         columns[name] = values[rows]
-        check_finite(f"{table.source}: column {name!r}", columns[name], rows.start)
+        check_finite(f"{table.source}: column {name!r}", columns[name], numbers)
     return columns
 
 

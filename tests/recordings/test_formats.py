@@ -17,6 +17,7 @@ import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
+import scipy.io
 from numpy.typing import NDArray
 
 from mjfim.errors import RecordingError
@@ -78,12 +79,32 @@ def as_json(path: Path, columns: Columns) -> None:
     )
 
 
+def as_json_lines(path: Path, columns: Columns) -> None:
+    """Write one JSON object a line."""
+    as_json(path, columns)
+    records = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text("\n".join(map(json.dumps, records)), encoding="utf-8")
+
+
+def as_npy(path: Path, columns: Columns) -> None:
+    """Write one array with fields."""
+    np.save(path, np.rec.fromarrays([*columns.values()], names=[*columns]))
+
+
+def as_mat(path: Path, columns: Columns) -> None:
+    """Write a MATLAB file of vectors."""
+    scipy.io.savemat(path, columns, do_compression=True)
+
+
 WRITERS = {
     ".csv": as_csv,
     ".csv.gz": as_gzip,
     ".parquet": as_parquet,
     ".npz": as_npz,
     ".json": as_json,
+    ".jsonl": as_json_lines,
+    ".npy": as_npy,
+    ".mat": as_mat,
 }
 formats = pytest.mark.parametrize("ending", WRITERS)
 

@@ -1,0 +1,633 @@
+"""Logs as other programs write them: each format and each fault, with exact values.
+
+The headers are those of PlotJuggler, `rostopic echo -p`, UR RTDE, MATLAB, LabVIEW, Excel, NumPy,
+pandas, Isaac Lab and SAGE.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import struct
+import tomllib
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+import scipy.io
+from numpy.typing import NDArray
+
+from mjfim.errors import RecordingError, RecordingWarning
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.model.coordinates import measurable_columns
+from mjfim.recordings.channels import Channels
+from mjfim.recordings.formats import read_columns
+from mjfim.recordings.proposal import proposed_recording
+from mjfim.recordings.read import Log, read_log
+from mjfim.recordings.section import RecordingSpec
+
+Array = NDArray[np.float64]
+
+M = 200
+T = np.arange(M) * 0.01
+Q = np.round(0.5 * np.sin(3.0 * T), 6)
+U = np.round(np.cos(2.0 * T), 6)
+
+# The time at which a log was recorded [ns].
+EPOCH = 1_714_564_800_000_000_123
+
+PENDULUM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" axis="0 1 0" damping="0.1" limited="true" range="-1 1"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+
+Cells = Sequence[Iterable[Any]]
+
+
+def rows(*columns: Iterable[Any], head: str = "", between: str = ",", end: str = "\n") -> str:
+    """Text of a table: a header and a line for each row."""
+    lines = (between.join(str(cell) for cell in row) for row in zip(*columns, strict=True))
+    return end.join([*([head] if head else []), *lines, ""])
+
+
+def commas(column: Array) -> list[str]:
+    """Numbers with decimal commas."""
+    return [str(float(x)).replace(".", ",") for x in column]
+
+
+def stamps(zone: str = "") -> list[str]:
+    """Times of a calendar (ISO 8601), which pass midnight."""
+    begin = np.datetime64("2024-05-01T23:59:59.500000")
+    return [f"{begin + np.timedelta64(round(1e6 * t), 'us')}{zone}" for t in T]
+
+
+def sparse(column: Array, which: int) -> list[str]:
+    """Cells of a column that is empty in every other row, beginning with the given one."""
+    return [str(x) if i % 2 == which else "" for i, x in enumerate(column)]
+
+
+NAMED = {"qpos:hinge": "q", "ctrl:motor": "u"}
+BY_PLACE = {"time": "[0]", "columns": {"qpos:hinge": "[1]", "ctrl:motor": "[2]"}}
+DEGREES = np.degrees(Q)
+ROSTOPIC = (
+    "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.name0,"
+    "field.position0,field.effort0"
+)
+
+# Text of a log, and the table [recording] that reads it.
+TEXTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "semicolon": (rows(T, Q, U, head="t;q;u", between=";"), {"columns": NAMED}),
+    "decimal comma": (
+        rows(*map(commas, (T, Q, U)), head="sep=;\r\nt;q;u", between=";", end="\r\n"),
+        {"columns": NAMED},
+    ),
+    "tab": (rows(*map(commas, (T, Q, U)), head="t\tq\tu", between="\t"), {"columns": NAMED}),
+    "quoted decimal comma": (
+        rows(*([f'"{x}"' for x in commas(c)] for c in (T, Q, U)), head="t,q,u"),
+        {"columns": NAMED},
+    ),
+    "spaces (UR RTDE)": (
+        rows(T, Q, U, head="timestamp actual_q_0 target_moment_0", between=" "),
+        {
+            "time": "timestamp",
+            "columns": {"qpos:hinge": "actual_q_0", "ctrl:motor": "target_moment_0"},
+        },
+    ),
+    "aligned spaces without a header (MATLAB -ascii)": (
+        "".join(f"  {t: .7e}  {q: .16e}  {u: .16e}\n" for t, q, u in zip(T, Q, U, strict=True)),
+        BY_PLACE,
+    ),
+    "commented header (NumPy)": (
+        rows(T, Q, U, head="# robot 3\n# t q u", between=" "),
+        {"columns": NAMED},
+    ),
+    "comments before the header": (
+        rows(T, Q, U, head="# robot: xl330\n% 100 Hz, indoors\n// run 3\n\nt,q,u"),
+        {"columns": NAMED},
+    ),
+    "comments between rows": (
+        rows(T, Q, U, head="t,q,u").replace("\n0.5,", "\n# gripper, closed\n0.5,") + "# end\n",
+        {"columns": NAMED},
+    ),
+    "units in the header": (
+        rows(1e3 * T, DEGREES, 1e3 * U, head="t [ms],q (deg),u [mNm]"),
+        {"columns": NAMED},
+    ),
+    "units in the header, titles named": (
+        rows(1e3 * T, DEGREES, 1e3 * U, head="t [ms],q (deg),u [mNm]"),
+        {
+            "time": "t [ms]",
+            "columns": {"qpos:hinge": "q (deg)", "ctrl:motor": "u [mNm]"},
+        },
+    ),
+    "row of units": (
+        rows(T, DEGREES, U, ["run"] * M, head="t;q;u;mode\ns;°;N·m;-", between=";"),
+        {"columns": NAMED},
+    ),
+    "spaces around names": (rows(T, Q, U, head=" t , q ,u ", between=" , "), {"columns": NAMED}),
+    "delimiter at the ends": (
+        rows(T, Q, U, [""] * M, head="t;q;u", between=";"),
+        {"columns": NAMED},
+    ),
+    "index (pandas)": (rows(range(M), T, Q, U, head=",t,q,u"), {"columns": NAMED}),
+    "calendar": (rows(stamps(), Q, U, head="t,q,u"), {"columns": NAMED}),
+    "calendar with a zone": (rows(stamps("Z"), Q, U, head="t,q,u"), {"columns": NAMED}),
+    "clock that passes midnight": (
+        rows((s[11:] for s in stamps()), Q, U, head="t,q,u"),
+        {"columns": NAMED},
+    ),
+    "clock with a comma": (
+        rows((s[11:].replace(".", ",") for s in stamps()), Q, U, head="t;q;u", between=";"),
+        {"columns": NAMED},
+    ),
+    "rostopic echo -p": (
+        rows(
+            [EPOCH + 10_000_000 * i for i in range(M)],
+            range(M),
+            [EPOCH + 10_000_000 * i for i in range(M)],
+            ["base"] * M,
+            ["hinge"] * M,
+            Q,
+            U,
+            head=ROSTOPIC,
+        ),
+        {
+            "time": "%time",
+            "time_unit": "ns",
+            "columns": {"qpos:hinge": "field.position0", "ctrl:motor": "field.effort0"},
+        },
+    ),
+    "lists in cells (SAGE)": (
+        rows(
+            ["STATE"] * M,
+            1e6 * T,
+            (f'"[{q}, 7]"' for q in Q),
+            (f'"[{u}]"' for u in U),
+            head="type,timestamp,positions,torques",
+        ),
+        {
+            "time": "timestamp",
+            "time_unit": "us",
+            "columns": {"qpos:hinge": "positions[0]", "ctrl:motor": "torques[0]"},
+        },
+    ),
+}
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., Log]:
+    """Read a file of the pendulum by a table [recording]."""
+
+    def run(name: str, content: bytes | None = None, **recording: Any) -> Log:
+        path = tmp_path / name
+        if content is not None:
+            path.write_bytes(content)
+        (tmp_path / "pendulum.xml").write_text(PENDULUM, encoding="utf-8")
+        experiment = Experiment(
+            model="pendulum.xml",
+            rate=100.0,
+            horizon=1.0,
+            parameters={"damping": {"target": "joint/hinge:damping"}},
+            noise={"state": 0.01},
+            recording=recording,
+            directory=tmp_path,
+        )
+        return read_log(path, System.resolve(experiment).channels)
+
+    return run
+
+
+def is_whole(log: Log, tolerance: float = 0.0) -> bool:
+    """Whether a log has the times, positions and controls of the pendulum."""
+    recording = log.recording
+    return (
+        recording.outputs == ("qpos:hinge",)
+        and np.allclose(recording.t, T, rtol=0, atol=1e-9)
+        and np.allclose(recording.y[:, 0], Q, rtol=tolerance, atol=0)
+        and np.allclose(recording.ctrl[:, 0], U[:-1], rtol=tolerance, atol=0)
+    )
+
+
+@pytest.mark.parametrize("case", TEXTS)
+@pytest.mark.parametrize("ending", [".csv", ".txt.gz"])
+def test_text(case: str, ending: str, read: Callable[..., Log]) -> None:
+    text, recording = TEXTS[case]
+    content = text.encode()
+    packed = gzip.compress(content, mtime=0) if ending.endswith(".gz") else content
+    assert is_whole(read(f"log{ending}", packed, **recording), tolerance=1e-14)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_encodings(encoding: str, read: Callable[..., Log]) -> None:
+    text = rows(T, DEGREES, U, head="t;q [°];u", between=";")
+    mark = "\ufeff" if encoding.endswith(("le", "be")) else ""
+    content = f"{mark}{text}".encode(encoding)
+    assert is_whole(read("log.csv", content, columns=NAMED), tolerance=1e-14)
+
+
+# ---- what is left out
+
+
+def sparse_rows(topics: Sequence[tuple[Array, Array]], head: str) -> str:
+    """One row for each message of some topics, sorted by time; other cells are empty."""
+    found = [
+        (t, i, value)
+        for i, (times, values) in enumerate(topics)
+        for t, value in zip(times.tolist(), values.tolist(), strict=True)
+    ]
+    cells = [
+        [t, *("",) * i, value, *("",) * (len(topics) - i - 1)] for t, i, value in sorted(found)
+    ]
+    return rows(*zip(*cells, strict=True), head=head)
+
+
+PLOTJUGGLER = {
+    "time": "__time",
+    "columns": {
+        "qpos:hinge": "/joint_states/hinge/position",
+        "ctrl:motor": "/command/data[0]",
+    },
+}
+HEAD = "__time,/joint_states/hinge/position,/command/data[0]"
+
+
+def test_messages_of_one_time_are_one_row(read: Callable[..., Log]) -> None:
+    """PlotJuggler: one topic in each row, also where their times are equal."""
+    text = sparse_rows([(T, Q), (T, U)], HEAD)
+    assert text.count("\n") == 2 * M + 1
+    log = read("log.csv", text.encode(), **PLOTJUGGLER)
+    assert is_whole(log) and log.summary.dropped == 0
+
+
+def test_a_topic_that_begins_later(read: Callable[..., Log]) -> None:
+    """Rows before the first command are left out and counted, if it is one period late at most."""
+    text = sparse_rows([(T, Q), (T[::2] + 0.013, U[::2])], HEAD)
+    with pytest.warns(
+        RecordingWarning, match=r"rows left out: 2 before the first value of a control"
+    ):
+        log = read("log.csv", text.encode(), **PLOTJUGGLER)
+    recording = log.recording
+    assert (recording.ctrl[0, 0], log.summary.dropped) == (U[0], 2)
+    assert np.array_equal(recording.y[np.isfinite(recording.y)], Q[2:])
+    assert recording.t[np.isfinite(recording.y[:, 0])][0] == pytest.approx(0.02 - 0.013)
+
+    late = sparse_rows([(T, Q), (T[::2] + 0.053, U[::2])], HEAD)
+    with pytest.raises(
+        RecordingError, match=r"no value in the first row; it begins 0\.053 s later"
+    ):
+        read("log.csv", late.encode(), **PLOTJUGGLER)
+
+
+@pytest.mark.parametrize(
+    ("changes", "left", "count"),
+    [
+        ({7: T[6]}, [7], 1),
+        ({7: T[5] + 0.001}, [7], 1),
+        ({7: 1e3}, [7], 1),
+        ({7: T[6], 150: T[20]}, [7, 150], 2),
+    ],
+    ids=["repeated", "too early", "too late", "two of them"],
+)
+def test_a_few_stamps_out_of_order(
+    changes: dict[int, float], left: list[int], count: int, read: Callable[..., Log]
+) -> None:
+    """They are counted, said and left out; the other rows are exactly those of the log."""
+    t = np.array(T)
+    t[[*changes]] = [*changes.values()]
+    text = rows(t, Q, U, head="t,q,u")
+    with pytest.warns(RecordingWarning, match=rf"log\.csv: rows left out: {count} whose time"):
+        log = read("log.csv", text.encode(), columns=NAMED)
+    kept = np.delete(np.arange(M), left)
+    assert log.summary.dropped == count
+    assert np.array_equal(log.recording.t, T[kept])
+    assert np.array_equal(log.recording.y[:, 0], Q[kept])
+    assert np.array_equal(log.recording.ctrl[:, 0], U[kept][:-1])
+
+
+@pytest.mark.parametrize("word", ["NaN", ".nan", "", "None", "-nan(ind)", "--", " NaN"])
+def test_missing_numbers(word: str, read: Callable[..., Log]) -> None:
+    text = rows(T, [word if i == 50 else q for i, q in enumerate(Q)], U, head="t,q,u")
+    recording = read("log.csv", text.encode(), columns=NAMED).recording
+    assert np.flatnonzero(np.isnan(recording.y[:, 0])).tolist() == [50]
+
+
+def test_a_unit_that_does_not_fit(read: Callable[..., Log]) -> None:
+    """The unit of a title is not ignored: another quantity is refused, and the table is right."""
+    text = rows(T, DEGREES, U, head="t,q [deg/s],u")
+    with pytest.raises(
+        RecordingError, match=r"title of column 'q' says deg/s, but 'qpos:hinge' is in rad"
+    ):
+        read("log.csv", text.encode(), columns=NAMED)
+    stated = {"qpos:hinge": {"column": "q", "unit": "deg"}, "ctrl:motor": "u"}
+    assert is_whole(read("log.csv", text.encode(), columns=stated), tolerance=1e-14)
+
+
+def test_two_units_of_one_column(read: Callable[..., Log]) -> None:
+    """Columns that differ in their units alone are named by their titles."""
+    text = rows(T, DEGREES, Q, U, head="t,q [deg],q [rad],u")
+    for title in ("q [deg]", "q [rad]"):
+        columns = {"qpos:hinge": title, "ctrl:motor": "u"}
+        assert is_whole(read("log.csv", text.encode(), columns=columns), tolerance=1e-14)
+    with pytest.raises(RecordingError, match=r"'q' is missing; found: t, q \[deg\], q \[rad\], u"):
+        read("log.csv", text.encode(), columns=NAMED)
+
+
+# ---- other formats
+
+
+def test_stamps_of_parquet_and_npz(tmp_path: Path, read: Callable[..., Log]) -> None:
+    """Times of a calendar as pandas and NumPy keep them."""
+    times = np.array(stamps(), dtype="datetime64[ns]")
+    table = pyarrow.table({"t": times, "q": Q, "u": U})
+    pyarrow.parquet.write_table(table, tmp_path / "log.parquet")
+    np.savez(tmp_path / "log.npz", t=times, q=Q, u=U)
+    for name in ("log.parquet", "log.npz"):
+        assert is_whole(read(name, columns=NAMED))
+
+
+@pytest.mark.parametrize("structure", [False, True])
+def test_matlab(structure: bool, tmp_path: Path, read: Callable[..., Log]) -> None:
+    """Columns and rows of numbers, matrices that lie on their side, and structures."""
+    contents = {"t": T[:, None], "q": np.array([Q, 7 + Q]), "u": U[None, :], "note": "run 3"}
+    scipy.io.savemat(tmp_path / "log.mat", {"run": contents} if structure else contents)
+    prefix = "run." if structure else ""
+    columns = {"qpos:hinge": f"{prefix}q[0]", "ctrl:motor": f"{prefix}u"}
+    assert is_whole(read("log.mat", time=f"{prefix}t", columns=columns))
+
+
+def test_matlab_hdf5_is_refused(read: Callable[..., Log]) -> None:
+    """The message says how to save the file."""
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    with pytest.raises(RecordingError, match=r"log\.mat: not a readable MATLAB .*'-v7'"):
+        read("log.mat", head + bytes(512), columns=NAMED)
+
+
+def test_json_lines(read: Callable[..., Log]) -> None:
+    lines = [
+        json.dumps({"t": t, "joint": {"q": [q, 7]}, "u": u})
+        for t, q, u in zip(T, Q, U, strict=True)
+    ]
+    columns = {"qpos:hinge": "joint.q[0]", "ctrl:motor": "u"}
+    content = "\n".join([*lines, ""]).encode()
+    assert is_whole(read("log.jsonl", content, columns=columns))
+    with pytest.raises(RecordingError, match=r"log\.jsonl: not readable JSON"):
+        read("log.jsonl", content[:-9], columns=columns)
+
+
+def test_npy(tmp_path: Path, read: Callable[..., Log]) -> None:
+    """A matrix has columns by place, an array with fields has names; no object is unpickled."""
+    np.save(tmp_path / "log.npy", np.column_stack([T, Q, U]))
+    assert is_whole(read("log.npy", **BY_PLACE))
+    fields = np.rec.fromarrays([T, Q, U], names="t,q,u")
+    np.save(tmp_path / "log.npy", fields)
+    assert is_whole(read("log.npy", columns=NAMED))
+    np.save(tmp_path / "log.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(RecordingError, match=r"log\.npy: not a readable array"):
+        read("log.npy", columns=NAMED)
+
+
+# ---- tables of tensors
+
+
+def text(value: str) -> bytes:
+    """A text in a pickle."""
+    return b"X" + struct.pack("<I", len(value.encode())) + value.encode()
+
+
+def number(value: int) -> bytes:
+    """An integer in a pickle."""
+    return b"J" + struct.pack("<i", value)
+
+
+def tensor(key: str, shape: Sequence[int], strides: Sequence[int], offset: int = 0) -> bytes:
+    """A tensor in a pickle, as torch 2 writes it."""
+    storage = text("storage") + b"ctorch\nDoubleStorage\n" + text(key) + text("cpu") + number(9999)
+    return (
+        b"ctorch._utils\n_rebuild_tensor_v2\n((" + storage + b"tQ" + number(offset)
+        + b"(" + b"".join(map(number, shape)) + b"t("
+        + b"".join(map(number, strides)) + b"t\x89ccollections\nOrderedDict\n)RtR"
+    )  # fmt: skip
+
+
+def torch_archive(table: bytes, packed: int = zipfile.ZIP_STORED) -> bytes:
+    """An archive of a table of tensors whose storages are T, and the columns of Q and U."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", packed) as archive:
+        archive.writestr("traj_0/data.pkl", b"\x80\x02" + table + b".")
+        archive.writestr("traj_0/byteorder", b"little")
+        archive.writestr("traj_0/data/0", T.tobytes())
+        archive.writestr("traj_0/data/1", np.column_stack([Q, U]).tobytes())
+    return stream.getvalue()
+
+
+TENSORS = {"time": "time", "columns": {"qpos:hinge": "dof_pos[0]", "ctrl:motor": "torque"}}
+TIME = text("time") + tensor("0", [M], [1])
+
+
+def test_tensors(read: Callable[..., Log]) -> None:
+    """Columns of a matrix, and a vector that is every second number of a storage."""
+    table = b"}(" + TIME
+    table += text("dof_pos") + tensor("1", [M, 2], [2, 1])
+    table += text("torque") + tensor("1", [M], [2], offset=1) + b"u"
+    assert is_whole(read("log.pt", torch_archive(table), **TENSORS))
+
+
+@pytest.mark.parametrize(
+    ("table", "packed", "said"),
+    [
+        (b"}(" + TIME + text("x") + b"cos\nmkdir\n" + text("sprung") + b"\x85Ru", 0, "os.mkdir"),
+        (b"}(" + TIME + text("x") + b"cbuiltins\neval\n" + text("1") + b"\x85Ru", 0, "eval"),
+        (b"}(" + TIME + text("x") + tensor("0", [M + 1], [1]) + b"u", 0, "larger than its storage"),
+        (b"}(" + TIME + text("x") + tensor("0", [M], [1], 1) + b"u", 0, "larger than its storage"),
+        (b"}(" + TIME + text("x") + tensor("0", [M], [1], -1) + b"u", 0, "larger than its"),
+        (b"}(" + TIME + text("x") + tensor("0", [1 << 30], [0]) + b"u", 0, "larger than its"),
+        (b"}(" + TIME + text("x") + tensor("7", [M], [1]) + b"u", 0, "no item named"),
+        (b"}(" + TIME + b"u", zipfile.ZIP_DEFLATED, "packed"),
+        (b"}(" + text("x")[:3], 0, "requires a buffer"),
+    ],
+    ids=["call", "eval", "long", "shifted", "before", "huge", "lost", "packed", "truncated"],
+)
+def test_hostile_tensors(
+    table: bytes,
+    packed: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    read: Callable[..., Log],
+) -> None:
+    """Nothing of the file is called, and no memory outside of its numbers is read."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(RecordingError, match=rf"log\.pt: not a table of tensors.*{said}"):
+        read("log.pt", torch_archive(table, packed), **TENSORS)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_memo_far_away(read: Callable[..., Log]) -> None:
+    """A place of a memo beyond all memory costs nothing."""
+    table = b"}r\xff\xff\xff\x7f(" + TIME + b"u"
+    with pytest.raises(RecordingError, match=r"column 'torque' is missing; found: time"):
+        read("log.pt", torch_archive(table), **TENSORS)
+
+
+# ---- what is proposed
+
+ARM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body>
+      <joint name="arm_shoulder" axis="0 1 0" damping="0.1" range="-1 1" limited="true"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+      <body pos="0 0 -0.3">
+        <joint name="arm_elbow" axis="0 1 0" damping="0.1" range="-1 1" limited="true"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+        <site name="tip" pos="0 0 -0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>{actuators}</actuator>
+  <sensor><force name="cell" site="tip"/></sensor>
+</mujoco>
+"""
+SERVOS = """
+    <position name="shoulder" joint="arm_shoulder" kp="9"/>
+    <position name="elbow" joint="arm_elbow" kp="9"/>
+"""
+MOTORS = SERVOS.replace("position", "motor").replace(' kp="9"', "")
+P = np.round(0.3 * np.cos(4.0 * T), 6)
+V = np.gradient(Q, T)
+
+
+def proposal(columns: dict[str, Any], actuators: str, folder: Path) -> dict[str, Any]:
+    """Tables that are proposed for a log of the arm, read from their TOML."""
+    np.savez(folder / "log.npz", **columns)
+    model = mujoco.MjModel.from_xml_string(ARM.format(actuators=actuators))
+    channels = Channels(
+        model=model,
+        controls=("shoulder", "elbow"),
+        laws=None,
+        outputs=measurable_columns(model),
+        sigma=np.zeros(0),
+        spec=RecordingSpec(),
+        source="arm.toml",
+    )
+    table = read_columns(folder / "log.npz", channels.spec)
+    return tomllib.loads(proposed_recording(table, channels))["recording"]
+
+
+def named(*columns: str | dict[str, str], kinds: str = "ctrl qpos") -> dict[str, Any]:
+    """A mapping of the columns of the shoulder and of the elbow, one pair for each kind."""
+    prefix = {"ctrl": "ctrl:", "qpos": "qpos:arm_", "qvel": "qvel:arm_"}
+    names = [f"{prefix[kind]}{joint}" for kind in kinds.split() for joint in ("shoulder", "elbow")]
+    return dict(zip(names, columns, strict=True))
+
+
+DEG = {"unit": "deg"}
+LEROBOT = ["action:shoulder.pos", "action:elbow.pos"]
+PROPOSALS: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
+    "names": (
+        {"time": T, "tau_elbow": P, "tau_shoulder": U, "elbowPosition": P, "shoulderPosition": Q},
+        MOTORS,
+        {
+            "time": "time",
+            "columns": named("tau_shoulder", "tau_elbow", "shoulderPosition", "elbowPosition"),
+        },
+    ),
+    "order from 0 (UR RTDE)": (
+        {
+            "timestamp": T,
+            "target_q_0": P,
+            "target_q_1": Q,
+            "actual_q_0": Q,
+            "actual_q_1": P,
+            "actual_qd_0": V,
+            "actual_qd_1": V,
+            "target_moment_0": U,
+            "target_moment_1": P,
+        },
+        MOTORS,
+        {
+            "time": "timestamp",
+            "columns": named(
+                "target_moment_0",
+                "target_moment_1",
+                "actual_qd_0",
+                "actual_qd_1",
+                "actual_q_0",
+                "actual_q_1",
+                kinds="ctrl qvel qpos",
+            ),
+        },
+    ),
+    "matrices of a servo robot (Isaac Lab)": (
+        {"time": T, "des_dof_pos": np.column_stack([P, Q]), "dof_pos": np.column_stack([Q, P])},
+        SERVOS,
+        {
+            "time": "time",
+            "columns": named("des_dof_pos[0]", "des_dof_pos[1]", "dof_pos[0]", "dof_pos[1]"),
+        },
+    ),
+    "degrees and milliseconds (LeRobot)": (
+        {
+            "timestamp": 1e3 * T,
+            "observation.state:shoulder.pos": 57.3 * Q,
+            "observation.state:elbow.pos": 57.3 * P,
+            "action:shoulder.pos": 57.3 * Q,
+            "action:elbow.pos": 57.3 * P,
+        },
+        SERVOS,
+        {
+            "time": "timestamp",
+            "time_unit": "ms",
+            "columns": named(
+                *({"column": name, **DEG} for name in LEROBOT),
+                *(
+                    {"column": f"observation.state:{joint}.pos", **DEG}
+                    for joint in ("shoulder", "elbow")
+                ),
+            ),
+        },
+    ),
+    "measured, not filtered": (
+        {"t": T, "u1": U, "u2": P, "pos_filt1": V, "pos_filt2": V, "pos_meas1": Q, "pos_meas2": P},
+        MOTORS,
+        {"time": "t", "columns": named("u1", "u2", "pos_meas1", "pos_meas2")},
+    ),
+    "a sensor, no command": (
+        {"t": T, "cell[0]": P, "q1": Q, "q2": P, "goal_q1": Q, "goal_q2": P},
+        MOTORS,
+        {"time": "t", "columns": named("q1", "q2", kinds="qpos") | {"cell[0]": "cell[0]"}},
+    ),
+    "nothing that fits": ({"x": Q, "y": P, "z": V}, MOTORS, {"columns": {}}),
+}
+
+
+@pytest.mark.parametrize("case", PROPOSALS)
+def test_proposals(case: str, tmp_path: Path) -> None:
+    columns, actuators, expected = PROPOSALS[case]
+    assert proposal(columns, actuators, tmp_path) == expected
+
+
+def test_a_proposal_reads_the_log(read: Callable[..., Log]) -> None:
+    """What the message of a log that does not fit proposes, pasted as it is, reads the log."""
+    text, _ = TEXTS["rostopic echo -p"]
+    with pytest.raises(RecordingError, match="column 't' is missing") as refused:
+        read("log.csv", text.encode())
+    pasted = str(refused.value).partition("\n")[2]
+    assert is_whole(read("log.csv", **tomllib.loads(pasted)["recording"]), tolerance=1e-14)
