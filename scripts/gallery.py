@@ -1,110 +1,102 @@
-"""Make every output of mjfim for several robots, and a page that shows them.
+"""Make the page of the gallery: what mjfim prints and draws for several robots.
 
-    python -m scripts.gallery --models FOLDER --data FOLDER -o out/gallery --page docs/gallery.md
+    python -m scripts.gallery            # writes docs/gallery.md and its pictures
+    python -m scripts.gallery --check    # compares the numbers of the page with those of today
 
-The command line is called as a user calls it. Pictures, what the terminal printed, screenshots of
-`report.html` at the width of a desktop and of a phone, in light and in dark colours, and
-screenshots of the Rerun files are collected per robot. Robots whose files are missing, and
-screenshots for which no browser or no viewer can start, are left out with a sentence on stderr.
+The command line is called as a user calls it. Recordings are simulated with a robot whose
+parameters differ from the model, or are logs of a real SO-101. A design ends after a stated number
+of iterations or where it has converged, so that its numbers do not depend on the speed of the
+computer.
 
-Recordings of own models and of first experiments are simulated with a robot whose parameters
-differ from the model, so that an identified model differs from the nominal one. What the calls
-printed is kept: `--reuse` makes the page again from the files of an earlier run.
-
-`--models` is a folder with `menagerie_panda` and `menagerie_so_arm100` of the MuJoCo Menagerie, and
-`--data` one with the logs `dfki_double_pendulum`.
+`--shared` is a folder with `models/so101`, `models/go2` and the logs `data/sage_so101`.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import gzip
 import json
 import os
 import re
 import shlex
 import shutil
 import sys
+import tempfile
 import textwrap
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+import numpy as np
 import tomlkit
 from PIL import Image
 
 from mjfim.output.page import TERMS
-from scripts.rerun_screenshot import Shot, screenshot
+from mjfim.output.plots.pictures import kind_of_picture
 from scripts.verbs import call_verb
 
 ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "gallery.md"
 
-# Columns of the terminal.
-COLUMNS = 80
-
-# Longest time of one verb [s].
-PATIENCE = 900.0
+# Columns of the terminal, and longest time of one verb [s].
+COLUMNS, PATIENCE = 80, 3600.0
 
 # Largest width of a picture on the page [pixels], and its number of colours.
 PAGE_WIDTH, PAGE_COLOURS = 1000, 64
 
-# Height of what the page shows of a long picture, such as a whole report, over its width.
-SHOWN_HEIGHT = 1.9
-
 # Relative difference of the simulated robots from their models.
 ROBOT_DIFFERENCE = 0.1
 
-# File with what the calls for a robot printed.
-CALLS = "calls.json"
+# Model of a robot on a floor.
+FLOOR = """<mujoco>
+  <include file="../{}"/>
+  <worldbody><geom name="floor" type="plane" size="0 0 1"/></worldbody>
+</mujoco>
+"""
 
-# Names of browsers with the DevTools protocol, the usual one first.
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+# Joints of the SO-101, in the order of its logs, and number of rows of a log that are fitted, 50 a
+# second.
+JOINTS = (
+    "shoulder_pan",
+    "shoulder_lift",
+    "elbow_flex",
+    "wrist_flex",
+    "wrist_roll",
+    "gripper",
+)
+LOG_ROWS = 500
 
-# Time after which all plots of a report must stand [ms].
-PATIENCE = 120_000
-
-# Widths of the windows in which reports are looked at [pixels].
-WINDOW_WIDTHS = {"desktop": 1280, "phone": 390}
-
-# Colour schemes in which reports are looked at.
-SCHEMES: tuple[Literal["light", "dark"], ...] = ("light", "dark")
-
-# Moment of the simulated motion that Rerun shows [s].
-SHOWN_TIME = 1.5
-
-# What the pictures of the page show, by the begin of their names, in the order of the page. Other
-# pictures are for looking at.
+# What the pictures of the page show, by their names, in the order of the page. Others follow.
 CAPTIONS = {
     "check": "Predicted and wanted σ of every parameter, and the correlations of the estimates",
-    "pairs": "Joint uncertainty of the estimates of pairs of parameters",
-    "worth": "What each sensor tells, and what limits cost",
     "accuracy_over_time": "σ of every parameter by the measurements up to each time",
     "accuracy": "Predicted, achieved and wanted σ of every parameter, and published values",
     "trajectories": "Motion and controls",
     "limits": "How much of each limit the design uses",
+    "rehearsal": "What happens to robots that differ from the model",
+    "worth": "What each sensor tells, and what limits cost",
     "parameters": "Estimates with their 95 % intervals, relative to the nominal values",
     "fit": "Measured outputs, the identified and the nominal model, and the residuals",
     "held_out": "A recording that was not fitted, and its predictions",
     "predictions": "Errors of the predictions of what was not fitted, over the noise",
     "deciding_seconds": "Which seconds of the recordings decide each parameter",
     "residual_torque": "Torque of each joint that the model does not explain",
+    "pairs": "Joint uncertainty of the estimates of pairs of parameters",
     "overview": "Scatter of the estimates of many simulated recordings, and the Cramér–Rao bound",
-    "histogram_": "Estimates of one parameter in many simulated recordings",
+    "histogram": "Estimates of one parameter in many simulated recordings",
     "compare": "The design beside other excitations with the same time",
-    "playback": "Limits, errors and coverage of robots that differ from the model",
     "campaign": "σ and estimate of every parameter over the rounds",
-    "report-desktop-light": "The beginning of `report.html`",
-    "report-phone-dark": "The beginning of `report.html` on a phone, in dark colours",
-    "rerun-design": "`design.rrd` in the viewer",
-    "rerun-estimate": "`estimate.rrd` in the viewer",
 }
 
-# Code in HTML, for text in Markdown.
-CODE = r"<code>\1</code>"
+# Numbers of a text, and their exponents in small digits.
+NUMBERS = re.compile(r"\d[\d.]*(?:e[-+]?\d+)?|[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+")
 
-# Pictures that the page shows of one call only.
-ONCE = "report-phone-dark"
+# Largest difference of a number of the page that is no difference of versions, relative, and in
+# units of its last digit: kernels of linear algebra round differently.
+TOLERANCE, LAST_DIGIT = 0.01, 1.001
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,15 +104,13 @@ class Step:
     """One call of the command line.
 
     Attributes:
-        verb: The verb.
-        words: Its arguments; `{experiment}`, the experiment with the `{robot}`'s values, and the
-            folder `{out}` are filled in.
-        folder: Folder of the results below that of the robot; None if the verb writes one file.
+        words: The verb and its arguments; `{experiment}`, the experiment with the `{robot}`'s
+            values, and the folder `{out}` are filled in.
+        is_quick: Whether it takes so little time that `--check` makes the call again.
     """
 
-    verb: str
-    words: tuple[str, ...]
-    folder: str | None = None
+    words: str
+    is_quick: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,22 +118,27 @@ class Robot:
     """A robot of the gallery.
 
     Attributes:
-        name: Short name, for folders.
         title: Title on the page.
-        text: One sentence on what is shown.
+        text: What is shown.
+        source: Experiment file, or the model for which `mjfim init` writes one.
         steps: Calls of the command line.
-        experiment: Experiment file; None if `mjfim init` writes one for `model`.
-        model: Model file for `mjfim init`.
-        needs: Files that have to exist.
+        iterations: Number of iterations of a design for an experiment of `init`; 0 for none.
+        needs_floor: Whether a floor is added to the model.
+        log: Folder of a measured log, which the calls find as `{out}/log.csv`; empty for none.
     """
 
-    name: str
     title: str
     text: str
+    source: str
     steps: tuple[Step, ...]
-    experiment: Path | None = None
-    model: Path | None = None
-    needs: tuple[Path, ...] = ()
+    iterations: int = 0
+    needs_floor: bool = False
+    log: str = ""
+
+    @property
+    def name(self) -> str:
+        """Short name, for folders."""
+        return self.title.lower().replace(" ", "-")
 
 
 @dataclass(kw_only=True)
@@ -153,179 +148,135 @@ class Shown:
     Attributes:
         command: The command, with short paths.
         code: Exit code.
-        seconds: Duration [s].
         terminal: What was printed on stdout; the messages on stderr where that is nothing.
         pictures: Pictures by name.
     """
 
     command: str
     code: int
-    seconds: float
     terminal: str
     pictures: dict[str, Path] = field(default_factory=dict)
 
-
-def _design_steps(*further: Step) -> tuple[Step, ...]:
-    """The calls from a check to an estimate from a simulated recording."""
-    return (
-        Step(verb="check", words=("{experiment}", "-o", "{out}/check"), folder="check"),
-        Step(verb="design", words=("{experiment}", "-o", "{out}/design"), folder="design"),
-        Step(verb="simulate", words=("{robot}", "{out}/design", "-o", "{out}/recording.csv")),
-        Step(
-            verb="identify",
-            words=("{experiment}", "{out}/recording.csv", "-o", "{out}/identify"),
-            folder="identify",
-        ),
-        *further,
-    )
+    @property
+    def verb(self) -> str:
+        """The verb of the call."""
+        return self.command.split()[1]
 
 
-def robots(models: Path, data: Path) -> tuple[Robot, ...]:
-    """Return the robots of the gallery.
+CHECK = Step(words="check {experiment} -o {out}/check", is_quick=True)
+DESIGN = Step(words="design {experiment} -o {out}/design")
+RECORDING = (
+    Step(words="simulate {robot} {out}/design -o {out}/log.csv"),
+    Step(words="identify {experiment} {out}/log.csv --predicted {out}/design -o {out}/identify"),
+)
 
-    Args:
-        models: Folder of models of others.
-        data: Folder of recordings of others.
-    """
-    own = ROOT / "models"
-    panda = models / "menagerie_panda" / "panda_nohand_nomesh.xml"
-    so_arm = models / "menagerie_so_arm100" / "so_arm100_nomesh.xml"
-    logs = [data / "dfki_double_pendulum" / f"A0_0{i}.csv.gz" for i in range(3)]
 
-    montecarlo = Step(
-        verb="montecarlo",
-        words=("{experiment}", "{out}/design", "-o", "{out}/montecarlo"),
-        folder="montecarlo",
-    )
-    compare = Step(
-        verb="compare",
-        words=("{experiment}", "-o", "{out}/compare", "--seconds", "5"),
-        folder="compare",
-    )
-    rehearse = Step(
-        verb="rehearse",
-        words=("{out}/design", "-o", "{out}/rehearse", "--robots", "300"),
-        folder="rehearse",
-    )
-    campaign = Step(
-        verb="campaign",
-        words=("{experiment}", "-o", "{out}/campaign", "--wanted", "0.005", "--rounds", "4"),
-        folder="campaign",
-    )
-
-    return (
-        Robot(
-            name="cart-pendulum",
-            title="Cart-pendulum",
-            text="The study of the paper: mass, length and damping of a pendulum on a cart.",
-            experiment=own / "cart_pendulum.toml",
-            steps=_design_steps(montecarlo, compare, rehearse, campaign),
+ROBOTS = (
+    Robot(
+        title="Cart-pendulum",
+        text="The study of the paper: mass, length and damping of a pendulum on a cart.",
+        source="models/cart_pendulum.toml",
+        steps=(
+            CHECK,
+            Step(words=DESIGN.words, is_quick=True),
+            *(Step(words=step.words, is_quick=True) for step in RECORDING),
+            Step(words="montecarlo {experiment} {out}/design -o {out}/montecarlo"),
+            Step(words="compare {experiment} --seconds 5 -o {out}/compare"),
+            Step(words="campaign {experiment} --wanted 0.005 --rounds 3 -o {out}/campaign"),
         ),
-        Robot(
-            name="servo-arm",
-            title="Servo arm",
-            text="Two joints with position servos, and limits of position, velocity and force.",
-            experiment=own / "servo_arm.toml",
-            steps=_design_steps(montecarlo, rehearse),
-        ),
-        Robot(
-            name="quadrotor",
-            title="Quadrotor",
-            text="A free body with four rotors.",
-            experiment=own / "quadrotor.toml",
-            steps=_design_steps(),
-        ),
-        Robot(
-            name="panda",
-            title="Panda",
-            text="A seven-joint arm, with the experiment that `mjfim init` writes.",
-            model=panda,
-            needs=(panda,),
-            steps=_design_steps(),
-        ),
-        Robot(
-            name="so-arm100",
-            title="SO-ARM100",
-            text="A table-top arm with servos, with the experiment that `mjfim init` writes.",
-            model=so_arm,
-            needs=(so_arm,),
-            steps=_design_steps(),
-        ),
-        Robot(
-            name="dfki-double-pendulum",
-            title="DFKI double pendulum",
-            text="Three measured logs of a real double pendulum; the third one is predicted.",
-            experiment=own / "dfki_double_pendulum.toml",
-            needs=tuple(logs),
-            steps=(
-                Step(
-                    verb="check",
-                    words=("{experiment}", str(logs[0]), str(logs[1]), "-o", "{out}/check"),
-                    folder="check",
-                ),
-                Step(
-                    verb="identify",
-                    words=(
-                        "{experiment}",
-                        *(str(log) for log in logs[:2]),
-                        "--held-out",
-                        str(logs[2]),
-                        "-o",
-                        "{out}/identify",
-                    ),
-                    folder="identify",
-                ),
-            ),
-        ),
-    )
+    ),
+    Robot(
+        title="Servo arm",
+        text="Four joints with position servos, whose gains are known to a tenth only.",
+        source="models/servo_arm.toml",
+        steps=(CHECK, DESIGN, *RECORDING),
+    ),
+    Robot(
+        title="SO-101",
+        text="A table-top arm with six servos, with the experiment that `mjfim init` writes.",
+        source="shared/models/so101/so101_nomesh.xml",
+        iterations=10,
+        steps=(CHECK, DESIGN, *RECORDING),
+    ),
+    Robot(
+        title="Go2",
+        text="A robot on legs on a floor, with the experiment that `mjfim init` writes.",
+        source="shared/models/go2/go2_nomesh.xml",
+        needs_floor=True,
+        iterations=5,
+        steps=(CHECK, DESIGN),
+    ),
+    Robot(
+        title="Measured SO-101",
+        text="A log of a real SO-101, a chirp of all joints, and the model as it is published.",
+        source="shared/models/so101/so101_nomesh.xml",
+        log="shared/data/sage_so101/chirp_sweep",
+        steps=(Step(words="identify {experiment} {out}/log.csv -o {out}/identify"),),
+    ),
+)
 
 
 # ---- calls
 
 
-def show_robot(robot: Robot, folder: Path) -> Iterator[Shown]:
-    """Make all calls for one robot, in turn.
+def show_robot(robot: Robot, root: Path, *, is_quick: bool = False) -> Iterator[Shown]:
+    """Make the calls for one robot, in turn.
 
     Args:
         robot: The robot.
-        folder: Fresh folder for its files.
+        root: Folder in which the calls are made.
+        is_quick: Whether only quick calls are made.
 
     Yields:
         What each call left behind.
     """
-    folder.mkdir(parents=True)
-    experiment = robot.experiment
-    if experiment is None:
-        experiment = folder / f"{robot.name}.toml"
-        init = Step(verb="init", words=(str(robot.model), "-o", str(experiment)))
-        yield _call(init, {}, folder.parent)
+    steps = [step for step in robot.steps if step.is_quick or not is_quick]
+    if not steps:
+        return
+    (root / robot.name).mkdir()
+    experiment = model = robot.source
+    if robot.needs_floor:
+        model = f"{robot.name}/scene.xml"
+        (root / model).write_text(FLOOR.format(robot.source), encoding="utf-8")
+    if model.endswith(".xml"):
+        experiment = f"{robot.name}/experiment.toml"
+        yield _call(["init", model, "-o", experiment], root)
+        if robot.iterations:
+            _end_after(root / experiment, robot.iterations)
+    if robot.log:
+        write_log(root / robot.log, root / robot.name / "log.csv")
+    for step in steps:
+        values = {"experiment": experiment, "out": robot.name}
+        if "{robot}" in step.words:
+            values["robot"] = simulated_robot(root, experiment, robot.name)
+        yield _call([word.format(**values) for word in step.words.split()], root)
 
-    values = {"experiment": experiment, "robot": experiment, "out": folder}
-    for step in robot.steps:
-        if step.verb == "simulate":
-            values["robot"] = simulated_robot(experiment, folder)
-        shown = _call(step, values, folder.parent)
-        if step.folder is not None:
-            shown.pictures = _pictures(folder / step.folder)
-        yield shown
+
+def _end_after(experiment: Path, count: int) -> None:
+    """State in an experiment after how many iterations a design ends, whatever time they take."""
+    stated = tomlkit.parse(experiment.read_text(encoding="utf-8"))
+    descent: dict[str, Any] = stated.setdefault("descent", {})
+    descent.update(max_iterations=count, seconds=PATIENCE)
+    experiment.write_text(tomlkit.dumps(stated), encoding="utf-8")
 
 
-def simulated_robot(experiment: Path, folder: Path) -> Path:
+def simulated_robot(root: Path, experiment: str, out: str) -> str:
     """Write an experiment whose robot differs from its model.
 
     Parameters without a prior or a stated true value differ by a share of their size, up and down
     in turn.
 
     Args:
+        root: Folder in which the calls are made.
         experiment: Experiment file.
-        folder: Folder of the robot, with the result of a check.
+        out: Folder of the robot, with the result of a check.
 
     Returns:
         The file; `experiment` itself where all parameters have a stated value.
     """
-    check = json.loads((folder / "check" / "check.json").read_text(encoding="utf-8"))
+    check = json.loads((root / out / "check" / "check.json").read_text(encoding="utf-8"))
     rows = {row["name"]: row for row in check["parameters"]}
-    stated = tomlkit.parse(experiment.read_text(encoding="utf-8"))
+    stated = tomlkit.parse((root / experiment).read_text(encoding="utf-8"))
     tables: dict[str, Any] = stated["parameters"]
     open_ones = [name for name, table in tables.items() if not {"true", "prior"} & set(table)]
     if not open_ones:
@@ -334,138 +285,46 @@ def simulated_robot(experiment: Path, folder: Path) -> Path:
     for i, name in enumerate(open_ones):
         change = ROBOT_DIFFERENCE * (-1) ** i
         tables[name]["true"] = float(f"{rows[name]['value'] + change * rows[name]['size']:.4g}")
-    model = experiment.parent / str(stated["model"])
-    stated["model"] = os.path.relpath(model, folder)
-    robot = folder / f"{experiment.stem}_robot.toml"
-    robot.write_text(tomlkit.dumps(stated), encoding="utf-8")
+    stated["model"] = os.path.relpath((root / experiment).parent / str(stated["model"]), root / out)
+    robot = f"{out}/robot.toml"
+    (root / robot).write_text(tomlkit.dumps(stated), encoding="utf-8")
     return robot
 
 
-def _call(step: Step, values: Mapping[str, Path], root: Path) -> Shown:
-    """Call a verb as a user does; paths below `root` are shown relative to it."""
-    words = [word.format(**values) if "{" in word else word for word in step.words]
+def write_log(source: Path, target: Path) -> None:
+    """Write the beginning of a log of the SO-101 as CSV: commands and measured angles [rad].
+
+    Args:
+        source: Folder of the log, with a JSON array of all joints in each row.
+        target: The CSV file.
+    """
+    columns: dict[str, Any] = {}
+    for file, name in (("control", "ctrl"), ("state_motor", "qpos")):
+        with gzip.open(source / f"{file}.csv.gz", "rt", encoding="utf-8") as opened:
+            rows = list(csv.DictReader(opened))[:LOG_ROWS]
+        columns["t"] = [
+            1e-6 * (float(row["timestamp"]) - float(rows[0]["timestamp"])) for row in rows
+        ]
+        angles = np.array([json.loads(row["positions"]) for row in rows])
+        columns |= {f"{name}:{joint}": angles[:, k] for k, joint in enumerate(JOINTS)}
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(target, table, "%.6f", delimiter=",", header=",".join(columns), comments="")
+
+
+def _call(words: Sequence[str], root: Path) -> Shown:
+    """Call a verb as a user does, and collect what it printed and drew."""
     variables = {"PYTHONPATH": str(ROOT), "COLUMNS": str(COLUMNS)}
     begun = time.perf_counter()
-    ended = call_verb([step.verb, *words], variables=variables, patience=PATIENCE)
+    ended = call_verb(words, variables=variables, patience=PATIENCE, folder=root)
+    command = shlex.join(["mjfim", *words])
     seconds = time.perf_counter() - begun
-
-    command = shlex.join(["mjfim", step.verb, *(_short(word) for word in words)])
     print(f"{command}: exit code {ended.returncode}, {seconds:.0f} s", file=sys.stderr)
-    printed = ended.stdout.rstrip() or (ended.stderr.rstrip() if ended.returncode else "")
     return Shown(
         command=command,
         code=ended.returncode,
-        seconds=seconds,
-        terminal=_without_long_paths(printed, root),
+        terminal=ended.stdout.rstrip() or (ended.stderr.rstrip() if ended.returncode else ""),
+        pictures={file.stem: file for file in sorted((root / words[-1]).glob("*.png"))},
     )
-
-
-def _short(word: str) -> str:
-    """Return the last two parts of a path; other words as they are."""
-    path = Path(word)
-    return "/".join(path.parts[-2:]) if path.is_absolute() else word
-
-
-def _without_long_paths(text: str, root: Path) -> str:
-    """Return what was printed, without the folder of the results and that of this checkout."""
-    return text.replace(f"{root}/", "").replace(f"{ROOT}/", "")
-
-
-def keep_calls(calls: Sequence[Shown], folder: Path) -> None:
-    """Write what the calls for a robot left behind into its folder."""
-    kept = [asdict(call) for call in calls]
-    for call in kept:
-        named = call["pictures"].items()
-        call["pictures"] = {name: path.relative_to(folder).as_posix() for name, path in named}
-    (folder / CALLS).write_text(json.dumps(kept, indent=2), encoding="utf-8")
-
-
-def kept_calls(folder: Path) -> list[Shown]:
-    """Read what the calls for a robot left behind in an earlier run."""
-    calls = [Shown(**call) for call in json.loads((folder / CALLS).read_text(encoding="utf-8"))]
-    for call in calls:
-        call.pictures = {name: folder / path for name, path in call.pictures.items()}
-    return calls
-
-
-# ---- pictures
-
-
-def _pictures(folder: Path) -> dict[str, Path]:
-    """Collect the pictures of a folder of results, with screenshots of its report and viewer."""
-    pictures = {picture.stem: picture for picture in sorted(folder.glob("*.png"))}
-
-    report = folder / "report.html"
-    if report.is_file():
-        pictures |= report_screenshots(report, folder / "screenshots")
-    for recording in sorted(folder.glob("*.rrd")):
-        picture = folder / "screenshots" / f"rerun-{recording.stem}.png"
-        picture.parent.mkdir(exist_ok=True)
-        try:
-            screenshot(Shot(rrd=recording, time_s=SHOWN_TIME), picture)
-        except ConnectionError as error:
-            print(f"{recording}: no viewer: {error}", file=sys.stderr)
-        else:
-            pictures[picture.stem] = picture
-    return pictures
-
-
-def report_screenshots(report: Path, folder: Path) -> dict[str, Path]:
-    """Save pictures of a whole report at several widths and in both colour schemes.
-
-    Args:
-        report: The report.
-        folder: Folder for the pictures.
-
-    Returns:
-        The pictures by name; none where no browser can start.
-    """
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        browser = None
-    if browser is None:
-        print(f"{report}: playwright and an installed browser are needed", file=sys.stderr)
-        return {}
-
-    folder.mkdir(exist_ok=True)
-    pictures = {}
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
-        for window, width in WINDOW_WIDTHS.items():
-            for scheme in SCHEMES:
-                page = opened.new_page(
-                    viewport={"width": width, "height": 800}, color_scheme=scheme
-                )
-                page.goto(report.resolve().as_uri())
-                page.wait_for_selector("body[data-ready=yes]", timeout=PATIENCE)
-                page.wait_for_timeout(500)
-                picture = folder / f"report-{window}-{scheme}.png"
-                page.screenshot(path=str(picture), full_page=True)
-                pictures[picture.stem] = picture
-                page.close()
-        opened.close()
-    return pictures
-
-
-def for_page(picture: Path, target: Path) -> int:
-    """Write a small copy of a picture; only the beginning of a long one.
-
-    Args:
-        picture: The picture.
-        target: File to write.
-
-    Returns:
-        The width of the copy [pixels].
-    """
-    with Image.open(picture) as opened:
-        image = opened.convert("RGB")
-    if image.height > SHOWN_HEIGHT * image.width:
-        image = image.crop((0, 0, image.width, int(SHOWN_HEIGHT * image.width)))
-    image.thumbnail((PAGE_WIDTH, image.height))
-    image.quantize(PAGE_COLOURS).save(target, optimize=True)
-    return image.width
 
 
 # ---- page
@@ -478,25 +337,27 @@ hide:
 
 # Gallery
 
-Every output of mjfim for several robots: what the terminal prints, the pictures, the beginning of
-`report.html`, and the files of the viewer. The page is made by
+What mjfim prints and draws for several robots. Every result also has a `report.html`, whose plots
+can be hovered and zoomed, and a design or an estimate a file for the viewer. The page is made by
 
 <!-- not run: needs models and logs of others -->
 
 ```sh
-python -m scripts.gallery --models FOLDER --data FOLDER \\
-    -o out/gallery --page docs/gallery.md
+python -m scripts.gallery
 ```
 
 The colours mean the same everywhere: {colours}
-([words and colours](reference/words-and-colours.md)). Pictures of reports end where their first
-screens end; the reports themselves have plots to hover and zoom.
+([words and colours](reference/words-and-colours.md)).
 """
 
-# What is said of the simulated recordings of a robot.
+# What is said of the simulated recordings of a robot, and of its designs.
 SIMULATED = (
     "Its recordings are simulated: the robot's parameters differ from the model by "
     f"{100 * ROBOT_DIFFERENCE:.0f} % of their sizes, unless they are known beforehand."
+)
+ITERATIONS = (
+    "So that its numbers do not depend on the computer, the design ends after {} iterations, far "
+    "from the best one."
 )
 
 
@@ -517,136 +378,127 @@ def write_page(page: Path, shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> No
     parts = [
         "\n".join(textwrap.wrap(line, 100)) for line in HEAD.format(colours=colours).split("\n")
     ]
-    parts.append(_contents(shown))
-    once = True
+    parts += ["| robot | results |", "|---|---|"]
     for robot, calls in shown:
-        parts += [f"## {robot.title}", "", *textwrap.wrap(robot_text(robot, calls), 100), ""]
-        for call in calls:
-            parts += [_section(robot, call, images, once=once)]
-            once &= ONCE not in call.pictures
+        links = [f"[{call.verb}](#{robot.name}-{call.verb})" for call in calls]
+        parts.append(f"| {robot.title} | {', '.join(links)} |")
+    parts.append("")
+    for robot, calls in shown:
+        text = robot.text
+        if any("robot.toml" in call.command for call in calls):
+            text += f" {SIMULATED}"
+        if robot.iterations:
+            text += f" {ITERATIONS.format(robot.iterations)}"
+        parts += [f"## {robot.title}", "", *textwrap.wrap(text, 100), ""]
+        parts += [_section(robot, call, images) for call in calls]
     page.write_text("\n".join(parts), encoding="utf-8")
 
 
-def robot_text(robot: Robot, calls: Sequence[Shown]) -> str:
-    """Return the sentences below the name of a robot."""
-    is_other = any("_robot.toml" in call.command for call in calls)
-    return f"{robot.text} {SIMULATED}" if is_other else robot.text
-
-
-def _contents(shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> str:
-    """Return a table with a link to every call of every robot."""
-    lines = ["| robot | results |", "|---|---|"]
-    for robot, calls in shown:
-        links = [f"[{_verb(call)}](#{_anchor(robot, _verb(call))})" for call in calls]
-        lines.append(f"| {robot.title} | {', '.join(links)} |")
-    return "\n".join([*lines, ""])
-
-
-def _verb(call: Shown) -> str:
-    """Return the verb of a call."""
-    return call.command.split()[1]
-
-
-def _anchor(robot: Robot, verb: str) -> str:
-    """Return the anchor of a section, as the documentation names it."""
-    return f"{robot.title}-{verb}".lower().replace(" ", "-")
-
-
-def terminal_block(call: Shown) -> str:
-    """Return a command and what it printed, as a terminal of the usual width shows them."""
+def command_of(call: Shown) -> str:
+    """Return the command of a call as a terminal of the usual width shows it."""
     # A command continues on the next line behind a backslash.
-    command = textwrap.wrap(
+    lines = textwrap.wrap(
         f"$ {call.command}",
         COLUMNS - 2,
         subsequent_indent="    ",
         break_long_words=False,
         break_on_hyphens=False,
     )
-    lines = [" \\\n".join(command)]
+    return " \\\n".join(lines)
+
+
+def _section(robot: Robot, call: Shown, images: Path) -> str:
+    """Describe one call: the command, what the terminal printed, and the pictures."""
+    lines = [f"### {robot.title}: {call.verb}", "", "```text", command_of(call)]
     for line in call.terminal.splitlines():
         indent = " " * (len(line) - len(line.lstrip()))
         lines += textwrap.wrap(line, COLUMNS, subsequent_indent=indent) or [""]
-    return "\n".join(["```text", *lines, "```", ""])
-
-
-def _section(robot: Robot, call: Shown, images: Path, *, once: bool) -> str:
-    """Describe one call: the command, what the terminal printed, and the pictures.
-
-    With `once`, the pictures are shown that the page has only once.
-    """
-    verb = _verb(call)
-    lines = [f"### {robot.title}: {verb}", "", terminal_block(call)]
+    lines += ["```", ""]
     if call.code == 1:
         lines += ["Exit code 1: the run is complete, and did not reach its goal.", ""]
 
-    for start, caption in CAPTIONS.items():
-        found = [name for name in call.pictures if _shows(name, start)]
-        if not found or (start == ONCE and not once):
+    # Of several pictures of a kind, such as one for each recording, the first one is shown.
+    kinds: dict[str, list[str]] = {kind: [] for kind in CAPTIONS}
+    for name in call.pictures:
+        kinds.setdefault(kind_of_picture(name), []).append(name)
+    for kind, found in kinds.items():
+        if not found:
             continue
-
-        target = images / f"{robot.name}-{verb}-{found[0]}.png"
-        width = for_page(call.pictures[found[0]], target)
-        alt = f"{robot.title}, {verb}: {caption.replace('`', '')}"
+        target = images / f"{robot.name}-{call.verb}-{kind}.png"
+        with Image.open(call.pictures[found[0]]) as opened:
+            image = opened.convert("RGB")
+        image.thumbnail((PAGE_WIDTH, image.height))
+        image.quantize(PAGE_COLOURS).save(target, optimize=True)
+        caption = CAPTIONS.get(kind, f"{kind}.png")
         more = f" (one of {len(found)})" if len(found) > 1 else ""
+        alt = f"{robot.title}, {call.verb}: {caption}"
         lines += [
             '<figure markdown="span">',
-            f'![{alt}](images/gallery/{target.name}){{ width="{width}" loading="lazy" }}',
-            f"<figcaption>{re.sub('`(.+?)`', CODE, caption)}{more}</figcaption>",
+            f'![{alt}](images/gallery/{target.name}){{ width="{image.width}" loading="lazy" }}',
+            f"<figcaption>{caption}{more}</figcaption>",
             "</figure>",
             "",
         ]
     return "\n".join(lines)
 
 
-def _shows(name: str, start: str) -> bool:
-    """Return whether a picture is of a kind: its name is the kind's, perhaps with a number."""
-    return (
-        name == start
-        or (name.startswith(start) and start.endswith("_"))
-        or (name.removeprefix(f"{start}_").isdecimal() and name.startswith(start))
-    )
+def differences(page: str, call: Shown) -> list[str]:
+    """Say which numbers of a page differ from those that a call prints.
+
+    Args:
+        page: Text of the page.
+        call: The call.
+    """
+    _, found, rest = page.partition(f"```text\n{command_of(call)}\n")
+    if not found:
+        return [f"{call.command}: is not on the page"]
+    shown, printed = (NUMBERS.findall(text) for text in (rest.partition("```")[0], call.terminal))
+    if len(shown) != len(printed):
+        return [f"{call.command}: {len(shown)} numbers on the page, {len(printed)} are printed"]
+    pairs = zip(shown, printed, strict=True)
+    return [f"{call.command}: {old} is now {new}" for old, new in pairs if not _is_same(old, new)]
 
 
-def _new_calls(robot: Robot, folder: Path, parser: argparse.ArgumentParser) -> list[Shown]:
-    """Make the calls for a robot; none if its files are missing."""
-    missing = [path for path in robot.needs if not path.exists()]
-    if missing:
-        print(f"{robot.name}: left out, {missing[0]} does not exist", file=sys.stderr)
-        return []
-    if folder.exists():
-        parser.error(f"{folder} exists; every robot needs a fresh folder")
-    calls = list(show_robot(robot, folder))
-    keep_calls(calls, folder)
-    return calls
+def _is_same(old: str, new: str) -> bool:
+    """Return whether two printed numbers differ by no more than kernels of linear algebra do."""
+    if old == new or not old[0].isascii() or not new[0].isascii():
+        return old == new
+    mantissa, _, power = old.partition("e")
+    digit = 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
+    return abs(float(new) - float(old)) <= TOLERANCE * abs(float(old)) + LAST_DIGIT * digit
 
 
 def main() -> int:
-    """Make the gallery; exit code 1 if a call ended with misuse."""
+    """Make the gallery, or compare its numbers; exit code 1 if a call fails or they differ."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--models", type=Path, default=Path("../shared/models"))
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("-o", "--output", type=Path, default=Path("out/gallery"))
-    parser.add_argument("--page", type=Path, help="page in Markdown to write")
-    parser.add_argument("--only", nargs="+", metavar="ROBOT", help="names of robots")
-    parser.add_argument("--reuse", action="store_true", help="use the files of an earlier run")
+    parser.add_argument("--shared", type=Path, default=ROOT.parent / "shared")
+    parser.add_argument("--check", action="store_true", help="compare the numbers of the page")
     options = parser.parse_args()
 
-    found = []
-    for robot in robots(options.models.resolve(), options.data.resolve()):
-        folder = options.output.resolve() / robot.name
-        if options.only and robot.name not in options.only:
-            continue
-        calls = kept_calls(folder) if options.reuse else _new_calls(robot, folder, parser)
-        if calls:
-            found.append((robot, calls))
-
-    if options.page is not None:
-        write_page(options.page, found)
-    summary = {robot.name: {call.command: call.code for call in calls} for robot, calls in found}
-    print(json.dumps(summary, indent=2))
-    return 1 if any(call.code == 2 for _, calls in found for call in calls) else 0
+    page = PAGE.read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory() as name:
+        root, shown = Path(name), []
+        (root / "models").symlink_to(ROOT / "models")
+        (root / "shared").symlink_to(options.shared.resolve())
+        for robot in ROBOTS:
+            missing = [path for path in (robot.source, robot.log) if not (root / path).exists()]
+            if missing and not options.check:
+                parser.error(f"{options.shared}: there is no {missing[0]}")
+            if not missing:
+                shown.append((robot, list(show_robot(robot, root, is_quick=options.check))))
+        calls = [call for _, calls in shown for call in calls]
+        faults = [f"{call.command}: exit code {call.code}" for call in calls if call.code > 1]
+        if options.check:
+            faults += [sentence for call in calls for sentence in differences(page, call)]
+        elif not faults:
+            write_page(PAGE, shown)
+    for fault in faults:
+        print(fault, file=sys.stderr)
+    if faults and options.check:
+        print(f"{PAGE} is stale: make it again with `python -m scripts.gallery`", file=sys.stderr)
+    return 1 if faults else 0
 
 
 if __name__ == "__main__":

@@ -1,82 +1,90 @@
-"""The page of the gallery: text of one width, no absolute paths, pictures with their texts."""
+"""The page of the gallery: text of one width, no absolute paths, and numbers of this version."""
 
 from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import tomlkit
 from PIL import Image
 
-from scripts.gallery import (
-    COLUMNS,
-    PAGE_WIDTH,
-    SHOWN_HEIGHT,
-    Robot,
-    Shown,
-    keep_calls,
-    kept_calls,
-    simulated_robot,
-    write_page,
-)
+from scripts import gallery
+from scripts.gallery import COLUMNS, PAGE_WIDTH, Robot, Shown, differences, write_page
 from tests.support.markdown import code_blocks
 
 
-def made_calls(folder: Path) -> list[Shown]:
-    """Make the calls of a robot, with pictures of several sizes."""
+def made_call(folder: Path) -> Shown:
+    """A call with pictures of several sizes."""
     pictures = {}
     for name, size in (
-        ("check", (1100, 100)),
         ("histogram_a", (60, 40)),
         ("histogram_b", (60, 40)),
-        ("report-desktop-light", (320, 1500)),
-        ("report-desktop-dark", (320, 200)),
+        ("fit_1", (60, 40)),
+        ("fit_2", (60, 40)),
+        ("a_new_one", (60, 40)),
+        ("check", (1100, 100)),
     ):
-        pictures[name] = folder / "check" / f"{name}.png"
-        pictures[name].parent.mkdir(parents=True, exist_ok=True)
+        pictures[name] = folder / f"{name}.png"
         Image.new("RGB", size, "white").save(pictures[name])
     long_words = " ".join(f"arm/log_{i}.csv" for i in range(12))
-    return [
-        Shown(
-            command=f"mjfim check arm.toml {long_words} -o arm/check",
-            code=1,
-            seconds=1.0,
-            terminal=f"{'word ' * 40}\n  • {'point ' * 30}\n\nlast",
-            pictures=pictures,
-        )
-    ]
+    return Shown(
+        command=f"mjfim check arm.toml {long_words} -o arm/check",
+        code=1,
+        terminal=f"{'word ' * 40}\n  • {'point ' * 30}\n\nσ = 2.4×10⁻³ kg, 5.0 %, 1e-07, 95",
+        pictures=pictures,
+    )
 
 
 def test_the_page_has_short_lines_links_and_small_pictures(tmp_path: Path) -> None:
-    robot = Robot(name="arm", title="Some arm", text="An arm.", steps=())
-    calls = made_calls(tmp_path / "arm")
-    keep_calls(calls, tmp_path / "arm")
-    assert kept_calls(tmp_path / "arm") == calls
-
+    robot = Robot(title="Some arm", text="An arm.", source="arm.toml", steps=())
     page = tmp_path / "docs" / "gallery.md"
     page.parent.mkdir()
-    write_page(page, [(robot, calls)])
+    write_page(page, [(robot, [made_call(tmp_path)])])
     text = page.read_text(encoding="utf-8")
-    blocks = [block for block in code_blocks(page) if block.language == "text"]
-    assert len(blocks) == 1
-    assert max(map(len, blocks[0].text.splitlines())) <= COLUMNS
+    (block,) = [block for block in code_blocks(page) if block.language == "text"]
+    assert max(map(len, block.text.splitlines())) <= COLUMNS
     assert str(tmp_path) not in text
-    assert "(#some-arm-check)" in text
+    assert "(#some-arm-check)" in text and "### Some arm: check\n" in text
     assert "Exit code 1" in text
 
-    # Pictures of a kind are shown once; screenshots in other colours are for looking at.
+    # Pictures of a kind are shown once, and those without a caption as well.
     found = re.findall(r"!\[(.+)\]\((.+)\)\{ width=\"(\d+)\"", text)
-    names = [Path(target).name for _, target, _ in found]
-    assert names == [
-        "arm-check-check.png",
-        "arm-check-histogram_a.png",
-        "arm-check-report-desktop-light.png",
-    ]
+    kinds = [Path(target).stem.removeprefix("some-arm-check-") for _, target, _ in found]
+    assert kinds == ["check", "fit", "histogram", "a_new_one"]
     for _, target, width in found:
         with Image.open(page.parent / target) as picture:
             assert picture.width == int(width) <= PAGE_WIDTH
-            assert picture.height <= SHOWN_HEIGHT * picture.width + 1
+
+
+def test_numbers_that_differ_from_those_of_the_page_are_named(tmp_path: Path) -> None:
+    """One percent or one unit of the last digit may come from another kernel."""
+    robot, call = Robot(title="Arm", text="", source="", steps=()), made_call(tmp_path)
+    page = tmp_path / "gallery.md"
+    write_page(page, [(robot, [call])])
+    text = page.read_text(encoding="utf-8")
+    for old, new, is_stale in (
+        ("5.0 %", "5.1 %", False),
+        ("5.0 %", "5.2 %", True),
+        ("1e-07", "2e-07", False),
+        ("1e-07", "3e-07", True),
+        ("2.4×10⁻³", "2.4×10⁻⁴", True),
+        (", 95", ", 96", False),
+        (", 95", "", True),
+    ):
+        now = replace(call, terminal=call.terminal.replace(old, new))
+        assert bool(differences(text, now)) == is_stale, (old, new)
+    assert differences("", call) == [f"{call.command}: is not on the page"]
+
+
+@pytest.mark.slow
+def test_the_numbers_of_the_page_are_those_of_this_version(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["gallery", "--check"])
+    assert gallery.main() == 0, capsys.readouterr().err
 
 
 def test_the_simulated_robot_differs_where_nothing_is_known(tmp_path: Path) -> None:
@@ -87,12 +95,13 @@ def test_the_simulated_robot_differs_where_nothing_is_known(tmp_path: Path) -> N
         'c = { target = "z", prior = 0.1 }\n[parameters.d]\ntarget = "w"\ntrue = 3.0\n',
         encoding="utf-8",
     )
-    folder = tmp_path / "out" / "arm"
+    folder = tmp_path / "arm"
     (folder / "check").mkdir(parents=True)
     rows = [{"name": name, "value": -1.0, "size": 2.0} for name in "abcd"]
     (folder / "check" / "check.json").write_text(json.dumps({"parameters": rows}))
 
-    robot = tomlkit.parse(simulated_robot(experiment, folder).read_text("utf-8")).unwrap()
+    file = tmp_path / gallery.simulated_robot(tmp_path, "models/arm.toml", "arm")
+    robot = tomlkit.parse(file.read_text("utf-8")).unwrap()
     values = {name: table.get("true") for name, table in robot["parameters"].items()}
     assert values == {"a": -0.8, "b": -1.2, "c": None, "d": 3.0}
     assert (folder / robot["model"]).resolve() == experiment.parent.resolve() / "arm.xml"

@@ -30,6 +30,7 @@ from mjfim.errors import (
     UndrawnWarning,
     UnfinishedError,
     WrongLogError,
+    first_ones,
 )
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
@@ -257,9 +258,9 @@ class Run:
         further: Mapping[str, object] = NOTHING,
         sections: Iterable[Section] = (),
         verdict: str = "",
-        remark: str = "",
+        remarks: Iterable[str] = (),
     ) -> None:
-        """Write the files of a result where there is a folder, print it, and say where it is.
+        """Write the files of a result where there is a folder, print it, and draw its pictures.
 
         Args:
             result: The result.
@@ -269,18 +270,17 @@ class Run:
             sections: Further sections of the printed page.
             verdict: Sentence for those who do not read the result on their terminal; default: that
                 of the page, where the result is bad.
-            remark: What is said behind the name of the folder.
+            remarks: Sentences that follow the name of the folder.
         """
         from mjfim.output.archive import summary_with_origin
         from mjfim.output.pages import page_of
 
-        remarks: Iterable[str] = ()
         try:
             if self.output:
-                with writing(self.output):
-                    from mjfim.output.folders import write_result  # imports matplotlib
+                with writing(self.output, "files"):
+                    from mjfim.output.folders import write_result  # slow to import
 
-                    remarks = write_result(self.output, result, system, self.pictures, further)
+                    lacks, draw = write_result(self.output, result, system, self.pictures, further)
         finally:
             # It is printed after it is written, also where it cannot be written.
             source = None if system is None else system.experiment.source
@@ -292,10 +292,18 @@ class Run:
                 verdict = verdict or page.verdict.text
             if verdict and (self.as_json or not out.is_terminal):
                 say_from_program(verdict)
-        for sentence in remarks:
-            say(f"warning: {sentence}")
         if self.output:
-            say_written(self.output, remark)
+            for sentence in lacks:
+                say(f"warning: {sentence}")
+            say_written(self.output)
+        for sentence in remarks:
+            say(sentence)
+        if self.output:
+            with writing(self.output, "pictures"):
+                left = draw()
+            if left:
+                folder = shlex.quote(str(self.output))
+                say(f"not drawn: {first_ones(left)}; `mjfim report {folder} --pictures` draws all")
 
 
 def print_result(
@@ -386,19 +394,19 @@ def keep_result(folder: Path | None = None) -> None:
 
 
 @contextmanager
-def writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path, what: str = "files and pictures") -> Iterator[None]:
     """Create a folder for results, keep them from Ctrl-C, and show which files are written."""
     keep_result()
-    with progress("writing files and pictures") as show, observed_by(show.show_file):
+    with progress(f"writing {what}") as show, observed_by(show.show_file):
         folder.mkdir(parents=True, exist_ok=True)
         keep_result(folder)
         yield
 
 
-def say_written(folder: Path, remark: str = "") -> None:
+def say_written(folder: Path) -> None:
     """Say where the results are, and which page shows all of them."""
     report = folder / REPORT
-    say(f"wrote {folder}/{f'; see {report}' if report.is_file() else ''}{remark}")
+    say(f"wrote {folder}/{f'; see {report}' if report.is_file() else ''}")
 
 
 # ---- verbs

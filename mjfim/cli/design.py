@@ -18,7 +18,7 @@ from mjfim.cli.common import (
     verb,
     write_wanted_video,
 )
-from mjfim.cli.progress import progress, say, say_from_program, watched
+from mjfim.cli.progress import progress, say_from_program, watched
 from mjfim.errors import MAX_STARTS, first_ones
 
 if TYPE_CHECKING:
@@ -90,27 +90,25 @@ def design(
         else:
             result = mjfim.design(stated, callback=show, threads=run.threads, executor=workers)
 
-    further = {}
+    further, remarks = {}, [f"to see the motion: mjfim replay {run.output}"]
     if found is not None:
         # The files describe the shortest horizon, not the stated one.
         system = System.resolve(found.experiment, threads=run.threads)
         further["shortest"] = found.summary()
         found.save(run.output)
-    motion = f"\nto see the motion: mjfim replay {run.output}"
-    run.finish(result, system, design=run.output, further=further, remark=motion)
-    if found is not None:
-        say(f"{found}" if found.reached else f"mjfim: {found}")
+        remarks.append(f"{found}" if found.reached else f"mjfim: {found}")
         if found.reached:
-            say(f"to use this horizon further, state horizon = {found.horizon:g} in {experiment}")
-    write_wanted_video(video, system, result)
-
+            state = f"state horizon = {found.horizon:g} in {experiment}"
+            remarks.append(f"to use this horizon further, {state}")
     if not result.separable:
-        say_from_program(_inseparable(result))
+        remarks.append(f"mjfim: {_inseparable(result)}")
     if has_default and result.seconds >= DEFAULT_SECONDS:
-        say_from_program(
-            f"the design ended after {DEFAULT_SECONDS:g} s, the default time; `seconds` in the "
-            "table [descent] states another one"
+        remarks.append(
+            f"mjfim: the design ended after {DEFAULT_SECONDS:g} s, the default time; `seconds` in "
+            "the table [descent] states another one"
         )
+    run.finish(result, system, design=run.output, further=further, remarks=remarks)
+    write_wanted_video(video, system, result)
     is_done = result.sound and result.separable and (found is None or found.closed)
     raise typer.Exit(0 if is_done else 1)
 

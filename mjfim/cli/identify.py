@@ -19,7 +19,7 @@ from mjfim.cli.common import (
     verb,
     write_wanted_video,
 )
-from mjfim.cli.progress import progress, say, watched
+from mjfim.cli.progress import progress, watched
 from mjfim.errors import MAX_SAMPLES, ExperimentError
 
 if TYPE_CHECKING:
@@ -136,9 +136,8 @@ def identify(
         result, not_drawn = _with_draws(result, system, samples, seed)
 
     sections = [log_section([log.summary for log in logs])] if run.verbose else []
-    run.finish(result, system, sections=sections)
-    if not_drawn:
-        say(f"warning: --samples: no robots were drawn{not_drawn}")
+    remarks = [f"warning: --samples: no robots were drawn{not_drawn}"] if not_drawn else []
+    run.finish(result, system, sections=sections, remarks=remarks)
     write_wanted_video(video, system, result)
     is_good = result.success and not result.misfit and not result.interrupted
     raise typer.Exit(0 if is_good and not not_drawn else 1)

@@ -30,7 +30,7 @@ FILE_WIDTH = 80
 LEAST_WIDTH = 20
 
 # Time between two lines of progress where stderr is not a terminal [s].
-LINE_SECONDS = 2.0
+LINE_SECONDS = 10.0
 
 # Share of all work from which the time that is left follows from the time so far.
 LEAST_DONE = 0.1

@@ -24,6 +24,7 @@ from mjfim.output.panels import Picture
 from mjfim.output.plots.pictures import (
     DESIGN_PICTURES,
     ESTIMATE_PICTURES,
+    ON_REQUEST,
     Pictures,
     begin_pictures,
     histogram_name,
@@ -303,8 +304,8 @@ def write_result(
     system: System | None = None,
     picture_format: PictureFormat = PictureFormat.PNG,
     further: Mapping[str, object] | None = None,
-) -> list[str]:
-    """Write all files of a result: its data, and then what a result is complete without.
+) -> tuple[list[str], Callable[[], list[str]]]:
+    """Write the data, the report and the Rerun file of a result.
 
     Files that an earlier run wrote and that are not written again are removed.
 
@@ -316,7 +317,9 @@ def write_result(
         further: Further entries of its JSON file.
 
     Returns:
-        Sentences about models that could not be written completely.
+        Sentences about models that could not be written completely, and a function that writes the
+        pictures and the video of the report. It returns the names of pictures that would take too
+        long.
     """
     # Another process draws the pictures, while this one writes the other files.
     drawn = begin_pictures(record, picture_format)
@@ -327,16 +330,20 @@ def write_result(
     # A video of the robot belongs to the motion of an earlier design or estimate.
     media = Media() if isinstance(record, Design | Estimate) else None
     write_optional(REPORT, lambda: write_report(folder, record, media))
-    _write_figures(folder, record, picture_format, drawn)
     if system is not None and isinstance(record, Design | Estimate):
         log = f"{record.file_stem}.rrd"
         write_optional(log, lambda: _write_log(folder / log, record, system))
 
+    def draw() -> list[str]:
+        _write_figures(folder, record, picture_format, drawn)
         # Who has pressed Ctrl-C does not wait for a video.
         interruption = current_interruption()
-        if interruption is None or not interruption.presses:
+        is_pressed = interruption is not None and interruption.presses
+        if system is not None and isinstance(record, Design | Estimate) and not is_pressed:
             write_optional("the video", lambda: _add_video(folder, record, system))
-    return remarks
+        return sorted(pictures_of(record).keys() - usual(record).keys() - ON_REQUEST)
+
+    return remarks, draw
 
 
 def _write_data(

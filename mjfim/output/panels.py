@@ -35,6 +35,9 @@ SERIES = (
 )
 ROLES |= {f"series{i}": colour for i, colour in enumerate(SERIES)}
 
+# Colours of negative, small and positive values of cells; those between are mixed in proportion.
+CELL_COLOURS = ("#2166ac", "#f7f7f7", "#b2182b")
+
 # Numbers of a mark.
 Numbers = Sequence[float] | NDArray[Any]
 

@@ -30,7 +30,7 @@ from mjfim.output.page import (
     capitalised,
 )
 from mjfim.output.pages import page_of
-from mjfim.output.panels import ROLES, Picture
+from mjfim.output.panels import CELL_COLOURS, ROLES, Picture
 from mjfim.output.plots.pictures import pictures_of
 from mjfim.output.plots.plotly import Group, group_of
 from mjfim.output.video import Video
@@ -77,8 +77,7 @@ DARK = {
     "link": "#7dbdf5",
 }
 
-# Colours of negative, small and positive values of cells.
-CELLS_LIGHT = ("#2166ac", "#f7f7f7", "#b2182b")
+# Colours of negative, small and positive values of cells on a dark page.
 CELLS_DARK = ("#2a73b5", "#262b31", "#c2412f")
 
 # How much lighter the colours of curves without a role are on a dark page.
@@ -91,7 +90,7 @@ def palettes() -> dict[str, dict[str, Any]]:
     light: dict[str, Any] = {
         **ROLES,
         **LIGHT,
-        "diverging": list(zip(places, CELLS_LIGHT, strict=True)),
+        "diverging": list(zip(places, CELL_COLOURS, strict=True)),
     }
     dark: dict[str, Any] = {
         **{role: _lighter(colour) for role, colour in ROLES.items()},

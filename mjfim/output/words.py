@@ -211,8 +211,8 @@ NOT_ALONE = "not alone"
 # Relative difference up to which two sizes are shown as one.
 SAME_SIZE = 1e-2
 
-# Largest number of digits of a share in percent.
-MAX_DIGITS = 6
+# Share above which a standard deviation says only that nothing is known [percent].
+LARGEST_PERCENT = 1000
 
 
 def relative(std: float, size: float, value: float | None = None) -> str:
@@ -226,10 +226,12 @@ def relative(std: float, size: float, value: float | None = None) -> str:
     if not size or not np.isfinite(std):
         return "-"
     percent = 100.0 * std / size
-    # Shares from 99.5 % on are whole numbers, not powers of ten.
-    places = len(f"{percent:.0f}") if percent < 10.0**MAX_DIGITS else MAX_DIGITS
     is_of_value = value is None or math.isclose(abs(value), size, rel_tol=SAME_SIZE)
-    return number(percent, max(places, 2), " %" if is_of_value else f" % of {number(size, 2)}")
+    unit = " %" if is_of_value else f" % of {number(size, 2)}"
+    if percent > LARGEST_PERCENT:
+        return f"> {LARGEST_PERCENT}{unit}"
+    # Shares from 99.5 % on are whole numbers, not powers of ten.
+    return number(percent, max(len(f"{percent:.0f}"), 2), unit)
 
 
 def improvement(before: float, after: float) -> str:
@@ -239,9 +241,9 @@ def improvement(before: float, after: float) -> str:
     return f"÷ {before / after:.1f}" if before >= after else f"× {after / before:.1f}"
 
 
-# Largest number of parameters that a sentence names, and share of the motion from which on it says
-# that a part of it tells nothing.
-MAX_NAMED, NOTABLE_SHARE = 3, 0.1
+# Largest number of parameters that a sentence names with their times, length of a list of others
+# [characters], and share of the motion from which on a part that tells nothing is named.
+MAX_NAMED, MISSED_TEXT, NOTABLE_SHARE = 3, 60, 0.1
 
 
 def when_learnt(design: Design, write: Callable[[str], str] = str) -> str:
@@ -262,7 +264,9 @@ def when_learnt(design: Design, write: Callable[[str], str] = str) -> str:
     missed = [design.parameters[j] for j in asked if not np.isfinite(seconds[j])]
     if missed:
         what = "the wanted σ" if is_stated else goal
-        return f"One experiment does not reach {what} for {first_ones(missed)}."
+        return (
+            f"One experiment does not reach {what} for {first_ones(missed, longest=MISSED_TEXT)}."
+        )
 
     last = sorted(asked, key=lambda j: seconds[j])[-MAX_NAMED:]
     named = [f"{write(design.parameters[j])} {seconds[j]:.3g} s" for j in last]

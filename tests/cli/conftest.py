@@ -59,4 +59,4 @@ def identified(home: Path, study: Path, recorded: Path) -> Result:
 @pytest.fixture
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write no files, in tests that do not look at them: to draw figures takes seconds."""
-    monkeypatch.setattr(folders, "write_result", lambda *_: [])
+    monkeypatch.setattr(folders, "write_result", lambda *_: ([], list))

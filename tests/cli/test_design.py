@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+from mjfim.cli import common
 from mjfim.cli import design as design_verb
 from mjfim.output.manifest import MANIFEST
+from mjfim.output.plots import draw
 from tests.support.cli import (
     DESIGN,
     loads,
@@ -247,3 +249,22 @@ def test_all_verbs_with_much_work_state_where_it_is_done(
 
     words = (verb, study, *(tmp_path / name for name in files), "-o", tmp_path / "out")
     misused(run(*words, "--executor", "cluster"), "state local, local:N")
+
+
+def test_the_answer_is_printed_before_pictures_are_drawn(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is printed when all other files are written."""
+    printed: list[set[str]] = []
+    drawn: list[str] = []
+
+    def print_result(*_: object, **__: object) -> None:
+        assert not drawn
+        printed.append(names(tmp_path / "out"))
+
+    monkeypatch.setattr(common, "print_result", print_result)
+    monkeypatch.setattr(draw, "save", lambda _, path: drawn.append(path.name))
+    run("design", study, "-o", tmp_path / "out")
+    (written,) = printed
+    assert {"design.json", "design.csv", "design.rrd", "report.html"} <= written
+    assert {"accuracy.png", "trajectories.png"} <= set(drawn)

@@ -259,7 +259,7 @@ def test_limits_that_no_control_can_keep_end_with_exit_code_one(
         model.replace("3.141592653589793", "2.0"), encoding="utf-8"
     )
     # The files are not looked at; to draw the figures takes seconds.
-    monkeypatch.setattr(folders, "write_result", lambda *_: [])
+    monkeypatch.setattr(folders, "write_result", lambda *_: ([], list))
     result = run("design", path, "-o", tmp_path / "out", "--json")
     summary = loads(result.stdout)
     found = (result.exit_code, summary["status"], summary["limits"]["satisfied"])

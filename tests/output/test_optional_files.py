@@ -54,7 +54,8 @@ def test_one_bad_picture_does_not_keep_the_others_away(
         folders.write_pictures(tmp_path, pictures, PictureFormat.PNG)
         monkeypatch.setattr(folders, "write_report", lambda *_, **__: fail())
         monkeypatch.setattr(folders, "pictures_of", lambda _: {"check": lambda: None})
-        folders.write_result(tmp_path, results.check())
+        _, draw = folders.write_result(tmp_path, results.check())
+        draw()
 
     drawn = {path.name for path in tmp_path.iterdir()}
     assert {"second.png", "check.json", "check.png"} <= drawn

@@ -444,6 +444,20 @@ def test_pictures_of_the_search_are_files_only_on_request() -> None:
         assert f"<details><summary>{title}</summary>" in html
 
 
+def test_the_largest_pictures_of_a_large_result_are_files_only_on_request() -> None:
+    """The first one of each kind is drawn before others of its kind."""
+    small, large = make_study(3), make_study(40)
+    assert usual(small).keys() == pictures_of(small).keys()
+    every = list(pictures_of(large))
+    chosen = list(usual(large))
+    assert chosen == every[: len(chosen)] and "overview" in chosen
+    assert 5 < len(chosen) < 40
+
+    long = usual(make_design(30, 24))
+    assert "trajectories" not in long and {"accuracy", "accuracy_over_time"} <= long.keys()
+    assert "trajectories" in usual(make_design(6, 24))
+
+
 # ---- names and words
 
 

@@ -70,6 +70,23 @@ def blueprint_column(path: Path, component: str) -> dict[str, Any]:
     return found
 
 
+def opened_rows(path: Path) -> list[list[str]]:
+    """Origins of the views in each row of the tab that is opened on the right."""
+    parts, origins, opened = (
+        blueprint_column(path, component)
+        for component in (
+            "ContainerBlueprint:contents",
+            "ViewBlueprint:space_origin",
+            "ContainerBlueprint:active_tab",
+        )
+    )
+    every = {tab[0]: parts[name] for name, tab in opened.items()}
+    names = blueprint_column(path, "ContainerBlueprint:display_name")
+    (tab,) = [tab for tab in every if names.get(f"/{tab}") == ["answers"]]
+    assert every[tab][0] == tab
+    return [[origins[f"/{view}"][0] for view in parts[f"/{row}"]] for row in parts[f"/{tab}"]]
+
+
 def empty_views(path: Path) -> list[str]:
     """Origins of views below which there is nothing."""
     found = entities(path)
@@ -112,8 +129,25 @@ def test_every_view_of_a_design_has_content_and_nothing_warns(file: Path) -> Non
     assert len(RrdReader(file).blueprints()) == 1
     names = blueprint_column(file, "ContainerBlueprint:display_name").values()
     assert {name[0] for name in names} >= {
-        "separate", "accuracy", "positions", "controls", "limits", "optimiser", "iterates"
+        "separate", "answers", "motion", "positions", "controls", "search", "optimiser", "iterates"
     }  # fmt: skip
+
+
+def test_a_design_opens_on_limits_information_and_the_motion_nearest_to_its_limits(
+    file: Path, design: Design, cart: mujoco.MjModel, tmp_path: Path
+) -> None:
+    limits, accuracy, positions = opened_rows(file)
+    assert [name.split("/")[1] for name in (*limits, *accuracy)] == ["limits", "accuracy"]
+    assert positions == [entity_path(("positions", name)) for name in ("slide [m]", "hinge [rad]")]
+
+    (usage,) = design.usage
+    other = replace(usage, name="hinge", share=2.0 * usage.share)
+    path = tmp_path / "design.rrd"
+    log_design(path, cart, replace(design, usage=(usage, other)), labels_of_model(cart))
+    assert opened_rows(path)[2] == positions[::-1]
+
+    log_design(path, cart, replace(design, usage=()), labels_of_model(cart))
+    assert [row[0].split("/")[1] for row in opened_rows(path)] == ["accuracy", "positions"]
 
 
 def test_accuracy_over_time_is_that_of_the_picture(file: Path, design: Design) -> None:
@@ -280,6 +314,44 @@ def test_the_camera_follows_a_body_that_flies_away_except_in_the_common_view(
     assert len(set(places) - set(tracked)) == 1
 
 
+def test_the_camera_follows_a_base_on_slides_that_drives_far() -> None:
+    """A cart that stays near its rail is seen from where it is."""
+    model = load("cart")
+    poses = [
+        body_poses(
+            model, np.arange(50.0), np.column_stack([np.linspace(0.0, way, 50), np.ones(50)])
+        )
+        for way in (1.0, 40.0)
+    ]
+    near, far = (place_camera(model, [each], views=1, aspect=1.3) for each in poses)
+    assert (near.followed, far.followed) == (None, model.body("cart").id)
+
+    # The nested slides of a mobile base: the camera follows the last one.
+    slide = "<joint type='slide' axis='{}'/><inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/>"
+    nested = (
+        f"<body name='along'>{slide.format('1 0 0')}<body name='across'>{slide.format('0 1 0')}"
+        "<body name='arm'><joint/><geom size='.1' pos='.2 0 0'/></body></body></body>"
+    )
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{nested}</worldbody></mujoco>")
+    qpos = np.column_stack([np.linspace(0.0, 9.0, 50)] * 2 + [np.zeros(50)])
+    camera = place_camera(model, [body_poses(model, np.arange(50.0), qpos)], views=1, aspect=1.3)
+    assert camera.followed == model.body("across").id
+
+
+def test_a_robot_below_the_floor_is_seen_through_it(tmp_path: Path) -> None:
+    """The floor between it and the camera is translucent; above it, the floor is as it was."""
+    model, path = load("quadrotor"), tmp_path / "replay.rrd"
+    above = simulated(model, 0.5, samples=50)
+    qpos = np.array(above.qpos)
+    qpos[:, 2] -= np.linspace(0.0, 4.0, len(qpos))
+    motions = {"initial": above, "final": replace(above, qpos=qpos)}
+    log_trajectories(path, model, motions, labels_of_model(model))
+    for name, is_translucent in (("initial", False), ("designed", True)):
+        floor = ("robots", name, "bodies", "world", "floor")
+        _, colours = column(path, floor, None, "Mesh3D:albedo_factor")
+        assert (len(colours) == 1 and int(colours[0, 0]) & 255 < 255) == is_translucent
+
+
 # ---- shapes
 
 
@@ -415,6 +487,9 @@ def test_ribbons_are_curves_over_time_and_residual_torques_are_planes(
     path = tmp_path / "estimate.rrd"
     log_estimate(path, cart, estimate, trajectory, trajectory, labels_of_model(cart))
     assert empty_views(path) == []
+    information, outputs, residuals = opened_rows(path)
+    assert information == [entity_path(("information [% per s]", "run 0"))]
+    assert [f"{name}:" in other for name, other in zip(outputs, residuals, strict=True)]
 
     first = entity_path(("information [% per s]", "run 0")) + "/0"
     (curve,) = (name for name in entities(path) if name.startswith(first))

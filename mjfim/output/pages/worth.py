@@ -29,6 +29,9 @@ from mjfim.records.worth import Price, SensorWorth, Worth
 # Increase of σ up to which a sensor is hardly needed, and from which its row is marked (factors).
 SMALL_INCREASE, LARGE_INCREASE = 1.05, 2.0
 
+# Number of repetitions above which nobody needs to know it.
+MANY_REPETITIONS = 1e6
+
 
 def worth_page(worth: Worth) -> Page:
     """Describe which sensor, which data and which limit would help."""
@@ -110,7 +113,8 @@ def _sentences(worth: Worth) -> Iterator[str]:
         yield f"The smallest set that reaches {worth.goal} everywhere: {listed(worth.fewest)}."
     now = worth.ratio(worth.std)
     if 1.0 < now < np.inf:
-        yield f"Without priors, {int(np.ceil(now**2))} repetitions reach {worth.goal}."
+        count = f"{np.ceil(now**2):.0f}" if now**2 < MANY_REPETITIONS else "more than a million"
+        yield f"Without priors, {count} repetitions reach {worth.goal}."
     needless = [
         each.name
         for each in worth.single

@@ -11,6 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices
+from mjfim.errors import first_ones
 from mjfim.model.coordinates import split_unit
 from mjfim.output.page import DESIGNED, IDENTIFIED, MEASURED, NOMINAL, capitalised
 from mjfim.output.panels import (
@@ -409,7 +410,10 @@ def _over_time(
 ) -> Picture:
     """Show a row per output: the curves over time, and their errors."""
     sigma = np.array([estimate.sigma.get(name, np.nan) for name in recording.outputs])
-    columns = shown_outputs([recording.y], [identified], sigma, MAX_OUTPUTS)
+    measured = [bool(np.isfinite(y).any()) for y in recording.y.T]
+    largest = shown_outputs([recording.y], [identified], sigma, MAX_OUTPUTS).tolist()
+    has_room = len(measured) <= MAX_OUTPUTS
+    columns = [j for j in largest if measured[j] or has_room] or largest
     rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
     size = np.clip(900.0 / len(rows), 1.5, 4.0)
     t = recording.t[rows]
@@ -440,17 +444,20 @@ def _over_time(
             Panel(
                 title=remark,
                 role="muted",
-                marks=errors,
+                marks=errors if remark else (),
                 x=time,
                 y=unit,
                 message=message,
             )
         )
-    if len(columns) < len(recording.outputs):
+    count = sum(measured)
+    if len(columns) < count:
         note += (
-            f" Shown: those {len(columns)} of {len(recording.outputs)} outputs "
-            "whose residuals over σ are largest."
+            f" Shown: those {len(columns)} of {count} outputs whose residuals over σ are largest."
         )
+    if 0 < count < len(measured) and not has_room:
+        pairs = zip(recording.outputs, measured, strict=True)
+        note += f" Not measured: {first_ones([name for name, is_known in pairs if not is_known])}."
     heights = [1.2] * len(columns)
     heights[-1] += 0.2
     panels = in_grid(panels, 2)

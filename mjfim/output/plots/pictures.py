@@ -69,6 +69,10 @@ ESTIMATE_PICTURES = (
 # Pictures of how a result was found. The report has them folded, and files are drawn on request.
 ON_REQUEST = {"convergence", "spectra", "horizons"}
 
+# Largest size of the pictures that are files without a request: to draw them takes less than 3 s on
+# one core. A picture counts as much as 3 panels, and a panel as 16 marks or words.
+MOST_PANELS, PANELS_OF_PICTURE, PARTS_OF_PANEL = 80.0, 3.0, 16.0
+
 # Functions that make the pictures of a record, by their names.
 Pictures = dict[str, Callable[[], Picture]]
 
@@ -119,9 +123,48 @@ def draw(
     return figure
 
 
+def kind_of_picture(name: str) -> str:
+    """Return what pictures of several recordings or parameters have in common."""
+    return re.sub(r"_\d+$|(?<=^histogram)_.*", "", name)
+
+
 def usual(record: ShownRecord) -> Pictures:
-    """Return functions that make the pictures of a record that are files without a request."""
-    return {name: make for name, make in pictures_of(record).items() if name not in ON_REQUEST}
+    """Return functions that make the pictures of a record that are files without a request.
+
+    The first picture of each kind comes first, and small pictures before large ones, until drawing
+    all of them would take too long.
+    """
+    found = {name: make for name, make in pictures_of(record).items() if name not in ON_REQUEST}
+    ranks: dict[str, tuple[bool, float]] = {}
+    kinds: set[str] = set()
+    for name, make in found.items():
+        kind = kind_of_picture(name)
+        # A fault is told when the picture is drawn.
+        size = 0.0
+        with suppress(Exception):
+            size = _size(make())
+        ranks[name] = (kind in kinds, size)
+        kinds.add(kind)
+
+    chosen, total = set(), 0.0
+    for name in sorted(found, key=ranks.__getitem__):
+        if total + ranks[name][1] <= MOST_PANELS:
+            chosen.add(name)
+            total += ranks[name][1]
+    return {name: make for name, make in found.items() if name in chosen}
+
+
+def _size(picture: Picture) -> float:
+    """Return the time that it takes to draw a picture, over that of an empty panel."""
+    parts = sum(
+        len(panel.marks)
+        + len(panel.x.names or ())
+        + len(panel.y.names or ())
+        + sum(len(texts) for _, _, texts in panel.beside)
+        + sum(map(len, panel.cells.texts if panel.cells else ()))
+        for panel in picture.panels
+    )
+    return PANELS_OF_PICTURE + len(picture.panels) + parts / PARTS_OF_PANEL
 
 
 @singledispatch

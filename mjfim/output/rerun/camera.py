@@ -28,8 +28,8 @@ PLANAR_RATIO = 0.2
 # Height of the unit vector towards the camera below which the ground is seen edge-on.
 EDGE_ON = 0.3
 
-# A free body is followed if it travels as far as this multiple of the size of the robot around it;
-# the followed robot is then seen with free space around it, as a multiple of its size.
+# A base is followed if it travels as far as this multiple of the size of the robot around it; the
+# followed robot is then seen with free space around it, as a multiple of its size.
 FOLLOWED_TRAVEL, FOLLOW_ROOM = 1.5, 1.5
 
 # The (8, 3) corners of a cube from -1 to 1.
@@ -51,7 +51,7 @@ class Camera:
         target: Point that it looks at [m].
         stacked: True where several views show the scene larger if they are above each other.
         edge_on: True where the ground is seen edge-on.
-        followed: Number of the free body that it follows; None where it stands still.
+        followed: Number of the body that it follows; None where it stands still.
     """
 
     position: tuple[float, ...]
@@ -71,7 +71,7 @@ def place_camera(
 ) -> Camera:
     """Place a camera that has all moving geoms of every motion in view.
 
-    If nothing moves, the whole model is in view. A free body that travels far may be followed.
+    If nothing moves, the whole model is in view. A base that travels far may be followed.
 
     Args:
         model: The model.
@@ -116,24 +116,34 @@ def place_camera(
 
 
 def followed_body(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> int | None:
-    """Return the free body that a camera follows; None where none travels far.
+    """Return the moving base that a camera follows; None where none travels far.
 
     Args:
         model: The model.
         motions: Poses along each trajectory.
     """
-    free = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
-    if not len(free):
+    # Bases are moving bodies that something at rest carries. The one with most mass counts.
+    parents, welds = model.body_parentid, model.body_weldid
+    bases = np.flatnonzero((welds == np.arange(model.nbody)) & (welds[parents] == 0))[1:]
+    if not len(bases):
         return None
+    body = int(bases[np.argmax(model.body_subtreemass[bases])])
+    tree = model.body_treeid == model.body_treeid[body]
 
-    # The free body that carries most of the mass, and its size with everything on it.
-    bodies = model.jnt_bodyid[free]
-    body = int(bodies[np.argmax(model.body_subtreemass[bodies])])
-    members = np.flatnonzero(model.body_rootid == model.body_rootid[body])
-    reach = model.geom_rbound[np.isin(model.geom_bodyid, members)].max(initial=0.0)
-    size = 2.0 * float(reach) or model.stat.extent
-    travel = max(float(np.ptp(poses.positions[:, body], axis=0).max()) for poses in motions)
-    return body if travel >= FOLLOWED_TRAVEL * size else None
+    # Each slide of a base may have a body of its own.
+    slides = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE)]
+    while len(carried := slides[parents[slides] == body]):
+        body = int(carried[0])
+
+    geoms = np.flatnonzero(tree[model.geom_bodyid])
+    own = np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
+    size, travel = 0.0, 0.0
+    for poses in motions:
+        around = poses.positions[:, model.geom_bodyid[geoms]] - poses.positions[:, [body]]
+        reach = np.linalg.norm(around, axis=2) + own
+        size = max(size, 2.0 * float(reach.max(initial=0.0)))
+        travel = max(travel, float(np.ptp(poses.positions[:, body], axis=0).max()))
+    return body if travel >= FOLLOWED_TRAVEL * (size or model.stat.extent) else None
 
 
 def moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[Array]:

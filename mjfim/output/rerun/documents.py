@@ -18,6 +18,7 @@ import rerun.blueprint as rrb
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.files import replacing
+from mjfim.model.coordinates import split_unit
 from mjfim.output.archive import shown_positions
 from mjfim.output.live import start_viewer
 from mjfim.output.page import (
@@ -40,14 +41,17 @@ from mjfim.output.panels import Panel, line
 from mjfim.output.plots.design import (
     accuracy_over_time,
     convergence,
+    largest_share,
     limit_panels,
     motion_panels,
 )
 from mjfim.output.plots.estimate import deciding_seconds, fit, held_out, residual_torque
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.plots import (
+    PLOTS_PER_ROW,
     Plane,
     Tabs,
+    answers,
     grid_tabs,
     log_series,
     planes_of,
@@ -78,8 +82,8 @@ from mjfim.records.trajectory import Labels, Trajectory
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
 FURTHER_ROLES = ("series2", "series5", IDENTIFIED, "series4")
 
-# Largest number of samples of a motion in a file, and of recordings that have a tab each.
-MAX_SAMPLES, MAX_TABS = 20_000, 3
+# Largest number of samples of a motion in a file.
+MAX_SAMPLES = 20_000
 
 # Colour of the background of the 3D views (0..255); width over height of the region of the robots,
 # with text below it and without; heights of robots and text, and widths of the left and the right
@@ -106,19 +110,30 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
         DESIGNED: design.final.trajectory,
     }
     learning = accuracy_over_time(design, complete_labels(design))
-    tabs: Tabs = {"accuracy": list(learning.panels)}
-    tabs |= motion_panels(labels, both, design.usage)
-    tabs |= {"limits": limit_panels(design, labels, rows=False)}
+    motion = motion_panels(labels, both, design.usage)
+    bounds: Tabs = {"limits": limit_panels(design, labels, rows=False)} if design.usage else {}
+    asked = bounds | {"accuracy": list(learning.panels)}
+    # The positions nearest to their limits, or the first ones.
+    near = {use.name: largest_share(use) for use in design.usage if use.kind == "position"}
+    nearest = sorted(
+        motion["positions"], key=lambda panel: -near.get(split_unit(panel.title)[0], 0.0)
+    )
     search = planes_of("optimiser", convergence(design).panels)
     iterates = _iterate_plots(design, labels)
-    grids = grid_tabs("optimiser", [plane.view() for plane, _ in search])
-    grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
+    tabs = [
+        answers([*asked.items(), ("positions", nearest[:PLOTS_PER_ROW])]),
+        rrb.Tabs(*series_tabs(motion), name="motion", active_tab=0),
+    ]
+    if search or iterates:
+        grids = grid_tabs("optimiser", [plane.view() for plane, _ in search])
+        grids += grid_tabs("iterates", [plane.view() for plane, *_ in iterates])
+        tabs.append(rrb.Tabs(*grids, name="search", active_tab=0))
 
     poses = _poses_of(model, both)
     robots = _robots(model, poses, ASPECT_WITH_TEXT)
     text = as_markdown(page_of(design), DESIGN_COLOURS)
-    with open_recording(path, model, "design", robots, [*series_tabs(tabs), *grids], text) as rec:
-        log_series(rec, tabs)
+    with open_recording(path, model, "design", robots, tabs, text) as rec:
+        log_series(rec, asked | motion)
         for plane, panel in search:
             plane.log(rec, panel.marks)
         _log_robots(rec, model, poses, {}, [INITIAL])
@@ -161,26 +176,29 @@ def log_estimate(
         for k, (picture, name) in enumerate(zip(pictures, names, strict=True), start=1)
     }
     states: Tabs = motion_panels(labels, shown)
+    asked: Tabs = {}
     if estimate.in_time is not None:
         ribbons = deciding_seconds(estimate, complete_labels(estimate)).panels
-        states = {"information [% per s]": [with_curves(panel) for panel in ribbons]} | states
+        asked["information [% per s]"] = [with_curves(panel) for panel in ribbons]
     planes = []
     if estimate.residual_forces:
         torques = residual_torque(estimate.residual_forces).panels
         planes = planes_of("residual torque", torques)
-    tabs = series_tabs(recordings)
-    if len(tabs) > MAX_TABS:
-        tabs = [rrb.Tabs(*tabs, name="recordings", active_tab=0)]
-
+    name, panels = next(iter(recordings.items()))
+    pairs = panels[: 2 * PLOTS_PER_ROW]
+    tabs = [
+        answers([*asked.items(), (name, pairs[::2]), (name, pairs[1::2])]),
+        rrb.Tabs(*series_tabs(recordings), name="recordings", active_tab=0),
+    ]
     poses = _poses_of(model, shown)
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
     root = ("robots", IDENTIFIED)
     view = robot_views(model, camera, {title: ("robots",)}, followed=root)[0]
     tabs += grid_tabs("residual torque", [plane.view() for plane, _ in planes])
-    tabs += series_tabs(states)
+    tabs.append(rrb.Tabs(*series_tabs(states), name="motion", active_tab=0))
     text = as_markdown(page_of(estimate), ESTIMATE_COLOURS)
     with open_recording(path, model, "estimate", view, tabs, text) as rec:
-        log_series(rec, recordings | states)
+        log_series(rec, asked | recordings | states)
         for plane, panel in planes:
             plane.log(rec, panel.marks)
         _log_robots(rec, model, poses, {}, [IDENTIFIED])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +20,9 @@ AXIS_COLOUR, WORD_COLOUR = (150, 150, 150), (205, 205, 205)
 # Share of white in the colours of curves that have no role.
 LIGHTER = 0.25
 
-# Largest number of plots on a page of a tab, and above each other rather than in two columns.
-PLOTS_PER_PAGE, MAX_SINGLE_COLUMN = 6, 3
+# Largest number of plots on a page of a tab, above each other rather than in two columns, and in a
+# line of the row of a question.
+PLOTS_PER_PAGE, MAX_SINGLE_COLUMN, PLOTS_PER_ROW = 6, 3, 3
 
 # Width and height of the axes of a plot of 2D lines, and space on the left, on the right, at the
 # top and at the bottom of them [points].
@@ -70,20 +71,36 @@ def grid_tabs(name: str, views: Sequence[rrb.View]) -> list[rrb.Container]:
 
 
 def series_tabs(tabs: Tabs) -> list[rrb.Container]:
-    """Return a tab for each group of plots of series; the first plot of a page has a legend."""
-    found = []
-    for name, panels in tabs.items():
-        views = [
-            rrb.TimeSeriesView(
-                origin=entity_path((name, panel.title)),
-                name=panel.title,
-                plot_legend=rrb.PlotLegend(visible=k % PLOTS_PER_PAGE == 0),
-                axis_y=_range(panel.y),
-            )
-            for k, panel in enumerate(panels)
-        ]
-        found += grid_tabs(name, views)
-    return found
+    """Return a tab for each group of plots of series."""
+    return [tab for name, panels in tabs.items() for tab in grid_tabs(name, _views(name, panels))]
+
+
+def answers(questions: Iterable[tuple[str, Sequence[Panel]]]) -> rrb.Container:
+    """Return the tab that is opened: a row of plots of series for each question.
+
+    Args:
+        questions: The name of a group, and some of its plots.
+    """
+    rows = [(name, panels) for name, panels in questions if panels]
+    grids = [
+        rrb.Grid(*_views(*row), grid_columns=min(len(row[1]), PLOTS_PER_ROW), name=row[0])
+        for row in rows
+    ]
+    heights = [-(-len(panels) // PLOTS_PER_ROW) for _, panels in rows]
+    return rrb.Vertical(*grids, row_shares=heights, name="answers")
+
+
+def _views(name: str, panels: Sequence[Panel]) -> list[rrb.View]:
+    """Return a view for each plot of a group; the first one of a page has a legend."""
+    return [
+        rrb.TimeSeriesView(
+            origin=entity_path((name, panel.title)),
+            name=panel.title,
+            plot_legend=rrb.PlotLegend(visible=k % PLOTS_PER_PAGE == 0),
+            axis_y=_range(panel.y),
+        )
+        for k, panel in enumerate(panels)
+    ]
 
 
 def _range(axis: Axis) -> rrb.ScalarAxis | None:

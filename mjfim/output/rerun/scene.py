@@ -25,7 +25,8 @@ SOLID, OUTLINE = rr.components.FillMode.Solid, rr.components.FillMode.MajorWiref
 # Opacity of the meshes of an outlined robot, which have no wire frame.
 OUTLINE_OPACITY = 0.3
 
-# Opacity of a robot beside which another one is drawn in the same view.
+# Opacity of a robot beside which another one is drawn in the same view, and of a floor below which
+# a robot goes.
 PALE_OPACITY = 0.4
 
 # Share of white in the colour of an outlined robot, and of the accent colour in that of others.
@@ -164,7 +165,7 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
         if archetype is None:
             continue
         yield DrawnShape(
-            name=model.geom(geom).name or f"geom{geom}",
+            name=shape_name(model, geom),
             position=geom_origin(model, geom),
             quaternion=model.geom_quat[geom],
             archetype=archetype,
@@ -173,6 +174,11 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
 
     if moving and not geoms:
         yield from stick_figure(model, body, style.geom_colour(DEFAULT_RGBA, moving), fill)
+
+
+def shape_name(model: mujoco.MjModel, geom: int) -> str:
+    """Return the name of the entity of a geom; unnamed geoms are numbered."""
+    return str(model.geom(geom).name) or f"geom{geom}"
 
 
 def geom_origin(model: mujoco.MjModel, geom: int) -> Array:
@@ -501,6 +507,7 @@ def log_robot(
         poses: Poses of its bodies.
         style: Style in which it is drawn.
     """
+    above = {shape_name(model, geom) for geom in planes_above(model, poses)}
     for body in range(model.nbody):
         parts = body_parts(model, root, body)
         for shape in drawn_shapes(model, body, style):
@@ -509,6 +516,9 @@ def log_robot(
             )
             path = entity_path((*parts, shape.name))
             rec.log(path, pose, shape.archetype, static=True, strict=True)
+            if shape.name in above:
+                pale = rr.Mesh3D.from_fields(albedo_factor=(255, 255, 255, 255 * PALE_OPACITY))
+                rec.log(path, pale, static=True, strict=True)
 
         # Body 0 is the world, which stays at the origin.
         if body == 0:
@@ -599,6 +609,26 @@ def moving_geoms(model: mujoco.MjModel) -> NDArray[np.intp]:
         model: The model.
     """
     return np.flatnonzero(model.body_weldid[model.geom_bodyid])
+
+
+def planes_above(model: mujoco.MjModel, poses: BodyPoses) -> list[int]:
+    """Return the planes below which the centre of mass of a moving body goes.
+
+    Args:
+        model: The model.
+        poses: Poses of its bodies.
+    """
+    moving = np.flatnonzero(model.body_weldid)
+    centres = poses.world_paths(moving, model.body_ipos[moving])
+    found = []
+    for geom in np.flatnonzero(model.geom_type == int(GeomType.mjGEOM_PLANE)).tolist():
+        normal = np.empty(3)
+        mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), model.geom_quat[geom])
+        ends = model.geom_pos[geom] + np.stack([np.zeros(3), normal])
+        foot, tip = poses.world_paths(model.geom_bodyid[[geom, geom]], ends)[0]
+        if np.any((centres - foot) @ (tip - foot) < 0.0):
+            found.append(geom)
+    return found
 
 
 def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
