@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mjfim.identification.identify import identify
     from mjfim.identification.inverse_dynamics import inverse_dynamics
     from mjfim.identification.left_out import predict
+    from mjfim.identification.meter import Meter
     from mjfim.output.export.design import export_design
     from mjfim.output.export.sysid import export_sysid
     from mjfim.output.live import live
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from mjfim.records.robots import RobotComparison
     from mjfim.records.studies import Comparison, MonteCarloStudy
     from mjfim.records.trajectory import Recording, Trajectory
+    from mjfim.records.watch import Watch
     from mjfim.records.worth import Worth
     from mjfim.studies.campaign import run_campaign
     from mjfim.studies.check import check
@@ -61,6 +63,7 @@ __all__ = [
     "ExecutorLike",
     "Experiment",
     "InverseDynamicsFit",
+    "Meter",
     "MjfimError",
     "MonteCarloStudy",
     "Pool",
@@ -70,6 +73,7 @@ __all__ = [
     "ShortestExperiment",
     "StopToken",
     "Trajectory",
+    "Watch",
     "Workers",
     "Worth",
     "check",
@@ -114,6 +118,7 @@ MODULES = {
     "simulate": "mjfim.experiment.system",
     "predict": "mjfim.identification.left_out",
     "identify": "mjfim.identification.identify",
+    "Meter": "mjfim.identification.meter",
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",
     "draw_parameters": "mjfim.identification.assessment.parameter_draws",
     "export_design": "mjfim.output.export.design",
@@ -133,6 +138,7 @@ MODULES = {
     "Recording": "mjfim.records.trajectory",
     "RobotComparison": "mjfim.records.robots",
     "Trajectory": "mjfim.records.trajectory",
+    "Watch": "mjfim.records.watch",
     "Worth": "mjfim.records.worth",
     "run_campaign": "mjfim.studies.campaign",
     "check": "mjfim.studies.check",

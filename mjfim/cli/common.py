@@ -159,7 +159,7 @@ LiveView = Annotated[
     typer.Option(
         "--live",
         metavar="[ADDRESS]",
-        help="Show the search in a Rerun viewer while it runs; in the one at HOST:PORT if given.",
+        help="Show the work in a Rerun viewer while it runs; in the one at HOST:PORT if given.",
     ),
 ]
 

@@ -21,6 +21,7 @@ ORDER = (
     "worth",
     "rehearse",
     "simulate",
+    "watch",
     "identify",
     "payload",
     "montecarlo",

@@ -183,7 +183,7 @@ class SegmentSimulation(FitUnknowns):
         """One segment over some samples."""
         plant, segment = self.system.plant, self.segments[index]
         theta = self.theta_of_recording(at, segment.recording)
-        start = self._initial_state(at, index)[None]
+        start = self.initial_state(at, index)[None]
         lead = plant.lead(theta)
         inputs = self._control(index, samples, lead)[None]
         context = None
@@ -263,7 +263,7 @@ class SegmentSimulation(FitUnknowns):
         begins = np.array([self.segments[i].begin for i in batch.segments])
         responses = self.system.plant.derivatives.responses(
             theta,
-            np.stack([self._initial_state(at, i) for i in batch.segments]),
+            np.stack([self.initial_state(at, i) for i in batch.segments]),
             np.stack([self._control(i, longest, lead) for i in batch.segments]),
             lead=lead,
             samples=begins - lead,
@@ -276,9 +276,9 @@ class SegmentSimulation(FitUnknowns):
             if response is None:
                 raise DivergedSegmentError
             for place, i in enumerate(batch.segments):
-                yield from self._rows_of_segment(theta, i, place, response)
+                yield from self.rows_of_segment(theta, i, place, response)
 
-    def _initial_state(self, at: UnknownValues, index: int) -> Array:
+    def initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""
         plant = self.system.plant
         start = self.segments[index].start
@@ -299,7 +299,7 @@ class SegmentSimulation(FitUnknowns):
         places = np.arange(segment.begin - lead, segment.begin + samples)
         return recorded[np.clip(places, 0, len(recorded) - 1)]
 
-    def _rows_of_segment(
+    def rows_of_segment(
         self, theta: Array, index: int, place: int, response: Response
     ) -> Iterator[SegmentRows]:
         """Predictions of the rows of a segment inside a simulated interval, if there are any.

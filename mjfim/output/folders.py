@@ -155,9 +155,10 @@ DESIGN_FILES = (
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
-# Files that `mjfim check`, `mjfim worth`, `mjfim compare-robots` and `mjfim rehearse` may write.
+# Files that `mjfim check`, `worth`, `watch`, `compare-robots` and `rehearse` may write.
 CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "worth.png", "rehearsal.png")
 WORTH_FILES = ("worth.json", "worth.npz", REPORT, "worth.png")
+WATCH_FILES = ("watch.json", "watch.npz", REPORT, "watch.png")
 ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png")
 REHEARSAL_FILES = ("rehearsal.json", "rehearsal.npz", REPORT, "rehearsal.png")
 

@@ -42,6 +42,7 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.watch import Watch
 from mjfim.records.worth import Worth
 
 if TYPE_CHECKING:
@@ -173,6 +174,7 @@ KINDS: tuple[type[ShownRecord], ...] = (
     Rehearsal,
     Check,
     Worth,
+    Watch,
 )
 
 # Longest list of recordings among the facts [characters].

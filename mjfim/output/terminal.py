@@ -94,7 +94,7 @@ class TerminalPage:
 
 def _styled(text: str, style: str) -> Styled:
     """A text of one style, which is folded and never cut."""
-    return Styled(text, style=style, overflow="fold")
+    return Styled(text, style=style, overflow="fold", no_wrap=False)
 
 
 # ---- short form

@@ -470,9 +470,9 @@ class FirstDerivatives:
         moves = 2 * len(widths)
         if sensors is not None:
             sensors = sensors.reshape(moves, -1, sensors.shape[1])
-        return self._quotients(after.reshape(moves, -1, after.shape[1]), sensors, widths)
+        return self.quotients(after.reshape(moves, -1, after.shape[1]), sensors, widths)
 
-    def _quotients(
+    def quotients(
         self,
         states: Array,
         sensors: Array | None,

@@ -19,7 +19,7 @@ from mjfim.plant.batch import Rollouts
 from mjfim.plant.dynamics import Dynamics
 from mjfim.plant.first_derivatives import TINY
 from mjfim.plant.mixed_derivatives import MixedDerivatives
-from mjfim.plant.running_law import InputContext
+from mjfim.plant.running_law import InputContext, LawMemory
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # Relative step of the differences between whole rollouts.
@@ -197,7 +197,7 @@ class Derivatives(MixedDerivatives):
         G = np.zeros((len(widths), len(origin), len(plant.outputs)))
         if out is not None:
             first = len(begin)
-            psi[rolled], by_sensors = self._quotients(
+            psi[rolled], by_sensors = self.quotients(
                 out.states[first:],
                 None if out.sensors is None else out.sensors[first:],
                 widths[rolled] * (2.0 if central else 1.0),
@@ -304,6 +304,54 @@ class Derivatives(MixedDerivatives):
             The response over each interval; None, and nothing after it, if a simulation diverges.
         """
         plant = self.plant
+        curves = Curves(
+            self,
+            theta,
+            initial_states,
+            start_directions=start_directions,
+            central=central,
+            step=step,
+            wanted=wanted,
+        )
+        # Control laws are evaluated where an interval begins.
+        ticks = plant.tick_samples
+        interval = max(int(max_numbers / (ticks * curves.numbers_per_sample)), 1) * ticks
+        begun = np.zeros(len(ctrl), dtype=np.intp) if samples is None else samples
+        for first in range(lead, ctrl.shape[1], interval):
+            place = slice(first, first + interval)
+            context = None
+            if plant.laws is not None:
+                context = InputContext.of_interval(ctrl, begun, place, lead, curves.memory)
+            response = curves.advance(ctrl[:, place], context)
+            yield response
+            if response is None:
+                return
+
+
+class Curves:
+    """S curves that are simulated piece by piece, each beside its moves for the derivatives.
+
+    Attributes:
+        samples: Number of samples so far.
+        numbers_per_sample: Number of values that the simulation of a sample records.
+        memory: What control laws remember; None without laws or before the first sample.
+    """
+
+    def __init__(
+        self,
+        derivatives: Derivatives,
+        theta: Array,
+        initial_states: Array,
+        *,
+        start_directions: Array | None = None,
+        central: bool = True,
+        step: float = SENSITIVITY_STEP,
+        wanted: np.ndarray | None = None,
+    ) -> None:
+        """Begin the curves; the arguments are those of `Derivatives.responses`."""
+        plant = self._plant = derivatives.plant
+        self._derivatives, self._theta, self._central = derivatives, theta, central
+        self._with_derivatives = start_directions is not None
         # Moves along parameters that are wanted and change the motion, then along k directions of
         # the initial state.
         moving = np.zeros(0, dtype=np.intp)
@@ -312,7 +360,7 @@ class Derivatives(MixedDerivatives):
             chosen = plant.parameters.changes_motion
             moving = np.flatnonzero(chosen if wanted is None else chosen & wanted)
             directions = start_directions
-        h = (step * self.parameter_scale)[moving]
+        h = (step * derivatives.parameter_scale)[moving]
         along = np.zeros((len(moving) + directions.shape[1], len(theta)))
         along[np.arange(len(moving)), moving] = h
 
@@ -321,7 +369,8 @@ class Derivatives(MixedDerivatives):
         reach = (np.abs(directions) / plant.sizes.state[:, None]).max(axis=0, initial=0.0)
         start_steps = step / np.maximum(reach, TINY)
         of_start[len(moving) :] = start_steps[:, None] * directions.T
-        widths = np.concatenate([h, start_steps]) * (2.0 if central else 1.0)
+        self._moving = moving
+        self._widths = np.concatenate([h, start_steps]) * (2.0 if central else 1.0)
 
         # J rollouts: without a move, then forward, then backward for two-sided differences.
         theta_moves, start_moves = (
@@ -329,56 +378,67 @@ class Derivatives(MixedDerivatives):
             for each in (along, of_start)
         )
         models, compiled = plant.try_models(theta + theta_moves)
+        self._is_possible = bool(compiled.all())
 
-        # States at the beginning of the interval: those of each of the J moves for all S curves.
-        current = plant.space.plus(initial_states, start_moves[:, None])
-        J, S, state_size = current.shape
-        if J > 1:
-            models = [model for model in models for _ in range(S)]
+        # States of each of the J moves for all S curves.
+        self._current = plant.space.plus(initial_states, start_moves[:, None])
+        J, S, state_size = self._current.shape
+        self._models = [model for model in models for _ in range(S)] if J > 1 else models
+        self.numbers_per_sample = J * S * plant.simulator.substeps * (1 + state_size)
+        self.memory: tuple[LawMemory, ...] | None = None
+        self.samples = 0
 
-        numbers_per_sample = J * S * plant.simulator.substeps * (1 + state_size)
-        # Control laws are evaluated where an interval begins.
-        ticks = plant.tick_samples
-        interval = max(int(max_numbers / (ticks * numbers_per_sample)), 1) * ticks
-        begun = np.zeros(S, dtype=np.intp) if samples is None else samples
-        memory = None
-        for first in range(lead, ctrl.shape[1], interval):
-            held = ctrl[:, first : first + interval]
-            every = np.broadcast_to(held, (J, *held.shape)).reshape(J * S, *held.shape[1:])
-            context = None
-            if plant.laws is not None:
-                place = slice(first, first + interval)
-                context = InputContext.of_interval(ctrl, begun, place, lead, memory).repeated(J)
-            out = plant.simulator.rollout(
-                models, current.reshape(J * S, -1), every, context=context
-            )
-            memory = out.memory
-            if not (out.finite.all() and compiled.all()):
-                yield None
-                return
+    @property
+    def states(self) -> Array:
+        """(S, ns) states of the curves after these samples."""
+        return np.asarray(self._current[0])
 
-            count = held.shape[1] + 1
-            states = out.states.reshape(J, S, count, -1)
-            sensors = None if out.sensors is None else out.sensors.reshape(J, S, count, -1)
-            current = states[:, :, -1]
-            still = states[0], None if sensors is None else sensors[0]
-            h_still = plant.outputs(*still)
-            y = plant.calibration.measured(h_still, theta)
-            if start_directions is None:
-                yield Response(first=first - lead, y=y, common=None, private=None)
-                continue
+    def advance(self, held: Array, context: InputContext | None = None) -> Response | None:
+        """Simulate the next samples.
 
-            moved = None if sensors is None else sensors[1:]
-            moves = self._quotients(states[1:], moved, widths, None if central else still)
-            G = np.moveaxis(plant.outputs.tangent(states[0], *moves), 0, 3)
-            common = np.zeros((*y.shape, len(theta)))
-            common[..., moving] = G[..., : len(moving)]
-            yield Response(
-                first=first - lead,
-                y=y,
-                common=plant.calibration.by_theta(h_still, common, theta),
-                private=plant.calibration.scaled(G[..., len(moving) :], theta),
-            )
+        Args:
+            held: (S, n, nu) controls, or inputs of control laws.
+            context: What control laws read besides; None without laws.
+
+        Returns:
+            The response over these samples; None if a simulation diverges.
+        """
+        plant, (J, S, _) = self._plant, self._current.shape
+        every = np.broadcast_to(held, (J, *held.shape)).reshape(J * S, *held.shape[1:])
+        out = plant.simulator.rollout(
+            self._models,
+            self._current.reshape(J * S, -1),
+            every,
+            context=None if context is None else context.repeated(J),
+        )
+        self.memory = out.memory
+        if not (out.finite.all() and self._is_possible):
+            return None
+
+        first, count = self.samples, held.shape[1] + 1
+        self.samples += held.shape[1]
+        states = out.states.reshape(J, S, count, -1)
+        sensors = None if out.sensors is None else out.sensors.reshape(J, S, count, -1)
+        self._current = states[:, :, -1]
+        still = states[0], None if sensors is None else sensors[0]
+        h_still = plant.outputs(*still)
+        y = plant.calibration.measured(h_still, self._theta)
+        if not self._with_derivatives:
+            return Response(first=first, y=y, common=None, private=None)
+
+        moved = None if sensors is None else sensors[1:]
+        moves = self._derivatives.quotients(
+            states[1:], moved, self._widths, None if self._central else still
+        )
+        G = np.moveaxis(plant.outputs.tangent(states[0], *moves), 0, 3)
+        common = np.zeros((*y.shape, len(self._theta)))
+        common[..., self._moving] = G[..., : len(self._moving)]
+        return Response(
+            first=first,
+            y=y,
+            common=plant.calibration.by_theta(h_still, common, self._theta),
+            private=plant.calibration.scaled(G[..., len(self._moving) :], self._theta),
+        )
 
 
 def _columns(by_move: Array, is_moved: np.ndarray, lumped: LumpedParameters | None) -> Array:

@@ -11,9 +11,10 @@ are removed from the values.
 
 from __future__ import annotations
 
+import csv
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ import numpy as np
 import pyarrow
 
 from mjfim.arrays import Array, record
-from mjfim.errors import RecordingError, RecordingWarning, listed, unknown
+from mjfim.errors import RecordingError, RecordingWarning, listed, shortened, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.channels import (
     ANY,
@@ -33,6 +34,7 @@ from mjfim.recordings.channels import (
     units_of,
 )
 from mjfim.recordings.checks import (
+    LARGEST_VALUE,
     MIN_ROWS,
     check_angles,
     check_clock,
@@ -264,6 +266,90 @@ def _check_units_of_controls(table: Table, sources: Mapping[str, ColumnSpec]) ->
             )
 
 
+class RowReader:
+    """Reads the rows of a CSV stream one after the other, by the rules of the files.
+
+    Args:
+        header: The first line, with the names of the columns.
+        channels: The signals of the experiment, and how to read them.
+        source: Name of the stream, for messages.
+
+    Raises:
+        ExperimentError: The `[recording]` table does not fit the model.
+        RecordingError: A column is missing, or two have one name.
+    """
+
+    def __init__(self, header: str, channels: Channels, source: str) -> None:
+        check_spec(channels)
+        self._channels, self._source, spec = channels, Path(source), channels.spec
+        self._names = [name.strip() for name in next(csv.reader([header]))]
+        if len(set(self._names)) < len(self._names):
+            raise RecordingError(f"{source}: line 1: two columns have the same name")
+        # Only names and units are looked up here, so that one row of ones stands for all.
+        table = Table.of(self._source, dict.fromkeys(self._names, np.ones(1)), spec)
+        if "time" not in spec.model_fields_set and spec.time not in table.names:
+            raise _unfit(table, channels, f"column {spec.time!r} is missing")
+        self._sources = _in_units_of_titles(table, _sources(table, channels), channels)
+        self._unit_of_time = float(_stamps(table, spec)[0])
+        rules = self._sources.values()
+        used = [spec.time, *(name for rule in rules for name in (rule.column, *rule.multiply_by))]
+        for name in used:
+            table.column(name)
+        self._places = {name: table.names.index(table.key(name)) for name in used}
+        self._begin = np.nan
+        # The latest number of every column that is used, and of every column of the recording.
+        self._raw = dict.fromkeys(used, np.nan)
+        self._values = dict.fromkeys(self._sources, np.nan) | spec.constants
+
+    def row(self, line: str) -> tuple[float, list[float], list[float]] | None:
+        """Read a line.
+
+        Args:
+            line: The line.
+
+        Returns:
+            Time [s], controls, and outputs in the order of the channels, NaN where there is no
+            number yet or none of this row; None outside the window.
+
+        Raises:
+            RecordingError: A cell is missing or holds no number that can be used.
+        """
+        spec, cells = self._channels.spec, next(csv.reader([line]))
+        if len(cells) != len(self._names):
+            raise RecordingError(f"{len(cells)} cells, but line 1 has {len(self._names)}")
+        new = {name: _number(name, cells[place]) for name, place in self._places.items()}
+        held = {name: old if np.isnan(new[name]) else new[name] for name, old in self._raw.items()}
+        pairs = {name: np.array([self._raw[name], held[name]]) for name in held}
+        for name, rule in self._sources.items():
+            before, value = _converted(self._source, pairs.__getitem__, rule)
+            # An unwrapped value goes on from the one before it.
+            jumps = rule.unwrap or rule.period is not None
+            shift = np.nan_to_num(self._values[name] - before) if jumps else 0.0
+            self._values[name] = float(value + shift)
+        self._raw = held
+        time = self._unit_of_time * new[spec.time]
+        self._begin = time if np.isnan(self._begin) else self._begin
+        since, window = time - self._begin, spec.window or (-np.inf, np.inf)
+        if since < window[0] - WINDOW_TOLERANCE or since > window[1] + WINDOW_TOLERANCE:
+            return None
+        is_new = {name: not np.isnan(new[rule.column]) for name, rule in self._sources.items()}
+        outputs = [
+            self._values[name] if is_new.get(name) else np.nan for name in self._channels.outputs
+        ]
+        return time, [self._values[name] for name in self._channels.control_columns], outputs
+
+
+def _number(name: str, cell: str) -> float:
+    """The number in a cell, NaN where it is empty."""
+    try:
+        value = float(cell) if cell.strip() else np.nan
+    except ValueError:
+        value = np.inf
+    if abs(value) > LARGEST_VALUE:
+        raise RecordingError(f"column {name!r}: {shortened(repr(cell))} is no measured number")
+    return value
+
+
 # ---- which column is what
 
 
@@ -469,7 +555,7 @@ def _columns(
             table.measurement(source.column)
         for raw in (source.column, *source.multiply_by):
             check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], numbers)
-        values = _converted(table, source)
+        values = _converted(table.source, table.column, source)
         if name.startswith(INPUT_PREFIXES):
             # Empty rows hold the last value before them.
             last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
@@ -483,11 +569,11 @@ def _columns(
     return columns
 
 
-def _converted(table: Table, spec: ColumnSpec) -> Array:
-    """(M,) one column of a recording by equation (1)."""
-    raw = table.column(spec.column)
+def _converted(source: Path, column: Callable[[str], Array], spec: ColumnSpec) -> Array:
+    """(M,) one column of a recording by equation (1), from the columns of a log."""
+    raw = column(spec.column)
     if spec.signed is not None:
-        raw = _signed(table, spec.column, raw, spec.signed)
+        raw = _signed(source, spec.column, raw, spec.signed)
     if spec.period is not None:
         raw = _unwrapped(raw, spec.period)
 
@@ -495,11 +581,11 @@ def _converted(table: Table, spec: ColumnSpec) -> Array:
     if spec.unwrap:
         value = _unwrapped(value, TURN)
     for name in spec.multiply_by:
-        value = value * table.column(name)
+        value = value * column(name)
     return value
 
 
-def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
+def _signed(source: Path, name: str, raw: Array, bits: int) -> Array:
     """(M,) signed integers of bits from their two's complement raw: (M,)."""
     half = 2.0 ** (bits - 1)
     outside = (raw < -half) | (raw >= 2.0 * half)
@@ -507,7 +593,7 @@ def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
     if invalid.any():
         row = np.argmax(invalid)
         raise RecordingError(
-            f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
+            f"{source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
             f"not an integer of {bits} bits"
         )
     return np.where(raw >= half, raw - 2.0 * half, raw)

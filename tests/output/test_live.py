@@ -29,6 +29,7 @@ from mjfim.output.live import HERE, live, url_of
 from mjfim.output.rerun.live import OTHER_STARTS, UPDATE_SECONDS, LiveShow
 from mjfim.records.design import Design
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
+from tests.support import results
 from tests.support.paths import MODELS
 
 
@@ -295,6 +296,28 @@ class TestShown:
         assert received.series("/squares/all\\ data") == pytest.approx([0.0, -1.0, -2.0, -3.0])
         assert received.series("/step/all\\ data") == pytest.approx([-1.0] * 3)
         assert received.series("/share/monte_carlo") == pytest.approx([25.0, 75.0])
+
+    def test_a_stream_shows_its_accuracy_over_its_time(
+        self, experiment: mjfim.Experiment, tmp_path: Path
+    ) -> None:
+        record = results.watch()
+        parts = [
+            StudyEvent(
+                study="watch",
+                part="",
+                index=0,
+                count=None,
+                share=0.0,
+                result=replace(record, t=record.t[:k], std_over_time=record.std_over_time[:k]),
+            )
+            for k in (20, 60)
+        ]
+        received = watched(parts, experiment, tmp_path, step=1.0)
+        assert set(received.curves("accuracy")) == {"wanted", *record.parameters}
+        for j, name in enumerate(record.parameters):
+            shares = record.std_over_time[[19, 59], j] / record.wanted[j]
+            assert received.series(f"/accuracy/{name}") == pytest.approx(np.log10(shares))
+        assert received.series("/accuracy/wanted") == [0.0, 0.0]
 
 
 def free_port() -> int:

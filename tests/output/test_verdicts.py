@@ -373,3 +373,25 @@ def test_worth_names_a_wanted_standard_deviation_only_where_one_is_stated(
     said = " ".join(printed(page_of(result), 100, verbose=True).split())
     assert ("the wanted σ" in said) is is_stated
     assert ("a σ of 5 %" in said) is not is_stated
+
+
+@pytest.mark.parametrize(
+    ("std", "said"),
+    [
+        # Half of the wanted variance of c is missing: as much information again is needed.
+        ([0.01, 0.01, np.sqrt(2.0) * 0.05], "2 of 3 reach the wanted σ; c needs about 12 s more"),
+        ([0.01, np.inf, 0.1], "1 of 3 reach the wanted σ; the rows so far do not determine"),
+        ([0.01, 0.01, 0.01], "Enough after 4.0 s, in the best case: every parameter reaches"),
+    ],
+)
+def test_a_live_meter_says_what_is_missing(std: list[float], said: str) -> None:
+    t = np.linspace(0.1, 12.0, 200)
+    over_time = np.sqrt(12.0 / t)[:, None] * np.array(std)
+    result = results.MAKERS["watch"](
+        wanted=np.full(3, 0.05),
+        t=t,
+        std_over_time=over_time,
+        reached=np.where(np.array(std) <= 0.05, 4.0, np.inf),
+    )
+    text = " ".join(printed(page_of(result), 100).split())
+    assert said.replace("c needs", f"{results.PARAMETERS[2]} needs") in text

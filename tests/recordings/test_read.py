@@ -17,7 +17,7 @@ from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.output.archive import write_table
-from mjfim.recordings.read import Log, read_log, read_recording
+from mjfim.recordings.read import Log, RowReader, read_log, read_recording
 from tests.support.paths import SHARED_DATA
 
 Array = NDArray[np.float64]
@@ -675,3 +675,88 @@ def test_columns_of_other_programs_are_proposed(
 ) -> None:
     with pytest.raises(RecordingError, match=rf"(?s){said}"):
         read(columns, bare=True)
+
+
+# ---- rows of a stream
+
+
+class TestRowReader:
+    def test_rows_are_read_as_files_are(self, read: Read, tmp_path: Path) -> None:
+        """Units, counters, turns, factors, empty cells and the window, a few rows at a time."""
+        counts = np.mod(np.rint(9000.0 * np.sin(2.0 * T)), 4096)
+        counts[50:53] = np.nan
+        push = np.where(np.arange(M) % 3 == 0, np.arange(M, dtype=float), np.nan)
+        columns = {
+            "stamp": 1e6 * (T + 1000.0),
+            "counts": counts,
+            "angle": np.rad2deg(np.mod(wave(9.0), 2.0 * np.pi)),
+            "speed": wave(3.0),
+            "on": (T < 1.0).astype(float),
+            "raw": np.mod(np.rint(wave(300.0)), 2**16),
+            "push": push,
+        }
+        recording = {
+            "time": "stamp",
+            "time_unit": "us",
+            "window": (0.1, 1.5),
+            "columns": {
+                "ctrl:push": "push",
+                "ctrl:turn": 0.5,
+                "encoder": {"column": "counts", "period": 4096.0, "scale": 1e-3},
+                "qpos:pin": {"column": "angle", "unit": "deg", "unwrap": True},
+                "qvel:rail": {"column": "speed", "multiply_by": ["on"]},
+                "motor": {"column": "raw", "signed": 16, "scale": 0.01},
+            },
+        }
+        logged = read(columns, bare=True, **recording).recording
+        channels = task_of(tmp_path, recording).system.channels
+        header, *lines = (tmp_path / "lab.csv").read_text(encoding="utf-8").splitlines()
+        reader = RowReader(header, channels, "stdin")
+        rows = [row for row in map(reader.row, lines) if row is not None]
+        t, ctrl, y = map(np.array, zip(*rows, strict=True))
+        np.testing.assert_allclose(t - t[0], logged.t, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(ctrl[:-1], logged.ctrl)
+        for name in logged.outputs:
+            found = y[:, channels.outputs.index(name)]
+            expected = logged.y[:, logged.outputs.index(name)]
+            # A window in the middle of a turn may begin at another turn.
+            turn = {"encoder": 4.096, "qpos:pin": 2.0 * np.pi}.get(name, np.inf)
+            shift = np.rint((found - expected)[0] / turn) * turn if np.isfinite(turn) else 0.0
+            np.testing.assert_allclose(found, expected + shift, rtol=0, atol=1e-9)
+        assert np.isnan(y[:, channels.outputs.index("ruler")]).all()
+
+    def reader(
+        self, folder: Path, header: str = "t,ctrl:push,ctrl:turn,qpos:pin,note"
+    ) -> RowReader:
+        """A reader of rows with a column of text."""
+        return RowReader(header, task_of(folder, {}).system.channels, "stdin")
+
+    @pytest.mark.parametrize(
+        ("line", "said"),
+        [
+            ("0.1,1,2,3", "4 cells, but line 1 has 5"),
+            ("0.1,1,2,three,", "column 'qpos:pin': 'three' is no measured number"),
+            ("0.1,1,2,1e300,", "column 'qpos:pin': '1e300' is no measured number"),
+        ],
+    )
+    def test_a_faulty_row(self, line: str, said: str, tmp_path: Path) -> None:
+        reader = self.reader(tmp_path)
+        assert reader.row("0,1,2,3,begin") is not None
+        with pytest.raises(RecordingError, match=re.escape(said)):
+            reader.row(line)
+        # A control is held, and what was not measured is unknown.
+        t, ctrl, outputs = reader.row("0.2,,,,end") or (0.0, [], [])
+        assert (t, ctrl) == (0.2, [1.0, 2.0]) and np.isnan(outputs).all()
+
+    @pytest.mark.parametrize(
+        ("header", "said"),
+        [
+            ("t,ctrl:push,ctrl:turn,qpos:pni", "did you mean 'qpos:pin'"),
+            ("t,ctrl:push,qpos:pin", "column 'ctrl:turn' is missing"),
+            ("time,ctrl:push,ctrl:turn,qpos:pin", "column 't' is missing"),
+            ("t,ctrl:push,ctrl:turn,qpos:pin,t", "line 1: two columns have the same name"),
+        ],
+    )
+    def test_a_wrong_header(self, header: str, said: str, tmp_path: Path) -> None:
+        with pytest.raises(RecordingError, match=re.escape(said)):
+            self.reader(tmp_path, header)

@@ -34,6 +34,7 @@ from mjfim.records.studies import (
 )
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Labels, Recording, Trajectory
+from mjfim.records.watch import Watch
 from mjfim.records.worth import Price, SensorWorth, Worth
 from tests.support.made_records import (
     bare_estimate,
@@ -475,6 +476,25 @@ def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
     return Worth(**{**fields, **changes})  # type: ignore[arg-type]
 
 
+def watch(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Watch:
+    """A stream of 12 s, after which one of three parameters is known well enough."""
+    t = np.linspace(0.0, 12.0, 60)
+    std = np.outer(1.0 / np.sqrt(np.maximum(t, 0.1)), THETA * np.array([0.1, 0.2, 0.4]))
+    fields = {
+        "parameters": parameters,
+        "units": UNITS,
+        "sizes": np.abs(THETA),
+        "wanted": 0.05 * np.abs(THETA),
+        "is_stated": True,
+        "t": t,
+        "std_over_time": std,
+        "reached": np.array([4.0, np.inf, np.inf]),
+        "rows": 1200,
+        "left_out": 2,
+    }
+    return Watch(**{**fields, **changes})  # type: ignore[arg-type]
+
+
 MAKERS = {
     "compare-robots": robots,
     "design": design,
@@ -484,5 +504,6 @@ MAKERS = {
     "montecarlo": study,
     "rehearse": rehearsal,
     "worth": worth,
+    "watch": watch,
     "campaign": campaign,
 }

@@ -23,6 +23,7 @@ PAGES = {
     "MonteCarloStudy": ("studies", "study_page"),
     "RobotComparison": ("studies", "robots_page"),
     "Rehearsal": ("design", "rehearsal_page"),
+    "Watch": ("studies", "watch_page"),
     "Worth": ("worth", "worth_page"),
 }
 

@@ -32,7 +32,7 @@ from mjfim.output.page import (
     tabulated,
     warned,
 )
-from mjfim.output.words import BEST_CASE, NOT_ALONE, complete_labels
+from mjfim.output.words import BEST_CASE, NOT_ALONE, complete_labels, relative
 from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.estimate_parts import InverseDynamicsFit, ResidualForce
 from mjfim.records.robots import RobotComparison, p_text
@@ -43,6 +43,7 @@ from mjfim.records.studies import (
     MonteCarloStudy,
     TrialStatistics,
 )
+from mjfim.records.watch import Watch
 
 # What to do after a campaign, by how it ended.
 AFTER_CAMPAIGN = {
@@ -541,3 +542,54 @@ def residual_parts(found: Sequence[ResidualForce]) -> Sequence[Part]:
         detail=True,
     )
     return (table, Plot("residual_torque"))
+
+
+# ---- live meter
+
+# Time after which nobody waits for more rows of this kind [s].
+LONG_SECONDS = 3600.0
+
+
+def watch_page(watch: Watch) -> Page:
+    """Describe how accurate the parameters are by the rows so far; open ones come first."""
+    order = np.argsort(np.isfinite(watch.reached), kind="stable")
+    std, wanted, reached = watch.std[order], watch.wanted[order], watch.reached[order]
+    columns = {
+        "parameter": [named(watch.parameters[j], watch.units[j]) for j in order.tolist()],
+        "σ now": numbers(std, infinite=NOT_ALONE),
+        "of the value": list(map(relative, std.tolist(), watch.sizes[order].tolist())),
+        "wanted": numbers(wanted, infinite=""),
+        "enough": [f"at {t:.1f} s" if np.isfinite(t) else "" for t in reached],
+    }
+    title = f"After {watch.seconds:.1f} s, {watch.rows} rows"
+    if watch.left_out:
+        title += f"; faulty rows, left out: {watch.left_out}"
+    marked = warned(np.isfinite(wanted) & np.isinf(reached))
+    note = f"At the guess. {BEST_CASE}"
+    table = tabulated(title, columns, marked, spare=("of the value",), note=note)
+    return Page(
+        kind="Live meter",
+        verdict=Verdict(progress_of_watch(watch), Level.GOOD if watch.enough else Level.DOUBTFUL),
+        warnings=watch.warnings,
+        facts={"rows": str(watch.rows), "duration": f"{watch.seconds:.1f} s"},
+        sections=[Section("Accuracy so far", [table, Plot("watch")])],
+    )
+
+
+def progress_of_watch(watch: Watch) -> str:
+    """Say how many parameters are known well enough, and how long the slowest one needs."""
+    asked = watch.asked
+    reached = np.isfinite(watch.reached[asked])
+    if reached.all():
+        when = watch.reached[asked].max(initial=0.0)
+        return f"Enough after {when:.1f} s, in the best case: every parameter reaches {watch.goal}."
+    ratio = np.where(reached, 0.0, watch.std[asked] / watch.wanted[asked])
+    slowest = int(asked[np.argmax(ratio)])
+    name, left = watch.parameters[slowest], watch.seconds_left[slowest]
+    if np.isinf(watch.std[slowest]):
+        needs = f"the rows so far do not determine {name} alone"
+    elif left > LONG_SECONDS:
+        needs = f"the last seconds tell hardly anything about {name}"
+    else:
+        needs = f"{name} needs about {left:.2g} s more at this rate"
+    return f"{int(reached.sum())} of {len(asked)} reach {watch.goal}; {needs}."

@@ -1,4 +1,4 @@
-"""Dots of standard deviations in percent: predicted, formal, honest, wanted, published."""
+"""Standard deviations in percent: as dots by their source, and over time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.output.page import number
-from mjfim.output.panels import Axis, Panel, around, dots, line, row_axis
-from mjfim.output.words import relative
+from mjfim.output.panels import Axis, Panel, around, dots, hline, line, row_axis
+from mjfim.output.words import relative, shorten
 
 # Height of a picture of accuracies without its rows, of a row, and of one of many rows [inch].
 FRAME, ROW, LOW_ROW, MAX_HIGH_ROWS = 0.8, 0.32, 0.2, 20
+
+# Look of the curves of the initial motion, and multiple of the wanted σ up to which σ over time is
+# drawn.
+INITIAL_LOOK, LARGEST_OVER_TARGET = {"width": 0.9, "dash": "--"}, 10.0
 
 
 class Accuracies(NamedTuple):
@@ -79,6 +83,60 @@ def accuracy_panel(
         x=Axis(label="σ [% of the value]", log=True, limits=(low, high * 1.05)),
         y=row_axis(names),
         beside=beside,
+    )
+
+
+def accuracy_over_time_panel(
+    motions: Sequence[tuple[Array, Array]],
+    names: Sequence[str],
+    sizes: Array,
+    targets: Array,
+    reached: Array,
+    shown: Sequence[int],
+    *,
+    is_stated: bool,
+) -> Panel:
+    """Return curves of the standard deviations in percent, with the times at which targets are met.
+
+    Args:
+        motions: (N,) times [s] and (N, p) standard deviations from the measurements up to them, of
+            motions for comparison and then of the one that the panel is about.
+        names: Names of the p parameters.
+        sizes: (p,) their sizes [theta-unit].
+        targets: (p,) wanted standard deviations, infinite for none [theta-unit].
+        reached: (p,) times at which they are reached, infinite where they are not [s].
+        shown: Numbers of the parameters that are shown.
+        is_stated: Whether the experiment states the targets.
+    """
+    shares = sizes / 100.0
+    ends = (np.stack([std[-1] for _, std in motions]) / shares)[:, shown]
+    goals = np.where(np.isfinite(targets), targets, np.nan)[shown] / shares[shown]
+    _, high = around(np.concatenate([ends.ravel(), LARGEST_OVER_TARGET * goals]), factor=1.5)
+    low, _ = around(np.concatenate([ends.ravel(), goals]), factor=1.5)
+
+    curves, targets_met = [], []
+    for place, j in enumerate(shown):
+        role, goal = f"series{place}", targets[j] / shares[j]
+        final = relative(motions[-1][1][-1, j], sizes[j])
+        main = {"width": 2.0, "label": f"{shorten(names[j])} {final}"}
+        for order, (t, std) in enumerate(motions, start=1):
+            percent = std[:, j] / shares[j]
+            look = main if order == len(motions) else INITIAL_LOOK
+            curves.append(line(t, np.where(percent <= high, percent, np.nan), role, **look))
+        if np.isfinite(goal):
+            word = "wanted σ" if is_stated else f"σ of {goal:.2g} %"
+            is_common = np.allclose(goals[np.isfinite(goals)], goal)
+            look = {"dash": ":", "width": 1.4, "label": word}
+            targets_met.append(hline(goal, "muted" if is_common else role, **look))
+        if np.isfinite(goal) and np.isfinite(reached[j]):
+            met = {"size": 6.0, "front": 4.0, "label": "reached"}
+            targets_met.append(dots([reached[j]], [goal], role, **met))
+    return Panel(
+        title="σ by the measurements up to each time [% of the value]",
+        marks=[*curves, *targets_met],
+        x=Axis(label="time [s]"),
+        y=Axis(label="σ [%]", log=True, limits=(low, high)),
+        message="" if shown else "no parameter is determined alone",
     )
 
 

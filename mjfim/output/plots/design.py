@@ -33,7 +33,13 @@ from mjfim.output.panels import (
     row_axis,
     vline,
 )
-from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows
+from mjfim.output.plots.accuracy import (
+    INITIAL_LOOK,
+    Accuracies,
+    accuracy_over_time_panel,
+    accuracy_panel,
+    height_of_rows,
+)
 from mjfim.output.words import (
     BEST_CASE,
     format_number,
@@ -100,11 +106,10 @@ def whole_percent(share: float) -> str:
 
 
 # Look of the curves of the initial motion where colours tell parameters.
-INITIAL_LOOK = {"width": 0.9, "dash": "--"}
 
 # Number of panels of the trajectories side by side, and largest σ that is drawn over time, over its
 # target.
-PANEL_COLUMNS, LARGEST_OVER_TARGET = 4, 10.0
+PANEL_COLUMNS = 4
 
 # Widths of the lines of the initial and of the designed trajectory [points].
 LINE_WIDTHS = (1.1, 1.6)
@@ -323,60 +328,25 @@ def accuracy_over_time(design: Design, labels: Labels) -> Picture:
     last_first = sorted(asked, key=lambda j: (-seconds[j], -design.stated_std[j] / design.sizes[j]))
     shown = sorted(last_first[: len(SERIES)])
     which = "parameters, those that are known last"
+    begin = design.trajectory.t[0]
+    panel = accuracy_over_time_panel(
+        [
+            (design.initial.trajectory.t, design.initial.std_over_time),
+            (design.trajectory.t, design.std_over_time),
+        ],
+        labels.parameters,
+        design.sizes,
+        targets,
+        begin + seconds,
+        shown,
+        is_stated=bool(np.isfinite(labels.wanted).any()),
+    )
     return Picture(
         title=when_learnt(design, shorten).removesuffix(".") or "Accuracy over time",
-        panels=[accuracy_over_time_panel(design, labels, shown)],
+        panels=[panel],
         note=f"Beside the names: σ at the end. {BEST_CASE}{share_note(shown, asked, which)}",
         heights=[3.4],
         keys=[line([], [], "muted", label="initial motion", **INITIAL_LOOK)],
-    )
-
-
-def accuracy_over_time_panel(design: Design, labels: Labels, shown: Sequence[int]) -> Panel:
-    """Return curves of the standard deviations in percent, with the times at which targets are met.
-
-    Args:
-        design: The design.
-        labels: Names of its parameters.
-        shown: Numbers of the parameters.
-    """
-    targets = design.targets
-    seconds = design.seconds_to(targets)
-    sizes = design.sizes / 100.0
-    ends = (np.stack([design.initial.std, design.stated_std]) / sizes)[:, shown]
-    goals = np.where(np.isfinite(targets), targets, np.nan)[shown] / sizes[shown]
-    _, high = around(np.concatenate([ends.ravel(), LARGEST_OVER_TARGET * goals]), factor=1.5)
-    low, _ = around(np.concatenate([ends.ravel(), goals]), factor=1.5)
-
-    is_stated = bool(np.isfinite(labels.wanted).any())
-    begin, curves, targets_met = float(design.trajectory.t[0]), [], []
-    for place, j in enumerate(shown):
-        role, size, goal = f"series{place}", sizes[j], targets[j] / sizes[j]
-        final = relative(design.stated_std[j], design.sizes[j])
-        for t, values, look in (
-            (design.initial.trajectory.t, design.initial.std_over_time, INITIAL_LOOK),
-            (
-                design.trajectory.t,
-                design.std_over_time,
-                {"width": 2.0, "label": f"{shorten(labels.parameters[j])} {final}"},
-            ),
-        ):
-            percent = values[:, j] / size
-            curves.append(line(t, np.where(percent <= high, percent, np.nan), role, **look))
-        if np.isfinite(goal):
-            word = "wanted σ" if is_stated else f"σ of {goal:.2g} %"
-            is_common = np.allclose(goals[np.isfinite(goals)], goal)
-            look = {"dash": ":", "width": 1.4, "label": word}
-            targets_met.append(hline(goal, "muted" if is_common else role, **look))
-        if np.isfinite(goal) and np.isfinite(seconds[j]):
-            met = {"size": 6.0, "front": 4.0, "label": "reached"}
-            targets_met.append(dots([begin + seconds[j]], [goal], role, **met))
-    return Panel(
-        title="σ by the measurements up to each time [% of the value]",
-        marks=[*curves, *targets_met],
-        x=Axis(label="time [s]"),
-        y=Axis(label="σ [%]", log=True, limits=(low, high)),
-        message="" if shown else "no parameter is determined alone",
     )
 
 

@@ -33,6 +33,7 @@ from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.watch import Watch
 from mjfim.records.worth import Worth
 
 if TYPE_CHECKING:
@@ -277,6 +278,11 @@ def _(check: Check) -> Pictures:
 @pictures_of.register
 def _(result: Worth) -> Pictures:
     return {"worth": partial(of_design.worth, result)}
+
+
+@pictures_of.register
+def _(result: Watch) -> Pictures:
+    return {"watch": partial(studies.watch, result)}
 
 
 @pictures_of.register

@@ -21,8 +21,9 @@ from mjfim.output.page import (
     as_sentence,
     shown_word,
 )
-from mjfim.output.pages.studies import budget_in_words
+from mjfim.output.pages.studies import budget_in_words, progress_of_watch
 from mjfim.output.panels import (
+    SERIES,
     Axis,
     Cells,
     Mark,
@@ -44,7 +45,13 @@ from mjfim.output.panels import (
     vspan,
     words,
 )
-from mjfim.output.plots.accuracy import Accuracies, accuracy_panel, height_of_rows, share_text
+from mjfim.output.plots.accuracy import (
+    Accuracies,
+    accuracy_over_time_panel,
+    accuracy_panel,
+    height_of_rows,
+    share_text,
+)
 from mjfim.output.words import (
     BEST_CASE,
     format_number,
@@ -69,6 +76,7 @@ from mjfim.records.studies import (
     TrialStatistics,
 )
 from mjfim.records.trajectory import Labels, with_unit
+from mjfim.records.watch import Watch
 
 # Largest numbers of parameters of a Monte Carlo study, of two robots and of a campaign; of more,
 # those that say most are drawn.
@@ -655,6 +663,33 @@ def campaign(result: Campaign, true: Array | None = None) -> Picture:
     )
     title = f"{count} {'round' if count == 1 else 'rounds'} of design, recording and estimate"
     return grid(title, panels, [1.75] * len(panels), 2, note)
+
+
+# ---- live meter
+
+
+def watch(result: Watch) -> Picture:
+    """Show the standard deviation of each parameter, by the rows up to each time."""
+    known = np.flatnonzero(np.isfinite(result.std) & np.isfinite(result.wanted))
+    share = result.std[known] / result.wanted[known]
+    shown = sorted(known[np.argsort(-share)][: len(SERIES)].tolist())
+    panel = accuracy_over_time_panel(
+        [(result.t, result.std_over_time)],
+        result.parameters,
+        result.sizes,
+        result.wanted,
+        result.reached,
+        shown,
+        is_stated=result.is_stated,
+    )
+    which = "parameters, those furthest from it"
+    return Picture(
+        title=progress_of_watch(result).removesuffix("."),
+        panels=[panel],
+        note=f"Beside the names: σ at the end, at the guess. {BEST_CASE}"
+        + share_note(shown, known, which),
+        heights=[3.4],
+    )
 
 
 def _accuracy_over_rounds(

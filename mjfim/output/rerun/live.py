@@ -38,6 +38,7 @@ from mjfim.output.rerun.scene import (
 )
 from mjfim.records.design import HistoryRow
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
+from mjfim.records.watch import Watch
 
 # Shortest time between two motions that are shown [s], samples of a motion, and motions in which
 # the robot passes through its motion once.
@@ -46,8 +47,9 @@ UPDATE_SECONDS, MOTION_SAMPLES, UPDATES_PER_MOTION = 0.3, 120, 12
 # Longest time to wait at the end for what is still to be transmitted [s].
 FLUSH_SECONDS = 3.0
 
-# Timeline of the events, which are counted over all starts and phases, and entity of the robot.
-TIMELINE, ROBOT = "event", ("robot",)
+# Timeline of the events, which are counted over all starts and phases, that of a stream, and entity
+# of the robot.
+TIMELINE, STREAM_TIMELINE, ROBOT = "event", "time", ("robot",)
 
 # Style of the robot, and roles of curves that share a plot.
 STYLE = style_of(DESIGNED)
@@ -56,14 +58,18 @@ ROLES_IN_TURN = (DESIGNED, INITIAL, MEASURED, NOMINAL, IDENTIFIED, OTHER)
 # Name, colour and width of the curves of other starts than the one of the best iterate.
 OTHER_STARTS, OTHER_COLOUR, OTHER_WIDTH, BEST_WIDTH = "other starts", (130, 130, 130), 1.0, 2.0
 
+# Name of the line that the accuracy of a stream shall reach.
+WANTED = "wanted"
+
 # Heights of robot, plots over the events, and text, relative to each other.
 LEFT_HEIGHTS = [9, 7, 5]
 
 # Titles of the plots by the kind of event, and plots with a curve for each start.
-PLOTS: dict[type[Event], dict[str, str]] = {
+PLOTS: dict[type[Event | Watch], dict[str, str]] = {
     DesignEvent: {"cost": "log10 of the cost J", "eigenvalue": "log10 of λ_min"},
     FitEvent: {"squares": "log10 of half the sum of squares", "step": "log10 of the step [σ]"},
     StudyEvent: {"share": "finished [%]"},
+    Watch: {"accuracy": "log10 of σ over the wanted σ"},
 }
 PLOTS_BY_START = tuple(PLOTS[DesignEvent])
 
@@ -92,7 +98,7 @@ class LiveShow:
         self._rec, self._model, self._now = rec, model, now
         self._events = self._updates = 0
         self._sent = -np.inf
-        self._kinds: list[type[Event]] = []
+        self._kinds: list[type[Event | Watch]] = []
         self._curves: list[tuple[str, str]] = []
         self._best: DesignEvent | None = None
         self._is_shown = True
@@ -140,8 +146,10 @@ class LiveShow:
     def _take(self, event: Event) -> None:
         self._events += 1
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
-        if type(event) not in self._kinds:
-            self._kinds.append(type(event))
+        result = event.result if isinstance(event, StudyEvent) else None
+        kind = Watch if isinstance(result, Watch) else type(event)
+        if kind not in self._kinds:
+            self._kinds.append(kind)
             self._arrange()
         if isinstance(event, DesignEvent):
             self._add("cost", event.start, _logarithm(event.row.cost))
@@ -150,6 +158,12 @@ class LiveShow:
         elif isinstance(event, FitEvent):
             self._add("squares", event.phase, _logarithm(event.cost))
             self._add("step", event.phase, _logarithm(event.step))
+        elif isinstance(result, Watch):
+            self._rec.set_time(STREAM_TIMELINE, duration=result.seconds)
+            self._add("accuracy", WANTED, 0.0)
+            for j in result.asked.tolist():
+                share = float(result.std[j] / result.wanted[j])
+                self._add("accuracy", result.parameters[j], _logarithm(share))
         elif event.count is not None:
             share = (event.index + event.share) / max(event.count, 1)
             self._add("share", event.study, 100.0 * share)
@@ -194,6 +208,8 @@ class LiveShow:
             colour = STYLE.accent
             if self._best is not None and self._best.start != name:
                 colour, shown, width = OTHER_COLOUR, OTHER_STARTS, OTHER_WIDTH
+        if name == WANTED:
+            colour = OTHER_COLOUR
         look = rr.SeriesLines(colors=[colour], names=[shown], widths=[width])
         self._rec.log(entity_path((plot, name)), look, static=True, strict=True)
 
@@ -279,7 +295,8 @@ class LiveShow:
             layout = rrb.Horizontal(
                 left, rrb.Tabs(*tabs, active_tab=0), column_shares=LEFT_TO_RIGHT
             )
-        panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following")
+        timeline = STREAM_TIMELINE if Watch in self._kinds else TIMELINE
+        panel = rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following")
         self._rec.send_blueprint(blueprint_of(layout, panel), make_active=True, make_default=True)
 
 
