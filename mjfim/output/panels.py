@@ -36,6 +36,9 @@ SERIES = (
 )
 ROLES |= {f"series{i}": colour for i, colour in enumerate(SERIES)}
 
+# Roles of two robots that a motion does not tell apart: orange and indigo.
+ROBOT_ROLES = ("series10", "series6")
+
 # Numbers of a mark.
 Numbers = Sequence[float] | NDArray[Any]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array, scaled_pseudo_inverse
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array, record
-from mjfim.records.rehearsal import Rehearsal
+from mjfim.records.rehearsal import Rehearsal, Valley
 from mjfim.records.trajectory import Labels, Trajectory
 from mjfim.records.worth import Worth
 
@@ -471,6 +471,8 @@ class Design(ShownRecord):
             interrupted before.
         worth: What each sensor tells along the designed trajectory, and what each limit costs;
             None where the search was interrupted.
+        valley: Two robots that the initial motion does not tell apart, in both motions; None where
+            the initial motion determines well what the designed one determines.
         reserve: Key `limits.reserve` that the search kept, also where it was found automatically.
     """
 
@@ -501,6 +503,7 @@ class Design(ShownRecord):
     improvement: float = float("nan")
     rehearsal: Rehearsal | None = None
     worth: Worth | None = None
+    valley: Valley | None = None
     reserve: dict[str, float] = field(default_factory=dict)
 
     file_stem = "design"
@@ -530,6 +533,7 @@ class Design(ShownRecord):
         "data",
         "rehearsal",
         "worth",
+        "valley",
         "reserve",
     )
     json_names = {"outcome": "message"}

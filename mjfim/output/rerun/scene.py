@@ -491,6 +491,8 @@ def log_robot(
     root: EntityParts,
     poses: BodyPoses,
     style: RobotStyle,
+    *,
+    is_ghost: bool = False,
 ) -> None:
     """Log the shapes of one robot, and its poses on `sim_time`.
 
@@ -500,15 +502,18 @@ def log_robot(
         root: Entity of the robot.
         poses: Poses of its bodies.
         style: Style in which it is drawn.
+        is_ghost: Whether it shows moving bodies only, and on this timeline only.
     """
-    for body in range(model.nbody):
+    if is_ghost:
+        rec.set_time("sim_time", duration=float(poses.t[0]))
+    for body in np.flatnonzero(model.body_weldid).tolist() if is_ghost else range(model.nbody):
         parts = body_parts(model, root, body)
         for shape in drawn_shapes(model, body, style):
             pose = rr.Transform3D(
                 translation=shape.position, quaternion=rerun_quaternion(shape.quaternion)
             )
             path = entity_path((*parts, shape.name))
-            rec.log(path, pose, shape.archetype, static=True, strict=True)
+            rec.log(path, pose, shape.archetype, static=not is_ghost, strict=True)
 
         # Body 0 is the world, which stays at the origin.
         if body == 0:
@@ -522,6 +527,8 @@ def log_robot(
         else:
             pose = rr.Transform3D(translation=xyz[0], quaternion=rerun_quaternion(wxyz[0]))
             rec.log(entity_path(parts), pose, static=True, strict=True)
+    if is_ghost:
+        rec.reset_time()
 
 
 def pale_shapes(
