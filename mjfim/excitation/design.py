@@ -41,6 +41,7 @@ from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import labels_of_system
 from mjfim.information.criteria import shared
+from mjfim.information.finite_steps import valley
 from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.parallel.budget import Budget, StopReason, StopToken, stop_on_interrupt
@@ -304,8 +305,17 @@ def _record(
 
     # After Ctrl-C a rehearsal would take too long.
     rehearsal = None if interrupted else rehearse_task(played, after)
-    worth = None
+    worth, robots = None, None
     if not interrupted:
+        robots = valley(
+            [(task.plant, before.trajectory), (played.plant, after.trajectory)],
+            task.system.noise,
+            task.theta,
+            information=before.information,
+            prior=information.prior,
+            # The designed motion tells robots apart by what it determines.
+            std=np.where(np.isfinite(after.std), before.std, 0.0),
+        )
         sensing = sensing_along(played, final, identifiability)
         worth = sensing.worth("the design", task.horizon)
         worth = replace(worth, prices=tuple(starmap(Price.of_limit, winner.prices.items())))
@@ -350,6 +360,7 @@ def _record(
         improvement=improvement_per_iteration(history, stage.problem.size(final)),
         rehearsal=rehearsal,
         worth=worth,
+        valley=robots,
     )
 
 

@@ -7,22 +7,35 @@ A derivative says what an infinitely small change of a parameter does. Dry frict
 strong curvature answer otherwise to a change as large as the standard deviation. The outputs are
 simulated at theta - 2 s v and theta + 2 s v, along each principal direction v of the covariance
 with the standard deviation s. Where the derivatives hold, the whitened outputs differ by 4.
+
+Where a motion hardly determines a parameter, the largest such step shows it: two robots that differ
+much, whose outputs differ by less than a test of the noise can tell.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices, scaled_to_unit_diagonal
+from mjfim.arrays import (
+    NORMAL_95,
+    POORLY_KNOWN_SHARE,
+    Array,
+    evenly_spread_indices,
+    scaled_to_unit_diagonal,
+)
 from mjfim.information.criteria import SINGULAR_RATIO
 from mjfim.information.null_space import LEAST_EFFECT, LEAST_RELATIVE_EFFECT
+from mjfim.model.coordinates import output_label
+from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.active_constraints import active_constraints
 from mjfim.plant.outputs import Noise
 from mjfim.plant.plant import SENSITIVITY_STEP, Plant
-from mjfim.records.rehearsal import FiniteSteps
+from mjfim.records.rehearsal import FiniteSteps, Separation, Valley
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # ---- roughness
@@ -234,3 +247,99 @@ def finite_steps(
     samples = evenly_spread_indices(trajectory.samples, CAUSE_SAMPLES).tolist()
     played = trajectory if plant.laws is None else plant.applied(theta, trajectory)[0]
     return replace(found, causes=active_constraints(plant.model(theta), played, samples))
+
+
+# ---- two robots that a motion does not tell apart
+
+# Number of lengths among which the largest step is searched.
+LENGTHS = 256
+
+# A parameter whose effect is less than this fraction of the largest one moves by round-off.
+LEAST_SHARE = 1e-7
+
+
+def valley(
+    motions: Sequence[tuple[Plant, Trajectory]],
+    noise: Noise,
+    theta: Array,
+    *,
+    information: Array,
+    prior: Array,
+    std: Array,
+) -> Valley | None:
+    """Find two robots with different parameters that a motion does not tell apart.
+
+    The parameter that is known worst moves, and the others as its covariance with them says: so
+    they hide it best. The robots lie on both sides of theta. Their distance grows until their
+    outputs, or the prior, differ by 1.96 standard deviations, or the worst parameter changes by
+    half; the others stop at their bounds. One direction has one degree of freedom, so that a
+    chi-square test at 95 % does not find a smaller difference.
+
+    Args:
+        motions: The motion and, where there is one, the designed motion, each with its plant.
+        noise: Noise of the measured outputs.
+        theta: (p,) parameter values.
+        information: (p, p) information along the first motion, with the prior.
+        prior: (p, p) information that does not come from the motion.
+        std: (p,) standard deviations after the first motion [theta-unit].
+
+    Returns:
+        The two robots; None where every parameter is known well, or a simulation diverges.
+    """
+    plant, trajectory = motions[0]
+    p = plant.parameters
+    sizes = p.sizes(theta)
+    share = np.zeros(len(p))
+    share[p.interest] = NORMAL_95 * (std / sizes)[p.interest]
+    worst = int(np.argmax(share))
+    if share[worst] < POORLY_KNOWN_SHARE:
+        return None
+
+    unit, size = scaled_to_unit_diagonal(information)
+    values, vectors = np.linalg.eigh(unit)
+    column = (vectors / np.maximum(values, SINGULAR_RATIO)) @ vectors[worst]
+    column[np.abs(column) < LEAST_SHARE * np.abs(column).max()] = 0.0
+    step = column / size * (MAX_RELATIVE_STEP * sizes[worst] * size[worst] / column[worst])
+    reach = np.where(p.changes_model, MAX_RELATIVE_STEP * p.magnitude, np.inf)
+    lower, upper = np.maximum(theta - reach, p.lower), np.minimum(theta + reach, p.upper)
+    writer = ParameterWriter(p)
+
+    def robots(length: int) -> Array:
+        """(2, p) parameters of the robots, by the number of the length."""
+        return np.clip(theta + length / LENGTHS * np.array([step, -step]), lower, upper)
+
+    def differ(length: int) -> bool:
+        """Whether the robots are impossible, or differ by more than the noise."""
+        pair = robots(length)
+        y, finite = plant.measure(pair, trajectory.ctrl)
+        if not finite.all() or any(writer.unphysical_bodies(plant.source, row) for row in pair):
+            return True
+        apart = pair[0] - pair[1]
+        square = np.sum(noise.whitened_rows(y[0] - y[1]) ** 2) + apart @ prior @ apart
+        return bool(square > NORMAL_95**2)
+
+    pair = robots(bisect_left(range(1, LENGTHS + 1), True, key=differ))
+    measured = [each.measure(pair, motion.ctrl) for each, motion in motions]
+    if not (np.any(pair[0] != pair[1]) and all(finite.all() for _, finite in measured)):
+        return None
+
+    # The output is that in which the last motion shows most.
+    y = measured[-1][0]
+    seen = noise.measured(y.shape[1] - 1)
+    output = int(np.argmax(np.linalg.norm((y[0] - y[1]) * seen / noise.sigma, axis=0)))
+    along = []
+    for (y, _), (_, motion) in zip(measured, motions, strict=True):
+        square = (noise.whiten(y[0] - y[1]) ** 2 * seen).sum(axis=1)
+        distance = np.sqrt(np.cumsum(square))
+        along.append(Separation(t=motion.t, y=y[:, :, output], distance=distance))
+    return Valley(
+        parameters=p.names,
+        units=tuple(each.unit for each in p.parameters),
+        nominal=theta,
+        sizes=sizes,
+        theta=pair,
+        output=output_label(plant.source.model, plant.outputs.names[output]),
+        sigma=float(noise.sigma[output]),
+        motion=along[0],
+        designed=along[1] if len(along) > 1 else None,
+    )

@@ -25,7 +25,9 @@ from PIL import Image, ImageDraw, ImageFont
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import NoVideoError
 from mjfim.experiment.system import System
+from mjfim.model.elements import model_length
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, OTHER, Term
+from mjfim.output.panels import ROBOT_ROLES, ROLES
 from mjfim.output.rerun.camera import (
     EDGE_ON,
     camera_axes,
@@ -37,7 +39,7 @@ from mjfim.output.rerun.camera import (
 )
 from mjfim.output.rerun.scene import BodyPoses, body_poses, has_floor
 from mjfim.records.base import record
-from mjfim.records.design import Design
+from mjfim.records.design import Design, round_share
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Trajectory
 
@@ -67,6 +69,11 @@ TRAIL_POINTS = 100
 FIELD_OF_VIEW = float(np.radians(40.0))
 FILLED = 0.9
 
+# Largest distance between two robots that nobody would see, over the length of the model; and their
+# colours, which have no words in the titles.
+SEEN_DISTANCE = 0.1
+ROBOT_COLOURS = [Term("", ROLES[role], ROLES[role], "") for role in ROBOT_ROLES]
+
 # Distance between the lines of the floor, as a share of the distance of the camera, or of its
 # height above the floor where that is larger.
 FLOOR_SPACING = 0.12
@@ -92,7 +99,8 @@ class FilmView:
     """One picture of a frame.
 
     Attributes:
-        tracks: Its robots; those after the first one are ghosts over it.
+        tracks: Its robots; those after the first one are ghosts over it. A robot without a word is
+            not in the title.
         target: (F, 3) point at which the camera looks in each frame [m].
         trail: (n, 3) path of the body that the camera follows [m]; empty where it follows none.
     """
@@ -133,6 +141,7 @@ class Film:
         camera: The camera.
         speed: Speed in multiples of real time.
         left_out: Time at the end of the motion that is not shown [s].
+        note: Words below the pictures.
     """
 
     model: mujoco.MjModel = field(repr=False)
@@ -141,6 +150,7 @@ class Film:
     camera: FilmCamera
     speed: float
     left_out: float
+    note: str = ""
 
     @property
     def speed_text(self) -> str:
@@ -159,6 +169,7 @@ class Film:
             robots = [
                 f"the {track.term} motion{' (transparent)' if track.is_ghost else ''}"
                 for track in view.tracks
+                if track.term
             ]
             pictures.append(" and ".join(robots))
         shown = " beside ".join(pictures)
@@ -166,7 +177,7 @@ class Film:
         if self.left_out > 0.0:
             seconds = self.t[-1] - self.t[0]
             caption += f" Only the first {seconds:.3g} s are shown; {self.left_out:.3g} s follow."
-        return caption
+        return f"{caption} {self.note}".rstrip()
 
 
 def film_of(system: System, result: Filmed) -> Film:
@@ -184,7 +195,10 @@ def film_of(system: System, result: Filmed) -> Film:
             [(INITIAL, result.initial.trajectory)],
             [(DESIGNED, result.final.trajectory)],
         ]
-        return film_of_motions(system.model_at(system.theta), motions)
+        pairs, note = robots_beside(system, result)
+        for view, pair in zip(motions, pairs, strict=False):
+            view += zip(ROBOT_COLOURS, pair, strict=True)
+        return replace(film_of_motions(system.model_at(system.theta), motions), note=note)
     if isinstance(result, Trajectory):
         simulated = Term("simulated", OTHER.colour, OTHER.colour_on_dark, OTHER.colour_name)
         return film_of_motions(system.model_at(system.theta), [[(simulated, result)]])
@@ -204,6 +218,49 @@ def film_of(system: System, result: Filmed) -> Film:
     t = result.motion.t
     missing = float(recording.t[-1] - recording.t[0]) - float(t[-1] - t[0])
     return replace(film, left_out=film.left_out + (missing if missing > t[1] - t[0] else 0.0))
+
+
+def robots_beside(
+    system: System, design: Design
+) -> tuple[list[tuple[Trajectory, Trajectory]], str]:
+    """Move the two robots that the initial motion of a design does not tell apart.
+
+    Their differences from the model are magnified where nobody would see them.
+
+    Args:
+        system: The experiment, resolved.
+        design: The design.
+
+    Returns:
+        The positions of both robots in the initial and in the designed motion, and what they show
+        in words; nothing where the design has no such robots, or they move alike.
+    """
+    if design.valley is None:
+        return [], ""
+    model, theta = system.model_at(system.theta), design.valley.theta
+    planned = [each.trajectory for each in (design.initial, design.final)]
+    found = [
+        [system.released_as(plan.state[0]).plant.simulate(row, plan.ctrl) for row in theta]
+        for plan in planned
+    ]
+    first, second = moving_points(
+        model, [body_poses(model, each.t, each.qpos) for each in found[1]]
+    )
+    apart = float(np.linalg.norm(first - second, axis=2).max(initial=0.0))
+    if apart == 0.0:
+        return [], ""
+    factor = round_share(max(SEEN_DISTANCE * float(model_length(model)) / apart, 1.0))
+    pairs = []
+    for plan, pair in zip(planned, found, strict=True):
+        for each in pair:
+            qpos, move = plan.qpos.copy(), np.empty(model.nv)
+            for position, own in zip(qpos, each.qpos, strict=True):
+                mujoco.mj_differentiatePos(model, move, 1.0, position, own)
+                mujoco.mj_integratePos(model, position, move, factor)
+            pairs.append(replace(each, qpos=qpos))
+    magnified = f", differences × {factor:g}" if factor > 1.0 else ""
+    note = f"Pale: two robots that the initial motion does not tell apart{magnified}."
+    return [(pairs[0], pairs[1]), (pairs[2], pairs[3])], note
 
 
 def film_of_motions(
@@ -448,7 +505,7 @@ class Painter:
         bold, plain = _font("DejaVuSans-Bold.ttf", TITLE_SIZE), _font("DejaVuSans.ttf", TITLE_SIZE)
         for k, view in enumerate(self._film.views):
             x = float(k * (self._film.camera.size[0] + GAP) + MARGIN)
-            for j, track in enumerate(view.tracks):
+            for j, track in enumerate(each for each in view.tracks if each.term):
                 words = [(" and " if j else "", FAINT_INK, plain)]
                 words.append((track.term, track.term.rgb, bold))
                 words.append((" (transparent)" if track.is_ghost else "", FAINT_INK, plain))
@@ -458,6 +515,8 @@ class Painter:
 
         place = (self.width - MARGIN, self.height - FOOT_HEIGHT // 2)
         text.text(place, self._film.speed_text, FAINT_INK, self._font, anchor="rm")
+        place = (self.width // 2, self.height - FOOT_HEIGHT // 2)
+        text.text(place, self._film.note, FAINT_INK, self._font, anchor="mm")
         return paper
 
     # ---- the scene
@@ -465,7 +524,7 @@ class Painter:
     def _picture(self, view: FilmView, k: int) -> NDArray[np.uint8]:
         model, data, scene = self._film.model, self._data, self._renderer.scene
         self._camera.lookat[:] = view.target[k]
-        for track in view.tracks:
+        for number, track in enumerate(view.tracks):
             data.qpos[:] = track.qpos[k]
             mujoco.mj_fwdPosition(model, data)
             first = scene.ngeom if track.is_ghost else 0
@@ -475,7 +534,7 @@ class Painter:
                 mujoco.mjv_addGeoms(model, data, self._option, nothing, dynamic, scene)
             else:
                 self._renderer.update_scene(data, self._camera, self._option)
-            self._paint(track, first)
+            self._paint(track, first, number * GHOST_SHIFT)
 
         colour = (*(np.array(view.tracks[0].term.rgb) / 255.0), 1.0)
         for begin, end in pairwise(view.trail):
@@ -485,8 +544,8 @@ class Painter:
             self._add_background()
         return np.asarray(self._renderer.render())
 
-    def _paint(self, track: Track, first: int) -> None:
-        """Tint the moving parts that were added to the scene from the number `first` on."""
+    def _paint(self, track: Track, first: int, shift: float) -> None:
+        """Tint and shift the moving parts that the scene has from the number `first` on."""
         for geom in self._renderer.scene.geoms[first : self._renderer.scene.ngeom]:
             is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
             if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
@@ -496,8 +555,7 @@ class Painter:
                 share = GHOST_TINT if track.is_ghost else TINT * (1.0 - KEPT_COLOUR * purity)
                 geom.rgba[:3] = (1.0 - share) * own + share * np.array(track.term.rgb) / 255.0
                 geom.rgba[3] *= GHOST_OPACITY if track.is_ghost else 1.0
-                if track.is_ghost:
-                    geom.pos[:] += GHOST_SHIFT * self._film.camera.offset
+                geom.pos[:] += shift * self._film.camera.offset
 
     def _add_floor(self, target: Array) -> None:
         """Add the lines of a floor around the point at which the camera looks."""

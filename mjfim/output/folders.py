@@ -156,7 +156,15 @@ DESIGN_FILES = (
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
 # Files that `mjfim check`, `worth`, `watch`, `compare-robots` and `rehearse` may write.
-CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "worth.png", "rehearsal.png")
+CHECK_FILES = (
+    "check.json",
+    "check.npz",
+    REPORT,
+    "check.png",
+    "worth.png",
+    "rehearsal.png",
+    "valley.png",
+)
 WORTH_FILES = ("worth.json", "worth.npz", REPORT, "worth.png")
 WATCH_FILES = ("watch.json", "watch.npz", REPORT, "watch.png")
 ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png")
@@ -382,7 +390,10 @@ def _write_log(file: Path, record: Design | Estimate, system: System) -> None:
     """Write the Rerun file of a result that holds a motion."""
     labels = labels_of_system(system)
     if isinstance(record, Design):
-        rerun_log.log_design(file, system.model_at(system.theta), record, labels)
+        from mjfim.output.film import robots_beside
+
+        beside = robots_beside(system, record)
+        rerun_log.log_design(file, system.model_at(system.theta), record, labels, beside)
     elif record.motion is not None:
         from mjfim.identification.aligned_recording import measured_trajectory
 

@@ -37,6 +37,8 @@ ROLES |= {f"series{i}": colour for i, colour in enumerate(SERIES)}
 
 # Colours of negative, small and positive values of cells; those between are mixed in proportion.
 CELL_COLOURS = ("#2166ac", "#f7f7f7", "#b2182b")
+# Roles of two robots that a motion does not tell apart: orange and indigo.
+ROBOT_ROLES = ("series10", "series6")
 
 # Numbers of a mark.
 Numbers = Sequence[float] | NDArray[Any]

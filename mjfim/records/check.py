@@ -11,7 +11,7 @@ from mjfim.arrays import Array, record
 from mjfim.errors import first_ones, shortened
 from mjfim.records.base import Record, ShownRecord
 from mjfim.records.design import CombinationAccuracy, LimitViolation
-from mjfim.records.rehearsal import FiniteSteps, Rehearsal
+from mjfim.records.rehearsal import FiniteSteps, Rehearsal, Valley
 from mjfim.records.worth import Worth
 
 # A coefficient that differs from 1 by less than this number is not written.
@@ -294,6 +294,8 @@ class Check(ShownRecord):
         steps: Standard deviations by finite steps along one motion; None where they were not made.
         rehearsal: What the motion does to robots; None for recordings.
         worth: What each sensor tells along one motion; None for recordings.
+        valley: Two robots that one motion does not tell apart; None where every parameter is known
+            well, and for recordings.
         is_start: Whether the motion is the initial control, at which a design begins.
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
@@ -319,6 +321,7 @@ class Check(ShownRecord):
     steps: FiniteSteps | None = None
     rehearsal: Rehearsal | None = None
     worth: Worth | None = None
+    valley: Valley | None = None
     is_start: bool = False
     combined: tuple[CombinationAccuracy, ...] = ()
     missing: tuple[str, ...] = ()
@@ -348,6 +351,7 @@ class Check(ShownRecord):
         "steps",
         "rehearsal",
         "worth",
+        "valley",
     )
     json_names = {
         "rows": "parameters",

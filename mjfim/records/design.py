@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array, record, scaled_pseudo_inverse
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array
-from mjfim.records.rehearsal import Rehearsal
+from mjfim.records.rehearsal import Rehearsal, Valley
 from mjfim.records.trajectory import Labels, Trajectory
 from mjfim.records.worth import Worth
 
@@ -468,6 +468,8 @@ class Design(ShownRecord):
             interrupted before.
         worth: What each sensor tells along the designed trajectory, and what each limit costs;
             None where the search was interrupted.
+        valley: Two robots that the initial motion does not tell apart, in both motions; None where
+            the initial motion determines well what the designed one determines.
     """
 
     status: Status
@@ -497,6 +499,7 @@ class Design(ShownRecord):
     improvement: float = float("nan")
     rehearsal: Rehearsal | None = None
     worth: Worth | None = None
+    valley: Valley | None = None
 
     file_stem = "design"
     made_by = "`mjfim design EXPERIMENT -o DIR`"
@@ -525,6 +528,7 @@ class Design(ShownRecord):
         "data",
         "rehearsal",
         "worth",
+        "valley",
         "reserve",
     )
     json_names = {"outcome": "message"}

@@ -1,7 +1,7 @@
 """Records of a rehearsal: a design on simulated robots, and standard deviations by finite steps.
 
-The first row of each array over robots is the model at the parameters of the design; the n robots
-follow.
+Two robots show what a motion does not determine. In a rehearsal, the first row of each array over
+robots is the model at the parameters of the design; the n robots follow.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.errors import first_ones
 from mjfim.records.base import Record, ShownRecord
 
@@ -100,6 +100,110 @@ def grouped(causes: Iterable[str]) -> list[str]:
         kind, of, name = cause.partition(" of ")
         names.setdefault(kind + of, []).append(name)
     return [kind + first_ones(found) for kind, found in names.items()]
+
+
+@record
+class Separation(Record):
+    """How far the measured outputs of two robots are apart along one motion.
+
+    Attributes:
+        t: (n,) times [s].
+        y: (2, n) output of each robot, that in which they differ most [unit of the output].
+        distance: (n,) distance of all outputs up to each time [standard deviations of the noise].
+    """
+
+    t: Array
+    y: Array
+    distance: Array
+
+    in_json = ("total", "largest", "at")
+    json_names = {"total": "distance", "largest": "largest_difference", "at": "time"}
+
+    @property
+    def total(self) -> float:
+        """Distance of all outputs [standard deviations of the noise]."""
+        return float(self.distance[-1])
+
+    @property
+    def largest(self) -> float:
+        """Largest difference of the output [unit of the output]."""
+        return float(np.abs(self.y[0] - self.y[1]).max())
+
+    @property
+    def at(self) -> float:
+        """Time of the largest difference [s]."""
+        return float(self.t[np.argmax(np.abs(self.y[0] - self.y[1]))])
+
+    @property
+    def seen_after(self) -> float:
+        """Time after which a test at 95 % tells the robots apart [s]; infinite for never."""
+        is_seen = self.distance > NORMAL_95
+        return float(self.t[np.argmax(is_seen)]) if is_seen.any() else np.inf
+
+
+# Parameters that move by less than this share of the largest relative move are not shown. Length of
+# the list of those that are named in a sentence [characters].
+SHOWN_MOVE, NAMES_TEXT = 0.01, 64
+
+
+@record
+class Valley(Record):
+    """Two robots with different parameters that a motion does not tell apart.
+
+    Attributes:
+        parameters: Names of the p parameters.
+        units: Their units; may be empty.
+        nominal: (p,) values in the middle between the robots, at which the experiment is made.
+        sizes: (p,) sizes of which percent are taken [theta-unit].
+        theta: (2, p) parameters of the robots [theta-unit].
+        output: Output in which they differ most, with its unit.
+        sigma: Standard deviation of its noise [unit of the output].
+        motion: The motion that does not tell them apart.
+        designed: The designed motion; None where there is none.
+    """
+
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    nominal: Array
+    sizes: Array
+    theta: Array
+    output: str
+    sigma: float
+    motion: Separation
+    designed: Separation | None = None
+
+    in_json = ("parameters", "units", "theta", "percent", "output", "sigma", "motion", "designed")
+
+    @property
+    def percent(self) -> Array:
+        """(2, p) differences from the nominal values [%]."""
+        return np.asarray(100.0 * (self.theta - self.nominal) / self.sizes)
+
+    @property
+    def moved(self) -> list[int]:
+        """Parameters in which the robots differ, those that differ most first."""
+        move = np.abs(np.diff(self.percent, axis=0)[0])
+        order = np.argsort(-move, kind="stable")
+        return [int(j) for j in order if move[j] >= SHOWN_MOVE * move.max()]
+
+    def __str__(self) -> str:
+        """Say how far the robots are apart in each motion."""
+        gaps = np.abs(np.diff(self.percent, axis=0)[0])
+        every = [f"{self.parameters[j]} by {gaps[j]:.2g} %" for j in self.moved]
+        names = first_ones(every, longest=NAMES_TEXT)
+        which = "this" if self.designed is None else "the initial"
+        found = (
+            f"Along {which} motion, two robots that differ in {names} are apart by "
+            f"{self.motion.total:.3g} σ of the noise: too little to tell them apart."
+        )
+        if self.designed is None:
+            return found
+        name, _, unit = self.output.partition(" [")
+        difference = f"{self.designed.largest:.2g} {unit.rstrip(']')}".rstrip()
+        return (
+            f"{found} Along the designed motion they are apart by {self.designed.total:.3g} σ, "
+            f"most in {name} ({difference} at {self.designed.at:.3g} s)."
+        )
 
 
 @record

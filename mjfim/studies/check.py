@@ -46,7 +46,7 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.search import refuse_same_data
 from mjfim.identification.segments import recorded_release
 from mjfim.information.criteria import shared
-from mjfim.information.finite_steps import visible_columns
+from mjfim.information.finite_steps import valley, visible_columns
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
 from mjfim.optimize.directions import LBFGS
@@ -515,13 +515,23 @@ def _checked(
     std = np.full(len(task.parameters), np.inf)
     std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
 
-    # Along one motion, standard deviations are checked by finite steps.
-    steps = None
+    # Along one motion, standard deviations are checked by finite steps, and two robots show what it
+    # does not determine.
+    steps, robots = None, None
     if not stop.requested and point.trajectory is not None and point.information is not None:
         along = information.std(point.information)
         steps = steps_along(task, point.trajectory, point.information, along)
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
+        if is_motion:
+            robots = valley(
+                [(task.plant, point.trajectory)],
+                task.system.noise,
+                task.theta,
+                information=point.information,
+                prior=information.prior,
+                std=std,
+            )
 
     # A motion that a robot could play is rehearsed as that of a design is.
     rehearsal, warning = None, ""
@@ -566,6 +576,7 @@ def _checked(
         steps=steps,
         rehearsal=rehearsal,
         worth=worth,
+        valley=robots,
         is_start=is_start,
         verdict=(),
         combined=() if not_excited else found.combinations(information, values, total, total),

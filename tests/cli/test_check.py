@@ -77,6 +77,7 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
         "report.html",
         "rehearsal.png",
         "worth.png",
+        "valley.png",
         MANIFEST,
     }
     assert imread(tmp_path / "out" / "check.png").shape[0] > 300

@@ -221,6 +221,33 @@ def test_the_search_is_on_the_timeline_of_iterations(file: Path) -> None:
     assert heights[0] < 0.5 * heights[2]
 
 
+def test_robots_beside_both_motions_are_outlines_without_static_shapes(
+    cart: mujoco.MjModel, design: Design, tmp_path: Path
+) -> None:
+    plans = design.initial.trajectory, design.final.trajectory
+    beside = [[replace(plan, qpos=plan.qpos + shift) for shift in (0.1, -0.2)] for plan in plans]
+    path = tmp_path / "two.rrd"
+    log_design(path, cart, design, labels_of_model(cart), (beside, "Pale: two robots."))
+    for name, pair in zip(("initial", "designed"), beside, strict=True):
+        for number, motion in enumerate(pair, start=1):
+            root = ("robots", name, f"robot {number}", "bodies")
+            times, places = column(path, (*root, "bob"), "sim_time", "Transform3D:translation")
+            expected = body_poses(cart, motion.t, motion.qpos)
+            assert len(times) == len(motion.t)
+            bob = cart.body("bob").id
+            np.testing.assert_allclose(places[:, 0], expected.positions[:, bob], atol=1e-6)
+            # On the timeline of the iterations they would stand still in a wrong place.
+            shape = (*root, "bob", "bob")
+            assert not len(column(path, shape, None, "Ellipsoids3D:half_sizes")[1])
+            _, fill = column(path, shape, "sim_time", "Ellipsoids3D:fill_mode")
+            assert fill[0, 0] == OUTLINE.value
+    assert not any("robot 1/bodies/world" in name for name in entities(path))
+    assert "Pale: two robots." in str(
+        column(path, ("summary",), None, "TextDocument:text")[1][0, 0]
+    )
+    assert empty_views(path) == []
+
+
 def test_in_the_view_of_both_robots_the_initial_one_is_translucent(file: Path) -> None:
     looks = blueprint_column(file, "Ellipsoids3D:colors")
     (path,) = [entity for entity in looks if "/initial/bodies/bob/bob/" in entity]

@@ -33,6 +33,7 @@ DESIGN = {
     "accuracy.png",
     "worth.png",
     "rehearsal.png",
+    "valley.png",
 }
 
 # Files that `mjfim identify` writes.

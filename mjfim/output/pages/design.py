@@ -40,7 +40,7 @@ from mjfim.output.words import (
 )
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup
 from mjfim.records.design import Design, ScaledStart
-from mjfim.records.rehearsal import REST_SHARE, Rehearsal, RehearsedLimit
+from mjfim.records.rehearsal import REST_SHARE, Rehearsal, RehearsedLimit, Valley
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
@@ -85,6 +85,8 @@ def design_page(design: Design) -> Page:
         sections.insert(2, Section("Limits", [Plot("limits"), table]))
     if design.rehearsal is not None:
         sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
+    if design.valley is not None:
+        sections.insert(1, Section("Two robots", _valley_parts(design.valley)))
     if design.worth is not None:
         sections.append(Section("What would help", worth_parts(design.worth, detail=True)))
     before, after = _least_eigenvalues(design)
@@ -462,6 +464,22 @@ def _rehearsal_parts(rehearsal: Rehearsal, *, is_detail: bool = False) -> Iterat
     yield Text(_surroundings(rehearsal), detail=True)
 
 
+def _valley_parts(valley: Valley) -> Sequence[Part]:
+    """Say which two robots a motion does not tell apart, and tabulate their parameters."""
+    moved = valley.moved
+    table = tabulated(
+        "Two robots that move alike",
+        {
+            "parameter": [named(valley.parameters[j], valley.units[j]) for j in moved],
+            "robot 1": numbers(valley.theta[0, moved], 4),
+            "robot 2": numbers(valley.theta[1, moved], 4),
+            "difference": numbers(np.diff(valley.percent, axis=0)[0, moved], 2, " %"),
+        },
+        detail=True,
+    )
+    return Text(str(valley)), Plot("valley"), table
+
+
 def _surroundings(rehearsal: Rehearsal) -> str:
     """Heights, distances, contacts and stops of all robots in a sentence."""
     parts = []
@@ -627,6 +645,8 @@ def check_page(check: Check) -> Page:
         is_detail = check.is_start and not check.is_dangerous
         parts = list(_rehearsal_parts(check.rehearsal, is_detail=is_detail))
         sections.append(Section("Rehearsal", parts))
+    if check.valley is not None:
+        sections.append(Section("Two robots", _valley_parts(check.valley)))
     if check.worth is not None:
         sections.append(Section("What would help", worth_parts(check.worth, detail=True)))
     if check.violations:

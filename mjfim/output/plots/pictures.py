@@ -18,7 +18,7 @@ from functools import partial, singledispatch
 from typing import TYPE_CHECKING
 
 from mjfim.errors import MjfimError, unknown
-from mjfim.output.page import PictureFormat
+from mjfim.output.page import DESIGNED, INITIAL, PictureFormat
 from mjfim.output.panels import Picture
 from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
@@ -51,6 +51,7 @@ DESIGN_PICTURES = (
     "convergence",
     "limits",
     "rehearsal",
+    "valley",
     "worth",
 )
 ESTIMATE_PICTURES = (
@@ -191,6 +192,9 @@ def _(design: Design) -> Pictures:
         pictures["limits"] = partial(of_design.limits, design, labels)
     if design.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, design.rehearsal)
+    if design.valley is not None:
+        motions = [(f"{term} motion", term) for term in (INITIAL, DESIGNED)]
+        pictures["valley"] = partial(studies.valley, design.valley, motions)
     if design.worth is not None:
         pictures["worth"] = partial(of_design.worth, design.worth)
     return pictures
@@ -270,6 +274,9 @@ def _(check: Check) -> Pictures:
     pictures: Pictures = {"check": partial(studies.check, check)}
     if check.rehearsal is not None:
         pictures["rehearsal"] = partial(studies.rehearsal, check.rehearsal)
+    if check.valley is not None:
+        motion = check.source, studies.source_role(check)
+        pictures["valley"] = partial(studies.valley, check.valley, [motion])
     if check.worth is not None:
         pictures["worth"] = partial(of_design.worth, check.worth)
     return pictures

@@ -23,6 +23,7 @@ from mjfim.output.page import (
 )
 from mjfim.output.pages.studies import budget_in_words, progress_of_watch
 from mjfim.output.panels import (
+    ROBOT_ROLES,
     SERIES,
     Axis,
     Cells,
@@ -66,7 +67,7 @@ from mjfim.output.words import (
 )
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check
-from mjfim.records.rehearsal import Rehearsal
+from mjfim.records.rehearsal import Rehearsal, Separation, Valley
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
@@ -77,6 +78,9 @@ from mjfim.records.studies import (
 )
 from mjfim.records.trajectory import Labels, with_unit
 from mjfim.records.watch import Watch
+
+# Lower end of the axis of a distance between two robots [standard deviations].
+LEAST_DISTANCE = 0.1
 
 # Largest numbers of parameters of a Monte Carlo study, of two robots and of a campaign; of more,
 # those that say most are drawn.
@@ -191,6 +195,90 @@ def _correlations(result: Check, rows: int) -> Panel:
         remark=remark,
         place=(0, 1),
     )
+
+
+# Largest number of parameters of two robots that are drawn, those in which they differ most.
+MAX_MOVED = 12
+
+
+def valley(found: Valley, motions: Sequence[tuple[str, str]]) -> Picture:
+    """Show two robots that a motion does not tell apart, and how the designed one does.
+
+    Args:
+        found: The robots.
+        motions: Name and role of each of the motions.
+    """
+    every = [found.motion] if found.designed is None else [found.motion, found.designed]
+    ends = (
+        0.6 * max(each.largest for each in every),
+        2.0 * max(2.0, *(each.total for each in every)),
+    )
+    panels = []
+    for k, (each, (name, role)) in enumerate(zip(every, motions, strict=True)):
+        panels += [
+            replace(panel, role=role, place=(row, k))
+            for row, panel in enumerate(_separation(found, each, name, ends))
+        ]
+    moved = found.moved[:MAX_MOVED]
+    rows, percent = np.arange(len(moved)), found.percent[:, moved]
+    marks: list[Mark] = [
+        vline(0.0, dash="--", label="nominal value"),
+        *(line(ends, [k, k], "band", width=3.0, front=1.0) for k, ends in enumerate(percent.T)),
+    ]
+    beside = []
+    for k, role in enumerate(ROBOT_ROLES):
+        marks.append(dots(percent[k], rows, role, size=8.0))
+        beside.append((f"robot {k + 1}", role, list(map(format_number, found.theta[k, moved]))))
+    panels.append(
+        Panel(
+            marks=marks,
+            x=Axis(label="difference from the nominal value [% of its size]"),
+            y=row_axis([with_unit(found.parameters[j], found.units[j]) for j in moved]),
+            beside=beside,
+            place=(2, 0),
+            is_wide=True,
+        )
+    )
+    return Picture(
+        title=str(found).removesuffix("."),
+        panels=panels,
+        note="Δ: from the mean of both robots. Distance: all measurements up to each time, over "
+        "their noise; below 1.96 σ a χ² test at 95 % finds nothing."
+        + share_note(moved, found.moved, "parameters, those that differ most"),
+        heights=[2.0, 1.7, height_of_rows(len(moved))],
+        widths=[1.0] * len(every),
+    )
+
+
+def _separation(
+    found: Valley, along: Separation, name: str, ends: tuple[float, float]
+) -> tuple[Panel, Panel]:
+    """Return the output of two robots about its mean, and their distance, with ends of the axes."""
+    curves = [
+        line(along.t, y, role, label=f"robot {k}")
+        for k, (y, role) in enumerate(
+            zip(along.y - along.y.mean(axis=0), ROBOT_ROLES, strict=True), start=1
+        )
+    ]
+    band = hspan(-2.0 * found.sigma, 2.0 * found.sigma, label="± 2 σ of one measurement")
+    after = "not told apart"
+    if np.isfinite(along.seen_after):
+        after = f"told apart after {along.seen_after:.3g} s"
+    output = Panel(
+        title=f"{name}: {along.total:.3g} σ apart",
+        marks=[band, *curves],
+        y=Axis(label=f"Δ {found.output}", limits=(-ends[0], ends[0])),
+    )
+    distance = Panel(
+        title=f"{name}: {after}",
+        marks=[
+            hspan(LEAST_DISTANCE, NORMAL_95, label="too little to tell apart (95 %)"),
+            line(along.t, np.maximum(along.distance, LEAST_DISTANCE), "text"),
+        ],
+        x=Axis(label="time [s]"),
+        y=Axis(label="distance [σ of noise]", limits=(LEAST_DISTANCE, ends[1]), log=True),
+    )
+    return output, distance
 
 
 # ---- comparison of methods

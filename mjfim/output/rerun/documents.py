@@ -37,7 +37,7 @@ from mjfim.output.page import (
     shown_word,
 )
 from mjfim.output.pages import page_of
-from mjfim.output.panels import Panel, line
+from mjfim.output.panels import ROBOT_ROLES, Panel, line
 from mjfim.output.plots.design import (
     accuracy_over_time,
     convergence,
@@ -46,6 +46,7 @@ from mjfim.output.plots.design import (
     motion_panels,
 )
 from mjfim.output.plots.estimate import deciding_seconds, fit, held_out, residual_torque
+from mjfim.output.plots.studies import valley
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.plots import (
     PLOTS_PER_ROW,
@@ -96,7 +97,13 @@ ROBOTS_TO_TEXT, LEFT_TO_RIGHT = [5, 4], [2, 3]
 START_SECONDS = 3.0
 
 
-def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels) -> None:
+def log_design(
+    path: Path,
+    model: mujoco.MjModel,
+    design: Design,
+    labels: Labels,
+    beside: tuple[Sequence[Sequence[Trajectory]], str] = ((), ""),
+) -> None:
     """Write design.rrd: accuracy over time, both robots, their signals, the search and a summary.
 
     Args:
@@ -104,6 +111,8 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
         model: Model with the parameters of the design.
         design: The design.
         labels: Labels of its columns.
+        beside: Motions of the two robots beside the initial and beside the designed motion, and
+            what they show in words.
     """
     both: dict[str, Trajectory] = {
         INITIAL: design.initial.trajectory,
@@ -113,6 +122,9 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
     motion = motion_panels(labels, both, design.usage)
     bounds: Tabs = {"limits": limit_panels(design, labels, rows=False)} if design.usage else {}
     asked = bounds | {"accuracy": list(learning.panels)}
+    if design.valley is not None:
+        panels = valley(design.valley, [(f"{term} motion", term) for term in both]).panels
+        asked |= {"two robots": list(panels[: 2 * len(both)])}
     # The positions nearest to their limits, or the first ones.
     near = {use.name: largest_share(use) for use in design.usage if use.kind == "position"}
     nearest = sorted(
@@ -131,12 +143,18 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
 
     poses = _poses_of(model, both)
     robots = _robots(model, poses, ASPECT_WITH_TEXT)
-    text = as_markdown(page_of(design), DESIGN_COLOURS)
+    text = as_markdown(page_of(design), DESIGN_COLOURS, beside[1])
     with open_recording(path, model, "design", robots, tabs, text) as rec:
         log_series(rec, asked | motion)
         for plane, panel in search:
             plane.log(rec, panel.marks)
         _log_robots(rec, model, poses, {}, [INITIAL])
+        for name, pair in zip(poses, beside[0], strict=False):
+            for k, (each, role) in enumerate(zip(pair, ROBOT_ROLES, strict=True), start=1):
+                style = RobotStyle(accent=rgb(role), outline=True)
+                ghost = body_poses(model, each.t, each.qpos)
+                root = ("robots", name, f"robot {k}")
+                log_robot(rec, model, root, ghost, style, is_ghost=True)
         _log_iterates(rec, model, design, iterates)
 
 

@@ -497,6 +497,8 @@ def log_robot(
     root: EntityParts,
     poses: BodyPoses,
     style: RobotStyle,
+    *,
+    is_ghost: bool = False,
 ) -> None:
     """Log the shapes of one robot, and its poses on `sim_time`.
 
@@ -506,16 +508,19 @@ def log_robot(
         root: Entity of the robot.
         poses: Poses of its bodies.
         style: Style in which it is drawn.
+        is_ghost: Whether it shows moving bodies only, and on this timeline only.
     """
+    if is_ghost:
+        rec.set_time("sim_time", duration=float(poses.t[0]))
     above = {shape_name(model, geom) for geom in planes_above(model, poses)}
-    for body in range(model.nbody):
+    for body in np.flatnonzero(model.body_weldid).tolist() if is_ghost else range(model.nbody):
         parts = body_parts(model, root, body)
         for shape in drawn_shapes(model, body, style):
             pose = rr.Transform3D(
                 translation=shape.position, quaternion=rerun_quaternion(shape.quaternion)
             )
             path = entity_path((*parts, shape.name))
-            rec.log(path, pose, shape.archetype, static=True, strict=True)
+            rec.log(path, pose, shape.archetype, static=not is_ghost, strict=True)
             if shape.name in above:
                 pale = rr.Mesh3D.from_fields(albedo_factor=(255, 255, 255, 255 * PALE_OPACITY))
                 rec.log(path, pale, static=True, strict=True)
@@ -532,6 +537,8 @@ def log_robot(
         else:
             pose = rr.Transform3D(translation=xyz[0], quaternion=rerun_quaternion(wxyz[0]))
             rec.log(entity_path(parts), pose, static=True, strict=True)
+    if is_ghost:
+        rec.reset_time()
 
 
 def pale_shapes(
