@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
@@ -30,9 +29,8 @@ if TYPE_CHECKING:
 # Time between two updates of the table, and between two lines where stderr is no terminal [s].
 REFRESH_SECONDS, LINE_SECONDS = 0.1, 10.0
 
-# Largest number of rows between two looks at the time, bytes that are read at once, and number of
-# such parts that wait at most.
-ROWS_AT_ONCE, BYTES_AT_ONCE, MOST_WAITING = 10, 65_536, 16
+# Largest number of rows between two looks at the time, and of lines that wait at most.
+ROWS_AT_ONCE, MOST_WAITING = 10, 1000
 
 # Number of faulty rows up to which each of them is told; the table counts all.
 MOST_TOLD = 50
@@ -97,16 +95,19 @@ def _followed(
 
     rows = _Rows(meter, STDIN_NAME if stream == STDIN else stream)
     event = StudyEvent(study="watch", part="", index=0, count=None, share=0.0)
-    shown, is_enough = -math.inf, False
-    for lines in takewhile(lambda _: not stop.requested, _lines(stream)):
-        for line in lines:
-            rows.take(line)
-        result = rows.result()
-        text = progress_of_watch(result)
-        if result.enough > is_enough:
-            say(text)
-        is_enough = result.enough
-        if time.monotonic() - shown >= REFRESH_SECONDS:
+    shown, taken, is_enough = -math.inf, 0, False
+    for line in takewhile(lambda _: not stop.requested, _lines(stream)):
+        rows.take(line)
+        taken += 1
+        is_late = time.monotonic() - shown >= REFRESH_SECONDS
+        if is_late or taken == ROWS_AT_ONCE:
+            taken = 0
+            result = rows.result()
+            text = progress_of_watch(result)
+            if result.enough > is_enough:
+                say(text)
+            is_enough = result.enough
+        if is_late:
             shown = time.monotonic()
             show(replace(event, message=text, result=result))
     try:
@@ -129,7 +130,7 @@ class _Rows:
         """Take a line; the first one is the header."""
         from mjfim.recordings.read import RowReader
 
-        self._lines += 1
+        self._lines += bool(line)
         if not line.strip():
             return
         if self._reader is None:
@@ -152,29 +153,25 @@ class _Rows:
         return replace(self._meter.read(ended=ended), left_out=self._left_out)
 
 
-def _lines(stream: str) -> Iterator[list[str]]:
-    """Lines of a stream as they come, a few at once; none where no line comes for a moment."""
-    chunks: Queue[bytes] = Queue(MOST_WAITING)
+def _lines(stream: str) -> Iterator[str]:
+    """Lines of a stream as they come; an empty one where none comes for a moment."""
+    lines: Queue[str | None] = Queue(MOST_WAITING)
 
     def read() -> None:
         """Read the stream, also while another thread computes."""
-        # The number of stdin is read directly: Python would not let go of its buffer at the end.
-        file = 0 if stream == STDIN else os.open(stream, os.O_RDONLY)
-        while chunk := os.read(file, BYTES_AT_ONCE):
-            chunks.put(chunk)
-        chunks.put(b"")
+        with open(0 if stream == STDIN else stream, encoding="utf-8-sig", errors="replace") as file:
+            for line in file:
+                lines.put(line)
+        lines.put(None)
 
     Thread(target=read, daemon=True).start()
-    rest, is_open = b"", True
-    while is_open:
-        with suppress(Empty):
-            chunk = chunks.get(timeout=REFRESH_SECONDS)
-            is_open = bool(chunk)
-            *lines, rest = (rest + (chunk or b"\n")).split(b"\n")
-            for begin in range(0, len(lines), ROWS_AT_ONCE):
-                few = lines[begin : begin + ROWS_AT_ONCE]
-                yield [line.decode("utf-8-sig", errors="replace") for line in few]
-        yield []
+    line: str | None = ""
+    while line is not None:
+        yield line
+        try:
+            line = lines.get(timeout=REFRESH_SECONDS)
+        except Empty:
+            line = ""
 
 
 @contextmanager

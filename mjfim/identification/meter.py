@@ -18,6 +18,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import (
     EDGE_TOLERANCE,
     GRID_TOLERANCE,
+    MIN_ROWS,
     AlignedRecording,
     resample_control,
 )
@@ -87,10 +88,7 @@ class Meter:
         self._wanted = p.wanted if self._is_stated else DEFAULT_RELATIVE_STD * self._sizes
 
         # Rows that are still needed, with times since the first one; then results over time.
-        self._waiting: list[tuple[float, Array, Array]] = []
-        self._t = np.zeros(0)
-        self._ctrl = np.zeros((0, len(self.system.inputs)))
-        self._y = np.zeros((0, len(self.system.outputs)))
+        self._kept: list[tuple[float, Array, Array]] = []
         self._origin, self._latest, self._rows = 0.0, -np.inf, 0
         self._simulation: _Simulation | None = None
         self._warnings: tuple[str, ...] = ()
@@ -113,10 +111,10 @@ class Meter:
                 comes after a long gap, or a control without a value. It is not used then.
         """
         u, y = np.array(ctrl, dtype=np.float64), np.array(measured, dtype=np.float64)
-        if (u.shape, y.shape) != (self._ctrl.shape[1:], self._y.shape[1:]):
+        inputs, outputs = self.system.inputs, self.system.outputs.names
+        if (u.shape, y.shape) != ((len(inputs),), (len(outputs),)):
             raise RecordingError(
-                f"{u.size} controls and {y.size} outputs; expected {self._ctrl.shape[1]} and "
-                f"{self._y.shape[1]}"
+                f"{u.size} controls and {y.size} outputs; expected {len(inputs)} and {len(outputs)}"
             )
         if not t > self._latest:
             raise RecordingError(f"time {t:.9g} s after {self._latest:.9g} s; it must increase")
@@ -128,12 +126,11 @@ class Meter:
                 f"{longest:.3g} s: raise recording.gap"
             )
         if not np.isfinite(u).all():
-            name = self.system.inputs[int(np.argmin(np.isfinite(u)))]
-            raise RecordingError(f"{name!r} has no value")
+            raise RecordingError(f"{inputs[int(np.argmin(np.isfinite(u)))]!r} has no value")
         self._origin = self._origin if self._rows else t
         self._latest = t
         self._rows += 1
-        self._waiting.append((t - self._origin, u, y))
+        self._kept.append((t - self._origin, u, y))
 
     @property
     def std(self) -> Array:
@@ -153,18 +150,17 @@ class Meter:
             RecordingError: The stream has ended with too few rows, or without a measured value.
             SimulationDivergedError: The model at the guess diverges.
         """
-        if self._waiting:
-            t, ctrl, y = zip(*self._waiting, strict=True)
-            self._t = np.append(self._t, t)
-            self._ctrl, self._y = np.vstack([self._ctrl, *ctrl]), np.vstack([self._y, *y])
-            self._waiting = []
+        if ended and self._rows < MIN_ROWS:
+            raise RecordingError(
+                f"the stream has too few rows ({self._rows}), not {MIN_ROWS} or more"
+            )
         if self._simulation is None:
             self._begin(ended)
         if self._simulation is not None:
-            self._simulation.advance(self._t, self._ctrl, self._y, ended=ended)
+            t, ctrl, y = map(np.array, zip(*self._kept, strict=True))
+            self._simulation.advance(t, ctrl, y, ended=ended)
             self._note(self._simulation.time, self._simulation.std)
-            kept = slice(max(self._simulation.first_row(self._t) - KEPT_ROWS, 0), None)
-            self._t, self._ctrl, self._y = self._t[kept], self._ctrl[kept], self._y[kept]
+            del self._kept[: max(self._simulation.first_row(t) - KEPT_ROWS, 0)]
         asked, names = self._asked, self.system.parameters.names
         return Watch(
             parameters=tuple(names[j] for j in asked.tolist()),
@@ -181,18 +177,13 @@ class Meter:
 
     def _begin(self, ended: bool) -> None:
         """Begin to simulate, once there are enough rows for the initial state."""
-        found = np.cumsum(np.isfinite(self._y[1:]).any(axis=1))
-        by_time = np.searchsorted(self._t, MIN_SAMPLES * self.system.dt)
-        count = int(max(np.searchsorted(found, ROWS_OF_NOISE) + 2, by_time + 1))
-        if count > len(self._t) and not ended:
+        shown = [k for k, (_, _, y) in enumerate(self._kept) if np.isfinite(y).any() and k]
+        if len(shown) < ROWS_OF_NOISE and not ended:
             return
-        first = Recording(
-            t=self._t[:count],
-            ctrl=self._ctrl[:count][:-1],
-            y=self._y[:count],
-            outputs=self.system.outputs.names,
-            name="stream",
-        )
+        rows = self._kept[: shown[:ROWS_OF_NOISE][-1] + 1] if shown else self._kept
+        t, ctrl, y = map(np.array, zip(*rows, strict=True))
+        names = self.system.outputs.names
+        first = Recording(t=t, ctrl=ctrl[:-1], y=y, outputs=names, name="stream")
         task = FitTask.of(self.system, [first])
         self._warnings = tuple(map(str, task.elsewhere))
         self._simulation = _Simulation(task.problem())

@@ -317,37 +317,34 @@ class RowReader:
         spec, cells = self._channels.spec, next(csv.reader([line]))
         if len(cells) != len(self._names):
             raise RecordingError(f"{len(cells)} cells, but line 1 has {len(self._names)}")
-        new = {name: _number(name, cells[place]) for name, place in self._places.items()}
-        held = {name: old if np.isnan(new[name]) else new[name] for name, old in self._raw.items()}
+        new, held = {}, {}
+        for name, old in self._raw.items():
+            cell = cells[self._places[name]]
+            try:
+                new[name] = float(cell.strip() or "nan")
+            except ValueError:
+                new[name] = np.inf
+            if abs(new[name]) > LARGEST_VALUE:
+                text = shortened(repr(cell))
+                raise RecordingError(f"column {name!r}: {text} is no measured number")
+            held[name] = old if np.isnan(new[name]) else new[name]
         pairs = {name: np.array([self._raw[name], held[name]]) for name in held}
+        measured = {}
         for name, rule in self._sources.items():
             before, value = _converted(self._source, pairs.__getitem__, rule)
             # An unwrapped value goes on from the one before it.
             jumps = rule.unwrap or rule.period is not None
-            shift = np.nan_to_num(self._values[name] - before) if jumps else 0.0
-            self._values[name] = float(value + shift)
+            value += np.nan_to_num(self._values[name] - before) if jumps else 0.0
+            self._values[name] = float(value)
+            measured[name] = np.nan if np.isnan(new[rule.column]) else float(value)
         self._raw = held
         time = self._unit_of_time * new[spec.time]
         self._begin = time if np.isnan(self._begin) else self._begin
         since, window = time - self._begin, spec.window or (-np.inf, np.inf)
         if since < window[0] - WINDOW_TOLERANCE or since > window[1] + WINDOW_TOLERANCE:
             return None
-        is_new = {name: not np.isnan(new[rule.column]) for name, rule in self._sources.items()}
-        outputs = [
-            self._values[name] if is_new.get(name) else np.nan for name in self._channels.outputs
-        ]
-        return time, [self._values[name] for name in self._channels.control_columns], outputs
-
-
-def _number(name: str, cell: str) -> float:
-    """The number in a cell, NaN where it is empty."""
-    try:
-        value = float(cell) if cell.strip() else np.nan
-    except ValueError:
-        value = np.inf
-    if abs(value) > LARGEST_VALUE:
-        raise RecordingError(f"column {name!r}: {shortened(repr(cell))} is no measured number")
-    return value
+        controls = [self._values[name] for name in self._channels.control_columns]
+        return time, controls, [measured.get(name, np.nan) for name in self._channels.outputs]
 
 
 # ---- which column is what
