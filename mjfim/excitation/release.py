@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -94,7 +94,7 @@ class Release:
         return (False, self.point.cost) if margin >= 0.0 else (True, -margin)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Releases:
     """Evaluates releases of a task.
 
@@ -221,7 +221,7 @@ def _made(
     return Releases(stage=DescentLevel(task, basis), space=space, plant=plant)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Order:
     """Order to evaluate some releases, or to follow one."""
 

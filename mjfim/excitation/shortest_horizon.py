@@ -11,7 +11,7 @@ that is shorter by the tolerance does not.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -284,7 +284,7 @@ class Tried:
         return f"{self.horizon:g} s: σ of {self.parameter} is {self.ratio:.3f} × its target"
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ShortestExperiment(SavedRecord):
     """The shortest experiment and its design.
 

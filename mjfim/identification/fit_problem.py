@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align, on_grid_of
@@ -56,7 +56,7 @@ ProblemWork = Callable[["FitProblem", Budget], T]
 CALIBRATION_SAMPLES = 1000
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FitProblem(SegmentSimulation):
     """Residuals of recordings as functions of the unknowns; a `levenberg_marquardt.Problem`.
 

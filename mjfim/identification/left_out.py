@@ -10,7 +10,7 @@ initial state of a predicted part is estimated from that part.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -81,7 +81,7 @@ MIN_STRETCHES = 2
 EQUAL_LOSS = 1e-3
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LeftOutPart:
     """A part of the data that is left out of a fit.
 

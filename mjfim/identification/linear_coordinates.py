@@ -7,6 +7,8 @@ where their pseudo-inertia is positive definite.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy
 
@@ -284,7 +286,7 @@ class LinearCoordinates:
         return slopes
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CadPrior:
     """Priors on the inertias of some bodies.
 

@@ -7,7 +7,7 @@ restarts in `starts` and the studies of models choose among them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from typing import Literal, get_args
@@ -325,7 +325,7 @@ def _from_start(problem: FitProblem, budget: Budget, *, begin: UnknownValues) ->
     return minimise(problem, begin, SHORT_SEARCH, budget)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FitSearch:
     """Searches of one identification, which share a budget and report their iterations.
 

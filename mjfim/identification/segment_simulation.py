@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,7 +66,7 @@ class SegmentRows:
     jacobians: tuple[Array, ...]
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentBatch:
     """Segments that are simulated together, and how they are differentiated.
 
@@ -87,7 +87,7 @@ class SegmentBatch:
     wanted: np.ndarray
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentSimulation(FitUnknowns):
     """Predicted outputs of all segments as functions of the unknowns.
 

@@ -13,7 +13,7 @@ initial velocity contains.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,7 @@ def bristles_of(model: Any) -> tuple[Bristle, ...]:
     return tuple(found)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class KnownActivations:
     """Activations that physical terms have added to a model.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -49,7 +50,7 @@ SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
 CLEAR_EFFECT = 1e3
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Identifiability:
     """Directions of the wanted parameters without effect on the measured outputs.
 

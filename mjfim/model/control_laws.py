@@ -8,6 +8,7 @@ finds those of each model in the model itself.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
@@ -137,7 +138,7 @@ class ControlLaw:
 MEASURED_SUMS = ("sum", "reference", "position", "share")
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ControlLaws:
     """All control laws of an experiment, and the input columns that drive a simulation.
 

@@ -250,7 +250,7 @@ class Problem(Protocol):
         """
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
     """Result of a search.
 
@@ -360,7 +360,7 @@ def minimise(
     return _Search(problem, settings, budget or Budget(), callback, start, cost, condensed).run()
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Trial:
     """A step and the point to which it leads.
 

@@ -7,7 +7,7 @@ The module knows arrays and two protocols, neither MuJoCo nor Fisher information
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -265,7 +265,7 @@ class Armijo:
         return None
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Iterate(Generic[P]):
     """One iterate of Algorithm 1.
 

@@ -66,7 +66,7 @@ MUCH_SHORTENED = 0.5
 SMALLEST_SQUARE = 1e-300
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CurveMetric:
     """Metric on curve coordinates: a quadratic form on the tangent curves to which they lift.
 

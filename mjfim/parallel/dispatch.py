@@ -7,11 +7,11 @@ import uuid
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
+from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from mjfim.arrays import record
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.parallel.budget import Budget, StopToken, hurried
 from mjfim.parallel.pool import one_blas_thread, pool_stop_token
@@ -44,7 +44,7 @@ class LostWorkError(MjfimError):
     """An order has no result, because its worker was lost each time that it was begun."""
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome(Generic[T]):
     """Result or loss of an order.
 

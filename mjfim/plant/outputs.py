@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -41,7 +42,7 @@ class Output:
     sensor: int | None = None
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Outputs:
     """The output map h without errors of the sensors and delay.
 

@@ -24,7 +24,7 @@ velocities, velocities a straight line, so that they depend continuously on the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,7 +109,7 @@ def filter_shares(time_constant: Array, period: float) -> Array:
     return np.where(filtered, -np.expm1(-ratio), 1.0)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Ticks:
     """Times at which laws with one period are evaluated, in engine steps.
 

@@ -7,6 +7,7 @@ use the logarithm of quaternions in the body frame.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from mjfim.records.trajectory import Trajectory
 SMALL_ANGLE = 1e-3
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StateSpace:
     """Layout of states and of their tangent vectors.
 

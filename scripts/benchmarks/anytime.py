@@ -35,10 +35,10 @@ from mjfim.parallel.budget import measured_by, stop_on_interrupt
 from mjfim.records.studies import DESIGN
 from mjfim.studies.baselines import TITLES
 from scripts.benchmarks import arms
-from scripts.benchmarks.child import new_table, options_of
+from scripts.benchmarks.child import ROOT, new_table, options_of
 
 # Folder of the examples.
-EXAMPLES = Path(__file__).resolve().parents[2] / "models"
+EXAMPLES = ROOT / "models"
 
 # Budgets of every method [s of the processor].
 SECONDS = (2.0, 3.0, 5.0, 10.0)

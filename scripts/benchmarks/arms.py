@@ -35,9 +35,10 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
+from scripts.benchmarks.child import ROOT
 
 # Folder of the models that others wrote, beside the repository.
-MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
+MODELS = ROOT.parent / "shared" / "models"
 
 # Rates of control updates and of measurements [Hz].
 RATE, MEASURED = 100.0, 50.0

@@ -24,7 +24,6 @@ Usage:  python -m scripts.benchmarks mjx_oracle [--models NAME...]
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -37,9 +36,9 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.plant.closed_form import closed_form_tree
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from scripts.benchmarks.child import options_of
+from scripts.benchmarks.child import ROOT, options_of
 
-MODELS = Path(__file__).resolve().parents[2] / "models"
+MODELS = ROOT / "models"
 
 
 @record

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
@@ -184,7 +184,7 @@ class ExpansionSums:
         return ExpansionSums(a=np.zeros((N + 1, nx)), b=np.zeros((N, nu)), weights=weights)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Constraint(ABC):
     """Inequality constraints of one or several kinds: quantities between bounds.
 
@@ -267,7 +267,7 @@ class Constraint(ABC):
         return self.number_bounds.slack_changes(self.change(values, step))
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SubstepConstraint(Constraint):
     """Ranges of positions, velocities, accelerations, angles, speeds and forces.
 
@@ -429,7 +429,7 @@ class SubstepConstraint(Constraint):
             yield i, magnitude.barrier(observed, upper, scale, delta=delta, weight=weight)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ControlConstraint(Constraint):
     """Ranges of the controls.
 
@@ -600,7 +600,7 @@ class EndStateConstraint(Constraint):
         sums.weights.Q[-1] += J.T @ (barrier.curvature[:, None] * J)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ClearanceConstraint(Constraint):
     """Distances between geoms that have to be at least a clearance.
 

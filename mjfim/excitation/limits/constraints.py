@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.constraint_kinds import (
     ClearanceConstraint,
@@ -118,7 +118,7 @@ def _addresses(limits: Iterable[Limit]) -> np.ndarray:
     return np.array(each, dtype=np.intp)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CurvatureOfLimits(StepCurvature):
     """The barrier about a trajectory, from which its curvature along steps follows.
 
@@ -191,7 +191,7 @@ SUBSTEP_KINDS = (
 FORCE_KINDS = ("force", "joint_force", "tendon_force")
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ConstraintSet:
     """The inequality constraints of an experiment.
 

@@ -8,12 +8,12 @@ of both counts.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.constraint_kinds import (
     ClearanceConstraint,
@@ -51,7 +51,7 @@ STATE_KINDS = ("position", "tilt", "velocity", "angular_velocity", "tendon_lengt
 CONTACT_SHARE = 1e-9
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Verification:
     """Margins of all limits when a control is played open loop on the unmodified model.
 

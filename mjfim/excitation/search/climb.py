@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -256,7 +256,7 @@ class Plan:
         return Grounds(task.with_variant(self.variant), self.combinations)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Move:
     """Order to let a candidate climb some rungs.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -64,7 +65,7 @@ SMALLER_TRIALS = 3
 LEAST_PROGRESS = 0.01
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LimitedLevel:
     """A level with its limits.
 
@@ -85,7 +86,7 @@ class LimitedLevel:
         return self.constraints.along(task.plant, task.theta, control)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LimitedCost(LimitedLevel):
     """Cost of controls that keep all limits on the stated level.
 

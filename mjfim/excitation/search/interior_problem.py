@@ -8,11 +8,11 @@ outside the limits as well (Hauser & Saccon 2006).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
@@ -27,7 +27,7 @@ SHARP_MU = 4e-3
 LEAST_EXPONENT = 0.01
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class InteriorPoint:
     """A trajectory with its cost and the values of its constraints.
 
@@ -71,7 +71,7 @@ def values_of(point: InteriorPoint) -> ConstraintValues:
     return point.values
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class InteriorProblem:
     """The problem of minimising `log J + mu B` over controls, in the form that Algorithm 1 needs.
 

@@ -6,6 +6,7 @@ That is the formal covariance, robust intervals, and the poorly known parameters
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -373,7 +374,7 @@ def std_at_start(fit: FitResult) -> Array:
     return std
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FitResult:
     """Result of the searches of one identification.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.optimize.levenberg_marquardt import Solution
@@ -342,7 +342,7 @@ def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float
 UNEXPLAINED_SHARE = 0.5
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FitQuality:
     """Residuals of a fit.
 

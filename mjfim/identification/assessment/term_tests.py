@@ -15,7 +15,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -434,7 +434,7 @@ def _score_test(
     return step / linearisation[2][chosen], float(-score @ step), float(move)
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _TermSearch:
     """Tests at the solution of a problem.
 

@@ -10,7 +10,7 @@ the integrators that are implicit in the velocity change the velocity first.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -72,7 +72,7 @@ class Readings:
     derivative: int
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RegressionSpline:
     """A fitted spline.
 

@@ -380,7 +380,7 @@ def with_first(polynomial: Any, value: float) -> np.ndarray:
     return numbers
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StateLayout:
     """Addresses of the stated model's state in the state of the extended model.
 

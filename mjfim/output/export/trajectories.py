@@ -23,6 +23,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -71,7 +72,7 @@ class Drive:
     upper: float
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RobotPlan:
     """A design with everything that the programs of a robot need.
 
@@ -369,7 +370,7 @@ DIGITS = 12
 REST = 1e-6
 
 
-@record
+@dataclass(frozen=True, kw_only=True, eq=False)
 class JointTrajectory:
     """The contents of a message `trajectory_msgs/JointTrajectory`.
 
