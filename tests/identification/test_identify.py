@@ -404,7 +404,7 @@ def test_a_misfit_is_the_reason_where_noise_alone_would_determine_a_parameter() 
     c = estimate.parameters.index("c")
     assert estimate.std[c] < 0.1 * estimate.theta[c]
     (sentence,) = [text for text in estimate.warnings if "c is not determined" in text]
-    assert "because the model does not explain the recordings" in sentence
+    assert "wider than white noise would" in sentence
     assert "smaller than the noise" not in sentence
     assert "Design an experiment" not in " ".join(page_of(estimate).next_steps)
 

@@ -345,7 +345,7 @@ def _poorly_known(
             if NORMAL_95 * std[j] < UNDETERMINED_SHARE * sizes[j]:
                 # White noise of this size would leave the parameter determined.
                 confounded = ""
-                why = "; the interval is wide because the model does not explain the recordings"
+                why = "; correlated or uneven residuals make it wider than white noise would"
             elif std[j] > GROWN * at_guess[j]:
                 why = "; the motion depends on it much less at the estimate than at the guess"
             elif max(abs(low), abs(high)) < abs(fit.task.start[j]):

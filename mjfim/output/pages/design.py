@@ -334,6 +334,8 @@ def _next_steps(design: Design) -> Iterator[str]:
     if design.rehearsal is not None and not design.rehearsal.is_safe:
         yield from _cures(design.rehearsal)
         return
+    if design.is_start and not design.status.success:
+        yield "Allow more time or iterations in the table `[descent]` for a better design."
     if not design.separable:
         groups = first_ones(design.combinations, "; ")
         yield (
@@ -349,8 +351,6 @@ def _next_steps(design: Design) -> Iterator[str]:
         )
     if _tells_less(design):
         yield "Lower `cost.control` and `cost.tracking` for a design that tells more."
-    if design.is_start and not design.status.success:
-        yield "Allow more time or iterations in the table `[descent]` for a better design."
     if design.sound:
         yield from PLAY
 
