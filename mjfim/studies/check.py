@@ -516,26 +516,26 @@ def _checked(
     std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
 
     # Along one motion, standard deviations are checked by finite steps.
-    steps = None
-    if not stop.requested and point.trajectory is not None and point.information is not None:
-        along = information.std(point.information)
-        steps = steps_along(task, point.trajectory, point.information, along)
+    steps, motion, known = None, point.trajectory, point.information
+    if not stop.requested and motion is not None and known is not None:
+        along = information.std(known)
+        steps = steps_along(task, motion, known, along)
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
 
     # A motion that a robot could play is rehearsed without feedback; a start has no gains for it.
     rehearsal, warning = None, ""
     is_motion = is_motion and not (is_start and task.experiment.rehearsal.feedback)
-    if is_motion and steps is not None and point.trajectory is not None and not refused:
+    if is_motion and steps is not None and known is not None and motion is not None and not refused:
         begin_stage("rehearsing the motion")
-        played, growth = point.trajectory, growth_along(task, point.trajectory)
-        gain = np.zeros((played.samples, len(task.controls), task.space.nx))
-        rehearsal = rehearsed(task, played, gain, steps, growth)
+        growth = growth_along(task, motion)
+        gain = np.zeros((motion.samples, len(task.controls), task.space.nx))
+        rehearsal = rehearsed(task, motion, gain, known, steps, growth)
         warning = growth_warning(growth) or ""
 
     # What each sensor tells along one motion.
     worth = None
-    if steps is not None and is_motion and point.trajectory is not None:
+    if steps is not None and is_motion:
         worth = sensing_along(task, point, found).worth(source, duration)
 
     # Eigenvalues of the criterion, without combinations that no experiment can identify.

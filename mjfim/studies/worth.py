@@ -261,9 +261,7 @@ def _redesigned(
     if point.values is None:
         return np.nan, {}
     iterations = task.experiment.descent.max_iterations
-    for step in ground.stage(
-        BARRIER, problem, point, ground.direction(), iterations, budget
-    ):
+    for step in ground.stage(BARRIER, problem, point, ground.direction(), iterations, budget):
         if budget.exhausted is not None or step.iterate.slope <= SETTLED * BARRIER.last:
             break
     if budget.exhausted is not None:

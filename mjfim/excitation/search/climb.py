@@ -410,9 +410,7 @@ class Climb:
             problem = ground.problem(barrier, weights[number], tightening)
             iterations = int(np.ceil(max(self._iterations_left, 1) / left))
             offset = max(self.candidate.iterations - bool(number or repeated), 0)
-            for step in ground.stage(
-                barrier, problem, point, direction, iterations, self._budget
-            ):
+            for step in ground.stage(barrier, problem, point, direction, iterations, self._budget):
                 yield from self._recorded(step, ground, offset)
                 if budget.exhausted is not None or self.candidate.is_held_up:
                     break

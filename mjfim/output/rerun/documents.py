@@ -44,6 +44,7 @@ from mjfim.output.plots.design import (
     motion_panels,
 )
 from mjfim.output.plots.estimate import deciding_seconds, fit, held_out, residual_torque
+from mjfim.output.plots.studies import fan_panels
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.plots import (
     Plane,
@@ -56,6 +57,7 @@ from mjfim.output.rerun.plots import (
     with_curves,
 )
 from mjfim.output.rerun.scene import (
+    PATH_THICKNESS,
     BodyPoses,
     EntityParts,
     RobotStyle,
@@ -69,10 +71,12 @@ from mjfim.output.rerun.scene import (
     log_pose,
     log_robot,
     pale_shapes,
+    time_column,
 )
 from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
 
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
@@ -109,6 +113,13 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
     tabs: Tabs = {"accuracy": list(learning.panels)}
     tabs |= motion_panels(labels, both, design.usage)
     tabs |= {"limits": limit_panels(design, labels, rows=False)}
+    if design.rehearsal is not None and design.rehearsal.fans:
+        tabs |= {
+            "robots": [
+                replace(panel, title=f"{panel.title} {panel.y.label}".strip())
+                for panel in fan_panels(design.rehearsal)
+            ]
+        }
     search = planes_of("optimiser", convergence(design).panels)
     iterates = _iterate_plots(design, labels)
     grids = grid_tabs("optimiser", [plane.view() for plane, _ in search])
@@ -123,6 +134,8 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, labels: Labels
             plane.log(rec, panel.marks)
         _log_robots(rec, model, poses, {}, [INITIAL])
         _log_iterates(rec, model, design, iterates)
+        if design.rehearsal is not None:
+            _log_rehearsed(rec, model, design.rehearsal, poses[DESIGNED])
 
 
 def log_estimate(
@@ -309,6 +322,33 @@ def _log_iterates(
             curve = plane.curve(*curves[i], DESIGNED)
             rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
     rec.reset_time()
+
+
+def _log_rehearsed(
+    rec: rr.RecordingStream, model: mujoco.MjModel, rehearsal: Rehearsal, designed: BodyPoses
+) -> None:
+    """Log the paths of the ends of robots that play the design, and the ends as moving points."""
+    motions, end = rehearsal.motions, end_point(model, designed)
+    if motions is None or end is None:
+        return
+    paths = [body_poses(model, motions.t, qpos).world_paths(*end)[:, 0] for qpos in motions.qpos]
+    unsafe = rehearsal.unsafe[list(motions.robots)]
+    for name, colour, chosen in (
+        ("robots that leave no limit", rgb(MEASURED), ~unsafe),
+        ("robots that leave a limit", rgb(NOMINAL), unsafe),
+    ):
+        found = [paths[k] for k in np.flatnonzero(chosen)]
+        if not found:
+            continue
+        parts = ("robots", DESIGNED, name)
+        thin = rr.Radius.ui_points(0.5 * PATH_THICKNESS)
+        lines = rr.LineStrips3D(found, colors=[colour], radii=thin)
+        rec.log(entity_path((*parts, "paths")), lines, static=True, strict=True)
+        look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3.0))
+        rec.log(entity_path((*parts, "ends")), look, static=True, strict=True)
+        ends = rr.Points3D.columns(positions=np.stack(found, axis=1).reshape(-1, 3))
+        rows = ends.partition([len(found)] * len(motions.t))
+        rec.send_columns(entity_path((*parts, "ends")), [time_column(motions.t)], rows, strict=True)
 
 
 # ---- layout
@@ -535,6 +575,8 @@ DESIGN_COLOURS = (
     _colours(
         (INITIAL, "the initial trajectory"),
         (DESIGNED, "the designed trajectory"),
+        (MEASURED, "rehearsed robots"),
+        (NOMINAL, "rehearsed robots that leave a limit"),
     )
     + " Grey lines: limits. Space bar: play or pause. The timeline `iteration` shows the search: "
     "its iterates in place of the designed trajectory."
