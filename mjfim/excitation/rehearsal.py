@@ -16,12 +16,13 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.arrays import Array, evenly_spread_indices, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import labels_of_model
 from mjfim.information.finite_steps import finite_steps
 from mjfim.model.clearance import (
     PLANE,
@@ -30,7 +31,7 @@ from mjfim.model.clearance import (
     farthest_points,
     find_geom_pairs,
 )
-from mjfim.model.coordinates import TRANSLATION, joint_dofs, joint_names
+from mjfim.model.coordinates import TRANSLATION, joint_dofs, joint_names, split_unit
 from mjfim.model.elements import model_length
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.units import ANGLE, LENGTH, joint_unit, per_second
@@ -39,7 +40,16 @@ from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.records.base import record
 from mjfim.records.design import Design, Evaluation
-from mjfim.records.rehearsal import REST_SHARE, FiniteSteps, Rehearsal, RehearsedLimit
+from mjfim.records.rehearsal import (
+    CLAMPED_KINDS,
+    MAX_PATHS,
+    REST_SHARE,
+    Fan,
+    FiniteSteps,
+    Rehearsal,
+    RehearsedLimit,
+    RobotMotions,
+)
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of attempts to draw a robot whose bodies are physical.
@@ -59,8 +69,17 @@ MAX_REST_STEPS = 15
 # Delay of the control under feedback where none is stated [s]; it is rounded up to timesteps.
 LATENCY = 5e-3
 
-# Number of instants of each robot at which heights, distances and contacts are measured.
-INSTANTS = 64
+# Number of instants of each robot at which heights, distances and contacts are measured, and at
+# which its paths are kept.
+INSTANTS, PATH_INSTANTS = 64, 400
+
+# Quantiles of the robots between which a fan is drawn, largest number of fans, and margin over half
+# of the range below which robots are close to a limit.
+BAND, MAX_FANS, CLOSE = (0.05, 0.95), 6, 0.5
+
+# Largest number of robots after the experiment, and of robots whose motions are kept; step between
+# the instants of these motions.
+MAX_AFTER, MAX_MOTIONS, MOTION_STEP = 30, 8, 2
 
 # Number of smaller errors of the parameters, each half of the one before, with which a motion that
 # is not safe is tried.
@@ -119,7 +138,7 @@ def rehearse(experiment: Experiment, design: Design, *, threads: int | None = No
 def rehearse_task(task: DesignTask, final: Evaluation) -> Rehearsal:
     """Rehearse the trajectory of an evaluation in a resolved task. See `rehearse`."""
     steps = steps_along(task, final.trajectory, final.information, final.std)
-    return rehearsed(task, final.trajectory, final.gain, steps, final.growth)
+    return rehearsed(task, final.trajectory, final.gain, final.information, steps, final.growth)
 
 
 def with_cures_tried(task: DesignTask, final: Evaluation, found: Rehearsal) -> Rehearsal:
@@ -137,7 +156,9 @@ def with_cures_tried(task: DesignTask, final: Evaluation, found: Rehearsal) -> R
     def is_safe_with(**changes: Any) -> bool:
         experiment = task.experiment.replace(rehearsal=changes)
         changed = replace(task, system=replace(task.system, experiment=experiment))
-        return rehearsed(changed, final.trajectory, final.gain, found.steps, found.growth).is_safe
+        return rehearsed(
+            changed, final.trajectory, final.gain, None, found.steps, found.growth
+        ).is_safe
 
     smaller = (found.wrong / 2**k for k in range(1, SMALLER_ERRORS + 1))
     safe_wrong = next((wrong for wrong in smaller if is_safe_with(wrong=wrong)), np.nan)
@@ -166,7 +187,12 @@ def steps_along(
 
 @one_blas_thread()
 def rehearsed(
-    task: DesignTask, trajectory: Trajectory, gain: Array, steps: FiniteSteps, growth: float
+    task: DesignTask,
+    trajectory: Trajectory,
+    gain: Array,
+    information: Array | None,
+    steps: FiniteSteps,
+    growth: float,
 ) -> Rehearsal:
     """Play a trajectory on robots.
 
@@ -174,24 +200,38 @@ def rehearsed(
         task: The task, released as the trajectory is.
         trajectory: The trajectory, an open-loop simulation of the model.
         gain: (N, nu, nx) gains, which matter under feedback only.
+        information: (p, p) Fisher information along it, with the prior; None without robots after
+            the experiment.
         steps: Its standard deviations by finite steps.
         growth: Largest growth of a small deviation along it.
     """
     spec, player = task.experiment.rehearsal, _RobotPlayer(task, trajectory, gain)
     rng = np.random.default_rng(spec.seed)
-    theta = np.array([task.theta, *(_drawn(task, rng) for _ in range(spec.robots))])
+    theta = np.array([task.theta, *(draw_robot(task, rng) for _ in range(spec.robots))])
 
     # The model comes first, because its motion is the plan of the feedback.
     steps_of_one = len(player.ctrl) * player.steps_per_row + player.late_steps
     values = task.space.nq + task.space.nv + 2 * len(player.limits) + 1
     most = max(MAX_VALUES // (steps_of_one * values), 1)
     blocks = [theta[:1], *(theta[i : i + most] for i in range(1, len(theta), most))]
-    parts = [part for block in blocks for part in player.play(block, rng)]
+    parts: list[_Played] = []
+    for part in (part for block in blocks for part in player.play(block, rng)):
+        has_paths = len(parts) <= MAX_PATHS
+        parts.append(part if has_paths else replace(part, paths=None, qpos=None))
     measured: dict[str, Any] = {
         each.name: np.array([getattr(part, each.name) for part in parts])
         for each in fields(_Played)
-        if each.name != "unbraked"
+        if each.name not in ("unbraked", "paths", "qpos")
     }
+    # Robots that are plausible after the experiment.
+    number = 0 if information is None else min(spec.robots, MAX_AFTER)
+    later = np.array([draw_robot(task, rng, information) for _ in range(number)])
+    after = [
+        player.paths(motion)
+        for i in range(0, number, most)
+        for motion in player.motions(later[i : i + most], rng)
+        if motion is not None
+    ]
     reserve = task.experiment.limits.reserve
     return Rehearsal(
         parameters=task.parameters.names,
@@ -212,22 +252,95 @@ def rehearsed(
         growth=growth,
         kept_reserve=None if reserve == "auto" else dict[str, float](reserve.items()),
         end=task.experiment.boundary.end,
+        fans=tuple(_fans(player, parts, after)),
+        motions=_motions_of(player, parts),
         **measured,
     )
 
 
-def _drawn(task: DesignTask, rng: np.random.Generator) -> Array:
+def _fans(player: _RobotPlayer, parts: Sequence[_Played], after: Sequence[Array]) -> Iterator[Fan]:
+    """Compare paths of the model and of robots: of each joint those closest to their limits.
+
+    Args:
+        player: The player.
+        parts: The model and the robots, of which some have no paths.
+        after: (q, n) paths of robots that are drawn after the experiment.
+    """
+    model, *robots = parts
+    known = [each for each in robots if each.paths is not None] or [model]
+    if model.paths is None:
+        return
+    paths = np.array([each.paths for each in known])
+    margins = np.full(paths.shape[:2], np.inf)
+    margins[:, : len(player.limited)] = [each.margins[player.limited] for each in known]
+
+    # Far from all limits, the position of a joint says most. The first quantities of all joints
+    # come before the second ones.
+    least = margins.min(axis=0)
+    is_other = [limit.kind != "position" for limit in player.shown]
+    order = np.lexsort((least, (least >= CLOSE) * (1 + np.array(is_other)))).tolist()
+    names = [player.shown[i].name for i in order]
+    ranked = sorted(range(len(order)), key=lambda k: names[:k].count(names[k]))
+    for i in (order[k] for k in ranked[:MAX_FANS]):
+        worst = int(margins[:, i].argmin())
+        yield Fan(
+            limit=player.shown[i],
+            t=player.t,
+            model=model.paths[i],
+            worst=np.where(np.isfinite(margins[worst, i]), paths[worst, i], np.nan),
+            before=np.quantile(paths[:, i], BAND, axis=0),
+            after=np.quantile([each[i] for each in after or [model.paths]], BAND, axis=0),
+        )
+
+
+def _motions_of(player: _RobotPlayer, parts: Sequence[_Played]) -> RobotMotions | None:
+    """Choose motions of robots to be drawn, from the one closest to its limits to the safest."""
+    known = [i for i, each in enumerate(parts) if i and each.qpos is not None]
+    known.sort(key=lambda i: parts[i].margins.min(initial=np.inf))
+    chosen = [known[k] for k in evenly_spread_indices(len(known), MAX_MOTIONS)]
+    if not chosen:
+        return None
+    return RobotMotions(
+        robots=tuple(chosen),
+        t=player.t[::MOTION_STEP],
+        qpos=np.array([parts[i].qpos for i in chosen]),
+    )
+
+
+def draw_robot(
+    task: DesignTask, rng: np.random.Generator, information: Array | None = None
+) -> Array:
     """Draw the (p,) parameters of a robot whose bodies are physical [theta-unit].
 
     Errors are reduced where the bodies would be unphysical.
+
+    Args:
+        task: The task.
+        rng: The generator.
+        information: (p, p) information of an experiment after which the robot is plausible, with
+            the priors; None before any experiment.
+
+    Raises:
+        ExperimentError: No physical robot is found.
     """
     p, spec = task.parameters, task.experiment.rehearsal
     prior = np.array([q.prior or 0.0 for q in p.parameters])
-    reach = np.where(p.changes_model, spec.wrong * p.sizes(task.theta), 0.0)
+    is_range = p.changes_model & (prior == 0.0)
+    reach = np.where(is_range, spec.wrong * p.sizes(task.theta), 0.0)
+    if information is not None:
+        # The range counts as a prior with the variance of its uniform distribution.
+        known = np.divide(3.0, reach**2, out=np.zeros(len(p)), where=reach > 0.0)
+        scaled, scale = scaled_to_unit_diagonal(information + np.diag(known))
+        values, vectors = np.linalg.eigh(scaled)
+        root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps)) / scale[:, None]
+        root[(prior == 0.0) & (reach == 0.0)] = 0.0
     for attempt in range(MAX_DRAWS):
-        by_prior = p.guess + prior * rng.standard_normal(len(p))
-        within = task.theta + reach * rng.uniform(-1.0, 1.0, len(p))
-        drawn = np.where(prior > 0.0, by_prior, within)
+        if information is None:
+            by_prior = p.guess + prior * rng.standard_normal(len(p))
+            within = task.theta + reach * rng.uniform(-1.0, 1.0, len(p))
+            drawn = np.where(prior > 0.0, by_prior, within)
+        else:
+            drawn = task.theta + root @ rng.standard_normal(len(p))
         error = DRAW_SHRINKAGE ** (attempt // len(p)) * (drawn - task.theta)
         theta = np.clip(task.theta + error, p.lower, p.upper)
         if not ParameterWriter(p).unphysical_bodies(task.plant.source, theta):
@@ -251,7 +364,12 @@ class _SpeedGroup:
 
 @record
 class _Played:
-    """Measurements of one robot; see `Rehearsal`."""
+    """Measurements of one robot; see `Rehearsal`.
+
+    Attributes:
+        paths: (q, n) quantities of the fans at n instants; None where the simulation diverges.
+        qpos: (n, nq) positions at every `MOTION_STEP`-th of these instants, likewise.
+    """
 
     margins: Array
     speed: Array
@@ -264,6 +382,29 @@ class _Played:
     in_contact: float = np.nan
     at_stop: float = np.nan
     unbraked: tuple[str, ...] = ()
+    paths: Array | None = None
+    qpos: Array | None = None
+
+
+@record
+class _Motion:
+    """A simulated robot.
+
+    Attributes:
+        model: Its model.
+        states: (n+1, ns) states at every engine step.
+        observed: (n, rows, w) observations at every engine step, with further rows of forces.
+        applied: (n, nu) controls at every engine step [unit of the actuator].
+        sent: (M, nu) controls that were sent [unit of the actuator].
+        before: (nu,) control before the motion begins [unit of the actuator].
+    """
+
+    model: Any
+    states: Array
+    observed: Array | None
+    applied: Array
+    sent: Array
+    before: Array
 
 
 class _RobotPlayer:
@@ -281,6 +422,9 @@ class _RobotPlayer:
         limits: The l limits that are checked.
         groups: Joints whose speeds are measured.
         plan: (M+1, ns) states of the model at the rows; None before it was played.
+        limited: Places of the limits that have paths; a force is clamped.
+        shown: The q quantities that have paths: these limits, and positions without a limit.
+        t: (n,) times of the paths [s].
     """
 
     def __init__(self, task: DesignTask, trajectory: Trajectory, gain: Array) -> None:
@@ -303,6 +447,25 @@ class _RobotPlayer:
         )
         self._observations = self.constraints.observations.of_single_steps()
         model = task.system.model_at(task.theta)
+        self.limited = [
+            i
+            for i, limit in enumerate(self.limits)
+            if limit.kind in SUBSTEP_KINDS and limit.kind not in CLAMPED_KINDS
+        ]
+        placed = {limit.name for limit in self.limits if limit.kind == "position"}
+        positions = [split_unit(label) for label in labels_of_model(model).positions]
+        self._free = [dof for dof, (name, _) in enumerate(positions) if name not in placed]
+        ranges = self.rehearsed_limits()
+        free = RehearsedLimit(kind="position", name="", lower=-np.inf, upper=np.inf, scale=1.0)
+        self.shown = [ranges[i] for i in self.limited]
+        for name, unit in (positions[dof] for dof in self._free):
+            self.shown.append(replace(free, name=name, unit=unit))
+        # Turns of ball and free joints are counted from the start.
+        self._origin = trajectory.state[0].copy()
+        self._origin[task.space.scalar_q] = 0.0
+        steps = len(self.ctrl) * self.steps_per_row
+        self._rows = self.late_steps + evenly_spread_indices(steps, PATH_INSTANTS)
+        self.t = trajectory.t[0] + (self._rows + 1 - self.late_steps) * self.timestep
         self._simulator = BatchSimulator(model, threads=task.plant.simulator.threads)
         # (nu,) control that holds the start; None where the motion begins without a rest.
         self.rest: Array | None = None
@@ -373,6 +536,21 @@ class _RobotPlayer:
 
     def play(self, theta: Array, rng: np.random.Generator) -> Iterator[_Played]:
         """Play the design on robots with the parameters (m, p), and measure each of them."""
+        for motion in self.motions(theta, rng):
+            if motion is None:
+                unknown = np.full(len(self.groups), np.nan)
+                yield _Played(
+                    margins=np.full(len(self.rehearsed_limits()), -np.inf),
+                    speed=unknown,
+                    acceleration=unknown,
+                    end_speed=unknown,
+                    travel=unknown,
+                )
+            else:
+                yield self._measured(motion)
+
+    def motions(self, theta: Array, rng: np.random.Generator) -> Iterator[_Motion | None]:
+        """Simulate robots with the parameters (m, p); None for a simulation that diverges."""
         task = self.task
         models = [task.system.model_at(row) for row in theta]
         starts = np.array([self._start(*each) for each in zip(models, theta, strict=True)])
@@ -392,24 +570,31 @@ class _RobotPlayer:
 
         for i, model in enumerate(models):
             if not out.finite[i]:
-                unknown = np.full(len(self.groups), np.nan)
-                margins = np.full(len(self.rehearsed_limits()), -np.inf)
-                yield _Played(
-                    margins=margins,
-                    speed=unknown,
-                    acceleration=unknown,
-                    end_speed=unknown,
-                    travel=unknown,
-                )
+                yield None
                 continue
-            observed = None if out.observed is None else out.observed[i]
-            margins = self._margins(observed, sent[i], before[i], out.states[i])
-            yield self._measured(model, out.states[i], applied[i], margins)
+            yield _Motion(
+                model=model,
+                states=out.states[i],
+                observed=None if out.observed is None else out.observed[i],
+                applied=applied[i],
+                sent=sent[i],
+                before=before[i],
+            )
+
+    def paths(self, motion: _Motion) -> Array:
+        """(q, n) quantities that are shown of a motion, with the digits of a picture."""
+        limited = np.zeros((len(self._rows), 0))
+        if motion.observed is not None:
+            found = self.constraints.substeps.quantities(motion.observed[self._rows, 0])
+            limited = found[:, self.limited]
+        moves = self.task.space.minus(motion.states[self._rows + 1], self._origin)
+        return np.hstack([limited, moves[:, self._free]]).T.astype(np.float32)
 
     # ---- what is measured
 
-    def _measured(self, model: Any, states: Array, applied: Array, margins: Array) -> _Played:
-        """Measure the motion of one robot, (n+1, ns) at every engine step."""
+    def _measured(self, motion: _Motion) -> _Played:
+        """Measure the motion of one robot."""
+        model, states, applied = motion.model, motion.states, motion.applied
         qpos, qvel, act = self.task.space.split(states)
         change = np.diff(qvel, axis=0) / self.timestep
 
@@ -436,7 +621,7 @@ class _RobotPlayer:
         if self._distances is not None:
             nearest = self._distances.nearest(qpos[rows])[0]
         return _Played(
-            margins=margins,
+            margins=self._margins(motion),
             speed=largest(qvel),
             acceleration=largest(change),
             end_speed=largest(qvel[-1:]),
@@ -447,6 +632,8 @@ class _RobotPlayer:
             in_contact=touches / len(rows),
             at_stop=stops / len(rows),
             unbraked=tuple(self._unbraked(model, data, qvel)),
+            paths=self.paths(motion),
+            qpos=qpos[self._rows[::MOTION_STEP] + 1].astype(np.float32),
         )
 
     def _lowest(self, model: Any, poses: Sequence[tuple[Array, ...]], geoms: np.ndarray) -> Array:
@@ -555,20 +742,13 @@ class _RobotPlayer:
                 return True
         return False
 
-    def _margins(self, observed: Array | None, sent: Array, before: Array, states: Array) -> Array:
-        """(l,) smallest margins of all limits over half of their ranges.
-
-        Args:
-            observed: (n, rows, w) observations at every engine step, with further rows of forces.
-            sent: (M, nu) controls that were sent [unit of the actuator].
-            before: (nu,) control before the motion begins [unit of the actuator].
-            states: (n+1, ns) states at every engine step.
-        """
-        constraints = self.constraints
+    def _margins(self, motion: _Motion) -> Array:
+        """(l,) smallest margins of all limits over half of their ranges."""
+        constraints, sent = self.constraints, motion.sent
         margins = []
-        if observed is not None:
+        if motion.observed is not None:
             bounds = constraints.substeps.bounds
-            quantities = constraints.substeps.quantities(observed)
+            quantities = constraints.substeps.quantities(motion.observed)
             inside = bounds.margin(quantities).min(axis=(0, 1), initial=np.inf) / bounds.scale
             margins = inside.tolist()
 
@@ -576,14 +756,15 @@ class _RobotPlayer:
         # to the control after its end.
         after = None if constraints.rate is None else constraints.rate.control_after
         after = sent[-1] if after is None or self.feedback else after
-        changes = np.diff(sent, axis=0, prepend=before[None], append=after[None])
+        changes = np.diff(sent, axis=0, prepend=motion.before[None], append=after[None])
         rates = changes / (self.steps_per_row * self.timestep)
         for limit in self.limits[len(margins) :]:
             values = (sent if limit.kind == "control" else rates)[:, limit.index]
             margin = np.minimum(values - limit.lower, limit.upper - values).min()
             margins.append(float(margin) / limit.scale)
         if constraints.clearance is not None:
-            nearest = constraints.clearance.distances.nearest(states[:, : self.task.space.nq])[0]
+            qpos = motion.states[:, : self.task.space.nq]
+            nearest = constraints.clearance.distances.nearest(qpos)[0]
             margins.append((nearest - constraints.clearance.least) / constraints.clearance.scale)
         return np.array(margins)
 

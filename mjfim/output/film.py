@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import field, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -26,7 +26,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import NoVideoError
 from mjfim.experiment.system import System
 from mjfim.model.elements import model_length
-from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, OTHER, Term
+from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, NOMINAL, OTHER, Term
 from mjfim.output.panels import ROBOT_ROLES, ROLES
 from mjfim.output.rerun.camera import (
     EDGE_ON,
@@ -41,10 +41,16 @@ from mjfim.output.rerun.scene import BodyPoses, body_poses, has_floor
 from mjfim.records.base import record
 from mjfim.records.design import Design, round_share
 from mjfim.records.estimate import Estimate
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Trajectory
 
 # What a video can show: a trajectory is a simulated motion.
 Filmed = Design | Estimate | Trajectory
+
+# Robots of a rehearsal, which are ghosts behind the design, and their largest number.
+REHEARSED = Term("rehearsed", MEASURED.colour, MEASURED.colour_on_dark, MEASURED.colour_name)
+UNSAFE = Term("unsafe", NOMINAL.colour, NOMINAL.colour_on_dark, NOMINAL.colour_name)
+MAX_GHOSTS = 2
 
 # Frames per second of the film, of which a slow computer draws a part. Every second frame is at a
 # multiple of 10 ms, as a GIF needs.
@@ -99,8 +105,8 @@ class FilmView:
     """One picture of a frame.
 
     Attributes:
-        tracks: Its robots; those after the first one are ghosts over it. A robot without a word is
-            not in the title.
+        tracks: Its robots; those after the first one are ghosts behind it. A robot without a word
+            is not in the title.
         target: (F, 3) point at which the camera looks in each frame [m].
         trail: (n, 3) path of the body that the camera follows [m]; empty where it follows none.
     """
@@ -108,6 +114,11 @@ class FilmView:
     tracks: tuple[Track, ...]
     target: Array
     trail: Array
+
+    @property
+    def named(self) -> list[Track]:
+        """One track for each word."""
+        return list({track.term: track for track in self.tracks if track.term}.values())
 
 
 @record
@@ -168,8 +179,7 @@ class Film:
         for view in self.views:
             robots = [
                 f"the {track.term} motion{' (transparent)' if track.is_ghost else ''}"
-                for track in view.tracks
-                if track.term
+                for track in view.named
             ]
             pictures.append(" and ".join(robots))
         shown = " beside ".join(pictures)
@@ -196,6 +206,8 @@ def film_of(system: System, result: Filmed) -> Film:
             [(DESIGNED, result.final.trajectory)],
         ]
         pairs, note = robots_beside(system, result)
+        if not pairs:
+            motions[1] += _rehearsed(result.rehearsal)
         for view, pair in zip(motions, pairs, strict=False):
             view += zip(ROBOT_COLOURS, pair, strict=True)
         return replace(film_of_motions(system.model_at(system.theta), motions), note=note)
@@ -261,6 +273,18 @@ def robots_beside(
     magnified = f", differences × {factor:g}" if factor > 1.0 else ""
     note = f"Pale: two robots that the initial motion does not tell apart{magnified}."
     return [(pairs[0], pairs[1]), (pairs[2], pairs[3])], note
+
+
+def _rehearsed(rehearsal: Rehearsal | None) -> Iterator[tuple[Term, Trajectory]]:
+    """Return motions of some robots, from the one closest to its limits to the safest."""
+    motions = None if rehearsal is None else rehearsal.motions
+    if rehearsal is None or motions is None:
+        return
+    nothing = np.zeros((len(motions.t), 0))
+    for k in evenly_spread_indices(len(motions.robots), MAX_GHOSTS).tolist():
+        term = UNSAFE if rehearsal.unsafe[motions.robots[k]] else REHEARSED
+        qpos = motions.qpos[k]
+        yield term, Trajectory(t=motions.t, qpos=qpos, qvel=nothing, act=nothing, ctrl=nothing[1:])
 
 
 def film_of_motions(
@@ -405,8 +429,8 @@ FLOOR_WIDTH = 0.02
 LINE_WIDTH = 0.0025
 
 # Share of the colour of its word in the grey parts of a robot, by which a part of a pure colour has
-# less, and in a ghost; opacity of a ghost, and its shift towards the camera as a share of its
-# distance, without which surfaces at the same place would be drawn as speckles.
+# less, and in a ghost; opacity of a ghost, and its shift away from the camera as a share of
+# its distance, without which surfaces at the same place would be drawn as speckles.
 TINT, KEPT_COLOUR = 0.45, 0.85
 GHOST_TINT, GHOST_OPACITY, GHOST_SHIFT = 0.9, 0.4, 0.002
 
@@ -505,10 +529,12 @@ class Painter:
         bold, plain = _font("DejaVuSans-Bold.ttf", TITLE_SIZE), _font("DejaVuSans.ttf", TITLE_SIZE)
         for k, view in enumerate(self._film.views):
             x = float(k * (self._film.camera.size[0] + GAP) + MARGIN)
-            for j, track in enumerate(each for each in view.tracks if each.term):
+            for j, track in enumerate(view.named):
                 words = [(" and " if j else "", FAINT_INK, plain)]
                 words.append((track.term, track.term.rgb, bold))
-                words.append((" (transparent)" if track.is_ghost else "", FAINT_INK, plain))
+                # Of three words, there is no room for more.
+                is_told = track.is_ghost and len(view.named) == 2
+                words.append((" (transparent)" if is_told else "", FAINT_INK, plain))
                 for word, colour, font in words:
                     text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
                     x += font.getlength(word)
@@ -524,7 +550,7 @@ class Painter:
     def _picture(self, view: FilmView, k: int) -> NDArray[np.uint8]:
         model, data, scene = self._film.model, self._data, self._renderer.scene
         self._camera.lookat[:] = view.target[k]
-        for number, track in enumerate(view.tracks):
+        for layer, track in enumerate(view.tracks):
             data.qpos[:] = track.qpos[k]
             mujoco.mj_fwdPosition(model, data)
             first = scene.ngeom if track.is_ghost else 0
@@ -534,7 +560,7 @@ class Painter:
                 mujoco.mjv_addGeoms(model, data, self._option, nothing, dynamic, scene)
             else:
                 self._renderer.update_scene(data, self._camera, self._option)
-            self._paint(track, first, number * GHOST_SHIFT)
+            self._paint(track, first, layer)
 
         colour = (*(np.array(view.tracks[0].term.rgb) / 255.0), 1.0)
         for begin, end in pairwise(view.trail):
@@ -544,8 +570,11 @@ class Painter:
             self._add_background()
         return np.asarray(self._renderer.render())
 
-    def _paint(self, track: Track, first: int, shift: float) -> None:
-        """Tint and shift the moving parts that the scene has from the number `first` on."""
+    def _paint(self, track: Track, first: int, layer: int) -> None:
+        """Tint the moving parts that were added to the scene from the number `first` on.
+
+        Each ghost lies in a layer behind the robots before it, so that it shows where it differs.
+        """
         for geom in self._renderer.scene.geoms[first : self._renderer.scene.ngeom]:
             is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
             if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
@@ -555,7 +584,8 @@ class Painter:
                 share = GHOST_TINT if track.is_ghost else TINT * (1.0 - KEPT_COLOUR * purity)
                 geom.rgba[:3] = (1.0 - share) * own + share * np.array(track.term.rgb) / 255.0
                 geom.rgba[3] *= GHOST_OPACITY if track.is_ghost else 1.0
-                geom.pos[:] += shift * self._film.camera.offset
+                if track.is_ghost:
+                    geom.pos[:] -= layer * GHOST_SHIFT * self._film.camera.offset
 
     def _add_floor(self, target: Array) -> None:
         """Add the lines of a floor around the point at which the camera looks."""

@@ -78,7 +78,7 @@ def save_video(experiment: Experiment, result: Filmed, path: str | Path) -> Vide
     """Write a video of the robot, drawn by MuJoCo without a display.
 
     A design is shown as the initial motion beside the designed one, an estimate as the measured
-    robot as a ghost over the identified one.
+    robot as a ghost behind the identified one.
 
     Args:
         experiment: The experiment of the result.

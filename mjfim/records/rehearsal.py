@@ -32,6 +32,9 @@ MAX_EXCURSION = 2.0
 # A joint rests at the end where its speed is below this share of its peak.
 REST_SHARE = 0.02
 
+# Largest number of robots whose paths are compared in fans.
+MAX_PATHS = 500
+
 # Kinds of limits that hold by a clamp of the simulation, which does not count as kept.
 CLAMPED_KINDS = ("force", "joint_force", "tendon_force")
 
@@ -228,6 +231,55 @@ class RehearsedLimit(Record):
 
 
 @record
+class Fan(Record):
+    """Paths of one quantity over the robots that are plausible before and after an experiment.
+
+    Attributes:
+        limit: The quantity and its range, which is infinite where nothing limits it.
+        t: (n,) times [s].
+        model: (n,) path of the model [unit of the quantity].
+        worst: (n,) path of the robot that comes closest to the limit; NaN without a limit.
+        before: (2, n) paths below which 5 % and 95 % of the robots are.
+        after: (2, n) the same of robots whose parameters are drawn from what the experiment leaves
+            unknown.
+    """
+
+    limit: RehearsedLimit
+    t: Array
+    model: Array
+    worst: Array
+    before: Array
+    after: Array
+
+    in_json = ("limit.kind", "limit.name", "limit.unit", "spread_before", "spread_after")
+
+    @property
+    def spread_before(self) -> float:
+        """Half of the largest distance between the two paths [unit of the quantity]."""
+        return 0.5 * float((self.before[1] - self.before[0]).max())
+
+    @property
+    def spread_after(self) -> float:
+        """The same after the experiment."""
+        return 0.5 * float((self.after[1] - self.after[0]).max())
+
+
+@record
+class RobotMotions(Record):
+    """Motions of g robots at n instants, to be drawn beside that of the model.
+
+    Attributes:
+        robots: Rows of these robots in the arrays of a rehearsal, the least safe one first.
+        t: (n,) times [s].
+        qpos: (g, n, nq) positions [m or rad; unit quaternions for ball and free joints].
+    """
+
+    robots: tuple[int, ...]
+    t: Array
+    qpos: Array
+
+
+@record
 class Rehearsal(ShownRecord):
     """Result of `mjfim.rehearse`: a design on the model and on n simulated robots.
 
@@ -270,6 +322,8 @@ class Rehearsal(ShownRecord):
         safe_wrong: Largest of the smaller errors that were tried with which this motion is safe;
             NaN where it is safe anyway, or with none of them; None where none was tried.
         safe_with_feedback: Whether feedback makes this motion safe; None where it was not tried.
+        fans: Spread of the motions, for the quantities that come closest to their limits.
+        motions: Motions of some of the robots; None without robots.
     """
 
     parameters: tuple[str, ...]
@@ -302,6 +356,8 @@ class Rehearsal(ShownRecord):
     end: str = "free"
     safe_wrong: float | None = None
     safe_with_feedback: bool | None = None
+    fans: tuple[Fan, ...] = ()
+    motions: RobotMotions | None = None
 
     file_stem = "rehearsal"
     made_by = "`mjfim rehearse DESIGN_FOLDER -o DIR`"
@@ -323,6 +379,7 @@ class Rehearsal(ShownRecord):
         "kept_reserve",
         "safe_wrong",
         "safe_with_feedback",
+        "fans",
     )
     json_names = {"is_safe": "safe", "all_kept": "all_limits_kept", "kept_reserve": "reserve"}
 
@@ -356,6 +413,11 @@ class Rehearsal(ShownRecord):
         """(n+1,) True where every limit that is no clamp is kept."""
         is_kept = (self.kept | self.is_clamped).all(axis=1)
         return np.asarray(is_kept & ~np.isnan(self.end_height))
+
+    @property
+    def unsafe(self) -> np.ndarray:
+        """(n+1,) True where a limit that is no clamp is left, or the floor is passed through."""
+        return np.asarray(~self.inside | self.passes_floor)
 
     @property
     def all_kept(self) -> int:

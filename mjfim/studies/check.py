@@ -517,33 +517,33 @@ def _checked(
 
     # Along one motion, standard deviations are checked by finite steps, and two robots show what it
     # does not determine.
-    steps, robots = None, None
-    if not stop.requested and point.trajectory is not None and point.information is not None:
-        along = information.std(point.information)
-        steps = steps_along(task, point.trajectory, point.information, along)
+    steps, robots, motion, known = None, None, point.trajectory, point.information
+    if not stop.requested and motion is not None and known is not None:
+        along = information.std(known)
+        steps = steps_along(task, motion, known, along)
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
         if is_motion:
             robots = valley(
-                [(task.plant, point.trajectory)],
+                [(task.plant, motion)],
                 task.system.noise,
                 task.theta,
-                information=point.information,
+                information=known,
                 prior=information.prior,
                 std=std,
             )
 
     # A motion that a robot could play is rehearsed as that of a design is.
     rehearsal, warning = None, ""
-    if is_motion and steps is not None and point.trajectory is not None and not refused:
+    if is_motion and steps is not None and known is not None and motion is not None and not refused:
         begin_stage("rehearsing the motion")
-        gain, growth = regulation_along(task, point.trajectory)
-        rehearsal = rehearsed(task, point.trajectory, gain, steps, growth)
+        gain, growth = regulation_along(task, motion)
+        rehearsal = rehearsed(task, motion, gain, known, steps, growth)
         warning = growth_warning(growth) or ""
 
     # What each sensor tells along one motion.
     worth = None
-    if steps is not None and is_motion and point.trajectory is not None:
+    if steps is not None and is_motion:
         worth = sensing_along(task, point, found).worth(source, duration)
 
     # Eigenvalues of the criterion, without combinations that no experiment can identify.

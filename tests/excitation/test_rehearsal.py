@@ -17,12 +17,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 import mjfim
 from mjfim.arrays import evenly_spread_indices
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
+from mjfim.excitation.rehearsal import draw_robot
 from mjfim.excitation.search.climb import Candidate
 from mjfim.excitation.search.search import Search
+from mjfim.excitation.task import DesignTask
 from mjfim.files import write_json
 from mjfim.output.folders import find_experiment_file
 from mjfim.output.page import Level
 from mjfim.output.pages import page_of
+from mjfim.output.plots.studies import fan_panels
+from mjfim.output.words import format_number
 from mjfim.records.design import Design
 from mjfim.records.rehearsal import FiniteSteps
 from tests.support.cli import run
@@ -149,6 +153,105 @@ def test_a_check_rehearses_the_start_as_a_design_does(plain: Played) -> None:
             assert_allclose(getattr(found, name), getattr(again, name), rtol=1e-9, atol=1e-12)
         assert_allclose(found.steps.stated, again.steps.stated, rtol=1e-9)
         assert found.growth == again.growth and found.is_safe is again.is_safe
+
+
+# Place of each quantity of the cart in its states.
+PLACES = {
+    ("position", "slide"): 0,
+    ("position", "hinge"): 1,
+    ("velocity", "slide"): 2,
+    ("velocity", "hinge"): 3,
+}
+
+
+def test_fans_are_quantiles_of_plain_loops(plain: Played) -> None:
+    """The band, the model, the robot that comes closest to a limit, and the kept motions."""
+    _, design = plain
+    found = design.rehearsal
+    assert found is not None and found.motions is not None
+    states = np.array([looped(theta, design.trajectory.ctrl) for theta in found.theta])
+    assert {(fan.limit.kind, fan.limit.name) for fan in found.fans} == set(PLACES)
+    for fan in found.fans:
+        rows = np.rint(fan.t / 0.005).astype(int)
+        assert rows[0] == 1 and rows[-1] == states.shape[1] - 1
+        paths = states[:, rows, PLACES[fan.limit.kind, fan.limit.name]]
+        assert_allclose(fan.model, paths[0], rtol=1e-6, atol=1e-7)
+        band = np.quantile(paths[1:], (0.05, 0.95), axis=0)
+        assert_allclose(fan.before, band, rtol=1e-6, atol=1e-6)
+        assert fan.spread_before == pytest.approx(0.5 * np.ptp(band, axis=0).max(), rel=1e-5)
+        if np.isfinite(fan.limit.upper):
+            worst = 1 + np.abs(paths[1:]).max(axis=1).argmax()
+            assert_allclose(fan.worst, paths[worst], rtol=1e-6, atol=1e-7)
+        else:
+            assert np.isnan(fan.worst).all()
+    for robot, qpos in zip(found.motions.robots, found.motions.qpos, strict=True):
+        rows = np.rint(found.motions.t / 0.005).astype(int)
+        assert_allclose(qpos, states[robot, rows, :2], rtol=1e-6, atol=1e-7)
+    assert len(set(found.motions.robots)) == 8 and min(found.motions.robots) > 0
+
+
+@pytest.mark.slow
+def test_robots_after_the_experiment_have_the_covariance_of_the_design(plain: Played) -> None:
+    """That of the information, the priors, and the ranges of parameters without a prior."""
+    experiment, design = plain
+    task, rng = DesignTask.resolve(experiment), np.random.default_rng(0)
+    reach = 0.2 * np.array([0.8, 0.1])
+    known = np.diag([*3.0 / reach**2, 0.0])
+    covariance = np.linalg.inv(design.final.information + known)
+    drawn = np.array([draw_robot(task, rng, design.final.information) for _ in range(4000)])
+    size = np.sqrt(np.diag(covariance))
+    assert_allclose(drawn.mean(axis=0), design.theta, atol=4.0 * size.max() / np.sqrt(4000))
+    error = (np.cov(drawn.T) - covariance) / np.outer(size, size)
+    assert np.abs(error).max() < 4.0 * np.sqrt(2.0 / 4000)
+    # These parameters are known far better than before, so that the ranges hardly matter.
+    assert_allclose(size, design.final.std, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_the_band_after_the_experiment_follows_from_plain_loops(
+    plain: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To first order, from finite differences of the motion and the covariance of the design."""
+    experiment, design = plain
+    monkeypatch.setattr("mjfim.excitation.rehearsal.MAX_AFTER", 400)
+    found = mjfim.rehearse(experiment.replace(rehearsal={"robots": 400}), design)
+    step = 1e-5 * design.theta
+    slopes = [
+        (looped(design.theta + each, design.trajectory.ctrl)
+         - looped(design.theta - each, design.trajectory.ctrl)) / (2.0 * each.sum())
+        for each in np.diag(step)
+    ]  # fmt: skip
+    covariance = np.linalg.inv(design.final.information)
+    spread = np.sqrt(np.einsum("itk,ij,jtk->tk", slopes, covariance, slopes))
+    for fan in found.fans:
+        rows = np.rint(fan.t / 0.005).astype(int)
+        std = spread[rows, PLACES[fan.limit.kind, fan.limit.name]]
+        half = 0.5 * np.ptp(fan.after, axis=0)
+        moved = std > 0.1 * std.max()
+        assert_allclose(half[moved] / std[moved], 1.645, rtol=0.2)
+        assert fan.spread_after < 0.5 * fan.spread_before
+
+
+def test_curves_are_chosen_by_joint_with_the_same_numbers_everywhere(tmp_path: Path) -> None:
+    """Of each joint the quantity that robots bring closest to its limit comes first."""
+    _, design = played(tmp_path, reach=0.6, speed=40.0)
+    found = design.rehearsal
+    assert found is not None
+    shown = [(fan.limit.kind, fan.limit.name) for fan in found.fans]
+    assert {name for _, name in shown[:2]} == {"slide", "hinge"}
+    assert shown.index(("position", "slide")) < shown.index(("velocity", "slide"))
+    page, numbers = page_of(found), found.summary()["fans"]
+    (table,) = [
+        part for part in page.sections[0].parts if getattr(part, "columns", ())[:1] == ("quantity",)
+    ]
+    for fan, row, told, panel in zip(
+        found.fans, table.rows, numbers, fan_panels(found), strict=True
+    ):
+        spreads = [0.5 * np.ptp(each, axis=0).max() for each in (fan.before, fan.after)]
+        assert [told["spread_before"], told["spread_after"]] == pytest.approx(spreads)
+        assert list(row.cells[1:]) == [f"{each:.3g}" for each in spreads]
+        before, after = (format_number(each, 2) for each in spreads)
+        assert panel.remark == f"spread ±{before}, after the experiment ±{after}"
 
 
 WALLED = """

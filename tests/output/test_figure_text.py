@@ -216,11 +216,13 @@ def rehearsal(size: Size) -> Rehearsal:
     rng = np.random.default_rng(0)
     joints = tuple(label.partition(" ")[0] for label in labels.positions)
     speed = rng.uniform(1.0, 9.0, (21, len(joints)))
+    limits = tuple(
+        RehearsedLimit(kind="control_rate", name=name, lower=-1.0, upper=1.0, scale=1.0)
+        for name in joints
+    )
     return results.rehearsal(
-        limits=tuple(
-            RehearsedLimit(kind="control_rate", name=name, lower=-1.0, upper=1.0, scale=1.0)
-            for name in joints
-        ),
+        limits=limits,
+        fans=tuple(map(results.fan, limits[:6])),
         margins=rng.uniform(-0.1, 0.5, (21, len(joints))),
         joints=joints,
         units=("rad/s",) * len(joints),

@@ -32,7 +32,9 @@ from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
 from mjfim.records.estimate_parts import InformationInTime, ResidualForce
+from mjfim.records.rehearsal import FiniteSteps, RobotMotions
 from mjfim.records.trajectory import Trajectory
+from tests.support import results
 from tests.support.made_motions import designed, estimated, load, simulated
 
 
@@ -246,6 +248,46 @@ def test_robots_beside_both_motions_are_outlines_without_static_shapes(
         column(path, ("summary",), None, "TextDocument:text")[1][0, 0]
     )
     assert empty_views(path) == []
+
+
+def test_ends_of_rehearsed_robots_are_those_of_mujoco(
+    cart: mujoco.MjModel, design: Design, tmp_path: Path
+) -> None:
+    """Two robots, of which one leaves a limit; the bands are series."""
+    t = np.linspace(0.0, 2.0, 30)
+    qpos = np.stack([a * np.stack([np.sin(t), np.cos(t)], axis=1) for a in (0.3, 0.6)])
+    std = np.array([0.1, 0.2])
+    steps = FiniteSteps(
+        names=design.parameters, predicted=std, std=std, length=np.ones(2), ratio=np.ones(2)
+    )
+    kept = results.rehearsal(steps=steps)
+    margins = kept.margins.copy()
+    margins[7] = -0.1
+    rehearsal = replace(kept, margins=margins, motions=RobotMotions(robots=(7, 2), t=t, qpos=qpos))
+    path = tmp_path / "design.rrd"
+    log_design(path, cart, replace(design, rehearsal=rehearsal), labels_of_model(cart))
+    assert empty_views(path) == []
+    data = mujoco.MjData(cart)
+    for positions, name in zip(qpos, ("a limit", "no limit"), strict=True):
+        expected = []
+        for row in positions:
+            data.qpos[:] = row
+            mujoco.mj_kinematics(cart, data)
+            expected.append(data.geom_xpos[-1].copy())
+        at = ("robots", "designed", f"robots that leave {name}")
+        _, (strips,) = column(path, (*at, "paths"), None, "LineStrips3D:strips")
+        np.testing.assert_allclose(strips[0], expected, atol=1e-6)
+        times, ends = column(path, (*at, "ends"), "sim_time", "Points3D:positions")
+        np.testing.assert_allclose(ends[:, 0], expected, atol=1e-6)
+        np.testing.assert_allclose(times * 1e-9, t, atol=1e-9)
+    fan = rehearsal.fans[0]
+    edges = [
+        np.ravel(column(path, entity, "sim_time", "Scalars:scalars")[1])
+        for entity in entities(path)
+        if entity.startswith("/robots/position") and "of" in entity.rpartition("/")[2]
+    ]
+    edges.sort(key=lambda edge: float(edge.sum()))
+    np.testing.assert_allclose(edges, fan.before)
 
 
 def test_in_the_view_of_both_robots_the_initial_one_is_translucent(file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import NoVideoError, RecordingError
 from mjfim.excitation.task import DesignTask
@@ -19,8 +21,11 @@ from mjfim.experiment.system import System, simulate_system
 from mjfim.output.film import Film, film_of, film_of_motions, film_speed, positions_at
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED
 from mjfim.output.video import Video, render, report_video, require_format
+from mjfim.records.rehearsal import RobotMotions
 from mjfim.records.trajectory import Trajectory
+from tests.support import results
 from tests.support.cart_pendulum import cart_pendulum
+from tests.support.paths import MODELS
 
 SWING = """
 <mujoco>
@@ -96,7 +101,34 @@ class TestFilm:
         film = film_of_motions(swing, motions)
         assert film.caption == "The initial motion beside the designed motion, in real time."
 
-    def test_measured_is_a_ghost_over_identified(self, swing: mujoco.MjModel) -> None:
+    def test_rehearsed_robots_are_ghosts_behind_the_design(self) -> None:
+        """The least safe and the safest one; a robot that leaves a limit has its own word."""
+        system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+        t = np.linspace(0.0, 4.0, 101)
+        moves = np.stack([a * np.sin(np.stack([t, 2.0 * t], axis=1)) for a in (1.0, 1.2, 0.9, 1.1)])
+        kept = results.rehearsal()
+        margins = kept.margins.copy()
+        margins[3] = -0.1
+        motions = RobotMotions(robots=(3, 1, 2), t=t, qpos=moves[1:])
+        designed = replace(results.evaluation(0.1, 50), trajectory=motion(t, moves[0]))
+        design = results.design(
+            initial=designed,
+            final=designed,
+            rehearsal=replace(kept, margins=margins, motions=motions),
+        )
+        film = film_of(system, design)
+        left, right = film.views
+        assert [track.term for track in left.tracks] == ["initial"]
+        assert [track.term for track in right.tracks] == ["designed", "unsafe", "rehearsed"]
+        assert [track.is_ghost for track in right.tracks] == [False, True, True]
+        for track, qpos in zip(right.tracks, moves[[0, 1, 3]], strict=True):
+            np.testing.assert_allclose(track.qpos, qpos, atol=1e-12)
+
+        # Two safe robots are named once.
+        safe = film_of(system, replace(design, rehearsal=replace(kept, motions=motions)))
+        assert len(safe.views[1].tracks) == 3 and safe.caption.count("rehearsed") == 1
+
+    def test_measured_is_a_ghost_behind_identified(self, swing: mujoco.MjModel) -> None:
         film = identified(swing, swinging(4.0), swinging(4.0, 0.6))
         (view,) = film.views
         assert [track.is_ghost for track in view.tracks] == [False, True]

@@ -22,7 +22,13 @@ from mjfim.records.estimate import (
     PredictionErrors,
     Whiteness,
 )
-from mjfim.records.rehearsal import FiniteSteps, Rehearsal, RehearsedLimit
+from mjfim.records.rehearsal import (
+    Fan,
+    FiniteSteps,
+    Rehearsal,
+    RehearsedLimit,
+    RobotMotions,
+)
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
@@ -352,22 +358,31 @@ def finite_steps(
     )
 
 
+def fan(limit: RehearsedLimit) -> Fan:
+    """A sine on robots that are up to 20 % off, and 2 % after the experiment."""
+    t = np.linspace(0.0, 2.0, 50)
+    model = 0.6 * np.sin(6.0 * t)
+    before, after = (np.outer([-each, each], t) + model for each in (0.1, 0.01))
+    return Fan(limit=limit, t=t, model=model, worst=1.15 * model, before=before, after=after)
+
+
 def rehearsal(
     name: str = "hinge", parameters: tuple[str, ...] = PARAMETERS, **changes: object
 ) -> Rehearsal:
     """Twenty robots that keep all limits, or some of which exceed one for small margins."""
     random = np.random.default_rng(0)
     rows = np.ones((21, 1))
+    limits = tuple(
+        RehearsedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0, unit=unit)
+        for kind, unit in (("position", "rad"), ("velocity", "rad/s"))
+    )
     fields: dict[str, object] = {
         "parameters": parameters,
         "wrong": 0.2,
         "feedback": False,
         "latency": 0.0,
         "theta": THETA * (1.0 + 0.2 * random.uniform(-1.0, 1.0, (21, 3))),
-        "limits": tuple(
-            RehearsedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0, unit=unit)
-            for kind, unit in (("position", "rad"), ("velocity", "rad/s"))
-        ),
+        "limits": limits,
         "margins": np.array([0.4, 0.5]) + 0.1 * random.uniform(-1.0, 1.0, (21, 2)),
         "joints": ("slide", name),
         "units": ("m/s", "rad/s"),
@@ -387,6 +402,10 @@ def rehearsal(
         "at_stop": 0.0 * rows[:, 0],
         "unbraked": {},
         "steps": finite_steps(parameters),
+        "fans": tuple(map(fan, limits)),
+        "motions": RobotMotions(
+            robots=(1, 2), t=np.array([0.0, 2.0]), qpos=np.array([[[0.1]], [[0.2]]]) * rows[:2]
+        ),
     }
     return Rehearsal(**{**fields, **changes})  # type: ignore[arg-type]
 

@@ -446,6 +446,17 @@ def _rehearsal_parts(rehearsal: Rehearsal, *, is_detail: bool = False) -> Iterat
     yield Plot("rehearsal")
     if rehearsal.limits:
         yield replace(_margin_table(rehearsal), detail=is_detail)
+    if rehearsal.fans:
+        limits = [fan.limit for fan in rehearsal.fans]
+        yield tabulated(
+            "Half width of the range in which 90 % of the robots are, at its widest",
+            {
+                "quantity": [named(f"{_kind(each)} of {each.name}", each.unit) for each in limits],
+                "before": numbers(fan.spread_before for fan in rehearsal.fans),
+                "after the experiment": numbers(fan.spread_after for fan in rehearsal.fans),
+            },
+            detail=True,
+        )
     yield tabulated(
         "Largest speeds and accelerations of the model and of all robots",
         {

@@ -133,13 +133,17 @@ def figure_of(picture: Picture) -> Figure:
             height_ratios=picture.heights,
             width_ratios=picture.widths,
         )
+        # Names beside a wide panel make all columns narrower.
+        wide = [name for panel in picture.panels if panel.is_wide for name in panel.y.names or ()]
+        names = (text_width(shorten(name, NAME_WIDTH), SMALL_FONT) for name in wide)
+        room = WIDTH - max(names, default=0.0)
         for panel in picture.panels:
             row, column = panel.place
             rows = slice(None) if panel.is_tall else row
             across = slice(None) if panel.is_wide else column
             share = 1.0 if panel.is_wide else picture.widths[column] / sum(picture.widths)
             axes = figure.add_subplot(grid[rows, across])
-            _draw_panel(axes, panel, WIDTH * share - PANEL_FRAME, picture.heights[row])
+            _draw_panel(axes, panel, room * share - PANEL_FRAME, picture.heights[row])
 
         # Empty lines of the title keep room for the legend.
         left = SIDE_SPACE / WIDTH
@@ -219,6 +223,8 @@ def _draw_panel(axes: Axes, panel: Panel, width: float, height: float) -> None:
         pad=4.0 + 10.5 * len(remark),
     )
     if remark:
+        # A common power of ten stands where no remark is.
+        axes.yaxis.get_offset_text().set(x=1.0, ha="right")
         _write(
             axes,
             (0.0, 1.0),

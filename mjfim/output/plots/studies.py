@@ -30,6 +30,7 @@ from mjfim.output.panels import (
     Mark,
     Panel,
     Picture,
+    area,
     around,
     bars,
     blank_rows,
@@ -67,7 +68,7 @@ from mjfim.output.words import (
 )
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check
-from mjfim.records.rehearsal import Rehearsal, Separation, Valley
+from mjfim.records.rehearsal import MAX_PATHS, Rehearsal, Separation, Valley
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
@@ -96,6 +97,10 @@ MAX_HIGH_ROWS, MAX_TITLE = 12, 260
 # Ratio of standard deviations to the design's at which the colours of the cells end, and ratios at
 # the bar of colours.
 LARGEST_RATIO, RATIOS = 3.0, (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
+
+# Number of fans up to which they are wide; spread over the range of the motion below which a fan is
+# thin; distance from the curves, over their range, up to which a limit is drawn.
+MAX_WIDE_FANS, THIN_FAN, NEAR_LIMIT = 4, 0.1, 0.5
 
 # Distance from the quartiles beyond which estimates are outliers, over the distance between the
 # quartiles, and reach of the bound that a histogram shows [standard deviations].
@@ -633,28 +638,103 @@ def robots(comparison: RobotComparison) -> Picture:
 
 
 def rehearsal(result: Rehearsal) -> Picture:
-    """Show the margin of every limit and the largest speed of every joint, for all robots."""
-    panels = [_margins(result)] if result.limits else []
-    panels.append(_speeds(result))
+    """Show the fans of the robots' motions, and the margin of every limit for all robots."""
+    fans = fan_panels(result)
+    columns = 3 if len(fans) > MAX_WIDE_FANS else 2 if len(fans) > 1 else 1
+    panels = in_grid(fans, columns)
+    heights = [1.8] * -(-len(fans) // columns)
+    if result.limits:
+        panels.append(replace(_margins(result), place=(len(heights), 0), is_wide=True))
+        heights.append(max(1.4, 0.8 + 0.24 * len(result.limits)))
     control = "with the gains K(t)" if result.feedback else "open loop"
     found = "some reach a clamp" if result.is_clamping else "safe to play"
     title = (
         f"{result.robots} robots, parameters up to {100 * result.wrong:g} % off, {control}: "
         f"{found if result.is_safe else 'do not play'}"
     )
-    note = "Dots are robots, bars the model."
+    note = (
+        "Horizontal axes of the curves: time [s]; deviations are from the model. Dots are robots, "
+        "bars the model."
+    )
+    shown = {fan.limit.name for fan in result.fans}
+    shown |= {name.rpartition(".")[0] for name in shown}
+    hidden = [name for name in result.joints if name.removesuffix(" (rotation)") not in shown]
+    if hidden:
+        note += f" The curves of {len(hidden)} further joints are not drawn."
+    if result.robots > MAX_PATHS:
+        note += f" Curves: the first {MAX_PATHS} robots."
     if not result.limits:
         note += " The experiment states no limits."
     elif (result.margins > 1.0).any():
         note += " Margins above 100 % are drawn there."
-    height = max(2.6, 1.0 + 0.24 * max(len(result.limits), len(result.joints)))
     return Picture(
         title=title,
-        panels=in_grid(panels, 2),
+        panels=panels or [Panel(message="neither robots nor limits")],
         note=note,
-        heights=[height],
-        widths=[1.3, 1.0] if result.limits else [1.0],
+        heights=heights or [1.4],
+        widths=[1.0] * columns,
     )
+
+
+def fan_panels(result: Rehearsal) -> list[Panel]:
+    """Return a panel for each fan: where the robots are before and after the experiment.
+
+    A fan that would hardly be wider than a line is drawn as deviations from the model.
+
+    Args:
+        result: The rehearsal.
+    """
+    panels = []
+    for fan in result.fans:
+        limit, broken = fan.limit, 0
+        if limit in result.limits:
+            broken = int((~result.kept[1:, result.limits.index(limit)]).sum())
+        # Robots that leave a limit are drawn however many curves there are.
+        is_thin = fan.spread_before < THIN_FAN * np.ptp(fan.model)
+        origin = fan.model if is_thin else np.zeros(len(fan.t))
+        spreads = (format_number(each, 2) for each in (fan.spread_before, fan.spread_after))
+        remark = "spread ±{}, after the experiment ±{}".format(*spreads)
+        nearest = "robot closest to the limit"
+        if broken:
+            remark = f"{broken} of {result.robots} leave the limit; {remark}"
+            nearest = "robot farthest beyond the limit"
+
+        low, high = fan.before - origin
+        worst = np.full(len(fan.t), np.nan) if is_thin and not broken else fan.worst - origin
+        marks = [
+            area(fan.t, low, high, MEASURED, label="90 % of the robots"),
+            # A strip that is thinner than a line can be seen, too.
+            *(
+                line(fan.t, edge - origin, IDENTIFIED, label="90 % after the experiment")
+                for edge in fan.after
+            ),
+            line(fan.t, fan.model - origin, "text", dash="--", width=1.0, label="model"),
+        ]
+        if np.isfinite(worst).any():
+            role = DESIGNED if broken else MEASURED
+            marks.append(line(fan.t, worst, role, width=1.0, label=nearest))
+        every = np.stack([low, high, fan.model - origin, worst])
+        least, most = np.nanmin(every), np.nanmax(every)
+        reach = NEAR_LIMIT * (most - least)
+        # Zero is no limit of a magnitude.
+        is_magnitude = limit.lower == 0.0 and limit.scale == limit.upper
+        for bound in (limit.lower, limit.upper)[is_magnitude:]:
+            edge = bound - origin
+            is_near = (least - reach < edge) & (edge < most + reach)
+            if is_near.any():
+                edge = np.where(is_near, edge, np.nan)
+                marks.append(line(fan.t, edge, "muted", dash=":", label="limit"))
+        panels.append(
+            Panel(
+                title=with_unit(f"{limit.kind.replace('_', ' ')} {limit.name}", limit.unit),
+                role=DESIGNED if broken else "text",
+                remark=remark,
+                marks=marks,
+                x=Axis(most=5),
+                y=Axis(label="deviation" if is_thin else "", most=4),
+            )
+        )
+    return panels
 
 
 def _margins(result: Rehearsal) -> Panel:
@@ -679,31 +759,11 @@ def _margins(result: Rehearsal) -> Panel:
     )
 
 
-def _speeds(result: Rehearsal) -> Panel:
-    """Return a row per joint: largest speed of the model, and of every robot."""
-    speeds = np.where(np.isfinite(result.speed), result.speed, np.nan)
-    most = np.nanmax(speeds, axis=0)
-    share = 100.0 * speeds / np.where(most > 0.0, most, 1.0)
-    marks = []
-    for i, name in enumerate(result.joints):
-        role = DESIGNED if name in result.unlimited else MEASURED
-        label = "robots, nothing limits the speed" if name in result.unlimited else "robots"
-        marks += _row(share[:, i], i, role, label)
-    texts = [f"{peak:.2g} {unit}" for peak, unit in zip(most, result.units, strict=True)]
-    return Panel(
-        title="largest speed of each joint",
-        marks=marks,
-        x=Axis(label="share of the largest one [%]", limits=(0.0, 105.0)),
-        y=row_axis(list(result.joints)),
-        beside=[("", "text", texts)],
-    )
-
-
 def _row(values: Array, row: int, role: str, label: str) -> list[Mark]:
     """Return dots for the robots, spread over the height of a row, and a bar for the model."""
     rng = np.random.default_rng(0)
     rows = row + rng.uniform(-0.22, 0.22, len(values) - 1)
-    look = {"symbol": "|", "size": 14.0, "width": 1.6, "label": "model"}
+    look = {"symbol": "|", "size": 14.0, "width": 1.6}
     return [
         dots(values[1:], rows, role, size=3.5, opacity=0.5, label=label),
         dots(values[:1], [row], "text", **look),

@@ -46,7 +46,7 @@ from mjfim.output.plots.design import (
     motion_panels,
 )
 from mjfim.output.plots.estimate import deciding_seconds, fit, held_out, residual_torque
-from mjfim.output.plots.studies import valley
+from mjfim.output.plots.studies import fan_panels, valley
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.plots import (
     PLOTS_PER_ROW,
@@ -61,6 +61,7 @@ from mjfim.output.rerun.plots import (
     with_curves,
 )
 from mjfim.output.rerun.scene import (
+    PATH_THICKNESS,
     BodyPoses,
     EntityParts,
     RobotStyle,
@@ -74,10 +75,12 @@ from mjfim.output.rerun.scene import (
     log_pose,
     log_robot,
     pale_shapes,
+    time_column,
 )
 from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.trajectory import Labels, Trajectory
 
 # Roles of trajectories whose name is no word of the vocabulary, one after the other.
@@ -120,11 +123,16 @@ def log_design(
     }
     learning = accuracy_over_time(design, complete_labels(design))
     motion = motion_panels(labels, both, design.usage)
-    bounds: Tabs = {"limits": limit_panels(design, labels, rows=False)} if design.usage else {}
-    asked = bounds | {"accuracy": list(learning.panels)}
+    asked: Tabs = {"limits": limit_panels(design, labels, rows=False)} if design.usage else {}
+    if design.rehearsal is not None and design.rehearsal.fans:
+        asked["robots"] = [
+            replace(panel, title=f"{panel.title} {panel.y.label}".strip())
+            for panel in fan_panels(design.rehearsal)
+        ]
+    asked["accuracy"] = list(learning.panels)
     if design.valley is not None:
         panels = valley(design.valley, [(f"{term} motion", term) for term in both]).panels
-        asked |= {"two robots": list(panels[: 2 * len(both)])}
+        asked["two robots"] = list(panels[: 2 * len(both)])
     # The positions nearest to their limits, or the first ones.
     near = {use.name: largest_share(use) for use in design.usage if use.kind == "position"}
     nearest = sorted(
@@ -156,6 +164,8 @@ def log_design(
                 root = ("robots", name, f"robot {k}")
                 log_robot(rec, model, root, ghost, style, is_ghost=True)
         _log_iterates(rec, model, design, iterates)
+        if design.rehearsal is not None:
+            _log_rehearsed(rec, model, design.rehearsal, poses[DESIGNED])
 
 
 def log_estimate(
@@ -345,6 +355,33 @@ def _log_iterates(
             curve = plane.curve(*curves[i], DESIGNED)
             rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
     rec.reset_time()
+
+
+def _log_rehearsed(
+    rec: rr.RecordingStream, model: mujoco.MjModel, rehearsal: Rehearsal, designed: BodyPoses
+) -> None:
+    """Log the paths of the ends of robots that play the design, and the ends as moving points."""
+    motions, end = rehearsal.motions, end_point(model, designed)
+    if motions is None or end is None:
+        return
+    paths = [body_poses(model, motions.t, qpos).world_paths(*end)[:, 0] for qpos in motions.qpos]
+    unsafe = rehearsal.unsafe[list(motions.robots)]
+    for name, colour, chosen in (
+        ("robots that leave no limit", rgb(MEASURED), ~unsafe),
+        ("robots that leave a limit", rgb(NOMINAL), unsafe),
+    ):
+        found = [paths[k] for k in np.flatnonzero(chosen)]
+        if not found:
+            continue
+        parts = ("robots", DESIGNED, name)
+        thin = rr.Radius.ui_points(0.5 * PATH_THICKNESS)
+        lines = rr.LineStrips3D(found, colors=[colour], radii=thin)
+        rec.log(entity_path((*parts, "paths")), lines, static=True, strict=True)
+        look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3.0))
+        rec.log(entity_path((*parts, "ends")), look, static=True, strict=True)
+        ends = rr.Points3D.columns(positions=np.stack(found, axis=1).reshape(-1, 3))
+        rows = ends.partition([len(found)] * len(motions.t))
+        rec.send_columns(entity_path((*parts, "ends")), [time_column(motions.t)], rows, strict=True)
 
 
 # ---- layout
@@ -571,6 +608,8 @@ DESIGN_COLOURS = (
     _colours(
         (INITIAL, "the initial trajectory"),
         (DESIGNED, "the designed trajectory"),
+        (MEASURED, "rehearsed robots"),
+        (NOMINAL, "rehearsed robots that leave a limit"),
     )
     + " Grey lines: limits. Space bar: play or pause. The timeline `iteration` shows the search: "
     "its iterates in place of the designed trajectory."

@@ -139,12 +139,15 @@ def with_curves(panel: Panel) -> Panel:
 
 
 def _log_mark(rec: rr.RecordingStream, parts: EntityParts, mark: Mark, ends: Array) -> None:
-    """Log one mark; level lines and the edges of level strips reach through the whole time."""
+    """Log one mark, of a strip its edges; those that are level reach through the whole time."""
     x, y = mark.x[: len(mark.y)], mark.y
     if mark.kind == "hline" or (mark.kind == "hspan" and mark.label):
         for k, level in enumerate((mark.y, mark.other) if mark.other is not None else (mark.y,)):
             look = replace(mark, width=1.0, label=mark.label or "limit")
             _send(rec, (*parts[:-1], f"{parts[-1]} {k}"), ends, np.repeat(level, 2), look)
+    elif mark.kind == "area" and mark.label:
+        for k, edge in enumerate((mark.y, mark.other)):
+            _send(rec, (*parts[:-1], f"{parts[-1]} {k}"), x, np.asarray(edge), mark)
     elif mark.kind in ("line", "steps", "dots"):
         _send(rec, parts, x, y, mark)
 
