@@ -14,6 +14,7 @@ much, whose outputs differ by less than a test of the noise can tell.
 
 from __future__ import annotations
 
+import itertools
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import replace
@@ -270,10 +271,10 @@ def valley(
     """Find two robots with different parameters that a motion does not tell apart.
 
     The parameter that is known worst moves, and the others as its covariance with them says: so
-    they hide it best. The robots lie on both sides of theta. Their distance grows until their
-    outputs, or the prior, differ by 1.96 standard deviations, or the worst parameter changes by
-    half; the others stop at their bounds. One direction has one degree of freedom, so that a
-    chi-square test at 95 % does not find a smaller difference.
+    they hide it best. The robots lie on both sides of theta. Their distance grows until the outputs
+    of two of the three, with the prior, differ by 1.96 standard deviations, or the worst parameter
+    changes by half; the others stop at their bounds. One direction has one degree of freedom, so
+    that a chi-square test at 95 % does not find a smaller difference.
 
     Args:
         motions: The motion and, where there is one, the designed motion, each with its plant.
@@ -309,14 +310,17 @@ def valley(
         return np.clip(theta + length / LENGTHS * np.array([step, -step]), lower, upper)
 
     def differ(length: int) -> bool:
-        """Whether the robots are impossible, or differ by more than the noise."""
-        pair = robots(length)
-        y, finite = plant.measure(pair, trajectory.ctrl)
-        if not finite.all() or any(writer.unphysical_bodies(plant.source, row) for row in pair):
+        """Whether a robot is impossible, or differs by more than the noise from any other."""
+        three = np.array([*robots(length), theta])
+        y, finite = plant.measure(three, trajectory.ctrl)
+        if not finite.all() or any(writer.unphysical_bodies(plant.source, row) for row in three):
             return True
-        apart = pair[0] - pair[1]
-        square = np.sum(noise.whitened_rows(y[0] - y[1]) ** 2) + apart @ prior @ apart
-        return bool(square > NORMAL_95**2)
+        for a, b in itertools.combinations(range(3), 2):
+            gap = three[a] - three[b]
+            square = np.sum(noise.whitened_rows(y[a] - y[b]) ** 2) + gap @ prior @ gap
+            if square > NORMAL_95**2:
+                return True
+        return False
 
     pair = robots(bisect_left(range(1, LENGTHS + 1), True, key=differ))
     measured = [each.measure(pair, motion.ctrl) for each, motion in motions]

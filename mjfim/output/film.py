@@ -271,7 +271,7 @@ def robots_beside(
                 mujoco.mj_integratePos(model, position, move, factor)
             pairs.append(replace(each, qpos=qpos))
     magnified = f", differences × {factor:g}" if factor > 1.0 else ""
-    note = f"Pale: two robots that the initial motion does not tell apart{magnified}."
+    note = f"Pale: two robots alike in the initial motion{magnified}."
     return [(pairs[0], pairs[1]), (pairs[2], pairs[3])], note
 
 
@@ -452,8 +452,9 @@ SHOWN_GROUPS = 3
 # even, as the encoder of mp4 needs.
 TITLE_HEIGHT, FOOT_HEIGHT, GAP = 36, 32, 4
 
-# Sizes of the letters of titles and foot [pixels], and the distance from the edge.
-TITLE_SIZE, FOOT_SIZE, MARGIN = 21, 17, 14
+# Sizes of the letters of titles and foot, and distances of texts and of the note from the edge
+# [pixels].
+TITLE_SIZE, FOOT_SIZE, MARGIN, NOTE_PLACE = 21, 17, 14, 130
 
 # Colours of the strips and of the text in the foot (0..255).
 PAPER, INK, FAINT_INK = (255, 255, 255), (40, 44, 52), (110, 116, 126)
@@ -484,13 +485,17 @@ class Painter:
         self.height = TITLE_HEIGHT + height + FOOT_HEIGHT
         self._film = film
         self._data = mujoco.MjData(model)
-        self._is_moving = model.body_weldid[model.geom_bodyid] != 0
+        moves = model.body_weldid[model.geom_bodyid] != 0
+        self._is_moving = {
+            int(mujoco.mjtObj.mjOBJ_GEOM): moves,
+            int(mujoco.mjtObj.mjOBJ_BODY): model.body_weldid != 0,
+        }
         self._has_sky = bool(np.any(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)))
         self._camera = _free_camera(film.camera.offset)
         self._option = mujoco.MjvOption()
-        if not np.any(model.geom_group[self._is_moving] < SHOWN_GROUPS):
+        if not np.any(model.geom_group[moves] < SHOWN_GROUPS):
             self._option.geomgroup[:] = 1
-        if not self._is_moving.any():
+        if not moves.any():
             self._option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
 
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
@@ -541,8 +546,8 @@ class Painter:
 
         place = (self.width - MARGIN, self.height - FOOT_HEIGHT // 2)
         text.text(place, self._film.speed_text, FAINT_INK, self._font, anchor="rm")
-        place = (self.width // 2, self.height - FOOT_HEIGHT // 2)
-        text.text(place, self._film.note, FAINT_INK, self._font, anchor="mm")
+        place = (NOTE_PLACE, self.height - FOOT_HEIGHT // 2)
+        text.text(place, self._film.note, FAINT_INK, self._font, anchor="lm")
         return paper
 
     # ---- the scene
@@ -555,9 +560,9 @@ class Painter:
             mujoco.mj_fwdPosition(model, data)
             first = scene.ngeom if track.is_ghost else 0
             if track.is_ghost:
-                dynamic = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
-                nothing = mujoco.MjvPerturb()
-                mujoco.mjv_addGeoms(model, data, self._option, nothing, dynamic, scene)
+                # Bodies without geoms are decoration, which shows their inertia.
+                kinds = int(mujoco.mjtCatBit.mjCAT_DYNAMIC | mujoco.mjtCatBit.mjCAT_DECOR)
+                mujoco.mjv_addGeoms(model, data, self._option, mujoco.MjvPerturb(), kinds, scene)
             else:
                 self._renderer.update_scene(data, self._camera, self._option)
             self._paint(track, first, layer)
@@ -576,8 +581,8 @@ class Painter:
         Each ghost lies in a layer behind the robots before it, so that it shows where it differs.
         """
         for geom in self._renderer.scene.geoms[first : self._renderer.scene.ngeom]:
-            is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
-            if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
+            is_moving = self._is_moving.get(geom.objtype, ())
+            if 0 <= geom.objid < len(is_moving) and is_moving[geom.objid]:
                 # Parts with a colour nearly keep it.
                 own = np.array(geom.rgba[:3], dtype=np.float64)
                 purity = float(np.ptp(own)) / max(float(own.max()), 1e-3)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array, record
-from mjfim.errors import first_ones
+from mjfim.errors import first_ones, shortened
 from mjfim.records.base import Record, ShownRecord
 
 # Ratios of the effect of a finite step to that of the derivatives that confirm a standard
@@ -192,7 +192,7 @@ class Valley(Record):
     def __str__(self) -> str:
         """Say how far the robots are apart in each motion."""
         gaps = np.abs(np.diff(self.percent, axis=0)[0])
-        every = [f"{self.parameters[j]} by {gaps[j]:.2g} %" for j in self.moved]
+        every = [f"{shortened(self.parameters[j])} by {gaps[j]:.3g} %" for j in self.moved]
         names = first_ones(every, longest=NAMES_TEXT)
         which = "this" if self.designed is None else "the initial"
         found = (

@@ -115,6 +115,9 @@ def test_the_initial_motion_tells_nothing_and_the_designed_one_tells_them_apart(
     assert before.total <= NORMAL_95 < after.total
     assert np.isinf(before.seen_after)
     assert distance(valley.theta, plan.ctrl)[-1] <= NORMAL_95
+    # The model between them is no third robot that can be told from them.
+    for theta in valley.theta:
+        assert distance(np.array([theta, valley.nominal]), plan.ctrl)[-1] <= NORMAL_95
     # A step that is 2 % longer would be seen.
     longer = valley.nominal + 1.02 * (valley.theta - valley.nominal)
     assert distance(longer, plan.ctrl)[-1] > NORMAL_95
@@ -203,7 +206,7 @@ def test_a_film_shows_both_robots_as_ghosts_whose_differences_are_magnified(
     film = film_of(System.resolve(noisy_cart_pendulum(), threads=1), design)
     factor = float(film.note.rpartition(" ")[2].rstrip("."))
     assert film.caption.startswith("The initial motion beside the designed motion, in real time.")
-    assert film.note.startswith("Pale: two robots that the initial motion does not tell apart")
+    assert film.note.startswith("Pale: two robots alike in the initial motion")
     for view, (_, plan) in zip(film.views, motions(design), strict=True):
         model, *ghosts = view.tracks
         assert [ghost.is_ghost for ghost in ghosts] == [True, True]

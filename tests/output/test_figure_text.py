@@ -28,7 +28,7 @@ from mjfim.records.estimate import (
     Whiteness,
 )
 from mjfim.records.estimate_parts import InformationInTime, ResidualForce
-from mjfim.records.rehearsal import Rehearsal, RehearsedLimit
+from mjfim.records.rehearsal import Rehearsal, RehearsedLimit, Separation, Valley
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
@@ -102,6 +102,29 @@ def design(size: Size) -> Design:
         usage=tuple(usage),
         limits=margins,
         combined=combined,
+        valley=valley(size, is_designed=True),
+    )
+
+
+def valley(size: Size, *, is_designed: bool) -> Valley:
+    """Two robots that differ in every parameter, and part in a designed motion."""
+    t = np.linspace(0.0, 2.0, 201)
+    wave = np.sin(3.0 * t)
+    along = [
+        Separation(t=t, y=np.array([wave, wave + far * t]), distance=far * t)
+        for far in (0.9, 400.0)
+    ]
+    size_of_step = np.geomspace(0.5, 0.01, size.parameters)
+    return Valley(
+        parameters=size.labels.parameters,
+        units=size.labels.parameter_units,
+        nominal=np.ones(size.parameters),
+        sizes=np.ones(size.parameters),
+        theta=1.0 + np.outer((-1.0, 1.0), size_of_step),
+        output=f"qpos:{size.labels.positions[0]}",
+        sigma=0.1,
+        motion=along[0],
+        designed=along[1] if is_designed else None,
     )
 
 
@@ -179,6 +202,7 @@ def check(size: Size) -> Check:
         combined=(
             CombinationAccuracy(expression="a + b", value=1.0, std_initial=0.1, std_final=0.1),
         ),
+        valley=valley(size, is_designed=False),
     )
 
 

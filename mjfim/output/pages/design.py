@@ -484,7 +484,7 @@ def _valley_parts(valley: Valley) -> Sequence[Part]:
             "parameter": [named(valley.parameters[j], valley.units[j]) for j in moved],
             "robot 1": numbers(valley.theta[0, moved], 4),
             "robot 2": numbers(valley.theta[1, moved], 4),
-            "difference": numbers(np.diff(valley.percent, axis=0)[0, moved], 2, " %"),
+            "difference": numbers(np.diff(valley.percent, axis=0)[0, moved], 3, " %"),
         },
         detail=True,
     )

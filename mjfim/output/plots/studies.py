@@ -215,7 +215,7 @@ def valley(found: Valley, motions: Sequence[tuple[str, str]]) -> Picture:
     """
     every = [found.motion] if found.designed is None else [found.motion, found.designed]
     ends = (
-        0.6 * max(each.largest for each in every),
+        max(2.4 * found.sigma, *(0.6 * each.largest for each in every)),
         2.0 * max(2.0, *(each.total for each in every)),
     )
     panels = []
