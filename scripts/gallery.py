@@ -203,7 +203,7 @@ ROBOTS = (
         text="A robot on legs on a floor, with the experiment that `mjfim init` writes.",
         source="shared/models/go2/go2_nomesh.xml",
         needs_floor=True,
-        steps=(CHECK,),
+        steps=(Step(words=CHECK.words),),
     ),
     Robot(
         title="Measured SO-101",
