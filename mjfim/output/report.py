@@ -329,9 +329,7 @@ def _pictures(record: ShownRecord, page: Page) -> dict[str, list[Picture]]:
     """The pictures of a page, by their names in it."""
     pictures = pictures_of(record)
     return {
-        part.name: [
-            make() for name, make in pictures.items() if kind_of_picture(name) == part.name
-        ]
+        part.name: [make() for name, make in pictures.items() if kind_of_picture(name) == part.name]
         for part in page.every_part
         if isinstance(part, Plot)
     }
