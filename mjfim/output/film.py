@@ -66,7 +66,7 @@ SLOW_SPEEDS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 # is largest. They are even, as the encoder of mp4 needs.
 VIEW_SIZES = ((640, 360), (560, 420), (480, 480))
 
-# Time over which the motion of a camera that follows a free body is averaged [s of the film], and
+# Time over which the motion of a camera that follows a base is averaged [s of the film], and
 # points of the line along the path of the body.
 CAMERA_SECONDS = 0.5
 TRAIL_POINTS = 100

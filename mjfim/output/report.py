@@ -31,7 +31,7 @@ from mjfim.output.page import (
 )
 from mjfim.output.pages import page_of
 from mjfim.output.panels import CELL_COLOURS, ROLES, Picture
-from mjfim.output.plots.pictures import pictures_of
+from mjfim.output.plots.pictures import kind_of_picture, pictures_of
 from mjfim.output.plots.plotly import Group, group_of
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
@@ -331,9 +331,7 @@ def _pictures(record: ShownRecord, page: Page) -> dict[str, list[Picture]]:
     """The pictures of a page, by their names in it."""
     pictures = pictures_of(record)
     return {
-        part.name: [
-            make() for name, make in pictures.items() if re.fullmatch(rf"{part.name}(_.*)?", name)
-        ]
+        part.name: [make() for name, make in pictures.items() if kind_of_picture(name) == part.name]
         for part in page.every_part
         if isinstance(part, Plot)
     }

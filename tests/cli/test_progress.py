@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -82,16 +83,17 @@ def test_messages_are_broken_between_words_and_paths_stay_whole(
     assert all(len(line) <= 40 for line in lines if path not in line)
 
 
-def test_without_a_terminal_lines_come_from_time_to_time(
+def test_without_a_terminal_a_line_comes_every_ten_seconds(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(module, "LINE_SECONDS", 0.0)
+    now = [0.0]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     with progress("designing") as display:
-        display(an_iterate())
-    monkeypatch.setattr(module, "LINE_SECONDS", 1e3)
-    with progress("fitting") as display:
-        display.show("too early")
-    assert capsys.readouterr().err.startswith("searching inside the limits at 50 Hz, barrier")
+        for now[0] in np.arange(0.0, 32.0, 0.5):
+            display(an_iterate(cost=now[0]))
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(" J ")[2].split()[0] for line in lines] == ["10", "20", "30"]
+    assert lines[0].startswith("searching inside the limits at 50 Hz, barrier")
 
 
 def test_the_report_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

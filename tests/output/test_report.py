@@ -7,7 +7,7 @@ import json
 import re
 from dataclasses import replace
 from functools import cache
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +148,15 @@ def test_a_design_shows_its_tables_and_curves() -> None:
     ]
     position = next(t for t in curves if len(numbers(t["y"])) == 51)
     assert numbers(position["x"])[-1] == pytest.approx(results.design().trajectory.t[-1])
+
+
+def test_every_picture_is_in_a_report_once() -> None:
+    """The names of some pictures begin with that of another one."""
+    for record in (results.design(), results.estimate()):
+        headings = re.findall(r"<(?:h3|summary)>([^<]*)</", report_of([record]))
+        shown = [unescape(heading).replace("\u00a0", " ") for heading in headings]
+        titles = [make().title for make in pictures_of(record).values()]
+        assert [shown.count(title) for title in titles] == [1] * len(titles)
 
 
 def test_an_estimate_shows_predictions_and_residuals() -> None:

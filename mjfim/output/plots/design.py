@@ -418,8 +418,9 @@ def _limit_panel(
 ) -> Panel:
     """Return the panel of one kind of limit; the curves closest to a bound are strong."""
     closest = sorted(curves, key=lambda usage: -largest_share(usage))
+    # Words with their numbers stay in one line.
     shares = [
-        f"{shorten(usage.name, 18)} {whole_percent(largest_share(usage))}"
+        f"{shorten(usage.name, 18)} {whole_percent(largest_share(usage))}".replace(" ", "\u00a0")
         for usage in closest[:NAMED_CURVES]
     ]
     solid = [usage for usage in curves if would_be_solid(usage)]

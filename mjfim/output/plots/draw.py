@@ -380,8 +380,8 @@ def _draw_intervals(axes: Axes, mark: Mark, colour: str) -> None:
         mark.y, begin, end, color=colour, linewidth=mark.width, alpha=mark.opacity, capstyle="butt"
     )
     for cut, place, symbol in ((mark.x < low, low, "<"), (ends > high, high, ">")):
-        for row in mark.y[cut]:
-            axes.plot(place, row, symbol, color=colour, markersize=5, clip_on=False)
+        places = np.full(np.count_nonzero(cut), place)
+        axes.plot(places, mark.y[cut], symbol, color=colour, markersize=5, clip_on=False)
 
 
 def _draw_cells(axes: Axes, cells: Cells) -> None:

@@ -79,7 +79,7 @@ def power_density(x: Array, rate: float, length: int) -> tuple[Array, Array]:
 
 # Largest numbers of outputs over time, of outputs with a spectrum, of predicted recordings, of
 # parameters over the iterations, and of joints; of more, those that say most are drawn.
-MAX_OUTPUTS, MAX_SPECTRA, MAX_PREDICTIONS, MAX_PARAMETERS, MAX_JOINTS = 8, 12, 8, 12, 6
+MAX_OUTPUTS, MAX_SPECTRA, MAX_PREDICTIONS, MAX_PARAMETERS, MAX_JOINTS = 6, 12, 8, 12, 6
 
 # Largest number of samples of a recording that are drawn, and of segments whose boundaries are.
 MAX_SAMPLES, MAX_BOUNDARIES = 4000, 40
@@ -209,23 +209,25 @@ def accuracy(estimate: Estimate, labels: Labels) -> Picture:
         Accuracies(np.abs(labels.published - estimate.theta), MEASURED, "to published", symbol="D"),
     ]
     shown = [source for source in sources if np.isfinite(source.std).any()]
-    sizes = np.where(estimate.theta == 0.0, np.nan, estimate.sizes)
+    # A share of a value or of a nominal value of 0 says nothing.
+    known = (estimate.theta != 0.0) & (estimate.initial_theta != 0.0) & (estimate.sizes > 0.0)
+    sizes = np.where(known, estimate.sizes, np.nan)
     note = "Honest σ: a quarter of the width of the 95 % interval."
     if np.isfinite(labels.published).any():
         note += " To published: distance of the estimate from the published value."
     return Picture(
-        title=capitalised("; ".join(_about_accuracy(estimate, labels))),
+        title=capitalised("; ".join(_about_accuracy(estimate, labels, sizes))),
         panels=[accuracy_panel(names, sizes, shown, labels.wanted)],
         note=note,
         heights=[height_of_rows(len(names))],
     )
 
 
-def _about_accuracy(estimate: Estimate, labels: Labels) -> Iterator[str]:
+def _about_accuracy(estimate: Estimate, labels: Labels, sizes: Array) -> Iterator[str]:
     """Compare the honest σ with what was predicted, and the estimates with published values."""
     honest, names = estimate.honest_std, estimate.parameters
+    share = honest / sizes
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(estimate.sizes > 0.0, honest / estimate.sizes, np.nan)
         ratio = honest / estimate.predicted_std
         distance = np.abs(labels.published - estimate.theta) / honest
     if np.isfinite(ratio).any():
@@ -233,7 +235,7 @@ def _about_accuracy(estimate: Estimate, labels: Labels) -> Iterator[str]:
         yield f"honest σ at most {format_number(ratio[j], 2)} times the predicted one ({names[j]})"
     elif np.isfinite(share).any():
         j = int(np.nanargmax(share))
-        most = relative(honest[j], estimate.sizes[j])
+        most = relative(honest[j], sizes[j])
         yield f"accuracy of the fit: honest σ is at most {most} ({names[j]})"
     if np.isfinite(distance).any():
         j = int(np.nanargmax(distance))

@@ -73,7 +73,7 @@ ON_REQUEST = {"convergence", "spectra", "horizons"}
 
 # Largest size of the pictures that are files without a request: to draw them takes less than 3 s on
 # one core. A picture counts as much as 3 panels, and a panel as 16 marks or words.
-MOST_PANELS, PANELS_OF_PICTURE, PARTS_OF_PANEL = 80.0, 3.0, 16.0
+MOST_PANELS, PANELS_OF_PICTURE, PARTS_OF_PANEL = 72.0, 3.0, 16.0
 
 # Functions that make the pictures of a record, by their names.
 Pictures = dict[str, Callable[[], Picture]]

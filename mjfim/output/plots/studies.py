@@ -90,6 +90,9 @@ MAX_STUDIED, MAX_DIFFERENCES, MAX_ROUNDS = 30, 40, 8
 # Largest numbers of parameters for which correlations, and ratios, are written into the cells.
 MAX_CORRELATIONS, MAX_RATIOS = 8, 12
 
+# Largest number of rounds that have a tick each.
+MAX_TICKS = 8
+
 # Number of rows up to which rows are high, and characters of a title above which what stands in
 # brackets is left out.
 MAX_HIGH_ROWS, MAX_TITLE = 12, 260
@@ -789,7 +792,8 @@ def campaign(result: Campaign, true: Array | None = None) -> Picture:
         name = shorten(result.parameters[j], 18)
         unit = result.rounds[0].estimate.units[j]
         label = "round" if j == shown[-1] else ""
-        axis = Axis(label=label, limits=limits, most=min(len(numbers), 8), whole=True)
+        ticks = numbers.tolist() if len(numbers) <= MAX_TICKS else None
+        axis = Axis(label=label, limits=limits, ticks=ticks, most=MAX_TICKS, whole=True)
         guess = format_number(result.rounds[0].theta[j], 4)
         panels += [
             _accuracy_over_rounds(
