@@ -16,6 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.model.coordinates import joint_names, scalar_joints
+from mjfim.model.elements import identifier, names_of
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.checks import doubtful_angles, likely_unit
 from mjfim.recordings.formats import SECONDS, Table
@@ -35,6 +36,9 @@ OF_FORCES = KINDS["effort"]
 
 # How TOML writes a text.
 _quoted = partial(json.dumps, ensure_ascii=False)
+
+# What sensors of joints measure.
+QUANTITIES = {mujoco.mjtSensor.mjSENS_JOINTPOS: "qpos", mujoco.mjtSensor.mjSENS_JOINTVEL: "qvel"}
 
 # Words of columns that are measured, in contrast to filtered ones.
 MEASURED = {"meas", "measured", "actual", "present", "raw"}
@@ -77,13 +81,23 @@ def proposed_recording(table: Table, channels: Channels) -> str:
                 break
     found |= {name: (name, "by name") for name in channels.outputs if name in columns}
 
+    # A sensor stands for its joint where the experiment measures this alone.
+    sensor_of = {}
+    for name in names_of(model, "sensor"):
+        i = identifier(model, "sensor", name)
+        quantity = QUANTITIES.get(mujoco.mjtSensor(model.sensor_type[i]))
+        if name in channels.outputs and quantity:
+            sensor_of[f"{quantity}:{joint_names(model)[model.sensor_objid[i]]}"] = name
+
     units = _units(table, channels, found, t)
     for name in dict.fromkeys((*controls, *found)):
         column, why = found.get(name, ("", "no column found: name it, or 0.0 for a motor off"))
         words = set(columns.get(column, ()))
         if is_motor and name in controls and _kind(words) == "reference" and not words & OF_FORCES:
             column, why = "", f"{column} may be a reference: state [controllers]"
-        key, value = _quoted(name), _quoted(column)
+        is_output = name in channels.outputs
+        key = _quoted(name if is_output else sensor_of.get(name, name))
+        value = _quoted(column)
         if name in units:
             value = f'{{ column = {value}, unit = "{units[name]}" }}'
             why += "; unit by range"

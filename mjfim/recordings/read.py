@@ -198,7 +198,7 @@ def read_log(path: Path, channels: Channels) -> Log:
     sources = _in_units_of_titles(table, sources, channels)
     table, stamps = _merged(table, sources, _stamps(table, spec))
     rows = _rows(table, channels, sources, stamps)
-    numbers = np.arange(len(stamps))[rows]
+    numbers = _places(rows, len(stamps))
     check_clock(f"{path}: column {spec.time!r}", stamps[rows], numbers, spec.time_unit, spec.gap)
     columns = _columns(table, sources, stamps, rows, spec)
 
@@ -427,6 +427,11 @@ def _rows(
     return slice(begin, rows.stop) if stays.all() else begin + np.flatnonzero(stays)
 
 
+def _places(rows: slice | np.ndarray, count: int) -> Sequence[int]:
+    """Places of some of `count` rows."""
+    return range(count)[rows] if isinstance(rows, slice) else rows.tolist()
+
+
 def _period(t: Array) -> float:
     """Median step of times t: (M,) [s]; 0 of a single one."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
@@ -462,7 +467,7 @@ def _columns(
     spec: RecordingSpec,
 ) -> dict[str, Array]:
     """Converted columns of the rows that are used, by the name of the recording's column."""
-    columns, numbers = {}, np.arange(len(t))[rows]
+    columns, numbers = {}, _places(rows, len(t))
     for name, source in sources.items():
         # Truth values may switch a control or a factor on and off.
         if not name.startswith(INPUT_PREFIXES):

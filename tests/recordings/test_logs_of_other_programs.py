@@ -320,7 +320,10 @@ def test_a_few_stamps_out_of_order(
     assert np.array_equal(log.recording.ctrl[:, 0], U[kept][:-1])
 
 
-@pytest.mark.parametrize("word", ["NaN", ".nan", "", "None", "-nan(ind)", "--", " NaN"])
+WORDS = ("NaN", ".nan", "", "None", "-nan(ind)", "--", " NaN", "  ", "NaN ")
+
+
+@pytest.mark.parametrize("word", WORDS)
 def test_missing_numbers(word: str, read: Callable[..., Log]) -> None:
     text = rows(T, [word if i == 50 else q for i, q in enumerate(Q)], U, head="t,q,u")
     recording = read("log.csv", text.encode(), columns=NAMED).recording
