@@ -21,8 +21,8 @@ import pyarrow.csv
 from mjfim.recordings.quantities import is_unit
 
 # The head of a file from which its dialect is guessed [bytes], and the part that is used [lines].
-HEAD_BYTES = 1 << 18
-HEAD_LINES = 200
+HEAD_BYTES = 1 << 16
+HEAD_LINES = 100
 
 # Delimiters that are tried, the likeliest first; a space stands for runs of spaces and tabs.
 DELIMITERS = (",", ";", "\t", " ")

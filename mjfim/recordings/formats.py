@@ -838,19 +838,6 @@ def _table_of_arrays(path: Path, arrays: Mapping[str, Any], spec: RecordingSpec)
     return Table.of(path, contents, spec)
 
 
-# Types of the numbers of a torch storage, by the name of its class.
-STORAGES = {
-    "DoubleStorage": "<f8",
-    "FloatStorage": "<f4",
-    "HalfStorage": "<f2",
-    "LongStorage": "<i8",
-    "IntStorage": "<i4",
-    "ShortStorage": "<i2",
-    "ByteStorage": "u1",
-    "BoolStorage": "?",
-}
-
-
 # The unpickler in C allocates as many places for memos as a file asks for; this one does not.
 class _TensorReader(pickle._Unpickler):
     """Reader of the table of tensors in a torch archive; it knows no name that could do harm."""
@@ -865,12 +852,9 @@ class _TensorReader(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """What stands for a name of the file."""
-        known: dict[str, Any] = {f"torch.{key}": kind for key, kind in STORAGES.items()}
-        known["torch._utils._rebuild_tensor_v2"] = _tensor
-        known["collections.OrderedDict"] = dict
-        if f"{module}.{name}" not in known:
+        if f"{module}.{name}" not in TORCH_NAMES:
             raise ValueError(f"it holds {module}.{name}, which is no table of tensors")
-        return known[f"{module}.{name}"]
+        return TORCH_NAMES[f"{module}.{name}"]
 
     def persistent_load(self, place: Any) -> Any:
         """The numbers of a storage."""
@@ -884,6 +868,21 @@ def _tensor(storage: Array, offset: int, size: Any, stride: Any, *_: Any) -> Arr
         raise ValueError("a tensor is larger than its storage")
     steps = [step * storage.itemsize for step in stride]
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False)
+
+
+# What stands for the names in a table of tensors; a storage stands for the type of its numbers.
+TORCH_NAMES: dict[str, Any] = {
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "collections.OrderedDict": dict,
+    "torch.DoubleStorage": "<f8",
+    "torch.FloatStorage": "<f4",
+    "torch.HalfStorage": "<f2",
+    "torch.LongStorage": "<i8",
+    "torch.IntStorage": "<i4",
+    "torch.ShortStorage": "<i2",
+    "torch.ByteStorage": "u1",
+    "torch.BoolStorage": "?",
+}
 
 
 def _read_torch(path: Path, spec: RecordingSpec) -> Table:

@@ -341,6 +341,14 @@ def test_a_unit_that_does_not_fit(read: Callable[..., Log]) -> None:
     assert is_whole(read("log.csv", text.encode(), columns=stated), tolerance=1e-14)
 
 
+def test_a_sign_beside_the_unit_of_a_title(read: Callable[..., Log]) -> None:
+    """The cure of a wrong sign keeps the unit; another scale stands for the whole conversion."""
+    text = rows(T, -DEGREES, U, head="t,q [deg],u")
+    for scale in (-1.0, -np.pi / 180.0):
+        columns = {"qpos:hinge": {"column": "q", "scale": scale}, "ctrl:motor": "u"}
+        assert is_whole(read("log.csv", text.encode(), columns=columns), tolerance=1e-14)
+
+
 def test_two_units_of_one_column(read: Callable[..., Log]) -> None:
     """Columns that differ in their units alone are named by their titles."""
     text = rows(T, DEGREES, Q, U, head="t,q [deg],q [rad],u")
