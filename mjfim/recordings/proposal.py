@@ -141,10 +141,12 @@ def _matches(
     elements = {target: words - common for target, words in elements.items()}
     own = set().union(*elements.values())
 
-    # Columns that differ in numbers and in names of elements alone form a group.
+    # Columns that differ in numbers and in names of elements alone form a group; so do all columns
+    # that have names alone.
     groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, words in columns.items():
-        groups[tuple(w for w in words if w not in own and not w.isdigit())].append(name)
+        stem = (word for word in words if word not in own and not word.isdigit())
+        groups[tuple(stem) if may_be_ordered else ()].append(name)
     found: list[tuple[int, bool, dict[str, tuple[str, str]]]] = []
     for stem, group in groups.items():
         named = {

@@ -77,7 +77,11 @@ def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
     stated = tomllib.loads(file.read_text(encoding="utf-8"))["recording"]
     assert stated == {
         "time": "time",
-        "columns": {"ctrl:force": "force_cmd", "qpos:slide": "x_slide", "qpos:hinge": "hinge"},
+        "columns": {
+            "ctrl:force": "force_cmd",
+            "slide_position": "x_slide",
+            "hinge_angle": "hinge",
+        },
     }
     read = read_recording(log, System.resolve(Experiment.from_file(file)).channels)
     expected = np.array(rows)
