@@ -664,6 +664,7 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
     return Table.of(path, columns, RecordingSpec(time="t"))
 
 
+Reader = Callable[[Path, RecordingSpec], Table]
 Records = Sequence[Mapping[str, Any]]
 
 
@@ -735,6 +736,9 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
     if path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if _reader(file) is _read_csv]
+        if files and not (path / "metadata.yaml").is_file():
+            return _read_folder(path, files, spec)
         if not (path / "metadata.yaml").is_file():
             raise RecordingError(
                 f"{path}: a folder without metadata.yaml is not a ROS 2 bag, and one without "
@@ -742,8 +746,7 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
             )
         return read_bag(path, spec)
 
-    name = path.name.lower()
-    reader = next((read for ending, read in READERS.items() if name.endswith(ending)), None)
+    reader = _reader(path)
     if reader is None:
         raise RecordingError(
             f"{path}: unknown format; a log is a file that ends in {', '.join(READERS)}, or the "
@@ -768,6 +771,45 @@ def read_table(path: Path) -> dict[str, Array]:
     table = _read_csv(path, RecordingSpec())
     columns = {name: table.column(name) for name in table.names}
     return columns | {n: Unit.parse(unit).factor * columns[n] for n, unit in table.units.items()}
+
+
+def _reader(path: Path) -> Reader | None:
+    """Reader of a file by the ending of its name."""
+    name = path.name.lower()
+    return next((read for ending, read in READERS.items() if name.endswith(ending)), None)
+
+
+def _read_folder(path: Path, files: Sequence[Path], spec: RecordingSpec) -> Table:
+    """Read tables of one clock, such as one for commands and one for states, as one table.
+
+    The column that all of them have is the time; the others are called `<file>:<column>`.
+    """
+    columns = {}
+    for file in files:
+        table = _read_csv(file, spec)
+        numbers = {n: table.column(n) for n in table.names if not _fault(table.contents[n])}
+        if len(numbers) > 1:
+            columns[file.name.partition(".")[0]] = numbers
+    shared = [
+        name
+        for name in next(iter(columns.values()), {})
+        if all(name in c for c in columns.values())
+    ]
+    time = spec.time if spec.time in shared else next(iter(shared), "")
+    if not time:
+        raise RecordingError(
+            f"{path}: the tables in this folder have no column in common, which would be the time; "
+            "name a file"
+        )
+
+    stamps = np.unique(np.concatenate([numbers[time] for numbers in columns.values()]))
+    joined = {time: stamps}
+    for stem, numbers in columns.items():
+        rows = np.searchsorted(stamps, numbers.pop(time))
+        for name, values in numbers.items():
+            joined[f"{stem}:{name}"] = np.full(len(stamps), np.nan)
+            joined[f"{stem}:{name}"][rows] = values
+    return Table.of(path, joined, spec)
 
 
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
@@ -893,8 +935,6 @@ def _read_torch(path: Path, spec: RecordingSpec) -> Table:
         arrays = tensors if isinstance(tensors, Mapping) else {"": tensors}
         return _table_of_arrays(path, arrays, spec)
 
-
-Reader = Callable[[Path, RecordingSpec], Table]
 
 # Further endings of tables that are written as text.
 TEXT = ("tsv", "txt", "dat")

@@ -95,6 +95,8 @@ def proposed_recording(table: Table, channels: Channels) -> str:
         words = set(columns.get(column, ()))
         if is_motor and name in controls and _kind(words) == "reference" and not words & OF_FORCES:
             column, why = "", f"{column} may be a reference: state [controllers]"
+        if column and name not in controls and np.ptp(table.column(column)) == 0.0:
+            column, why = "", f"{column} never changes"
         is_output = name in channels.outputs
         key = _quoted(name if is_output else sensor_of.get(name, name))
         value = _quoted(column)
@@ -145,8 +147,8 @@ def _matches(
     # that have names alone.
     groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, words in columns.items():
-        stem = (word for word in words if word not in own and not word.isdigit())
-        groups[tuple(stem) if may_be_ordered else ()].append(name)
+        others = (word for word in words if word not in own and not word.isdigit())
+        groups[tuple(others) if may_be_ordered else ()].append(name)
     found: list[tuple[int, bool, dict[str, tuple[str, str]]]] = []
     for stem, group in groups.items():
         named = {

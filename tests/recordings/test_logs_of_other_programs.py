@@ -90,6 +90,8 @@ ROSTOPIC = (
     "field.position0,field.effort0"
 )
 
+SAGE = "type,timestamp,positions"
+
 # Text of a log, and the table [recording] that reads it.
 TEXTS: dict[str, tuple[str, dict[str, Any]]] = {
     "semicolon": (rows(T, Q, U, head="t;q;u", between=";"), {"columns": NAMED}),
@@ -239,6 +241,28 @@ def test_encodings(encoding: str, read: Callable[..., Log]) -> None:
     mark = "\ufeff" if encoding.endswith(("le", "be")) else ""
     content = f"{mark}{text}".encode(encoding)
     assert is_whole(read("log.csv", content, columns=NAMED), tolerance=1e-14)
+
+
+def test_tables_of_one_clock(tmp_path: Path, read: Callable[..., Log]) -> None:
+    """A folder with a table of commands and one of states, as SAGE writes it."""
+    folder = tmp_path / "chirp"
+    folder.mkdir()
+    stamp = 1e6 * T + 4.956964403390884
+    texts = {
+        "control": rows(["CONTROL"] * M, stamp, (f'"[{u}]"' for u in U), head=SAGE),
+        "state_motor": rows(["STATE"] * M, stamp, (f'"[{q}, 7]"' for q in Q), head=SAGE),
+        "event": rows(["EVENT"] * 2, [0, 7e6], ["START", "STOP"], head="type,timestamp,event"),
+    }
+    for name, text in texts.items():
+        (folder / f"{name}.csv.gz").write_bytes(gzip.compress(text.encode(), mtime=0))
+    (folder / "joint_list.md").write_text("hinge", encoding="utf-8")
+    with pytest.raises(RecordingError, match="column 't' is missing") as refused:
+        read("chirp")
+    proposed = tomllib.loads(str(refused.value).partition("\n")[2])["recording"]
+    assert (proposed["time"], proposed["time_unit"]) == ("timestamp", "us")
+    assert proposed["columns"] == {"ctrl:motor": "control:positions[0]"}
+    columns = {**proposed["columns"], "qpos:hinge": "state_motor:positions[0]"}
+    assert is_whole(read("chirp", **{**proposed, "columns": columns}))
 
 
 # ---- what is left out
