@@ -16,7 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.model.coordinates import joint_names, scalar_joints
-from mjfim.model.elements import identifier, names_of
+from mjfim.model.elements import identifier
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.checks import doubtful_angles, likely_unit
 from mjfim.recordings.formats import SECONDS, Table
@@ -53,6 +53,7 @@ def proposed_recording(table: Table, channels: Channels) -> str:
 
     Returns:
         The table as TOML. Comments say what was guessed, and which signal has no column.
+        Columns with mjfim's names are left out.
     """
     model, joints = channels.model, scalar_joints(channels.model)
     time, t, lines = _time(table)
@@ -81,15 +82,11 @@ def proposed_recording(table: Table, channels: Channels) -> str:
                 break
     found |= {name: (name, "by name") for name in channels.outputs if name in columns}
 
-    # A sensor stands for its joint where the experiment measures this alone.
-    sensor_of = {}
-    for name in names_of(model, "sensor"):
-        i = identifier(model, "sensor", name)
-        quantity = QUANTITIES.get(mujoco.mjtSensor(model.sensor_type[i]))
-        if name in channels.outputs and quantity:
-            sensor_of[f"{quantity}:{joint_names(model)[model.sensor_objid[i]]}"] = name
-
-    units = _units(table, channels, found, t)
+    # Columns that have mjfim's names need no line.
+    units, sensors = _units(table, channels, found, t), _sensors(channels)
+    usual = {name for name, (column, _) in found.items() if column == name and name not in units}
+    if not usual.issuperset(name for name in found if name not in controls):
+        usual &= set(controls)
     for name in dict.fromkeys((*controls, *found)):
         column, why = found.get(name, ("", "no column found: name it, or 0.0 for a motor off"))
         words = set(columns.get(column, ()))
@@ -97,14 +94,27 @@ def proposed_recording(table: Table, channels: Channels) -> str:
             column, why = "", f"{column} may be a reference: state [controllers]"
         if column and name not in controls and np.ptp(table.column(column)) == 0.0:
             column, why = "", f"{column} never changes"
-        is_output = name in channels.outputs
-        key = _quoted(name if is_output else sensor_of.get(name, name))
-        value = _quoted(column)
+        signal = sensors.get(name, name)
+        if name in usual and signal == name:
+            continue
+        key, value = _quoted(signal), _quoted(column)
         if name in units:
             value = f'{{ column = {value}, unit = "{units[name]}" }}'
             why += "; unit by range"
         lines.append(f"{key} = {value}  # {why}" if column else f"# {key} = 0.0  # {why}")
     return "\n".join(lines)
+
+
+def _sensors(channels: Channels) -> dict[str, str]:
+    """Sensors that are measured in place of the coordinates of joints, by the joints' columns."""
+    model, found = channels.model, {}
+    for name in channels.outputs:
+        i = identifier(model, "sensor", name)
+        quantity = QUANTITIES.get(mujoco.mjtSensor(model.sensor_type[i])) if i >= 0 else None
+        column = f"{quantity}:{joint_names(model)[model.sensor_objid[i]]}" if quantity else name
+        if column not in channels.outputs:
+            found[column] = name
+    return found
 
 
 def _time(table: Table) -> tuple[str, Array, list[str]]:
