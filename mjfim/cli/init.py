@@ -113,18 +113,20 @@ def _recording(log: Path, proposal: Proposal) -> str:
     """The table `[recording]` that is proposed for a log."""
     import numpy as np
 
-    from mjfim.model.coordinates import measurable_columns
+    from mjfim.experiment.outputs import columns_of_keys
+    from mjfim.model.coordinates import ModelCoordinates
     from mjfim.recordings.channels import Channels
     from mjfim.recordings.formats import read_columns
     from mjfim.recordings.proposal import proposed_recording
     from mjfim.recordings.read import recording_paths
     from mjfim.recordings.section import RecordingSpec
 
+    columns = columns_of_keys(ModelCoordinates.of(proposal.compiled))
     channels = Channels(
         model=proposal.compiled,
         controls=tuple(proposal.amplitudes),
         laws=None,
-        outputs=measurable_columns(proposal.compiled),
+        outputs=tuple(name for key, _, _ in proposal.noise for name in columns[key]),
         sigma=np.zeros(0),
         spec=RecordingSpec(),
         source=proposal.model,

@@ -7,7 +7,7 @@ columns that contradict each other.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -74,6 +74,8 @@ def in_order(t: Array) -> np.ndarray:
         (M,) True for the rows that stay. All stay where more than a few would be left out, or a
         time is not finite.
     """
+    if (np.diff(t) > 0.0).all():
+        return np.ones(len(t), dtype=bool)
     # A row is late after a time that is not smaller, or early before one that is not larger.
     earlier = np.concatenate([[-np.inf], np.maximum.accumulate(t)[:-1]])
     later = np.concatenate([np.minimum.accumulate(t[::-1])[-2::-1], [np.inf]])
@@ -82,13 +84,13 @@ def in_order(t: Array) -> np.ndarray:
     return stays if few else np.ones(len(t), dtype=bool)
 
 
-def check_clock(where: str, t: Array, numbers: np.ndarray, unit: str, gap: float) -> None:
+def check_clock(where: str, t: Array, numbers: Sequence[int], unit: str, gap: float) -> None:
     """Refuse times that cannot be the clock of a robot's log.
 
     Args:
         where: File and column, for messages.
         t: (M,) times inside the window [s].
-        numbers: (M,) places of the rows in the log from 0, for messages.
+        numbers: M places of the rows in the log from 0, for messages.
         unit: Unit of time that the experiment file states.
         gap: Longest accepted gap [s].
 
@@ -101,13 +103,13 @@ def check_clock(where: str, t: Array, numbers: np.ndarray, unit: str, gap: float
             f"{where}: too few rows ({len(t)}); an identification needs at least {MIN_ROWS}"
         )
     if not np.isfinite(t).all():
-        row = np.argmax(~np.isfinite(t))
+        row = int(np.argmax(~np.isfinite(t)))
         fault = "NaN" if np.isnan(t[row]) else "an infinite time"
         raise RecordingError(f"{where} holds {fault} in data row {numbers[row] + 1}")
 
     steps = np.diff(t)
     if np.any(steps <= 0.0):
-        row = np.argmax(steps <= 0.0)
+        row = int(np.argmax(steps <= 0.0))
         raise RecordingError(
             f"{where} does not increase in data row {numbers[row + 1] + 1}: {t[row]:.9g} s, then "
             f"{t[row + 1]:.9g} s {_why_not_later(t, steps, row)}"
@@ -121,7 +123,7 @@ def check_clock(where: str, t: Array, numbers: np.ndarray, unit: str, gap: float
         )
 
     limit = longest_bridged_gap(t, gap)
-    row = np.argmax(steps)
+    row = int(np.argmax(steps))
     if steps[row] > limit:
         raise RecordingError(
             f"{where}: a gap of {steps[row]:g} s after data row {numbers[row] + 1} "
@@ -145,7 +147,7 @@ def longest_bridged_gap(t: Array, gap: float) -> float:
     return max(gap, MIN_GAP_STEPS * float(np.median(np.diff(t))))
 
 
-def _why_not_later(t: Array, steps: Array, row: np.intp) -> str:
+def _why_not_later(t: Array, steps: Array, row: int) -> str:
     """Probable cause of a time that is not later than the one before, and its cure."""
     if steps[row] == 0.0:
         count = np.sum(steps == 0.0)
@@ -161,7 +163,7 @@ def _why_not_later(t: Array, steps: Array, row: np.intp) -> str:
     return "(rows out of order); sort them by time"
 
 
-def check_finite(where: str, values: Array, numbers: np.ndarray) -> None:
+def check_finite(where: str, values: Array, numbers: Sequence[int]) -> None:
     """Refuse a column with a value that is infinite or whose square is; NaN is an empty field.
 
     Raises:
@@ -169,7 +171,7 @@ def check_finite(where: str, values: Array, numbers: np.ndarray) -> None:
     """
     too_large = np.abs(values) > LARGEST_VALUE
     if too_large.any():
-        at = np.argmax(too_large)
+        at = int(np.argmax(too_large))
         raise RecordingError(
             f"{where} is {values[at]:g} in data row {numbers[at] + 1}, which is too large to be a "
             "measured number; leave the field empty if there is no number"

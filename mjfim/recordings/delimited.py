@@ -12,6 +12,7 @@ import gzip
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ import pyarrow.csv
 from mjfim.recordings.quantities import is_unit
 
 # The head of a file from which its dialect is guessed [bytes], and the part that is used [lines].
-HEAD_BYTES = 1 << 18
-HEAD_LINES = 200
+HEAD_BYTES = 1 << 16
+HEAD_LINES = 100
 
 # Delimiters that are tried, the likeliest first; a space stands for runs of spaces and tabs.
 DELIMITERS = (",", ";", "\t", " ")
@@ -72,7 +73,12 @@ def read_delimited(path: Path) -> Any:
         "parse_options": pyarrow.csv.ParseOptions(delimiter=delimiter),
         "convert_options": pyarrow.csv.ConvertOptions(
             decimal_point=decimal,
-            null_values=[f"{gap}{word}" for word in (*missing, *MISSING) for gap in ("", " ")],
+            null_values=[
+                f"{before}{word}{after}"
+                for word in (*missing, *MISSING)
+                for before in ("", " ")
+                for after in ("", " ")
+            ],
         ),
     }
     # A thread of pyarrow that reads from Python can abort the process at its end.
@@ -110,31 +116,27 @@ def _dialect(head: str) -> tuple[list[str], int | None, str, str]:
     rows = {
         i: [*cells, ""][:width]
         for i, cells in table.items()
-        if len(cells) == width or (len(cells) == width - 1 and _are_words(cells))
+        if len(cells) == width or (len(cells) == width - 1 and cells[-1] and _are_words(cells))
     }
     numeric = [_are_numbers(column) for column in zip(*[*rows.values()][1:], strict=True)]
 
     # A header is a row of words, or has a word above numbers; a row of units may follow.
-    titles, units, end = [""] * width, [""] * width, -1
-    for i, cells in rows.items():
-        above = end < 0 and any(n and _are_words([c]) for n, c in zip(numeric, cells, strict=False))
-        if not (above or (_are_words(cells) and (end < 0 or any(numeric)))):
-            break
-        if end >= 0 and any(is_unit(cell.strip("[]()")) for cell in cells):
-            units = [cell.strip("[]()") for cell in cells]
-        else:
-            titles = cells
-        end = i
-    if end < 0:
+    (end, titles), (second, units) = [*rows.items(), (-1, []), (-1, [])][:2]
+    above = (n and _are_words([cell]) for n, cell in zip(numeric, titles, strict=False))
+    if any(above) or _are_words(titles):
+        units = [cell.strip("[]()") for cell in units]
+        end = second if _are_words(units) and any(map(is_unit, units)) else end
+        units = units if end == second else []
+    else:
         # The header may be a comment; lines before the first number tell of something else.
         end = next((i for i, cells in table.items() if not _are_words(cells)), 0) - 1
-        remarks = (line for line in lines[end::-1] if COMMENT.match(line))
+        remarks = (line for line in reversed(lines[: end + 1]) if COMMENT.match(line))
         named = (_cells(COMMENT_MARK.sub("", line, count=1), delimiter) for line in remarks)
-        titles = next((cells for cells in named if len(cells) == width), titles)
+        titles, units = next((cells for cells in named if len(cells) == width), [""] * width), []
 
     names = [
         (title or f"[{j}]") + (f" [{unit}]" if is_unit(unit) else "")
-        for j, (title, unit) in enumerate(zip(titles, units, strict=True))
+        for j, (title, unit) in enumerate(zip_longest(titles, units, fillvalue=""))
     ]
     cells_of_rows = [cell for cells in table.values() for cell in cells]
     has_commas = any(map(DECIMAL_COMMA.fullmatch, cells_of_rows))

@@ -663,6 +663,7 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
     return Table.of(path, columns, RecordingSpec(time="t"))
 
 
+Reader = Callable[[Path, RecordingSpec], Table]
 Records = Sequence[Mapping[str, Any]]
 
 
@@ -734,6 +735,9 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
     if path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if _reader(file) is _read_csv]
+        if files and not (path / "metadata.yaml").is_file():
+            return _read_folder(path, files, spec)
         if not (path / "metadata.yaml").is_file():
             raise RecordingError(
                 f"{path}: a folder without metadata.yaml is not a ROS 2 bag, and one without "
@@ -741,8 +745,7 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
             )
         return read_bag(path, spec)
 
-    name = path.name.lower()
-    reader = next((read for ending, read in READERS.items() if name.endswith(ending)), None)
+    reader = _reader(path)
     if reader is None:
         raise RecordingError(
             f"{path}: unknown format; a log is a file that ends in {', '.join(READERS)}, or the "
@@ -767,6 +770,45 @@ def read_table(path: Path) -> dict[str, Array]:
     table = _read_csv(path, RecordingSpec())
     columns = {name: table.column(name) for name in table.names}
     return columns | {n: Unit.parse(unit).factor * columns[n] for n, unit in table.units.items()}
+
+
+def _reader(path: Path) -> Reader | None:
+    """Reader of a file by the ending of its name."""
+    name = path.name.lower()
+    return next((read for ending, read in READERS.items() if name.endswith(ending)), None)
+
+
+def _read_folder(path: Path, files: Sequence[Path], spec: RecordingSpec) -> Table:
+    """Read tables of one clock, such as one for commands and one for states, as one table.
+
+    The column that all of them have is the time; the others are called `<file>:<column>`.
+    """
+    columns = {}
+    for file in files:
+        table = _read_csv(file, spec)
+        numbers = {n: table.column(n) for n in table.names if not _fault(table.contents[n])}
+        if len(numbers) > 1:
+            columns[file.name.partition(".")[0]] = numbers
+    shared = [
+        name
+        for name in next(iter(columns.values()), {})
+        if all(name in c for c in columns.values())
+    ]
+    time = spec.time if spec.time in shared else next(iter(shared), "")
+    if not time:
+        raise RecordingError(
+            f"{path}: the tables in this folder have no column in common, which would be the time; "
+            "name a file"
+        )
+
+    stamps = np.unique(np.concatenate([numbers[time] for numbers in columns.values()]))
+    joined = {time: stamps}
+    for stem, numbers in columns.items():
+        rows = np.searchsorted(stamps, numbers.pop(time))
+        for name, values in numbers.items():
+            joined[f"{stem}:{name}"] = np.full(len(stamps), np.nan)
+            joined[f"{stem}:{name}"][rows] = values
+    return Table.of(path, joined, spec)
 
 
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
@@ -837,19 +879,6 @@ def _table_of_arrays(path: Path, arrays: Mapping[str, Any], spec: RecordingSpec)
     return Table.of(path, contents, spec)
 
 
-# Types of the numbers of a torch storage, by the name of its class.
-STORAGES = {
-    "DoubleStorage": "<f8",
-    "FloatStorage": "<f4",
-    "HalfStorage": "<f2",
-    "LongStorage": "<i8",
-    "IntStorage": "<i4",
-    "ShortStorage": "<i2",
-    "ByteStorage": "u1",
-    "BoolStorage": "?",
-}
-
-
 # The unpickler in C allocates as many places for memos as a file asks for; this one does not.
 class _TensorReader(pickle._Unpickler):
     """Reader of the table of tensors in a torch archive; it knows no name that could do harm."""
@@ -864,12 +893,9 @@ class _TensorReader(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """What stands for a name of the file."""
-        known: dict[str, Any] = {f"torch.{key}": kind for key, kind in STORAGES.items()}
-        known["torch._utils._rebuild_tensor_v2"] = _tensor
-        known["collections.OrderedDict"] = dict
-        if f"{module}.{name}" not in known:
+        if f"{module}.{name}" not in TORCH_NAMES:
             raise ValueError(f"it holds {module}.{name}, which is no table of tensors")
-        return known[f"{module}.{name}"]
+        return TORCH_NAMES[f"{module}.{name}"]
 
     def persistent_load(self, place: Any) -> Any:
         """The numbers of a storage."""
@@ -885,6 +911,21 @@ def _tensor(storage: Array, offset: int, size: Any, stride: Any, *_: Any) -> Arr
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False)
 
 
+# What stands for the names in a table of tensors; a storage stands for the type of its numbers.
+TORCH_NAMES: dict[str, Any] = {
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "collections.OrderedDict": dict,
+    "torch.DoubleStorage": "<f8",
+    "torch.FloatStorage": "<f4",
+    "torch.HalfStorage": "<f2",
+    "torch.LongStorage": "<i8",
+    "torch.IntStorage": "<i4",
+    "torch.ShortStorage": "<i2",
+    "torch.ByteStorage": "u1",
+    "torch.BoolStorage": "?",
+}
+
+
 def _read_torch(path: Path, spec: RecordingSpec) -> Table:
     """Read a table of tensors, as `torch.save` writes it; nothing of the file is executed."""
     kind = "a table of tensors as torch.save writes it (a zip archive)"
@@ -893,8 +934,6 @@ def _read_torch(path: Path, spec: RecordingSpec) -> Table:
         arrays = tensors if isinstance(tensors, Mapping) else {"": tensors}
         return _table_of_arrays(path, arrays, spec)
 
-
-Reader = Callable[[Path, RecordingSpec], Table]
 
 # Further endings of tables that are written as text.
 TEXT = ("tsv", "txt", "dat")

@@ -16,6 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.model.coordinates import joint_names, scalar_joints
+from mjfim.model.elements import identifier
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.checks import doubtful_angles, likely_unit
 from mjfim.recordings.formats import SECONDS, Table
@@ -36,6 +37,9 @@ OF_FORCES = KINDS["effort"]
 # How TOML writes a text.
 _quoted = partial(json.dumps, ensure_ascii=False)
 
+# What sensors of joints measure.
+QUANTITIES = {mujoco.mjtSensor.mjSENS_JOINTPOS: "qpos", mujoco.mjtSensor.mjSENS_JOINTVEL: "qvel"}
+
 # Words of columns that are measured, in contrast to filtered ones.
 MEASURED = {"meas", "measured", "actual", "present", "raw"}
 
@@ -49,6 +53,7 @@ def proposed_recording(table: Table, channels: Channels) -> str:
 
     Returns:
         The table as TOML. Comments say what was guessed, and which signal has no column.
+        Columns with mjfim's names are left out.
     """
     model, joints = channels.model, scalar_joints(channels.model)
     time, t, lines = _time(table)
@@ -77,18 +82,39 @@ def proposed_recording(table: Table, channels: Channels) -> str:
                 break
     found |= {name: (name, "by name") for name in channels.outputs if name in columns}
 
-    units = _units(table, channels, found, t)
+    # Columns that have mjfim's names need no line.
+    units, sensors = _units(table, channels, found, t), _sensors(channels)
+    usual = {name for name, (column, _) in found.items() if column == name and name not in units}
+    if not usual.issuperset(name for name in found if name not in controls):
+        usual &= set(controls)
     for name in dict.fromkeys((*controls, *found)):
         column, why = found.get(name, ("", "no column found: name it, or 0.0 for a motor off"))
         words = set(columns.get(column, ()))
         if is_motor and name in controls and _kind(words) == "reference" and not words & OF_FORCES:
             column, why = "", f"{column} may be a reference: state [controllers]"
-        key, value = _quoted(name), _quoted(column)
+        if column and name not in controls and np.ptp(table.column(column)) == 0.0:
+            column, why = "", f"{column} never changes"
+        signal = sensors.get(name, name)
+        if name in usual and signal == name:
+            continue
+        key, value = _quoted(signal), _quoted(column)
         if name in units:
             value = f'{{ column = {value}, unit = "{units[name]}" }}'
             why += "; unit by range"
         lines.append(f"{key} = {value}  # {why}" if column else f"# {key} = 0.0  # {why}")
     return "\n".join(lines)
+
+
+def _sensors(channels: Channels) -> dict[str, str]:
+    """Sensors that are measured in place of the coordinates of joints, by the joints' columns."""
+    model, found = channels.model, {}
+    for name in channels.outputs:
+        i = identifier(model, "sensor", name)
+        quantity = QUANTITIES.get(mujoco.mjtSensor(model.sensor_type[i])) if i >= 0 else None
+        column = f"{quantity}:{joint_names(model)[model.sensor_objid[i]]}" if quantity else name
+        if column not in channels.outputs:
+            found[column] = name
+    return found
 
 
 def _time(table: Table) -> tuple[str, Array, list[str]]:
@@ -127,10 +153,12 @@ def _matches(
     elements = {target: words - common for target, words in elements.items()}
     own = set().union(*elements.values())
 
-    # Columns that differ in numbers and in names of elements alone form a group.
+    # Columns that differ in numbers and in names of elements alone form a group; so do all columns
+    # that have names alone.
     groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, words in columns.items():
-        groups[tuple(w for w in words if w not in own and not w.isdigit())].append(name)
+        others = (word for word in words if word not in own and not word.isdigit())
+        groups[tuple(others) if may_be_ordered else ()].append(name)
     found: list[tuple[int, bool, dict[str, tuple[str, str]]]] = []
     for stem, group in groups.items():
         named = {

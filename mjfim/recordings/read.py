@@ -153,6 +153,9 @@ OTHER_NAMES = (
     (r"action:(.+?)(?:\.pos|\.vel|\.effort)?", ("ctrl:", "reference:")),
 )
 
+# Period of a control that is sent more seldom than rows are written [median steps of the rows].
+MIN_PERIOD = 1.2
+
 # Tolerance of the beginning and the end of the window [s].
 WINDOW_TOLERANCE = 1e-9
 
@@ -198,9 +201,10 @@ def read_log(path: Path, channels: Channels) -> Log:
     measured = tuple(name for name in sources if name not in channels.control_columns)
 
     sources = _in_units_of_titles(table, sources, channels)
-    table, stamps = _merged(table, sources, _stamps(table, spec))
+    unit = spec.time_unit if "time_unit" in spec.model_fields_set else None
+    table, stamps = _merged(table, sources, table.seconds(spec.time, unit))
     rows = _rows(table, channels, sources, stamps)
-    numbers = np.arange(len(stamps))[rows]
+    numbers = _places(rows, len(stamps))
     check_clock(f"{path}: column {spec.time!r}", stamps[rows], numbers, spec.time_unit, spec.gap)
     columns = _columns(table, sources, stamps, rows, spec)
 
@@ -290,7 +294,8 @@ class RowReader:
         if "time" not in spec.model_fields_set and spec.time not in table.names:
             raise _unfit(table, channels, f"column {spec.time!r} is missing")
         self._sources = _in_units_of_titles(table, _sources(table, channels), channels)
-        self._unit_of_time = float(_stamps(table, spec)[0])
+        unit = spec.time_unit if "time_unit" in spec.model_fields_set else None
+        self._unit_of_time = float(table.seconds(spec.time, unit)[0])
         rules = self._sources.values()
         used = [spec.time, *(name for rule in rules for name in (rule.column, *rule.multiply_by))]
         for name in used:
@@ -442,11 +447,11 @@ def _matrices(channels: Channels) -> dict[str, list[str]]:
 def _in_units_of_titles(
     table: Table, sources: Mapping[str, ColumnSpec], channels: Channels
 ) -> dict[str, ColumnSpec]:
-    """The rules with the units of the columns' titles, where a rule states no unit and no scale."""
+    """The rules with the units of titles, where a rule states no unit and no scale but -1."""
     converted = dict(sources)
     for name, source in sources.items():
         unit, wanted = table.unit(source.column), units_of(channels)[name]
-        if not unit or source.unit is not None or source.scale != 1.0:
+        if not unit or source.unit is not None or abs(source.scale) != 1.0:
             continue
         if wanted not in (ANY, "") and not Unit.parse(unit).measures(Unit.parse(wanted)):
             raise RecordingError(
@@ -454,14 +459,10 @@ def _in_units_of_titles(
                 f"is in {wanted}; name another column, or state its unit or scale in "
                 "[recording.columns]"
             )
-        converted[name] = source.model_copy(update={"scale": Unit.parse(unit).factor})
+        converted[name] = source.model_copy(
+            update={"scale": source.scale * Unit.parse(unit).factor}
+        )
     return converted
-
-
-def _stamps(table: Table, spec: RecordingSpec) -> Array:
-    """(M,) times of all rows [s]."""
-    is_stated = "time_unit" in spec.model_fields_set
-    return table.seconds(spec.time, spec.time_unit if is_stated else None)
 
 
 def _merged(table: Table, sources: Mapping[str, ColumnSpec], t: Array) -> tuple[Table, Array]:
@@ -469,9 +470,10 @@ def _merged(table: Table, sources: Mapping[str, ColumnSpec], t: Array) -> tuple[
 
     Programs that write one row for each message leave the columns of other messages empty.
     """
-    starts = np.flatnonzero(np.diff(t, prepend=np.nan) != 0.0)
-    if len(starts) == len(t):
+    differs = np.diff(t) != 0.0
+    if differs.all():
         return table, t
+    starts = np.flatnonzero(np.append(True, differs))
     used = {name for s in sources.values() for name in (s.column, *s.multiply_by)}
     contents = dict(table.contents)
     for name in used:
@@ -494,11 +496,13 @@ def _rows(
     for name in channels.control_columns:
         if name not in sources:
             continue
-        is_set = np.isfinite(table.column(sources[name].column))
-        first = _first_true(is_set)
+        set_at = np.flatnonzero(np.isfinite(table.column(sources[name].column)))
         # A control that is sent more seldom than rows are written begins within its own period.
-        if rows.start < first < len(t) and t[first] - t[rows.start] <= _period(t[is_set]):
-            begin = max(begin, first)
+        if len(set_at) > 1 and set_at[0] > begin:
+            period = np.median(np.diff(t[set_at]))
+            is_near = t[set_at[0]] - t[rows.start] <= period
+            is_seldom = period > MIN_PERIOD * np.median(np.diff(t))
+            begin = int(set_at[0]) if is_near and is_seldom else begin
     stays = in_order(t[begin : rows.stop])
     left_out = {
         "before the first value of a control": begin - rows.start,
@@ -510,9 +514,9 @@ def _rows(
     return slice(begin, rows.stop) if stays.all() else begin + np.flatnonzero(stays)
 
 
-def _period(t: Array) -> float:
-    """Median step of times t: (M,) [s]; 0 of a single one."""
-    return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+def _places(rows: slice | np.ndarray, count: int) -> Sequence[int]:
+    """Places of some of `count` rows."""
+    return range(count)[rows] if isinstance(rows, slice) else rows.tolist()
 
 
 def _window(source: Path, t: Array, spec: RecordingSpec) -> slice:
@@ -545,7 +549,7 @@ def _columns(
     spec: RecordingSpec,
 ) -> dict[str, Array]:
     """Converted columns of the rows that are used, by the name of the recording's column."""
-    columns, numbers = {}, np.arange(len(t))[rows]
+    columns, numbers = {}, _places(rows, len(t))
     for name, source in sources.items():
         # Truth values may switch a control or a factor on and off.
         if not name.startswith(INPUT_PREFIXES):

@@ -6,11 +6,14 @@ import json
 import tomllib
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 from typer.testing import Result
 
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.recordings.read import read_recording
 from tests.support.cli import MODELS, loads, misused, names, run
 
 
@@ -49,6 +52,43 @@ def test_a_model_without_joints_is_refused(tmp_path: Path) -> None:
     model.write_text("<mujoco/>", encoding="utf-8")
     result = run("init", model, "-o", tmp_path / "a.toml")
     misused(result, "rigid.xml: the model has no joint")
+
+
+@pytest.mark.slow
+def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
+    """The experiment file reads the log as it is, and the next command fits it."""
+    model = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(round(4.0 / model.opt.timestep)):
+        data.ctrl[:] = 2.0 * np.sin(4.0 * data.time)
+        slide, hinge = data.qpos + 1e-3 * rng.standard_normal(2)
+        rows.append((1e3 * data.time, data.ctrl[0], slide, np.degrees(hinge)))
+        mujoco.mj_step(model, data)
+    lines = ("; ".join(f"{x:.9f}".replace(".", ",") for x in row) for row in rows)
+    log = tmp_path / "robot.csv"
+    log.write_text("\n".join(("time [ms]; force_cmd; x_slide; hinge [deg]", *lines)), "utf-8")
+
+    file = tmp_path / "robot.toml"
+    result = run("init", MODELS / "cart_pendulum.xml", "--log", log, "-o", file)
+    assert result.exit_code == 0
+    assert result.stdout.strip() == f"next: mjfim identify {file} {log}"
+    stated = tomllib.loads(file.read_text(encoding="utf-8"))["recording"]
+    assert stated == {
+        "time": "time",
+        "columns": {
+            "ctrl:force": "force_cmd",
+            "slide_position": "x_slide",
+            "hinge_angle": "hinge",
+        },
+    }
+    read = read_recording(log, System.resolve(Experiment.from_file(file)).channels)
+    expected = np.array(rows)
+    assert np.allclose(read.t, expected[:, 0] / 1e3, rtol=0, atol=1e-9)
+    assert np.allclose(read.y[:, 0], expected[:, 2], rtol=0, atol=1e-9)
+    assert np.allclose(read.y[:, 1], np.radians(expected[:, 3]), rtol=0, atol=1e-9)
+    assert run("identify", file, log, "-o", tmp_path / "fit").exit_code in (0, 1)
 
 
 def asked(file: Path, *answers: str) -> Result:

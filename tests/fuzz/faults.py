@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
+import scipy.io
 
 from tests.fuzz.bad_inputs import (
     Call,
@@ -324,6 +325,12 @@ def encoded_log(rng: Rng, folder: Path) -> Call:
     """A CSV in another encoding or of another dialect."""
     file = folder / "run.csv"
     text = file.read_text(encoding="utf-8")
+    columns = log_columns(folder)
+    lines = text.splitlines()
+    clock = [
+        f"12:00:{t:09.6f}{line[line.index(',') :]}"
+        for t, line in zip(columns["t"], lines[1:], strict=True)
+    ]
     changes: dict[str, Callable[[], bytes]] = {
         "UTF-16": lambda: text.encode("utf-16"),
         "UTF-8 with a mark": lambda: text.encode("utf-8-sig"),
@@ -334,15 +341,38 @@ def encoded_log(rng: Rng, folder: Path) -> Call:
         "tabs": lambda: text.replace(",", "\t").encode(),
         "blank lines": lambda: text.replace("\n", "\n\n").encode(),
         "a comment": lambda: b"# a comment\n" + text.encode(),
+        "comments": lambda: text.replace("\n", "\n# a, b\n").encode(),
+        "delimiters at the ends": lambda: text.replace("\n", ",\n").encode(),
+        "clock times": lambda: "\n".join([lines[0], *clock]).encode(),
+        "units": lambda: "\n".join(
+            [lines[0], "s" + "," * lines[0].count(","), *lines[1:]]
+        ).encode(),
         "no header": lambda: text.partition("\n")[2].encode(),
         "two headers": lambda: (text.partition("\n")[0] + "\n" + text).encode(),
         "spaces": lambda: text.replace(",", " , ").encode(),
         "an open quote": lambda: text.replace("\n", '\n"', 3).encode(),
     }
-    how = pick(rng, tuple(changes))
-    file.write_bytes(changes[how]())
-    refused = how in ("no header", "two headers", "decimal commas")
-    return Call(words=list(IDENTIFY), spoiled=f"CSV: {how}", refused=refused)
+    how = pick(rng, (*changes, ".npy", ".mat", ".jsonl"))
+    refused = how in ("no header", "two headers")
+    if how in changes:
+        file.write_bytes(changes[how]())
+        accepted = not refused and how != "an open quote"
+        return Call(words=list(IDENTIFY), spoiled=f"CSV: {how}", refused=refused, accepted=accepted)
+
+    file = folder / f"log{how}"
+    if how == ".npy":
+        np.save(file, np.rec.fromarrays([*columns.values()], names=[*columns]))
+    elif how == ".mat":
+        scipy.io.savemat(file, columns)
+    else:
+        rows = zip(*columns.values(), strict=True)
+        records = (json.dumps(dict(zip(columns, row, strict=True))) for row in rows)
+        file.write_text("\n".join(records), encoding="utf-8")
+    is_spoiled = rng.random() < 0.5
+    if is_spoiled:
+        file.write_bytes(spoil_bytes(rng, file.read_bytes())[0])
+    spoiled = f"{how}{' with other bytes' if is_spoiled else ''}"
+    return Call(words=identify(file.name), spoiled=spoiled, accepted=not is_spoiled)
 
 
 def spoiled_bag(rng: Rng, folder: Path) -> Call:

@@ -90,6 +90,8 @@ ROSTOPIC = (
     "field.position0,field.effort0"
 )
 
+SAGE = "type,timestamp,positions"
+
 # Text of a log, and the table [recording] that reads it.
 TEXTS: dict[str, tuple[str, dict[str, Any]]] = {
     "semicolon": (rows(T, Q, U, head="t;q;u", between=";"), {"columns": NAMED}),
@@ -241,6 +243,28 @@ def test_encodings(encoding: str, read: Callable[..., Log]) -> None:
     assert is_whole(read("log.csv", content, columns=NAMED), tolerance=1e-14)
 
 
+def test_tables_of_one_clock(tmp_path: Path, read: Callable[..., Log]) -> None:
+    """A folder with a table of commands and one of states, as SAGE writes it."""
+    folder = tmp_path / "chirp"
+    folder.mkdir()
+    stamp = 1e6 * T + 4.956964403390884
+    texts = {
+        "control": rows(["CONTROL"] * M, stamp, (f'"[{u}]"' for u in U), head=SAGE),
+        "state_motor": rows(["STATE"] * M, stamp, (f'"[{q}, 7]"' for q in Q), head=SAGE),
+        "event": rows(["EVENT"] * 2, [0, 7e6], ["START", "STOP"], head="type,timestamp,event"),
+    }
+    for name, text in texts.items():
+        (folder / f"{name}.csv.gz").write_bytes(gzip.compress(text.encode(), mtime=0))
+    (folder / "joint_list.md").write_text("hinge", encoding="utf-8")
+    with pytest.raises(RecordingError, match="column 't' is missing") as refused:
+        read("chirp")
+    proposed = tomllib.loads(str(refused.value).partition("\n")[2])["recording"]
+    assert (proposed["time"], proposed["time_unit"]) == ("timestamp", "us")
+    assert proposed["columns"] == {"ctrl:motor": "control:positions[0]"}
+    columns = {**proposed["columns"], "qpos:hinge": "state_motor:positions[0]"}
+    assert is_whole(read("chirp", **{**proposed, "columns": columns}))
+
+
 # ---- what is left out
 
 
@@ -320,7 +344,10 @@ def test_a_few_stamps_out_of_order(
     assert np.array_equal(log.recording.ctrl[:, 0], U[kept][:-1])
 
 
-@pytest.mark.parametrize("word", ["NaN", ".nan", "", "None", "-nan(ind)", "--", " NaN"])
+WORDS = ("NaN", ".nan", "", "None", "-nan(ind)", "--", " NaN", "  ", "NaN ")
+
+
+@pytest.mark.parametrize("word", WORDS)
 def test_missing_numbers(word: str, read: Callable[..., Log]) -> None:
     text = rows(T, [word if i == 50 else q for i, q in enumerate(Q)], U, head="t,q,u")
     recording = read("log.csv", text.encode(), columns=NAMED).recording
@@ -336,6 +363,14 @@ def test_a_unit_that_does_not_fit(read: Callable[..., Log]) -> None:
         read("log.csv", text.encode(), columns=NAMED)
     stated = {"qpos:hinge": {"column": "q", "unit": "deg"}, "ctrl:motor": "u"}
     assert is_whole(read("log.csv", text.encode(), columns=stated), tolerance=1e-14)
+
+
+def test_a_sign_beside_the_unit_of_a_title(read: Callable[..., Log]) -> None:
+    """The cure of a wrong sign keeps the unit; another scale stands for the whole conversion."""
+    text = rows(T, -DEGREES, U, head="t,q [deg],u")
+    for scale in (-1.0, -np.pi / 180.0):
+        columns = {"qpos:hinge": {"column": "q", "scale": scale}, "ctrl:motor": "u"}
+        assert is_whole(read("log.csv", text.encode(), columns=columns), tolerance=1e-14)
 
 
 def test_two_units_of_one_column(read: Callable[..., Log]) -> None:

@@ -134,6 +134,8 @@ def names(folder: Path) -> set[str]:
 def misused(result: Result, *fragments: str) -> None:
     """Assert that a run ended with exit code 2 and one message of one line on stderr.
 
+    Lines to be copied may follow; they are indented.
+
     Args:
         result: Result of the run.
         *fragments: Words that the message contains.
@@ -142,7 +144,8 @@ def misused(result: Result, *fragments: str) -> None:
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr.startswith("mjfim: ")
     assert result.stderr.count("mjfim: ") == 1
-    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    lines = result.stderr.strip().splitlines()
+    assert len([line for line in lines if not line.startswith("  ")]) == 1, result.stderr
     assert "Traceback" not in result.stderr
     assert [f for f in fragments if f not in result.stderr] == []
 

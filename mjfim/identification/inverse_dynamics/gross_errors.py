@@ -391,5 +391,6 @@ def column_line(column: str, of: ColumnSpec, factor: float = 1.0, offset: float 
         offset: Constant that is added to it [unit of the signal].
     """
     zero = f", offset = {of.offset * factor + offset:.4g}" if offset else ""
-    entries = f'column = "{of.column}", scale = {of.scale * factor:.4g}{zero}'
+    unit = f', unit = "{of.unit}"' if of.unit else ""
+    entries = f'column = "{of.column}"{unit}, scale = {of.scale * factor:.4g}{zero}'
     return f'"{column}" = {{ {entries} }}'
