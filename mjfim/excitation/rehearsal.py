@@ -62,10 +62,6 @@ LATENCY = 5e-3
 # Number of instants of each robot at which heights, distances and contacts are measured.
 INSTANTS = 64
 
-# Number of smaller errors of the parameters, each half of the one before, with which a motion that
-# is not safe is tried.
-SMALLER_ERRORS = 3
-
 # Relative difference of two sample periods up to which they are equal.
 SAME_PERIOD = 1e-6
 
@@ -139,8 +135,10 @@ def with_cures_tried(task: DesignTask, final: Evaluation, found: Rehearsal) -> R
         changed = replace(task, system=replace(task.system, experiment=experiment))
         return rehearsed(changed, final.trajectory, final.gain, found.steps, found.growth).is_safe
 
-    smaller = (found.wrong / 2**k for k in range(1, SMALLER_ERRORS + 1))
-    safe_wrong = next((wrong for wrong in smaller if is_safe_with(wrong=wrong)), np.nan)
+    half, quarter, eighth = (found.wrong / 2**k for k in (1, 2, 3))
+    safe_wrong = quarter if is_safe_with(wrong=quarter) else np.nan
+    tried = half if np.isfinite(safe_wrong) else eighth
+    safe_wrong = tried if is_safe_with(wrong=tried) else safe_wrong
     is_fed_back = False
     if task.controls and not found.feedback:
         # The gains may need what is not measured.
