@@ -81,10 +81,6 @@ BAND, MAX_FANS, CLOSE = (0.05, 0.95), 6, 0.5
 # the instants of these motions.
 MAX_AFTER, MAX_MOTIONS, MOTION_STEP = 30, 8, 2
 
-# Number of smaller errors of the parameters, each half of the one before, with which a motion that
-# is not safe is tried.
-SMALLER_ERRORS = 3
-
 # Relative difference of two sample periods up to which they are equal.
 SAME_PERIOD = 1e-6
 
@@ -160,8 +156,10 @@ def with_cures_tried(task: DesignTask, final: Evaluation, found: Rehearsal) -> R
             changed, final.trajectory, final.gain, None, found.steps, found.growth
         ).is_safe
 
-    smaller = (found.wrong / 2**k for k in range(1, SMALLER_ERRORS + 1))
-    safe_wrong = next((wrong for wrong in smaller if is_safe_with(wrong=wrong)), np.nan)
+    half, quarter, eighth = (found.wrong / 2**k for k in (1, 2, 3))
+    safe_wrong = quarter if is_safe_with(wrong=quarter) else np.nan
+    tried = half if np.isfinite(safe_wrong) else eighth
+    safe_wrong = tried if is_safe_with(wrong=tried) else safe_wrong
     is_fed_back = False
     if task.controls and not found.feedback:
         # The gains may need what is not measured.

@@ -137,15 +137,21 @@ def basis_matrix(basis: Array, response: Array, weights: Weights) -> Array:
 
     Returns:
         (M nu, M nu) symmetric matrix.
+
+    Raises:
+        numpy.linalg.LinAlgError: The linearised motion is too unstable.
     """
     N, nu, nx = weights.S.shape
     M = basis.shape[1]
 
-    # Terms with the state: z'Qz + 2 v'Sz.
-    Qz = (weights.Q @ response).reshape(-1, M * nu)
-    coupling = np.einsum("km,kui->kimu", basis, weights.S)
-    Qz[: N * nx] += 2.0 * coupling.reshape(N * nx, M * nu)
-    H = Qz.T @ response.reshape(-1, M * nu)
+    # Terms with the state: z'Qz + 2 v'Sz. They overflow where the linearised motion explodes.
+    with np.errstate(over="ignore", invalid="ignore"):
+        Qz = (weights.Q @ response).reshape(-1, M * nu)
+        coupling = np.einsum("km,kui->kimu", basis, weights.S)
+        Qz[: N * nx] += 2.0 * coupling.reshape(N * nx, M * nu)
+        H = Qz.T @ response.reshape(-1, M * nu)
+    if not np.isfinite(H).all():
+        raise np.linalg.LinAlgError("the linearised motion is too unstable for a direction")
 
     # Terms with the control: v'Rv.
     products = np.einsum("km,kn->kmn", basis, basis).reshape(N, -1)

@@ -65,6 +65,14 @@ def dense(metric: CurveMetric) -> Array:
     return np.stack([metric.apply(e).reshape(-1) for e in units], axis=1)
 
 
+def test_a_linearised_motion_that_explodes_has_no_direction() -> None:
+    """The search ends this climb with its best control, as where a simulation diverges."""
+    expansion, weights = random_expansion(np.random.default_rng(7))
+    wild = replace(expansion, A=1e20 * expansion.A)
+    with pytest.raises(np.linalg.LinAlgError, match="too unstable"):
+        basis_metric(wild, weights, np.eye(N)[:, :4])
+
+
 @pytest.mark.parametrize("feedback", [False, True])
 def test_a_metric_is_symmetric_positive_and_its_solve_inverts_it(feedback: bool) -> None:
     rng = np.random.default_rng(1)
