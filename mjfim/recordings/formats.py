@@ -1,7 +1,7 @@
 """Reader of log files of all formats: their columns by name, which become numbers when needed.
 
 The ending of the name says the format; folders are ROS 2 bags or LeRobot datasets. No content of a
-file is executed. Nothing is unpickled but tables of tensors, by a reader that knows nothing else.
+file is executed.
 
 A LeRobot dataset of format v2.x or v3.0 is a folder with `meta/info.json` and Parquet files, whose
 rows are the frames of all episodes. One episode is one recording.
@@ -13,9 +13,8 @@ needed. Messages of several topics or publishers are merged by their time stamps
 from __future__ import annotations
 
 import csv
-import io
 import json
-import pickle
+import pickletools
 import re
 import zipfile
 import zlib
@@ -879,27 +878,93 @@ def _table_of_arrays(path: Path, arrays: Mapping[str, Any], spec: RecordingSpec)
     return Table.of(path, contents, spec)
 
 
-# The unpickler in C allocates as many places for memos as a file asks for; this one does not.
-class _TensorReader(pickle._Unpickler):
-    """Reader of the table of tensors in a torch archive; it knows no name that could do harm."""
+class _TensorReader:
+    """Reader of the table of tensors in a torch archive, whose instructions are read as data.
+
+    Nothing is made but numbers, texts, containers and what stands for `TORCH_NAMES`.
+    """
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
-        """Open the table; the archive must be stored without packing, as torch does."""
+        """Find the table; the archive must be stored without packing, as torch does."""
         if any(each.compress_type for each in archive.infolist()):
             raise ValueError("its files are packed")
-        name = next((n for n in archive.namelist() if n.endswith("/data.pkl")), "data.pkl")
-        super().__init__(io.BytesIO(archive.read(name)))
-        self._archive, self._folder = archive, name.removesuffix(".pkl")
+        self._archive = archive
+        tables = (name for name in archive.namelist() if name.endswith("/data.pkl"))
+        self._name = next(tables, "data.pkl")
+        self._stack: list[Any] = []
+        self._marks: list[int] = []
+        self._memo: dict[int, Any] = {}
 
-    def find_class(self, module: str, name: str) -> Any:
-        """What stands for a name of the file."""
-        if f"{module}.{name}" not in TORCH_NAMES:
-            raise ValueError(f"it holds {module}.{name}, which is no table of tensors")
-        return TORCH_NAMES[f"{module}.{name}"]
+    def read(self) -> Any:
+        """Follow the instructions."""
+        put = self._stack.append
+        values = ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "NONE")
+        instructions: dict[str, Callable[[Any], object]] = {
+            **dict.fromkeys(values, put),
+            "PROTO": lambda version: version,
+            "NEWTRUE": lambda _: put(True),
+            "NEWFALSE": lambda _: put(False),
+            "GLOBAL": lambda name: put(_meaning(name)),
+            "BINPUT": lambda place: self._memo.update({place: self._stack[-1]}),
+            "BINGET": lambda place: put(self._memo[place]),
+            "EMPTY_DICT": lambda _: put({}),
+            "EMPTY_LIST": lambda _: put([]),
+            "EMPTY_TUPLE": lambda _: put(()),
+            "MARK": lambda _: self._marks.append(len(self._stack)),
+            "TUPLE": lambda _: put(tuple(self._marked())),
+            "TUPLE1": lambda _: put(tuple(self._last(1))),
+            "TUPLE2": lambda _: put(tuple(self._last(2))),
+            "TUPLE3": lambda _: put(tuple(self._last(3))),
+            "SETITEM": lambda _: self._enter(self._last(2)),
+            "SETITEMS": lambda _: self._enter(self._marked()),
+            "APPEND": lambda _: self._stack[-1].extend(self._last(1)),
+            "APPENDS": lambda _: self._stack[-1].extend(self._marked()),
+            "BINPERSID": lambda _: put(self._storage(*self._last(1))),
+            "REDUCE": lambda _: put(_made(*self._last(2))),
+        }
+        for operation, value, _ in pickletools.genops(self._archive.read(self._name)):
+            if operation.name == "STOP":
+                break
+            instruction = instructions.get(operation.name.removeprefix("LONG_"))
+            if instruction is None:
+                raise ValueError(f"no table of tensors has the instruction {operation.name}")
+            instruction(value)
+        (table,) = self._stack
+        return table
 
-    def persistent_load(self, place: Any) -> Any:
+    def _last(self, count: int) -> list[Any]:
+        """The last values, which leave the stack."""
+        begin = len(self._stack) - count
+        if begin < 0:
+            raise ValueError("a value is missing")
+        values = self._stack[begin:]
+        del self._stack[begin:]
+        return values
+
+    def _marked(self) -> list[Any]:
+        """The values that follow the last mark."""
+        return self._last(len(self._stack) - self._marks.pop())
+
+    def _enter(self, values: list[Any]) -> None:
+        """Add keys and values to the table before them."""
+        self._stack[-1].update(zip(values[::2], values[1::2], strict=True))
+
+    def _storage(self, place: Any) -> Array:
         """The numbers of a storage."""
-        return np.frombuffer(self._archive.read(f"{self._folder}/{place[2]}"), dtype=place[1])
+        folder = self._name.removesuffix(".pkl")
+        return np.frombuffer(self._archive.read(f"{folder}/{place[2]}"), dtype=place[1])
+
+
+def _meaning(name: str) -> Any:
+    """What stands for a name of a table of tensors."""
+    if name not in TORCH_NAMES:
+        raise ValueError(f"it holds {name.replace(' ', '.')}, which is no table of tensors")
+    return TORCH_NAMES[name]
+
+
+def _made(kind: Callable[..., Any], values: tuple[Any, ...]) -> Any:
+    """A tensor or a table."""
+    return kind(*values)
 
 
 def _tensor(storage: Array, offset: int, size: Any, stride: Any, *_: Any) -> Array:
@@ -913,16 +978,16 @@ def _tensor(storage: Array, offset: int, size: Any, stride: Any, *_: Any) -> Arr
 
 # What stands for the names in a table of tensors; a storage stands for the type of its numbers.
 TORCH_NAMES: dict[str, Any] = {
-    "torch._utils._rebuild_tensor_v2": _tensor,
-    "collections.OrderedDict": dict,
-    "torch.DoubleStorage": "<f8",
-    "torch.FloatStorage": "<f4",
-    "torch.HalfStorage": "<f2",
-    "torch.LongStorage": "<i8",
-    "torch.IntStorage": "<i4",
-    "torch.ShortStorage": "<i2",
-    "torch.ByteStorage": "u1",
-    "torch.BoolStorage": "?",
+    "torch._utils _rebuild_tensor_v2": _tensor,
+    "collections OrderedDict": dict,
+    "torch DoubleStorage": "<f8",
+    "torch FloatStorage": "<f4",
+    "torch HalfStorage": "<f2",
+    "torch LongStorage": "<i8",
+    "torch IntStorage": "<i4",
+    "torch ShortStorage": "<i2",
+    "torch ByteStorage": "u1",
+    "torch BoolStorage": "?",
 }
 
 
@@ -930,7 +995,7 @@ def _read_torch(path: Path, spec: RecordingSpec) -> Table:
     """Read a table of tensors, as `torch.save` writes it; nothing of the file is executed."""
     kind = "a table of tensors as torch.save writes it (a zip archive)"
     with _reading(path, kind, (Exception,)), zipfile.ZipFile(path) as archive:
-        tensors = _TensorReader(archive).load()
+        tensors = _TensorReader(archive).read()
         arrays = tensors if isinstance(tensors, Mapping) else {"": tensors}
         return _table_of_arrays(path, arrays, spec)
 
