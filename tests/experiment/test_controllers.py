@@ -194,7 +194,7 @@ LOG_FAULTS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "missing": (
         ("t", "ctrl:elbow", "qpos:shoulder"),
         {},
-        "column 'reference:shoulder' is missing … [recording.columns] \"reference:shoulder\"",
+        "column 'reference:shoulder' is missing … [recording.columns] … \"reference:shoulder\"",
     ),
     "both": (
         (*COLUMNS, "ctrl:shoulder"),

@@ -230,8 +230,8 @@ FAULTS = {
     "fixed unit": ({"horizon": "4 m"}, "horizon: '4 m' is no number in s"),
     "angular rate": ({"rate": "60 rpm"}, "rate: '60 rpm' is no number in Hz"),
     "unknown unit": (
-        {"limits": {"velocity": {"hinge": "1 degree/s"}}},
-        "limits.velocity.hinge: unknown unit 'degree",
+        {"limits": {"velocity": {"hinge": "1 furlong/s"}}},
+        "limits.velocity.hinge: unknown unit 'furlong",
     ),
     "no unit": ({"noise": {"state": "0.1"}}, "noise.state: should be a number, or with its unit"),
     "sign": ({"horizon": "-4 s"}, "horizon: should be greater than 0"),

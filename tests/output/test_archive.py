@@ -19,7 +19,7 @@ from mjfim.errors import RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
-from mjfim.files import PREFIX, as_json, replacing
+from mjfim.files import PREFIX, as_json, remove_temporary_files, replacing
 from mjfim.output import archive
 from mjfim.recordings import read as logs
 from mjfim.records.design import MAX_MOTIONS, MOTION_SAMPLES, Design
@@ -87,6 +87,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         shapes = {key: data[key].shape for key in data.files}
         robots = {key: shapes.pop(key) for key in data.files if key.startswith("rehearsal.")}
         worth = {shapes.pop(key) for key in data.files if key.startswith("worth.")}
+        valley = {key: shapes.pop(key) for key in data.files if key.startswith("valley.")}
         motions = {key for key in data.files if key.startswith("motions.")}
         kinds = {data[key].dtype for key in {*data.files} - motions - {"record"}}
         kinds_of_motions = {data[key].dtype for key in motions}
@@ -116,6 +117,13 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         "record": (),
     }
     assert worth == {(P,)}
+    apart = {"t": (N + 1,), "y": (2, N + 1), "distance": (N + 1,)}
+    assert valley == {
+        **{f"valley.{key}": (P,) for key in ("nominal", "sizes")},
+        "valley.theta": (2, P),
+        **{f"valley.motion.{key}": shape for key, shape in apart.items()},
+        **{f"valley.designed.{key}": shape for key, shape in apart.items()},
+    }
     assert robots["rehearsal.theta"] == (5, P) and robots["rehearsal.steps.std"] == (P,)
     assert robots["rehearsal.speed"] == (5, NV)
     assert kinds == {np.dtype("float64")}
@@ -361,6 +369,13 @@ def test_files_of_killed_processes_are_removed_and_new_ones_stay(tmp_path: Path)
     with replacing(tmp_path / "x.json") as temporary:
         assert temporary.name.startswith(PREFIX)
     assert {path.name for path in tmp_path.iterdir()} == {"x.json", *kept}
+
+
+def test_a_process_that_has_to_end_at_once_leaves_no_temporary_file(tmp_path: Path) -> None:
+    with replacing(tmp_path / "x.json") as temporary:
+        remove_temporary_files()
+        assert not any(tmp_path.iterdir())
+        temporary.touch()
 
 
 @pytest.mark.parametrize("interruption", [OSError, KeyboardInterrupt])
