@@ -217,8 +217,8 @@ def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> A
 
     shape = _shape(signal, t, len(names))
     if signal.fade:
-        # It fades in the first half of this time, and the robot comes to rest in the second one.
-        left = np.clip(2.0 * (t[-1] - t) / signal.fade - 1.0, 0.0, 1.0)
+        # Value and slope are zero at the end.
+        left = np.minimum((t[-1] - t) / signal.fade, 1.0)
         shape *= (left**2 * (3.0 - 2.0 * left))[:, None]
     return offset + amplitude * shape
 

@@ -233,8 +233,8 @@ class Signal(Section):
     fade: Seconds | None = Field(
         default=None,
         description=(
-            "Time at the end [s], for a design that ends at rest: the signal fades to its offset "
-            "in the first half of it and rests in the second. Default: it does not fade."
+            "Time at the end over which the signal fades to its offset [s], for a design that ends "
+            "at rest. Default: it does not fade."
         ),
     )
 

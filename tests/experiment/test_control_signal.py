@@ -10,8 +10,8 @@ import pytest
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import generate
+from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
-from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import MODELS
 
 NAMES = ("left", "right")
@@ -49,18 +49,6 @@ def test_sine_has_its_frequency() -> None:
     u = generate(Signal(kind="sine", amplitude=3.0, frequency=0.5), T, NAMES, REST)
     assert np.allclose(u[:, 0], 3.0 * np.sin(np.pi * T), rtol=0, atol=1e-12)
     assert np.allclose(u[:, 1], 3.0 * np.sin(1.17 * np.pi * T), rtol=0, atol=1e-12)
-
-
-def test_a_signal_that_fades_rests_in_the_second_half_of_this_time() -> None:
-    faded, whole = (
-        generate(Signal(kind="sine", amplitude=3.0, frequency=0.5, fade=fade), T, NAMES, REST)
-        for fade in (2.0, None)
-    )
-    left = T[-1] - T
-    before, after = left > 2.0, left < 1.0
-    np.testing.assert_allclose(faded[before], whole[before], atol=1e-12)
-    np.testing.assert_allclose(faded[after], np.broadcast_to(REST, faded[after].shape), atol=1e-12)
-    assert np.abs(np.diff(faded, axis=0)).max() < 1.5 * np.abs(np.diff(whole, axis=0)).max()
 
 
 def test_chirp_sweeps_its_frequencies() -> None:
@@ -131,7 +119,7 @@ def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path)
     held = model.replace('name="hanging"', 'name="hanging" ctrl="1.5"')
     assert held != model
     (tmp_path / "held.xml").write_text(held, encoding="utf-8")
-    e = cart_pendulum(
+    e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
         model=str(tmp_path / "held.xml"),
         horizon=1.0,
         initial={"control": {"kind": "sine", "amplitude": 0.5}},
