@@ -187,7 +187,8 @@ def test_picture_table_and_json_agree(design: mjfim.Design, tmp_path: Path) -> N
     section = next(each for each in page_of(design).sections if each.title == "Two robots")
     table = next(part for part in section.parts if isinstance(part, Table))
     picture = pictures_of(design)["valley"]()
-    assert picture.title == sentence.removesuffix(".")
+    assert sentence.startswith(picture.title)
+    assert picture.title.endswith(f"apart by {stored['designed']['distance']:.3g} σ")
     names = [row.cells[0].partition(" (")[0] for row in table.rows]
     columns = [stored["parameters"].index(name) for name in names]
     theta = np.array(stored["theta"])[:, columns]

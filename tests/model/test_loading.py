@@ -74,8 +74,11 @@ def test_a_short_design_improves_and_writes_all_files(
     design = design_task(task)
     assert design.final.cost < design.initial.cost
     folder = tmp_path / "out"
-    results.write_result(folder, design, task.system)
-    assert names(folder) == DESIGN | ({"limits.png"} if design.usage else set())
+    _, draw = results.write_result(folder, design, task.system)
+    left_out = {f"{name}.png" for name in draw()}
+    without = set() if design.valley is not None else {"valley.png"}
+    limits = {"limits.png"} if design.usage else set()
+    assert names(folder) == (DESIGN | limits) - without - left_out
     told = read(folder / "design.json")
     assert len(told["final"]["std"]) == len(told["parameters"])
     assert [c["words"] for c in told["combined"]] == [c.expression for c in design.combined]

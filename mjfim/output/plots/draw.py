@@ -380,8 +380,10 @@ def _draw_intervals(axes: Axes, mark: Mark, colour: str) -> None:
         mark.y, begin, end, color=colour, linewidth=mark.width, alpha=mark.opacity, capstyle="butt"
     )
     for cut, place, symbol in ((mark.x < low, low, "<"), (ends > high, high, ">")):
-        places = np.full(np.count_nonzero(cut), place)
-        axes.plot(places, mark.y[cut], symbol, color=colour, markersize=5, clip_on=False)
+        # A line without points has no extent, which the layout needs.
+        if cut.any():
+            places = np.full(np.count_nonzero(cut), place)
+            axes.plot(places, mark.y[cut], symbol, color=colour, markersize=5, clip_on=False)
 
 
 def _draw_cells(axes: Axes, cells: Cells) -> None:

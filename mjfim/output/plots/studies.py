@@ -248,7 +248,8 @@ def valley(found: Valley, motions: Sequence[tuple[str, str]]) -> Picture:
         )
     )
     return Picture(
-        title=str(found).removesuffix("."),
+        # The panels name the output in which they differ most.
+        title=str(found).partition(", most in ")[0].removesuffix("."),
         panels=panels,
         note="Δ: from the mean of both robots. Distance: all measurements up to each time, over "
         "their noise; below 1.96 σ a χ² test at 95 % finds nothing."
