@@ -393,7 +393,9 @@ def _draw_cells(axes: Axes, cells: Cells) -> None:
         ends = (*cells.edges[[0, -1]].tolist(), len(cells.values) - 0.5, -0.5)
     image = axes.imshow(
         np.ma.masked_invalid(cells.values),
-        cmap=LinearSegmentedColormap.from_list("cells", CELL_COLOURS, bad=ROLES["band"]),
+        cmap=LinearSegmentedColormap.from_list("cells", CELL_COLOURS).with_extremes(
+            bad=ROLES["band"]
+        ),
         vmin=cells.middle - cells.reach,
         vmax=cells.middle + cells.reach,
         aspect="auto",
