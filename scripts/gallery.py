@@ -78,6 +78,7 @@ CAPTIONS = {
     "limits": "How much of each limit the design uses",
     "rehearsal": "What happens to robots that differ from the model",
     "worth": "What each sensor tells, and what limits cost",
+    "valley": "Two robots that a poor motion does not tell apart",
     "parameters": "Estimates with their 95 % intervals, relative to the nominal values",
     "fit": "Measured outputs, the identified and the nominal model, and the residuals",
     "held_out": "A recording that was not fitted, and its predictions",
