@@ -50,9 +50,6 @@ LONGEST_GAP = 10.0
 # Number of samples of a segment that has no end.
 WHOLE = 2**53
 
-# Whether differences are two-sided; one side alone takes half the time.
-CENTRAL = False
-
 
 class Meter:
     """Accuracy of the parameters of an experiment from the rows of a stream so far.
@@ -249,8 +246,9 @@ class _Simulation:
             fit.parameters.guess,
             start[None],
             start_directions=fit.start_directions,
-            central=CENTRAL,
-            step=fit.difference_step * (1.0 if CENTRAL else ONE_SIDED_STEP_FACTOR),
+            # Differences to one side take half the time.
+            central=False,
+            step=fit.difference_step * ONE_SIDED_STEP_FACTOR,
             wanted=fit.estimated,
         )
 
