@@ -17,7 +17,7 @@ import typer
 
 import mjfim
 from mjfim.cli.common import ExperimentFile, LiveView, Run, draw_elsewhere, verb
-from mjfim.cli.progress import errors, say, watched
+from mjfim.cli.progress import LINE_SECONDS, errors, say, watched
 from mjfim.errors import NoResultError, RecordingError
 from mjfim.parallel.budget import StopToken, current_interruption, stop_on_interrupt
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from mjfim.records.events import Event
     from mjfim.records.watch import Watch
 
-# Time between two updates of the table, and between two lines where stderr is no terminal [s].
-REFRESH_SECONDS, LINE_SECONDS = 0.1, 10.0
+# Time between two updates of the table [s].
+REFRESH_SECONDS = 0.1
 
 # Largest number of rows between two looks at the time, and of lines that wait at most.
 ROWS_AT_ONCE, MOST_WAITING = 10, 1000
@@ -147,7 +147,7 @@ class _Rows:
                 say(f"warning: {self._source}: line {self._lines}: {said}; the row is left out")
 
     def result(self, *, ended: bool = False) -> Watch:
-        """What is known from the rows so far."""
+        """The accuracy from the rows so far."""
         if ended and self._reader is None:
             raise RecordingError(f"{self._source}: no line; the first one names the columns")
         return replace(self._meter.read(ended=ended), left_out=self._left_out)

@@ -95,6 +95,12 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
 # ---- growth of disturbances
 
 
+def growth_along(task: DesignTask, trajectory: Trajectory) -> float:
+    """Largest open-loop amplification of a small deviation along a trajectory."""
+    A = task.plant.derivatives.jacobians(task.theta, trajectory)[0]
+    return largest_amplification(A, task.sizes[: task.space.nx])
+
+
 def regulation_along(task: DesignTask, trajectory: Trajectory) -> tuple[Array, float]:
     """Gains (N, nu, nx) about a trajectory, and the open-loop growth of a small deviation."""
     A, B, _, _ = task.plant.derivatives.jacobians(task.theta, trajectory)

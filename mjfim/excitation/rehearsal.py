@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array, evenly_spread_indices, scaled_to_unit_diagonal
+from mjfim.arrays import Array, evenly_spread_indices, record, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits.limits import Limit
@@ -38,7 +38,6 @@ from mjfim.model.units import ANGLE, LENGTH, joint_unit, per_second
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.outputs import outputs_by_state
-from mjfim.records.base import record
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.rehearsal import (
     CLAMPED_KINDS,
@@ -150,6 +149,7 @@ def with_cures_tried(task: DesignTask, final: Evaluation, found: Rehearsal) -> R
         return found
 
     def is_safe_with(**changes: Any) -> bool:
+        """Check whether robots are safe with other keys of `[rehearsal]`."""
         experiment = task.experiment.replace(rehearsal=changes)
         changed = replace(task, system=replace(task.system, experiment=experiment))
         return rehearsed(

@@ -207,9 +207,6 @@ class _Simulation:
 
     Args:
         fit: The problem of the first rows.
-
-    Attributes:
-        time: Time up to which rows count [s].
     """
 
     def __init__(self, fit: FitProblem) -> None:
@@ -227,6 +224,7 @@ class _Simulation:
 
     @property
     def time(self) -> float:
+        """Time up to which rows count [s]."""
         return (self._first + self._curves.samples) * self._dt
 
     def first_row(self, t: Array) -> int:

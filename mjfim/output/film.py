@@ -22,7 +22,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.arrays import Array, evenly_spread_indices, record
 from mjfim.errors import NoVideoError
 from mjfim.experiment.system import System
 from mjfim.model.elements import model_length
@@ -38,7 +38,6 @@ from mjfim.output.rerun.camera import (
     view_direction,
 )
 from mjfim.output.rerun.scene import BodyPoses, body_poses, has_floor
-from mjfim.records.base import record
 from mjfim.records.design import Design, round_share
 from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal

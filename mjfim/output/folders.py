@@ -344,6 +344,7 @@ def write_result(
         write_optional(log, lambda: _write_log(folder / log, record, system))
 
     def draw() -> list[str]:
+        """Write the pictures and the video; return the names of pictures that are left out."""
         _write_figures(folder, record, picture_format, drawn)
         # Who has pressed Ctrl-C does not wait for a video.
         interruption = current_interruption()

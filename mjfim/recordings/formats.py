@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import pickletools
 import re
 import zipfile
@@ -956,7 +957,7 @@ class _TensorReader:
 
 
 def _meaning(name: str) -> Any:
-    """What stands for a name of a table of tensors."""
+    """Function or type that a name of a table of tensors stands for."""
     if name not in TORCH_NAMES:
         raise ValueError(f"it holds {name.replace(' ', '.')}, which is no table of tensors")
     return TORCH_NAMES[name]
@@ -970,7 +971,7 @@ def _made(kind: Callable[..., Any], values: tuple[Any, ...]) -> Any:
 def _tensor(storage: Array, offset: int, size: Any, stride: Any, *_: Any) -> Array:
     """A tensor that lies in a storage."""
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    if min(offset, *size, *stride) < 0 or last >= len(storage) or np.prod(size) > len(storage):
+    if min(offset, *size, *stride) < 0 or last >= len(storage) or math.prod(size) > len(storage):
         raise ValueError("a tensor is larger than its storage")
     steps = [step * storage.itemsize for step in stride]
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False)

@@ -20,7 +20,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from mjfim.arrays import freeze
-from mjfim.arrays import record as record
 from mjfim.errors import RecordingError
 from mjfim.files import read_arrays, write_arrays, write_json
 

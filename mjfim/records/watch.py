@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.arrays import Array
-from mjfim.records.base import ShownRecord, record
+from mjfim.arrays import Array, record
+from mjfim.records.base import ShownRecord
 from mjfim.records.worth import DEFAULT_RELATIVE_STD
 
 # Time from whose information the rate of the information follows [s].

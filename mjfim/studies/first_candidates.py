@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError, first_ones, unknown
 from mjfim.experiment.time_grid import rates_near, whole_number
 from mjfim.model.coordinates import joint_dofs, joint_names
@@ -32,7 +32,6 @@ from mjfim.model.loading import NO_PACKAGES, load_spec
 from mjfim.model.model_files import PACKAGE
 from mjfim.model.paths import unit_of
 from mjfim.model.units import servo_kind
-from mjfim.records.base import record
 from mjfim.studies import GROUPS, Group
 
 # Comment at the head of the MJCF.

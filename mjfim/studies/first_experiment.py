@@ -16,7 +16,7 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
-from mjfim.arrays import Array, scaled_to_unit_diagonal
+from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 from mjfim.errors import (
     ExperimentError,
     MjfimError,
@@ -36,7 +36,6 @@ from mjfim.model.loading import ModelSource, resolve_packages, silence_mujoco_lo
 from mjfim.model.model_files import is_urdf
 from mjfim.model.paths import unit_of
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.base import record
 from mjfim.studies.first_candidates import (
     Candidate,
     ProposedNoise,

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, first_ones
 from mjfim.model.coordinates import joint_dofs, tangent_components
 from mjfim.model.elements import (
@@ -22,7 +22,6 @@ from mjfim.model.elements import (
     unique_names,
 )
 from mjfim.model.units import AT_JOINT, actuator_gear, commanded_joint, is_integrated
-from mjfim.records.base import record
 from mjfim.studies.first_candidates import require_keyframe, resting_keyframes, rounded
 
 # Samples in one characteristic period of the motion.

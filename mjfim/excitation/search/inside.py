@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.evaluation import UNSTABLE_GROWTH, regulation_along
+from mjfim.excitation.evaluation import UNSTABLE_GROWTH, growth_along
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues, EndStateConstraint
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.limits.verification import verify
@@ -382,7 +382,7 @@ class InsideSearch:
         """Amplification of a small disturbance along a control: (N, nu)."""
         task = self.cost.level.task
         try:
-            return regulation_along(task, task.plant.simulate(task.theta, control))[1]
+            return growth_along(task, task.plant.simulate(task.theta, control))
         except SimulationDivergedError:
             return np.inf
 

@@ -144,7 +144,10 @@ def usual(record: ShownRecord) -> Pictures:
         # A fault is told when the picture is drawn.
         size = 0.0
         with suppress(Exception):
-            size = _size(make())
+            picture = make()
+            size = _size(picture)
+            # It is made once.
+            found[name] = partial(_given, picture)
         ranks[name] = (kind in kinds, size)
         kinds.add(kind)
 
@@ -154,6 +157,11 @@ def usual(record: ShownRecord) -> Pictures:
             chosen.add(name)
             total += ranks[name][1]
     return {name: make for name, make in found.items() if name in chosen}
+
+
+def _given(picture: Picture) -> Picture:
+    """Return a picture that was made before."""
+    return picture
 
 
 def _size(picture: Picture) -> float:

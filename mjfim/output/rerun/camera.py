@@ -8,9 +8,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.output.rerun.scene import BodyPoses, moving_geoms
-from mjfim.records.base import record
 
 # Vertical field of view that holds the scene [rad]; a little less than that of the viewer, which
 # leaves a margin.

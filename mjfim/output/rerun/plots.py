@@ -9,10 +9,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.output.panels import ROLES, SERIES, Axis, Mark, Panel
 from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
-from mjfim.records.base import record
 
 # Colours (0..255) of axes, limits and the edges of bands, and of words, before a dark background.
 AXIS_COLOUR, WORD_COLOUR = (150, 150, 150), (205, 205, 205)

@@ -14,8 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array
-from mjfim.records.base import record
+from mjfim.arrays import Array, record
 
 GeomType = mujoco.mjtGeom
 
