@@ -83,6 +83,9 @@ SHORTER_DIFFERENCES = 0.01
 # How a search ends whose next step would lead over a jump of the residuals.
 AT_JUMP = "converged: next to a jump of the residuals, where a stop or a contact comes or goes"
 
+# Largest deviation of an encoder's scale that is tried as the cause of another begin.
+MAX_SHARE = 0.5
+
 # Reason for an estimate over whole recordings, although segments predict left-out data better.
 DIVERGED = "the fit over this length diverged"
 
@@ -248,7 +251,7 @@ def fit_task(
     )
 
     if checks_log and repeats and stated.elsewhere and is_doubtful(fit):
-        _refuse_other_zero(search, fit)
+        _refuse_other_reading(search, fit)
 
     # A result that does not explain the data may be a local minimum: fits over short segments give
     # other starts, the second time from many starts where most of the motion is unexplained.
@@ -279,52 +282,63 @@ def _check_log(problem: FitProblem, task: FitTask) -> None:
         refuse_gross_error(problem.system, problem.recordings, task.start)
 
 
-def _refuse_other_zero(search: FitSearch, fit: FitResult) -> None:
-    """Refuse recordings that another zero of their encoders explains, and the model alone not.
+def _refuse_other_reading(search: FitSearch, fit: FitResult) -> None:
+    """Refuse recordings that another zero or scale of their encoders explains, the model alone not.
 
     At rest, a log with such an error begins elsewhere in positions only. A fit from the stated
-    initial state finds the zeros beside the parameters.
+    initial state finds the zeros, or the scales, beside the parameters.
 
     Raises:
         WrongLogError: The fit explains the recordings. The message has the lines that cure them.
     """
     task = fit.task
     system, begins = task.system, task.elsewhere
-    places = measured_states(system, fit.problem.recordings[0])
-    positions = {system.outputs.names[j] for x, j in places.items() if x < system.space.nq}
-    names = {name for begin in begins for name in begin.by}
+    first = fit.problem.recordings[0]
+    places = measured_states(system, first)
+    columns = {system.outputs.names[j]: j for x, j in places.items() if x < system.space.nq}
+    names = sorted({name for begin in begins for name in begin.by})
     paths = {target.path for each in system.parameters.parameters for target in each.targets}
     if paths & {f"output/{name}:bias" for name in names}:
         return
-    if not names <= positions or len(begins) < len(task.recordings) + len(task.held_out):
+    if not {*names} <= {*columns} or len(begins) < len(task.recordings) + len(task.held_out):
         return
 
-    zeros = {name: float(np.mean([each.by.get(name, 0.0) for each in begins])) for name in names}
-    unknown = {
-        f"?{name}": {"target": f"output/{name}:bias", "guess": zero, "scale": abs(zero)}
-        for name, zero in zeros.items()
-    }
+    zeros = np.array([np.mean([each.by.get(name, 0.0) for each in begins]) for name in names])
+    stated_begin = first.y[0, [columns[name] for name in names]] - zeros
+    guesses = {"bias": zeros}
+    if (np.abs(zeros) < MAX_SHARE * np.abs(stated_begin)).all():
+        guesses["scale"] = zeros / stated_begin
     initial = system.experiment.initial.model_copy(update={"free": {}})
     experiment = system.experiment.model_copy(update={"initial": initial})
-    shifted = System.resolve(
-        experiment.replace(parameters=unknown), threads=system.threads, source=system.source
-    )
-    other = FitTask.of(shifted, task.recordings)
-    problem = other.problem()
-    try:
-        solved = replace(search, task=other).solve(problem, problem.begin(other.start), "zeros")
-    except SimulationDivergedError:
+    cures: dict[float, tuple[str, Array]] = {}
+    for kind, sizes in guesses.items():
+        unknown = {
+            f"?{name}": {"target": f"output/{name}:{kind}", "guess": size, "scale": abs(size)}
+            for name, size in zip(names, sizes.tolist(), strict=True)
+        }
+        shifted = System.resolve(
+            experiment.replace(parameters=unknown), threads=system.threads, source=system.source
+        )
+        other = FitTask.of(shifted, task.recordings)
+        problem = other.problem()
+        try:
+            solved = replace(search, task=other).solve(problem, problem.begin(other.start), kind)
+        except SimulationDivergedError:
+            continue
+        explained = _with_solution(replace(fit, task=other), *solved)
+        if not other.elsewhere and not is_doubtful(explained):
+            cures[explained.solution.cost] = kind, explained.solution.unknowns.theta[-len(names) :]
+    if not cures:
         return
-    if other.elsewhere or is_doubtful(_with_solution(replace(fit, task=other), *solved)):
-        return
-    found = dict(zip(shifted.parameters.names, solved[1].unknowns.theta.tolist(), strict=True))
+    kind, found = cures[min(cures)]
     stated = experiment.recording.sources
-    lines = [
-        column_line(name, stated.get(name, ColumnSpec(column=name)), offset=-found[f"?{name}"])
-        for name in sorted(names)
-    ]
+    lines = []
+    for name, value in zip(names, found.tolist(), strict=True):
+        change = {"offset": -value} if kind == "bias" else {"factor": 1.0 / (1.0 + value)}
+        lines.append(column_line(name, stated.get(name, ColumnSpec(column=name)), **change))
+    word = "zero" if kind == "bias" else kind
     raise WrongLogError(
-        f"{listed([each.name for each in begins])}: another zero of {listed(sorted(names))}; "
+        f"{listed([each.name for each in begins])}: another {word} of {listed(names)}; "
         f"without this error the model explains the motion. {STATE}{'; '.join(lines)}"
     )
 
