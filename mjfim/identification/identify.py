@@ -45,6 +45,7 @@ from mjfim.identification.starts import (
     start_beyond_stops,
     start_from_segments,
 )
+from mjfim.information.criteria import standard_deviations
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -224,7 +225,7 @@ def fit_task(
     begin_stage("testing what the recordings determine")
     subset = quick_subset(problem)
     begin = problem.begin(task.start)
-    null_space = _unseen_directions(task, problem.of_segments(subset))
+    null_space = _unseen_directions(task, problem.of_segments(subset), task.start)
     problem = problem.pinned(task.start, null_space)
 
     # With much data, the search begins on a subset. A request to stop ends it there.
@@ -265,6 +266,8 @@ def fit_task(
 
     if repeats:
         fit = _beyond_stops(search, fit)
+
+    fit = _with_lost_held(search, fit)
 
     # Where the model does not explain whole recordings, the length of the segments matters.
     chooses_length = task.settings.segments is None and task.method != "newton"
@@ -341,6 +344,19 @@ def _refuse_other_reading(search: FitSearch, fit: FitResult) -> None:
         f"{listed([each.name for each in begins])}: another {word} of {listed(names)}; "
         f"without this error the model explains the motion. {STATE}{'; '.join(lines)}"
     )
+
+
+def _with_lost_held(search: FitSearch, fit: FitResult) -> FitResult:
+    """The fit in which combinations are held that the recordings do not determine at the estimate.
+
+    The speed of a Stribeck friction, for example, has no effect where the friction vanishes.
+    """
+    if np.isfinite(standard_deviations(fit.solution.condensed.information())).all():
+        return fit
+    lost = _unseen_directions(search.task, fit.problem, fit.theta)
+    held = fit.problem.pinned(fit.theta, lost)
+    found = _fitted_from(search, held, fit.solution.unknowns, "all data, held", fit)
+    return fit if found is None else replace(found, null_space=lost)
 
 
 def _beyond_stops(search: FitSearch, fit: FitResult) -> FitResult:
@@ -483,7 +499,7 @@ def refit_task(
     task = search.task
     problem, held_out = _problems(task, workers)
     subset = quick_subset(problem)
-    null_space = _unseen_directions(task, problem.of_segments(subset))
+    null_space = _unseen_directions(task, problem.of_segments(subset), task.start)
     problem = problem.pinned(task.start, null_space)
     starts = [task.start] if other_start is None else [task.start, other_start]
     begins = [_begin_near(problem, problem.begin(start), near) for start in starts]
@@ -561,8 +577,8 @@ def least_squares(
     return found
 
 
-def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
-    """Directions of theta, at the start, about which the data contain no information."""
+def _unseen_directions(task: FitTask, problem: FitProblem, theta: Array) -> NullSpace:
+    """Directions at theta about which the data contain no information."""
     parameters = task.system.parameters
     tested = ~np.isin(parameters.names, task.settings.hold)
     tested[CadPrior.of(parameters).columns] = False
@@ -576,7 +592,7 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
         (problem, False),
         (problem, True),
     ):
-        begin = part.begin(task.start)
+        begin = part.begin(theta)
         rows = sensitivity_rows(part, begin, with_error=with_error, wanted=tested)
         # Priors are further rows, which have no error of finite differences.
         prior = parameters.prior_rows
