@@ -331,7 +331,7 @@ def share(flags: Sequence[bool]) -> float:
 
 def _percent(flags: Sequence[bool]) -> str:
     """Share of true values in percent."""
-    return f"{100.0 * share(flags):.0f} %"
+    return f"{100.0 * share(flags):.0f} %" if flags else "-"
 
 
 def main() -> int:
