@@ -32,5 +32,5 @@ class Verdict(NamedTuple):
     next: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        steps = [f"Next: {step}" for step in self.next[:1]]
-        return "\n".join([f"{self.level.upper()}: {self.sentence}", *self.reasons, *steps])
+        next_step = [f"Next: {step}" for step in self.next[:1]]
+        return "\n".join([f"{self.level.upper()}: {self.sentence}", *self.reasons, *next_step])

@@ -714,8 +714,7 @@ def _check_verdict(check: Check) -> Verdict:
         )
         is_doubtful = rehearsal is not None and rehearsal.is_unstable
         return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD, ok=True)
-    first = check.findings[0] if check.findings else "the check found a fault"
-    return Verdict(as_sentence(first), Level.DOUBTFUL)
+    return Verdict(as_sentence(check.findings[0]), Level.DOUBTFUL)
 
 
 def _has_no_fault(check: Check) -> bool:

@@ -143,8 +143,7 @@ def check(result: Check) -> Picture:
         note = f"No parameter is identifiable alone, so there are no correlations. {note}"
     if not all(row.stated for row in rows):
         note += " Without a stated one, the wanted σ is 5 %."
-    first = result.findings[0] if result.findings else "all parameters are identifiable"
-    title = first.replace("`", "").removesuffix(".")
+    title = result.findings[0].replace("`", "").removesuffix(".")
     if len(title) > MAX_TITLE:
         title = re.sub(r" \([^()]*\)", "", title)
     return Picture(
