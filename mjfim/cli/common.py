@@ -124,7 +124,13 @@ ExperimentOfDesign = Annotated[
     ),
 ]
 
-ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (MJCF or URDF).")]
+ModelFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="MODEL",
+        help="Model file (MJCF or URDF), or a name of the package robot_descriptions.",
+    ),
+]
 
 Verbose = Annotated[
     bool,
