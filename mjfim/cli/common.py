@@ -136,7 +136,13 @@ ExperimentOfDesign = Annotated[
     ),
 ]
 
-ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (MJCF or URDF).")]
+ModelFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="MODEL",
+        help="Model file (MJCF or URDF), or a name of the package robot_descriptions.",
+    ),
+]
 
 # Options of most verbs. The help of `mjfim` explains them once; that of a verb names them.
 Verbose = Annotated[

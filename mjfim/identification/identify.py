@@ -13,9 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, WrongLogError, listed
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.given import Arrays, RecordingsLike, recordings_of
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.poor_fit import touched_in
@@ -93,18 +95,20 @@ DIVERGED = "the fit over this length diverged"
 Callback = Callable[[FitEvent], None]
 
 
+@checked
 def identify(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
+    experiment: ExperimentLike,
+    recordings: RecordingsLike = (),
     *,
     method: Method = "least_squares",
     start: Array | None = None,
-    held_out: Sequence[Recording] = (),
+    held_out: RecordingsLike = (),
     callback: Callback | None = None,
     threads: int | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
     executor: ExecutorLike | None = None,
+    **arrays: Arrays,
 ) -> Estimate:
     """Estimate parameters from recordings, with the settings of the table `[fit]`.
 
@@ -113,8 +117,10 @@ def identify(
     autocorrelated. Ctrl-C ends the search with the best result so far.
 
     Args:
-        experiment: Model, parameters and noise; nothing else needs to be stated.
-        recordings: Recordings to which the parameters are fitted.
+        experiment: Model, parameters and noise, or the path of its file; nothing else needs to be
+            stated.
+        recordings: Recordings to which the parameters are fitted: recordings, paths of logs, tables
+            of arrays, or a `ModelSequences` of mujoco.sysid; one needs no list.
         method: `least_squares` (inside the bounds) or `newton` (the paper's method, without
             bounds).
         start: (p,) parameters at which the search starts; default: the guess.
@@ -126,6 +132,9 @@ def identify(
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
             simulates parts of much data, searches from several starts, and predicts parts of the
             data from the others side by side.
+        **arrays: One recording as MuJoCo's arrays, or as tables of columns by joint, actuator or
+            sensor: (M,) `t`, (M or M-1, nu) `ctrl`, (M, nq) `qpos`, (M, nv) `qvel` and
+            (M, nsensordata) `sensordata`; NaN where nothing was measured.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -138,12 +147,13 @@ def identify(
         SimulationDivergedError: The model diverges at the start.
     """
     with shown_progress("identifying", callback, progress) as show:
+        system = System.resolve(experiment, threads=threads)
         return identify_system(
-            System.resolve(experiment, threads=threads),
-            recordings,
+            system,
+            recordings_of(system, recordings, arrays),
             method=method,
             start=start,
-            held_out=held_out,
+            held_out=recordings_of(system, held_out),
             callback=show,
             stop=stop,
             executor=executor,
