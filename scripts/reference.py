@@ -27,7 +27,6 @@ import mjfim.cli.main  # noqa: F401 -- it registers the verbs
 from mjfim.cli.common import app
 from mjfim.experiment.schema import json_schema
 from mjfim.model.terms.library import KINDS
-from mjfim.output.page import TERMS
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
 SCHEMA = FOLDER / "experiment.schema.json"
@@ -75,24 +74,6 @@ def option_row(parameter: Any) -> tuple[str, str]:
     metavar = [parameter.metavar] if parameter.metavar else []
     default = f" Default: {parameter.default}." if type(parameter.default) in (str, int) else ""
     return f"`{' '.join([', '.join(names), *metavar]).strip()}`", f"{parameter.help}{default}"
-
-
-def words(_: str) -> str:
-    """The words with a colour."""
-    import mjfim.output.page as shown
-
-    meanings = dict(re.findall(r"^\| (\w+) +\| (.*?) +\|$", shown.__doc__ or "", re.MULTILINE))
-    return table(
-        ("word", "colour", "meaning"),
-        [
-            (
-                str(term),
-                f'<span style="color: {term.colour}">■</span> `{term.colour}`',
-                meanings[str(term)],
-            )
-            for term in TERMS
-        ],
-    )
 
 
 def terms(_: str) -> str:
@@ -222,7 +203,6 @@ PARTS: dict[str, Callable[[str], str]] = {
     "keys": keys,
     "python": python,
     "terms": terms,
-    "words": words,
 }
 
 

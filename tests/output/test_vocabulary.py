@@ -1,4 +1,4 @@
-"""One word and one colour for one thing, in all sentences that are shown."""
+"""One word and one colour for one thing: the page that explains them, and the sentences shown."""
 
 from __future__ import annotations
 
@@ -33,6 +33,18 @@ BETWEEN_PARTS = re.compile(r"""["']\s+f?["']""")
 
 # Folders whose sentences users see.
 SHOWN = ("cli", "output", "records", "studies", "identification", "excitation")
+
+
+@pytest.mark.parametrize("term", TERMS, ids=str)
+def test_the_page_has_the_words_colours_and_meanings(term: Term) -> None:
+    rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line[:1] == "|"]
+    (row,) = [row for row in rows if row.startswith(f"| {term} |")]
+    assert set(re.findall(r"#[0-9a-f]{6}", row)) == {term.colour}
+
+    import mjfim.output.page as shown
+
+    meaning = row.rstrip("| ").rpartition("|")[2].strip()
+    assert shown.__doc__ is not None and meaning in shown.__doc__
 
 
 def sentences_of_modules() -> Iterator[tuple[str, str]]:
