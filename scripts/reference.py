@@ -72,8 +72,7 @@ def option_row(parameter: Any) -> tuple[str, str]:
     is_option = parameter.param_type_name == "option"
     names = sorted(parameter.opts, key=len) if is_option else []
     metavar = [parameter.metavar] if parameter.metavar else []
-    default = f" Default: {parameter.default}." if type(parameter.default) in (str, int) else ""
-    return f"`{' '.join([', '.join(names), *metavar]).strip()}`", f"{parameter.help}{default}"
+    return f"`{' '.join([', '.join(names), *metavar]).strip()}`", str(parameter.help)
 
 
 def terms(_: str) -> str:
