@@ -14,7 +14,7 @@ import pytest
 from mjfim.output.page import TERMS, Term
 from tests.support.paths import ROOT
 
-PAGE = ROOT / "docs" / "reference" / "words-and-colours.md"
+PAGE = ROOT / "docs" / "how-to" / "read-results.md"
 
 # Words for which there is another one, and that one.
 REPLACED = {
