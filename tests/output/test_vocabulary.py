@@ -96,4 +96,4 @@ def test_a_copied_word_keeps_its_colours(term: Term) -> None:
 
 
 def test_the_page_is_part_of_the_documentation() -> None:
-    assert f"reference/{PAGE.name}" in Path(ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert f"how-to/{PAGE.name}" in Path(ROOT / "mkdocs.yml").read_text(encoding="utf-8")
