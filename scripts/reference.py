@@ -50,7 +50,8 @@ def table(headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 def command_line(_: str) -> str:
     """Options that verbs share, then each verb with its arguments and other options."""
-    verbs: dict[str, Any] = get_command(app).commands  # type: ignore[attr-defined]
+    # Their order is that in which this process imported them.
+    verbs: dict[str, Any] = dict(sorted(get_command(app).commands.items()))  # type: ignore[attr-defined]
     rows = {
         name: [option_row(each) for each in verb.params if each.name != "help"]
         for name, verb in verbs.items()
