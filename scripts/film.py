@@ -50,7 +50,7 @@ def main() -> None:
                 draw.text((x - 86, y + 9), design.parameters[j], INK, letters, anchor="lm")
                 draw.text(
                     (x + LENGTH + 14, y + 9),
-                    f"{min(percent, 99):.2g} %",
+                    f"{min(percent, 99):.3g} %",
                     colour,
                     letters,
                     anchor="lm",
