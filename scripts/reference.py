@@ -26,6 +26,7 @@ from typer.main import get_command
 import mjfim.cli.main  # noqa: F401 -- it registers the verbs
 from mjfim.cli.common import app
 from mjfim.experiment.schema import json_schema
+from mjfim.model.paths import MODEL_ARRAYS, fields_of
 from mjfim.model.terms.library import KINDS
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
@@ -34,6 +35,9 @@ PART = re.compile(r"(<!-- generated: ([\w ]+):?(.*?) -->\n).*?(?=<!-- end -->)",
 
 # Entries of the section `Attributes` of a docstring.
 ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)
+
+# Kinds of paths whose fields do not depend on the model.
+PATHS = (*MODEL_ARRAYS, "controller", "initial", "output")
 
 # Number of verbs from which on an option is described once for all of them.
 SHARED_BY = 4
@@ -94,6 +98,12 @@ def terms(_: str) -> str:
         )
         for kind, term in KINDS.items()
     )
+
+
+def paths(_: str) -> str:
+    """Fields of each kind of parameter path."""
+    rows = [(f"`{kind}`", ", ".join(f"`{each}`" for each in fields_of(kind))) for kind in PATHS]
+    return table(("kind", "fields"), rows)
 
 
 def keys(name: str) -> str:
@@ -201,6 +211,7 @@ PARTS: dict[str, Callable[[str], str]] = {
     "command line": command_line,
     "experiment file": experiment_file,
     "keys": keys,
+    "paths": paths,
     "python": python,
     "terms": terms,
 }

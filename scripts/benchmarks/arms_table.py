@@ -24,12 +24,12 @@ from rich.console import Console
 
 import mjfim
 from mjfim.parallel.budget import stop_on_interrupt
-from mjfim.records.studies import Comparison, MethodResult
+from mjfim.records.studies import DESIGN, Comparison
 from scripts.benchmarks import arms
 from scripts.benchmarks.child import options_of
 
 # Methods with five and with fifteen harmonics.
-FEW, MANY = ("fourier5",), ("fourier15",)
+FEW, MANY = "fourier5", "fourier15"
 
 # Frequency of the series that is one start of the design [Hz].
 FUNDAMENTAL = 0.2
@@ -100,7 +100,7 @@ def run(
     experiment = stated.replace(descent={"fourier": [FUNDAMENTAL], "max_iterations": 100_000})
     with mjfim.Pool() as executor:
         found = mjfim.compare(
-            experiment, seconds=args.seconds, methods=args.methods, executor=executor
+            experiment, seconds=args.seconds, methods=[FEW, MANY], executor=executor
         )
 
     for row in found.rows:
@@ -116,9 +116,9 @@ def run(
         horizon=horizon,
         dry=dry,
         parameters=len(found.parameters),
-        few=best(found, FEW),
-        many=best(found, MANY),
-        design=sound_sigma(design),
+        few=sigma_of(found, FEW),
+        many=sigma_of(found, MANY),
+        design=sigma_of(found, DESIGN),
         kept=design.sound,
         seconds=design.seconds,
         budget=args.seconds,
@@ -126,15 +126,10 @@ def run(
     )
 
 
-def sound_sigma(row: MethodResult) -> float:
+def sigma_of(found: Comparison, method: str) -> float:
     """Return the worst relative sigma of a method, infinite if its control violates a limit."""
+    row = next(row for row in found.rows if row.method == method)
     return row.worst_relative_std if row.sound else float("inf")
-
-
-def best(found: Comparison, methods: tuple[str, ...]) -> float:
-    """Return the smallest worst relative sigma of some methods."""
-    sigmas = [sound_sigma(row) for row in found.rows if row.method in methods]
-    return min(sigmas, default=float("inf"))
 
 
 def markdown_row(case: Case) -> str:
@@ -153,7 +148,6 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=list(arms.ARMS), default=list(arms.ARMS))
     parser.add_argument("--horizons", nargs="+", type=float, default=[5.0, 10.0])
     parser.add_argument("--joints", nargs="+", choices=["smooth", "dry"], default=["smooth", "dry"])
-    parser.add_argument("--methods", nargs="+", choices=[*FEW, *MANY], default=[*FEW, *MANY])
     parser.add_argument("--show", action="store_true", help="only print the results in the folder")
     args = parser.parse_args()
 
