@@ -28,6 +28,7 @@ from mjfim.cli.common import app
 from mjfim.experiment.schema import json_schema
 from mjfim.model.paths import MODEL_ARRAYS, fields_of
 from mjfim.model.terms.library import KINDS
+from mjfim.records.verdict import Verdict
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
 SCHEMA = FOLDER / "experiment.schema.json"
@@ -110,13 +111,14 @@ def keys(name: str) -> str:
     """Keys of the JSON file of a record, with the meaning of its attributes."""
     record: Any = locate(f"mjfim.{name}")
     meanings: dict[str, str] = {}
-    for base in reversed(record.__mro__):
+    for base in (Verdict, *reversed(record.__mro__)):
         section = (inspect.getdoc(base) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
         meanings |= ATTRIBUTE.findall(section)
     rows = []
     for path in record.in_json or [each.name for each in fields(record)]:
-        meaning = meanings.get(path) or inspect.getdoc(getattr(record, path)) or ""
-        key = record.json_names.get(path, path)
+        name = path.rpartition(".")[2]
+        meaning = meanings.get(name) or inspect.getdoc(getattr(record, name)) or ""
+        key = record.json_names.get(path, name)
         rows.append((f"`{key}`", " ".join(meaning.partition("\n\n")[0].split())))
     return table(("key", "meaning"), rows)
 

@@ -147,14 +147,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0, help="time of every method")
     parser.add_argument("--arms", nargs="+", choices=list(arms.ARMS), default=list(arms.ARMS))
     parser.add_argument("--horizons", nargs="+", type=float, default=[5.0, 10.0])
-    parser.add_argument("--joints", nargs="+", choices=["smooth", "dry"], default=["smooth", "dry"])
     parser.add_argument("--show", action="store_true", help="only print the results in the folder")
     args = parser.parse_args()
 
     console = Console(highlight=False, width=150)
     cases = []
     with stop_on_interrupt() as stop:
-        for arm, joints, horizon in itertools.product(args.arms, args.joints, args.horizons):
+        for arm, joints, horizon in itertools.product(args.arms, ("smooth", "dry"), args.horizons):
             file = args.folder / f"{arm}_{joints}_{horizon:g}s.json"
             if not file.is_file():
                 if args.show or stop.requested:
