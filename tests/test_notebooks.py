@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from tests.support.paths import ROOT
-from tests.support.quicker import quicker_models
 
 # All notebooks of the documentation.
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -62,10 +61,9 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run(path: Path, tmp_path: Path) -> None:
-    """Every cell runs, no cell warns, and tables and figures are shown."""
-    folder = tmp_path / "docs" / "notebooks"
-    folder.mkdir(parents=True)
-    quicker_models(tmp_path / "models")
+    """Every cell runs in any folder, no cell warns, and tables and figures are shown."""
+    folder = tmp_path / "anywhere"
+    folder.mkdir()
     result = tmp_path / path.name
 
     done = subprocess.run(

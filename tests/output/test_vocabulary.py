@@ -14,7 +14,7 @@ import pytest
 from mjfim.output.page import TERMS, Term
 from tests.support.paths import ROOT
 
-PAGE = ROOT / "docs" / "reference" / "words-and-colours.md"
+PAGE = ROOT / "docs" / "how-to" / "read-results.md"
 
 # Words for which there is another one, and that one.
 REPLACED = {
@@ -96,4 +96,4 @@ def test_a_copied_word_keeps_its_colours(term: Term) -> None:
 
 
 def test_the_page_is_part_of_the_documentation() -> None:
-    assert f"reference/{PAGE.name}" in Path(ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert f"how-to/{PAGE.name}" in Path(ROOT / "mkdocs.yml").read_text(encoding="utf-8")

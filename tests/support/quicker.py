@@ -12,7 +12,6 @@ QUICKER = {
     "--seconds 10 ": "--seconds 2 ",
     "seconds=4.0": "seconds=1.0",
     "--trials 200": "--trials 20",
-    "trials=100": "trials=20",
     "trials=60": "trials=10",
     '"starts": 3': '"starts": 2',
     '"max_iterations": 20': '"max_iterations": 5',
