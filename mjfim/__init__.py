@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from mjfim.records.robots import RobotComparison
     from mjfim.records.studies import Comparison, MonteCarloStudy
     from mjfim.records.trajectory import Recording, Trajectory
-    from mjfim.records.watch import Watch
-    from mjfim.records.worth import Worth
+    from mjfim.records.worth import Watch, Worth
     from mjfim.studies.campaign import run_campaign
     from mjfim.studies.check import check
     from mjfim.studies.compare import compare
@@ -142,7 +141,7 @@ MODULES = {
     "Recording": "mjfim.records.trajectory",
     "RobotComparison": "mjfim.records.robots",
     "Trajectory": "mjfim.records.trajectory",
-    "Watch": "mjfim.records.watch",
+    "Watch": "mjfim.records.worth",
     "Worth": "mjfim.records.worth",
     "run_campaign": "mjfim.studies.campaign",
     "check": "mjfim.studies.check",

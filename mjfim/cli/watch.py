@@ -24,7 +24,7 @@ from mjfim.parallel.budget import StopToken, current_interruption, stop_on_inter
 if TYPE_CHECKING:
     from mjfim.recordings.read import RowReader
     from mjfim.records.events import Event
-    from mjfim.records.watch import Watch
+    from mjfim.records.worth import Watch
 
 # Time between two updates of the table [s].
 REFRESH_SECONDS = 0.1

@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
@@ -39,6 +38,7 @@ from mjfim.excitation.search.search import Search
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_system
 from mjfim.information.criteria import shared

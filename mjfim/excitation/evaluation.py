@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
@@ -30,6 +29,7 @@ from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys, stated_motion
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import TrajectoryLike, trajectory_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees

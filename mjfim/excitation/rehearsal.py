@@ -16,12 +16,12 @@ import mujoco
 import numpy as np
 import scipy
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices, record, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_model
 from mjfim.information.finite_steps import finite_steps

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from mjfim import recordings
-from mjfim.arguments import checked
 from mjfim.arrays import Array, record
 from mjfim.errors import (
     ExperimentError,
@@ -32,6 +31,7 @@ from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.search.levels import MIN_COARSE_SAMPLES, SAMPLE_FACTORS
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment, ExperimentLike
 from mjfim.experiment.system_tables import Signal

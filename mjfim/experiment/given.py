@@ -11,8 +11,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mjfim.arguments import is_numeric
 from mjfim.errors import ExperimentError, RecordingError, in_words, unknown
+from mjfim.experiment.arguments import is_numeric
 from mjfim.experiment.sysid import columns_of
 from mjfim.experiment.system import System
 from mjfim.recordings.formats import table_of_arrays

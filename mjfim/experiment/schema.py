@@ -12,9 +12,9 @@ from pydantic import Field, InstanceOf, ValidationError
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticSerializationError
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, unknown
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.sysid import parameter_tables
 from mjfim.experiment.system_tables import (
     ControllerSpec,

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, WrongLogError, listed
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import Arrays, RecordingsLike, recordings_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System

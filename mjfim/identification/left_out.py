@@ -16,8 +16,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices, record
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System

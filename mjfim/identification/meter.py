@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import (
@@ -39,8 +39,7 @@ from mjfim.optimize.condensed_least_squares import Condensed, triangle
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, Curves
 from mjfim.records.trajectory import Recording
-from mjfim.records.watch import Watch
-from mjfim.records.worth import DEFAULT_RELATIVE_STD
+from mjfim.records.worth import DEFAULT_RELATIVE_STD, Watch
 
 # Number of rows before the present one that are kept. Initial states of segments follow from them.
 KEPT_ROWS = 10 * ROWS_PER_SIDE

@@ -22,9 +22,9 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices, record
 from mjfim.errors import NoVideoError
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.model.elements import model_length

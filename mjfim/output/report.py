@@ -42,8 +42,7 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
-from mjfim.records.watch import Watch
-from mjfim.records.worth import Worth
+from mjfim.records.worth import Watch, Worth
 
 if TYPE_CHECKING:
     from jinja2 import Template

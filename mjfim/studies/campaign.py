@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
@@ -36,6 +35,7 @@ from mjfim.excitation.shortest_horizon import (
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.identification.identify import identify_system

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError
 from mjfim.excitation.evaluation import (
@@ -38,6 +37,7 @@ from mjfim.excitation.task import (
     DesignTask,
 )
 from mjfim.excitation.task_parts import require_design_keys
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of, trajectory_of
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import ExperimentLike

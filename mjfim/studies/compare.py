@@ -8,7 +8,6 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, record
 from mjfim.errors import (
     ExperimentError,
@@ -28,6 +27,7 @@ from mjfim.excitation.search.inside import InsideSearch, LimitedCost
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System

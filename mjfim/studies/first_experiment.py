@@ -17,7 +17,6 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 from mjfim.errors import (
     ExperimentError,
@@ -31,6 +30,7 @@ from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.excitation.limits.verification import verify, violations_of
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import MAX_SAMPLES
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import joint_dofs

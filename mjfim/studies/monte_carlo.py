@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import scipy
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.evaluation import motion_of
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import TrajectoryLike
 from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import System, SystemOrder, labels_of_system

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import NORMAL_95, Array, record, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, listed, unknown
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.packing import model_of
 from mjfim.experiment.parameters import BARYCENTRIC_FIELDS, LOGCHOLESKY_FIELDS

@@ -14,9 +14,9 @@ from itertools import permutations
 import numpy as np
 import scipy
 
-from mjfim.arguments import checked
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import ExperimentError, first_ones
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.identification.assessment.honest_covariance import (
     agreeing_covariance,

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, record
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.errors import SimulationDivergedError, listed
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System

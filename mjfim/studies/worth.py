@@ -15,7 +15,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.excitation.evaluation import designable, identifiability_along, require_evaluated
@@ -25,6 +24,7 @@ from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint

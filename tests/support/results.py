@@ -40,8 +40,7 @@ from mjfim.records.studies import (
 )
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Labels, Recording, Trajectory
-from mjfim.records.watch import Watch
-from mjfim.records.worth import Price, SensorWorth, Worth
+from mjfim.records.worth import Price, SensorWorth, Watch, Worth
 from tests.support.made_records import (
     bare_estimate,
     falling,

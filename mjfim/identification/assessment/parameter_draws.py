@@ -21,9 +21,9 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import MAX_SAMPLES, ExperimentError, first_ones, listed
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import inertia_combinations

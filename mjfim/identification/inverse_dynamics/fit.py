@@ -18,9 +18,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 from mjfim.errors import MjfimError, RecordingError
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mjfim.arguments import checked
 from mjfim.errors import ExperimentError, unknown
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.files import replacing

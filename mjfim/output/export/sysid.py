@@ -18,9 +18,9 @@ import numpy as np
 from mujoco import sysid
 from scipy.interpolate import CubicSpline
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of, trajectory_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System

@@ -42,7 +42,7 @@ from mjfim.records.studies import (
     TrialStatistics,
 )
 from mjfim.records.verdict import Level, Verdict
-from mjfim.records.watch import Watch
+from mjfim.records.worth import Watch
 
 # What to do after a campaign, by how it ended.
 AFTER_CAMPAIGN = {

@@ -32,8 +32,7 @@ from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
-from mjfim.records.watch import Watch
-from mjfim.records.worth import Worth
+from mjfim.records.worth import Watch, Worth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

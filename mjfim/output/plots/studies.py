@@ -78,7 +78,7 @@ from mjfim.records.studies import (
     TrialStatistics,
 )
 from mjfim.records.trajectory import Labels, with_unit
-from mjfim.records.watch import Watch
+from mjfim.records.worth import Watch
 
 # Lower end of the axis of a distance between two robots [standard deviations].
 LEAST_DISTANCE = 0.1

@@ -12,8 +12,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System, labels_of_model
 from mjfim.output.archive import shown_positions
@@ -41,7 +41,7 @@ from mjfim.output.rerun.scene import (
 )
 from mjfim.records.design import HistoryRow
 from mjfim.records.events import Callback, DesignEvent, Event, FitEvent, StudyEvent
-from mjfim.records.watch import Watch
+from mjfim.records.worth import Watch
 
 # Shortest time between two motions that are shown [s], samples of a motion, and motions in which
 # the robot passes through its motion once.
