@@ -82,9 +82,9 @@ def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
 
     # Write the model with the estimated values.
     with claimed(target.parent, guard, exclusive=False):
-        remarks = write_identified(target, system, estimate.theta)
+        remarks = write_identified(target, system, estimate.theta, estimate)
     print("; ".join([f"wrote {target}", *remarks]))
-    return 0 if estimate.success and not estimate.misfit else 1
+    return 0 if estimate.verdict.ok else 1
 
 
 if __name__ == "__main__":

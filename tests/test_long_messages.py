@@ -182,7 +182,7 @@ def test_what_verbs_say_about_many_parameters_is_short(many_joints: Path) -> Non
     experiment = Experiment.from_file(many_joints)
     fewer = experiment.model_copy(update={"parameters": dict([*experiment.parameters.items()][1:])})
     log = mjfim.simulate(experiment, DesignTask.resolve(experiment).initial, seed=0)
-    said = [max(mjfim.check(experiment).verdict, key=len)]
+    said = [max(mjfim.check(experiment).findings, key=len)]
     for call in (
         lambda: mjfim.design(experiment),
         lambda: mjfim.identify(experiment, [log], start=np.zeros(2)),

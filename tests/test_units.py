@@ -309,7 +309,7 @@ def test_a_check_says_the_same_in_all_units(tmp_path, name: str) -> None:
 
     rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
     found = check(rescaled.experiment)
-    assert without_quantities(found.verdict) == without_quantities(expected.verdict)
+    assert without_quantities(found.findings) == without_quantities(expected.findings)
     assert found.not_separable == expected.not_separable
     assert_allclose(found.correlation, expected.correlation, rtol=1e-6, atol=1e-6)
     assert found.self_test.recursion == pytest.approx(expected.self_test.recursion, abs=1e-6)

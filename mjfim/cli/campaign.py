@@ -96,7 +96,8 @@ def campaign(
     true = task.parameters.true if simulated else None
     with writing(run.output):
         remarks = folder.write_campaign(found, simulated=simulated)
-    print_result(False, {}, campaign_page(found, true), verbose=run.verbose)
+    page = campaign_page(found, true)
+    print_result(False, {}, page, verbose=run.verbose)
     for remark in remarks:
         say(f"warning: {remark}")
     if found.status is CampaignStatus.WAITING:
@@ -105,7 +106,7 @@ def campaign(
             "then repeat this call with --recordings FILE.csv"
         )
     say_written(run.output)
-    raise typer.Exit(0 if found.reached else 1)
+    raise typer.Exit(0 if page.verdict.ok else 1)
 
 
 @dataclass(kw_only=True)

@@ -50,5 +50,4 @@ def check(
     with run.workers() as workers, progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=run.threads, executor=workers)
 
-    run.finish(result, system, design=design_file and design_file.parent)
-    raise typer.Exit(0 if result.ok else 1)
+    raise typer.Exit(run.finish(result, system, design=design_file and design_file.parent))

@@ -35,7 +35,7 @@ from mjfim.errors import (
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
 from mjfim.output.manifest import write_optional
-from mjfim.output.page import REPORT, Level, Page, PictureFormat, Section
+from mjfim.output.page import REPORT, Page, PictureFormat, Section
 from mjfim.output.video import require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
@@ -257,10 +257,11 @@ class Run:
         design: Path | None = None,
         further: Mapping[str, object] = NOTHING,
         sections: Iterable[Section] = (),
-        verdict: str = "",
         remarks: Iterable[str] = (),
-    ) -> None:
+    ) -> int:
         """Write the files of a result where there is a folder, print it, and draw its pictures.
+
+        Who does not read a bad result on the terminal gets its verdict on stderr.
 
         Args:
             result: The result.
@@ -268,9 +269,10 @@ class Run:
             design: The design that the next step names, where the result is one or about one.
             further: Further entries of the JSON file.
             sections: Further sections of the printed page.
-            verdict: Sentence for those who do not read the result on their terminal; default: that
-                of the page, where the result is bad.
             remarks: Sentences that follow the name of the folder.
+
+        Returns:
+            The exit code by the verdict.
         """
         from mjfim.output.archive import summary_with_origin
         from mjfim.output.pages import page_of
@@ -288,10 +290,8 @@ class Run:
             page = replace(page, sections=[*page.sections, *sections])
             values = {**summary_with_origin(result, system, self.output), **further}
             print_result(self.as_json, values, page, verbose=self.verbose)
-            if page.verdict.level is Level.BAD:
-                verdict = verdict or page.verdict.text
-            if verdict and (self.as_json or not out.is_terminal):
-                say_from_program(verdict)
+            if not page.verdict.ok and (self.as_json or not out.is_terminal):
+                say_from_program(page.verdict.sentence)
         if self.output:
             for sentence in lacks:
                 say(f"warning: {sentence}")
@@ -304,6 +304,7 @@ class Run:
             if left:
                 folder = shlex.quote(str(self.output))
                 say(f"not drawn: {first_ones(left)}; `mjfim report {folder} --pictures` draws all")
+        return 0 if page.verdict.ok else 1
 
 
 def print_result(

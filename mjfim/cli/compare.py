@@ -62,5 +62,4 @@ def compare(
     if not result.rows:
         raise NoResultError
 
-    run.finish(result, system, verdict="" if result.ok else " ".join(result.verdict))
-    raise typer.Exit(0 if result.ok else 1)
+    raise typer.Exit(run.finish(result, system))

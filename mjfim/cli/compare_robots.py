@@ -48,9 +48,7 @@ def compare_robots(
     result = replace(result, remarks=(*result.remarks, *_differences_of_files(first, second)))
 
     origin = {"first": _relative(first, run.output), "second": _relative(second, run.output)}
-    verdict = str(result) if result.differs else ""
-    run.finish(result, None, further=origin, verdict=verdict)
-    raise typer.Exit(1 if result.differs or not result.is_reliable else 0)
+    raise typer.Exit(run.finish(result, None, further=origin))
 
 
 def _names(first: Path, second: Path) -> tuple[str, str]:

@@ -19,11 +19,10 @@ from mjfim.cli.common import (
     write_wanted_video,
 )
 from mjfim.cli.progress import progress, say_from_program, watched
-from mjfim.errors import MAX_STARTS, first_ones
+from mjfim.errors import MAX_STARTS
 
 if TYPE_CHECKING:
     from mjfim.excitation.task import DesignTask
-    from mjfim.records.design import Design
 
 # Time after which a design ends that states none [s].
 DEFAULT_SECONDS = 120.0
@@ -100,17 +99,14 @@ def design(
         if found.reached:
             state = f"state horizon = {found.horizon:g} in {experiment}"
             remarks.append(f"to use this horizon further, {state}")
-    if not result.separable:
-        remarks.append(f"mjfim: {_inseparable(result)}")
     if has_default and result.seconds >= DEFAULT_SECONDS:
         remarks.append(
             f"mjfim: the design ended after {DEFAULT_SECONDS:g} s, the default time; `seconds` in "
             "the table [descent] states another one"
         )
-    run.finish(result, system, design=run.output, further=further, remarks=remarks)
+    code = run.finish(result, system, design=run.output, further=further, remarks=remarks)
     write_wanted_video(video, system, result)
-    is_done = result.sound and result.separable and (found is None or found.closed)
-    raise typer.Exit(0 if is_done else 1)
+    raise typer.Exit(code or (found is not None and not found.closed))
 
 
 def _cores(task: DesignTask) -> int:
@@ -129,13 +125,3 @@ def _tasks(task: DesignTask, run: Run) -> int:
     stated = run.executor.partition(":")[2]
     processes = int(stated) if stated.isdecimal() else _cores(task)
     return count if task.is_limited or count >= processes else 1
-
-
-def _inseparable(result: Design) -> str:
-    """Sentence about parameters that do the same, which `mjfim check` says, too."""
-    groups = first_ones(result.combinations, "; ")
-    return (
-        "the design is made for combinations of parameters, because no control separates these "
-        f"parameters: {groups}. Remove or fix one of each group, give it a prior, or measure "
-        "another output"
-    )

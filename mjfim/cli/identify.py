@@ -129,18 +129,16 @@ def identify(
     if prediction is not None:
         result = result.with_prediction(prediction)
     if result.selection is not None:
-        selected = mjfim.selected_experiment(stated, result.selection)
-        system = System.resolve(selected, threads=run.threads)
+        system = System.resolve(result.experiment, threads=run.threads)
     not_drawn = ""
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
     sections = [log_section([log.summary for log in logs])] if run.verbose else []
     remarks = [f"warning: --samples: no robots were drawn{not_drawn}"] if not_drawn else []
-    run.finish(result, system, sections=sections, remarks=remarks)
+    code = run.finish(result, system, sections=sections, remarks=remarks)
     write_wanted_video(video, system, result)
-    is_good = result.success and not result.misfit and not result.interrupted
-    raise typer.Exit(0 if is_good and not not_drawn else 1)
+    raise typer.Exit(code or bool(not_drawn))
 
 
 def _with_draws(result: Estimate, system: System, count: int, seed: int) -> tuple[Estimate, str]:

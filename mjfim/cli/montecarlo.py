@@ -58,11 +58,10 @@ def montecarlo(
     if not study.sets:
         raise NoResultError
 
-    run.finish(study, system, design=design_file)
+    code = run.finish(study, system, design=design_file)
     done = {name: found.trials for name, found in study.sets.items()}
     is_complete = done == dict.fromkeys(named, trials)
     if not is_complete:
         parts = ", ".join(f"{count} of {trials} trials of {name}" for name, count in done.items())
         say_from_program(f"interrupted; only {parts} are finished")
-    has_failures = any(found.failed for found in study.sets.values())
-    raise typer.Exit(0 if is_complete and not has_failures else 1)
+    raise typer.Exit(code or not is_complete)

@@ -93,7 +93,4 @@ def payload(
             logs[: len(paths)], without=logs[len(paths) :], callback=display
         )
 
-    run.finish(result, loaded)
-    is_good = result.success and not result.misfit and not result.interrupted
-    is_seen = result.payload is not None and result.payload.is_seen
-    raise typer.Exit(0 if is_good and is_seen else 1)
+    raise typer.Exit(run.finish(result, loaded))

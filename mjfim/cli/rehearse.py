@@ -56,5 +56,4 @@ def rehearse(
         run.claim(REHEARSAL_FILES, input_files(stated, [design_file]))
     with progress("playing the design"):
         result = mjfim.rehearse(stated, design, threads=run.threads)
-    run.finish(result, System.resolve(stated), design=design_file.parent)
-    raise typer.Exit(0 if result.is_safe else 1)
+    raise typer.Exit(run.finish(result, System.resolve(stated), design=design_file.parent))

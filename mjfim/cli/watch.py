@@ -64,7 +64,6 @@ def watch(
 
     from mjfim.experiment.packing import input_files
     from mjfim.output.folders import WATCH_FILES
-    from mjfim.output.pages.studies import progress_of_watch
 
     meter = mjfim.Meter(stated, threads=run.threads)
     if run.output:
@@ -82,8 +81,7 @@ def watch(
     interruption = current_interruption()
     if interruption is not None:
         interruption.presses = 0
-    run.finish(result, meter.system, verdict="" if result.enough else progress_of_watch(result))
-    raise typer.Exit(0 if result.enough else 1)
+    raise typer.Exit(run.finish(result, meter.system))
 
 
 def _followed(

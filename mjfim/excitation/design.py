@@ -53,6 +53,7 @@ from mjfim.records.design import (
     StartResult,
     Status,
     improvement_per_iteration,
+    is_playable,
     without_motions,
 )
 from mjfim.records.events import DesignCallback, DesignEvent, shown_progress
@@ -178,7 +179,7 @@ def design_task(
             initial_control = best.trajectory.ctrl
         reserve |= needed
     # A later design knows what the robots need; after Ctrl-C it is not rehearsed.
-    best = max(reversed(found), key=lambda each: each.rehearsal is not None and each.sound)
+    best = max(reversed(found), key=lambda each: each.rehearsal is not None and is_playable(each))
     if best.rehearsal is None:
         return best
     played = task.released_as(best.trajectory.state[0])

@@ -656,4 +656,8 @@ def labels_of_system(system: System) -> Labels:
         wanted=system.parameters.wanted,
         published=system.parameters.published,
         bounds=np.column_stack([system.parameters.lower, system.parameters.upper]),
+        targets=tuple(
+            tuple(target.path for target in parameter.targets)
+            for parameter in system.parameters.parameters
+        ),
     )

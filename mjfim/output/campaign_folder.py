@@ -220,7 +220,8 @@ class CampaignFolder:
         pictures: Pictures = {"campaign": partial(studies.campaign, campaign, true)}
         write_pictures(self.path, pictures, self.picture_format)
         try:
-            return write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
+            estimate, file = campaign.estimate, self.path / IDENTIFIED
+            return write_identified(file, self.system, estimate.theta, estimate)
         except ModelError as error:
             return [str(error)]
 

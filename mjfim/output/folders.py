@@ -376,7 +376,7 @@ def _write_data(
 
     clear_samples(folder)
     try:
-        remarks = write_identified(folder / IDENTIFIED, system, record.theta)
+        remarks = write_identified(folder / IDENTIFIED, system, record.theta, record)
     except ModelError as error:
         remarks = [str(error)]
     if record.draws is not None:

@@ -171,7 +171,8 @@ def _refusal(unknown: Sequence[Path], changed: Sequence[Path]) -> str:
         names = [*map(str, files[:1]), *(file.name for file in files[1:LISTED_FILES])]
         more = f" and {len(files) - len(names)} more" if len(files) > len(names) else ""
         parts += [f"{', '.join(names)}{more}: {reason}"] if files else []
-    return f"{'; '.join(parts)}; choose another place for the result, or replace with --force"
+    cure = "choose another place for the result, or replace with --force (Python: force=True)"
+    return f"{'; '.join(parts)}; {cure}"
 
 
 @contextmanager

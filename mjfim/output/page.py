@@ -24,6 +24,8 @@ from enum import StrEnum
 from itertools import zip_longest
 from typing import NamedTuple, Self
 
+from mjfim.records.verdict import Verdict
+
 # Name of the report in a folder of results.
 REPORT = "report.html"
 
@@ -125,21 +127,6 @@ class Emphasis(StrEnum):
     """Computed from several rows of the table."""
 
 
-class Level(StrEnum):
-    """Quality of a result."""
-
-    GOOD = "good"
-    DOUBTFUL = "doubtful"
-    BAD = "bad"
-
-
-class Verdict(NamedTuple):
-    """The result of a verb in one sentence."""
-
-    text: str
-    level: Level
-
-
 class Row(NamedTuple):
     """One row of a table, with a cell for each column."""
 
@@ -221,7 +208,7 @@ class Page:
 
     Attributes:
         kind: What kind of result it is.
-        verdict: The result in one sentence.
+        verdict: The result in one sentence; it takes reasons and steps from the page.
         next_steps: What the reader can do next, the most useful step first.
         causes: What is to be fixed first, each with its cure, the most probable cause first.
         warnings: What limits the result.
@@ -238,6 +225,14 @@ class Page:
     details: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     sections: Sequence[Section] = ()
+
+    def __post_init__(self) -> None:
+        verdict = self.verdict._replace(
+            sentence=capitalised(self.verdict.sentence),
+            reasons=(*self.causes, *self.warnings),
+            next=self.next_steps,
+        )
+        object.__setattr__(self, "verdict", verdict)
 
     @property
     def remarks(self) -> Mapping[str, tuple[str, ...]]:

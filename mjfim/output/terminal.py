@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -13,16 +14,8 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text as Styled
 
-from mjfim.output.page import (
-    Emphasis,
-    Level,
-    Listing,
-    Page,
-    Row,
-    Table,
-    Text,
-    capitalised,
-)
+from mjfim.output.page import Emphasis, Listing, Page, Row, Table, Text
+from mjfim.records.verdict import Level
 
 # Largest number of remarks of each weight that the short form shows.
 MOST = {"Fix first": 1, "Warning": 2, "Detail": 0}
@@ -59,15 +52,17 @@ class TerminalPage:
     Attributes:
         page: The page.
         verbose: True for all tables and sentences, False for a screen of text at most.
+        more: What shows those that are left out.
     """
 
     page: Page
     verbose: bool = False
+    more: str = "--verbose shows everything"
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Lay out the page for the width of the terminal which shows it."""
         page = self.page
-        verdict = capitalised(page.verdict.text)
+        verdict = page.verdict.sentence
         if verdict:
             yield _styled(verdict, VERDICT_STYLES[page.verdict.level])
         parts: list[Shown] = []
@@ -89,7 +84,15 @@ class TerminalPage:
             yield from _rendered(part, width, console, verbose=self.verbose)
         if hidden:
             rows = "1 row or sentence" if hidden == 1 else f"{hidden} rows and sentences"
-            yield _styled(f"Not shown here: {rows}; --verbose shows everything", "dim")
+            yield _styled(f"Not shown here: {rows}; {self.more}", "dim")
+
+
+def text_of(page: Page, width: int = 80) -> str:
+    """The short form of a page as plain text, for `print` in Python."""
+    console = Console(width=width, file=io.StringIO(), force_jupyter=False, color_system=None)
+    with console.capture() as captured:
+        console.print(TerminalPage(page, more="a notebook and the report show everything"))
+    return "\n".join(line.rstrip() for line in captured.get().splitlines())
 
 
 def _styled(text: str, style: str) -> Styled:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence, Sized
-from typing import Any
 
 import numpy as np
 
@@ -12,9 +11,7 @@ from mjfim.arrays import Array
 from mjfim.errors import first_ones
 from mjfim.output.page import number
 from mjfim.records.design import Design
-from mjfim.records.estimate import Estimate, Prediction
-from mjfim.records.studies import MonteCarloStudy
-from mjfim.records.trajectory import Labels
+from mjfim.records.estimate import Prediction
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -166,41 +163,6 @@ def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
     return np.asarray(np.exp(-0.5 * deviations**2) / (np.sqrt(2.0 * np.pi) * std))
 
 
-def complete_labels(record: Design | Estimate | MonteCarloStudy) -> Labels:
-    """Return the labels of a record; numbers in place of names where the record has no labels.
-
-    Records of earlier versions have none.
-
-    Args:
-        record: The record.
-
-    Raises:
-        MjfimError: The labels do not fit the record.
-    """
-    words = {
-        "qpos": "qpos",
-        "positions": "position",
-        "velocities": "velocity",
-        "controls": "control",
-    }
-    sizes: dict[str, int] = {}
-    if isinstance(record, Design):
-        motion = record.trajectory
-        arrays = (motion.qpos, motion.qvel, motion.qvel, motion.ctrl)
-        sizes = {name: array.shape[1] for name, array in zip(words, arrays, strict=True)}
-    if record.labels is not None:
-        record.labels.check(**sizes, parameters=len(record.parameters))
-        return record.labels
-
-    numbered: dict[str, Any] = {
-        name: tuple(f"{word} {i} [model unit]" for i in range(sizes.get(name, 0)))
-        for name, word in words.items()
-    }
-    units = record.units if isinstance(record, Estimate) else ("",) * len(record.parameters)
-    return Labels(**numbered, parameters=record.parameters, parameter_units=units)
-
-
-# Remark on predicted standard deviations.
 BEST_CASE = (
     "σ is the Cramér-Rao bound: the best case, reached if the model and the stated noise are right."
 )
@@ -259,7 +221,7 @@ def when_learnt(design: Design, write: Callable[[str], str] = str) -> str:
     if not asked:
         return ""
     seconds = design.seconds_to(targets)
-    is_stated = np.isfinite(complete_labels(design).wanted).any()
+    is_stated = np.isfinite(design.labels.wanted).any()
     goal = f"a σ of {100.0 * targets[asked[0]] / design.sizes[asked[0]]:.2g} %"
     missed = [design.parameters[j] for j in asked if not np.isfinite(seconds[j])]
     if missed:

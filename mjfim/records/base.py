@@ -22,19 +22,25 @@ import numpy as np
 from mjfim.arrays import freeze
 from mjfim.errors import RecordingError
 from mjfim.files import read_arrays, write_arrays, write_json
+from mjfim.records.verdict import Verdict
 
 # Name of the text array in an npz file that holds all fields of a record that are not arrays.
 RECORD = "record"
 
 # Version of the files; another one is refused.
-VERSION = 2
+VERSION = 3
 
 # Largest number of characters of one value, and of entries of a sequence, in a short text.
 MAX_VALUE_LENGTH = 48
 MAX_ENTRIES = 4
 
-# Modules that show records as HTML, and that draw their figures. They are imported by name where
-# they are used, because records must not depend on the output.
+# Largest number of numbers of an array in a short text.
+MAX_NUMBERS = 12
+
+# Modules that describe records, print them, show them as HTML, and draw their figures. They are
+# imported by name where they are used, because records must not depend on the output.
+PAGES = "mjfim.output.pages"
+TERMINAL = "mjfim.output.terminal"
 PRESENTATION = "mjfim.output.report"
 PICTURES = "mjfim.output.plots.pictures"
 
@@ -73,7 +79,7 @@ class Record:
         freeze(self, *(name for name in self.array_fields if getattr(self, name) is not None))
 
     def __repr__(self) -> str:
-        names = [each.name for each in fields(self)]  # type: ignore[arg-type]
+        names = [each.name for each in fields(self) if each.repr]  # type: ignore[arg-type]
         lines = [f"  {name}={_short_text(getattr(self, name))}" for name in names]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])
 
@@ -187,7 +193,17 @@ class SavedRecord(Record):
 
 
 class ShownRecord(SavedRecord):
-    """Base class of the results of verbs, which can also be shown and drawn."""
+    """Base class of the results of verbs, which can also be shown, printed and drawn."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """How good the result is, why, and what to do next, as the command line says it."""
+        found: Verdict = import_module(PAGES).page_of(self).verdict
+        return found
+
+    def __str__(self) -> str:
+        text: str = import_module(TERMINAL).text_of(import_module(PAGES).page_of(self))
+        return text
 
     @property
     def pictures(self) -> tuple[str, ...]:
@@ -244,6 +260,7 @@ def _stored(value: Any, path: str, arrays: dict[str, np.ndarray], names: Mapping
         return {
             each.name: _stored(getattr(value, each.name), f"{prefix}{each.name}", arrays, names)
             for each in fields(value)
+            if each.metadata.get("saved", True)
         }
     if hasattr(value, "stated"):
         return value.stated()
@@ -268,7 +285,7 @@ def _reader(kind: type) -> Any:
 
 
 class _ShortRepr(Repr):
-    """Short texts of values. They give only the size of arrays, mappings and long sequences."""
+    """Short texts of values; of large arrays, mappings and sequences only the size."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -277,7 +294,7 @@ class _ShortRepr(Repr):
 
     def repr1(self, value: Any, level: int) -> str:
         if isinstance(value, np.ndarray):
-            return f"<array of shape {value.shape}>"
+            return _short_array(value)
         if isinstance(value, Enum):
             return f"{type(value).__name__}.{value.name}"
         if is_dataclass(value):
@@ -290,3 +307,13 @@ class _ShortRepr(Repr):
 
 
 _short_text = _ShortRepr().repr
+
+
+def _short_array(array: np.ndarray) -> str:
+    """The numbers of a small array; how many a large one has, and their range."""
+    if array.size <= MAX_NUMBERS:
+        written: Any = {"float_kind": lambda number: f"{number:.5g}"}
+        return " ".join(np.array2string(array, formatter=written, separator=", ").split())
+    finite = array[np.isfinite(array)]
+    span = f", {finite.min():.3g} to {finite.max():.3g}" if finite.size else ""
+    return f"<{' × '.join(map(str, array.shape))} numbers{span}>"

@@ -167,7 +167,9 @@ class Campaign(ShownRecord):
         last = self.estimate
         return "" if last is None else missed_targets(self.parameters, last.std, self.wanted)
 
-    def __str__(self) -> str:
+    @property
+    def words(self) -> str:
+        """The end of the campaign in a clause."""
         missed = f": {self.short}" if self.short else ""
         if not self.rounds:
             return f"{self.status.value}{missed}"

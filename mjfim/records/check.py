@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.errors import first_ones, shortened
-from mjfim.records.base import Record, ShownRecord
+from mjfim.records.base import Record
 from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal, Valley
+from mjfim.records.values import ParameterResult, ParameterValue
 from mjfim.records.worth import Worth
 
 # A coefficient that differs from 1 by less than this number is not written.
@@ -193,6 +194,7 @@ class ParameterCheck(Record):
         repetitions: Number of repetitions of this experiment that reach `wanted`; 0 if no number
             does.
         seconds: Duration of these repetitions [s].
+        targets: The paths that it sets in the model.
     """
 
     name: str
@@ -206,6 +208,7 @@ class ParameterCheck(Record):
     stated: bool
     repetitions: int
     seconds: float
+    targets: tuple[str, ...] = ()
 
     in_json = (
         "name",
@@ -274,7 +277,7 @@ class SelfTest(Record):
 
 
 @record
-class Check(ShownRecord):
+class Check(ParameterResult):
     """Result of `mjfim.check`: which parameters can be identified, and how well.
 
     Attributes:
@@ -297,7 +300,7 @@ class Check(ShownRecord):
         valley: Two robots that one motion does not tell apart; None where every parameter is known
             well, and for recordings.
         is_start: Whether the motion is the initial control, at which a design begins.
-        verdict: Sentences for the user.
+        findings: What the check found, in sentences, the most serious first.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
             are equal.
         missing: What was not computed because the check was stopped, in words; empty where it is
@@ -317,7 +320,7 @@ class Check(ShownRecord):
     not_separable: tuple[ParameterGroup, ...]
     not_excited: tuple[ParameterGroup, ...]
     self_test: SelfTest
-    verdict: tuple[str, ...]
+    findings: tuple[str, ...]
     steps: FiniteSteps | None = None
     rehearsal: Rehearsal | None = None
     worth: Worth | None = None
@@ -331,11 +334,11 @@ class Check(ShownRecord):
     file_stem = "check"
     made_by = "`mjfim check EXPERIMENT -o DIR`"
     in_json = (
-        "ok",
+        "verdict.ok",
         "missing",
         "refused",
         "violations",
-        "verdict",
+        "findings",
         "source",
         "horizon",
         "rows",
@@ -354,9 +357,24 @@ class Check(ShownRecord):
         "valley",
     )
     json_names = {
+        "findings": "verdict",
         "rows": "parameters",
         "not_separable": "combinations",
     }
+
+    def each(self) -> Iterator[ParameterValue]:
+        """Values at which σ is predicted, and the wanted σ."""
+        for row in self.rows:
+            half = NORMAL_95 * row.std
+            yield ParameterValue(
+                name=row.name,
+                targets=row.targets,
+                unit=row.unit,
+                value=row.value,
+                std=row.std,
+                interval=(row.value - half, row.value + half),
+                further={"wanted": row.wanted, "repetitions": row.repetitions},
+            )
 
     @property
     def condition(self) -> float:
@@ -373,24 +391,6 @@ class Check(ShownRecord):
         std = np.array([row.std for row in self.rows if not row.nuisance])
         std = np.where(np.isfinite(std), std, np.nan)
         return np.asarray(self.correlation * np.outer(std, std))
-
-    @property
-    def ok(self) -> bool:
-        """True if the check found no fault.
-
-        The derivatives agree, all parameters are identifiable, one repetition reaches every stated
-        accuracy, and a design would not refuse the experiment. Limits that a start violates are no
-        fault, because a design looks for a motion inside. A fall that no limit forbids is one.
-        """
-        known = {row.name for row in self.rows if np.isfinite(row.std)}
-
-        # A prior may separate parameters that the data cannot separate.
-        separable = all(set(group.members) <= known for group in self.not_separable)
-
-        stated = [row for row in self.rows if row.stated and not row.nuisance]
-        reached = all(row.repetitions == 1 for row in stated)
-        passed = self.self_test.passed and not self.missing and not self.refused
-        return passed and not self.is_dangerous and separable and not self.not_excited and reached
 
     @property
     def is_dangerous(self) -> bool:
@@ -416,7 +416,7 @@ class Check(ShownRecord):
         }
 
 
-def verdict_of_check(check: Check) -> Iterator[str]:
+def findings_of_check(check: Check) -> Iterator[str]:
     """Yield what a check found, the most serious first."""
     for reason in check.refused:
         yield f"`mjfim design` refuses this experiment: {reason}"
@@ -460,7 +460,7 @@ def _about_derivatives(check: Check) -> Iterator[str]:
         yield str(check.steps)
 
 
-def _unknown_groups(check: Check) -> list[ParameterGroup]:
+def unknown_groups(check: Check) -> list[ParameterGroup]:
     """Inseparable groups that priors do not resolve either."""
     known = {row.name for row in check.rows if np.isfinite(row.std)}
     return [group for group in check.not_separable if not set(group.members) <= known]
@@ -468,7 +468,7 @@ def _unknown_groups(check: Check) -> list[ParameterGroup]:
 
 def _about_identifiability(check: Check) -> Iterator[str]:
     """Combinations that cannot be identified, and advice for the user."""
-    unknown = _unknown_groups(check)
+    unknown = unknown_groups(check)
     resolved = [group for group in check.not_separable if group not in unknown]
     if unknown:
         yield (
@@ -510,7 +510,7 @@ def _about_accuracy(check: Check, identifiable: Sequence[ParameterCheck]) -> Ite
         )
         return
     is_certain = check.self_test.passed and not check.missing
-    if is_certain and not _unknown_groups(check) and not check.not_excited:
+    if is_certain and not unknown_groups(check) and not check.not_excited:
         reached = "its wanted σ" if any(row.stated for row in identifiable) else "a σ of 5 %"
         # A start has to become a motion that a robot can play.
         end = "" if check.is_start else ": nothing more is needed"

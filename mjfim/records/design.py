@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array, record, scaled_pseudo_inverse
+from mjfim.errors import MjfimError
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array
 from mjfim.records.rehearsal import Rehearsal, Valley
 from mjfim.records.trajectory import Labels, Trajectory
+from mjfim.records.values import ParameterResult, ParameterValue, listed_values
 from mjfim.records.worth import Worth
 
 # Relative difference of two costs J, or of two σ, below which they count as equal.
@@ -425,7 +427,7 @@ def _npz_names() -> dict[str, str]:
 
 
 @record
-class Design(ShownRecord):
+class Design(ParameterResult):
     """Result of `mjfim.design`: the designed trajectory and the initial one.
 
     It is saved as design.json and design.npz, and `Design.load` reads design.npz. The arrays of the
@@ -457,7 +459,7 @@ class Design(ShownRecord):
             theta_j)].
         data: (p, p) information of this experiment alone, in which nuisance parameters that
             belong to a single experiment are marginalised.
-        labels: Names and units for figures and tables; None in records of earlier versions.
+        labels: Names and units for figures and tables.
         sizes: (p,) sizes of which standard deviations are a share: magnitudes of the values, or of
             the whole vectors or tensors of which they are entries [theta-unit]. Default: the
             magnitudes of the values.
@@ -493,7 +495,7 @@ class Design(ShownRecord):
     combined: tuple[CombinationAccuracy, ...] = ()
     prior: Array = no_array(0, 0)
     data: Array = no_array(0, 0)
-    labels: Labels | None = None
+    labels: Labels
     sizes: Array = no_array()
     motions: IterateMotions | None = None
     improvement: float = float("nan")
@@ -562,24 +564,6 @@ class Design(ShownRecord):
         return sentence.replace(" before convergence", f", {share}")
 
     @property
-    def success(self) -> bool:
-        """True if the optimisation converged and the trajectory keeps all limits."""
-        return self.status.success and self.within_limits
-
-    @property
-    def sound(self) -> bool:
-        """True if a person would play the trajectory on a robot.
-
-        The optimisation converged, or it found a trajectory other than the initial one. The
-        trajectory keeps all limits, and the rehearsal found no danger to robots that differ from
-        the model.
-        """
-        is_safe = self.rehearsal is None or self.rehearsal.is_safe
-        is_useful = self.status.success or not self.is_start
-        is_finished = self.status is not Status.INTERRUPTED
-        return is_finished and self.within_limits and is_safe and is_useful
-
-    @property
     def is_start(self) -> bool:
         """True if the cost and σ are, within 2 %, those of a start that keeps all limits."""
         if self.initial_violations:
@@ -630,7 +614,7 @@ class Design(ShownRecord):
         Where none is stated, the smallest share 1, 2 or 5 times a power of ten that all parameters
         reach which are determined. Infinite for parameters that are not asked for.
         """
-        wanted = np.full(len(self.theta), np.inf) if self.labels is None else self.labels.wanted
+        wanted = self.labels.wanted
         if np.isfinite(wanted).any():
             return wanted
         is_asked = np.isin(self.parameters, self.nuisance, invert=True)
@@ -653,20 +637,28 @@ class Design(ShownRecord):
         t = self.trajectory.t - self.trajectory.t[0]
         return np.where(is_reached.any(axis=0), t[np.argmax(is_reached, axis=0)], np.inf)
 
-    @property
-    def separable(self) -> bool:
-        """True if every wanted parameter is identifiable alone, from data or with its prior.
+    def compare(self, other: Design) -> DesignComparison:
+        """Compare σ of this design with σ of another one, by the names of the parameters.
 
-        Otherwise the design was made for the combinations that are. The command line exits with 0
-        for a design that is sound and separable.
+        Raises:
+            MjfimError: The other one is no design, or has none of the parameters.
         """
-        std = dict(zip(self.parameters, self.final.std.tolist(), strict=True))
-        return all(np.isfinite(std[name]) for name in std if name not in self.nuisance)
+        if not isinstance(other, Design):
+            raise MjfimError(f"compare takes another Design, not a {type(other).__name__}")
+        if not set(self.parameters) & set(other.parameters):
+            raise MjfimError("the two designs have no parameter in common")
+        return DesignComparison(design=self, other=other)
 
-    @property
-    def within_limits(self) -> bool:
-        """True if no margin is negative."""
-        return all(margin >= 0.0 for margin in self.limits.values())
+    def each(self) -> Iterator[ParameterValue]:
+        """Values at which σ is predicted, with σ of the initial and of the designed motion."""
+        return listed_values(
+            self.parameters,
+            self.labels.parameter_units,
+            self.theta,
+            self.stated_std,
+            self.labels.targets,
+            std_initial=self.initial.std,
+        )
 
     @property
     def iterations(self) -> int:
@@ -691,7 +683,40 @@ class Design(ShownRecord):
             "gains": GAIN_NOTE,
             "limits": {
                 "margins": self.limits,
-                "satisfied": self.within_limits,
+                "satisfied": keeps_limits(self),
                 "initial": [violation.summary() for violation in self.initial_violations],
             },
         }
+
+
+@record
+class DesignComparison(ShownRecord):
+    """Result of `Design.compare`: the accuracy that two designs predict.
+
+    Attributes:
+        design: The design that was asked.
+        other: The design with which it is compared.
+    """
+
+    design: Design
+    other: Design
+
+    file_stem = "designs"
+    made_by = "`Design.compare`"
+
+
+def is_playable(design: Design) -> bool:
+    """Whether a person would play a design on a robot, by which a search chooses among several.
+
+    The optimisation converged, or it found a trajectory other than the initial one. The trajectory
+    keeps all limits, and the rehearsal found no danger to robots that differ from the model.
+    """
+    is_safe = design.rehearsal is None or design.rehearsal.is_safe
+    is_useful = design.status.success or not design.is_start
+    is_finished = design.status is not Status.INTERRUPTED
+    return is_finished and keeps_limits(design) and is_safe and is_useful
+
+
+def keeps_limits(design: Design) -> bool:
+    """Whether no margin of a design is negative."""
+    return all(margin >= 0.0 for margin in design.limits.values())

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, field, replace
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array, record
-from mjfim.errors import first_ones
-from mjfim.records.base import Record, SavedRecord, ShownRecord, no_array
+from mjfim.errors import RecordingError, first_ones
+from mjfim.files import read_json
+from mjfim.records.base import Record, SavedRecord, no_array
 from mjfim.records.check import Check, join_names
 from mjfim.records.design import Design
 from mjfim.records.estimate_parts import (
@@ -23,6 +26,10 @@ from mjfim.records.estimate_parts import (
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Selection, Term, TermTestData
 from mjfim.records.trajectory import Labels, Recording, Trajectory
+from mjfim.records.values import ParameterResult, ParameterValue, listed_values
+
+# Module that writes identified models; records must not depend on the output.
+MODELS = "mjfim.output.export.mjcf"
 
 # Ratio of the errors over the longest and the shortest horizon above which they grow.
 GROWTH = 1.2
@@ -388,7 +395,7 @@ MAX_NOMINAL_ROWS = 1_000_000
 
 
 @record
-class Estimate(ShownRecord):
+class Estimate(ParameterResult):
     """Result of `mjfim.identify`: parameters estimated from recordings.
 
     Attributes:
@@ -401,7 +408,7 @@ class Estimate(ShownRecord):
             sum is scaled so that its expected value for pure noise stays `dof`.
         dof: Degrees of freedom of `chi2`.
         status: How the fit ended, in words.
-        success: True if the fit converged and all parameters are determined inside their bounds.
+        converged: True if the fit converged and all parameters are determined inside their bounds.
         misfit: True if the residuals are not noise of the stated size; the formal `std` is then
             too small.
         iterations: Number of iterations.
@@ -441,7 +448,7 @@ class Estimate(ShownRecord):
         steps: MuJoCo steps taken.
         units: Unit of each parameter.
         prior: (p, p) information of the parameters' priors, at the estimate.
-        labels: Names and units for figures and tables; None in records of earlier versions.
+        labels: Names and units for figures and tables.
         restart: How the fit was repeated from fits over segments; None where it was not.
         nominal: Outputs of the model at the initial guess, with the fitted initial states, for each
             recording, (M, ny) [unit of the output]; empty where it diverges, and for recordings of
@@ -478,6 +485,8 @@ class Estimate(ShownRecord):
             diagonal where a parameter is not determined; empty in records of earlier versions.
         prediction: (p, p) covariance that a design or a check predicted, NaN where it predicted
             none; empty where none was given (`with_prediction`).
+        experiment: The experiment (`mjfim.Experiment`), or the path of its file; None where it is
+            not known. It is not saved.
     """
 
     parameters: tuple[str, ...]
@@ -488,7 +497,7 @@ class Estimate(ShownRecord):
     chi2: float
     dof: int
     status: str
-    success: bool
+    converged: bool
     misfit: bool
     iterations: int
     residual_rms: dict[str, float]
@@ -519,7 +528,7 @@ class Estimate(ShownRecord):
     steps: int = 0
     units: tuple[str, ...] = ()
     prior: Array = no_array(0, 0)
-    labels: Labels | None = None
+    labels: Labels
     restart: Restart | None = None
     nominal: tuple[Array, ...] = ()
     segments: tuple[Array, ...] = ()
@@ -538,6 +547,7 @@ class Estimate(ShownRecord):
     tested_data: TermTestData | None = None
     honest_covariance: Array = no_array(0, 0)
     prediction: Array = no_array(0, 0)
+    experiment: Any = field(default=None, repr=False, metadata={"saved": False})
 
     file_stem = "estimate"
     made_by = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -555,7 +565,7 @@ class Estimate(ShownRecord):
         "chi2",
         "dof",
         "status",
-        "success",
+        "converged",
         "interrupted",
         "iterations",
         "residual_rms",
@@ -596,6 +606,7 @@ class Estimate(ShownRecord):
         "in_time",
     )
     json_names = {
+        "converged": "success",
         "in_time": "information_in_time",
         "worst_residual": "worst",
         "missing_terms": "suspects",
@@ -621,6 +632,53 @@ class Estimate(ShownRecord):
                 object.__setattr__(self, name, value())
         super().__post_init__()
 
+    @classmethod
+    def load(cls, path: str | Path) -> Estimate:
+        """Read an estimate; it knows the experiment that estimate.json names. See `SavedRecord`."""
+        found = super().load(path)
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        try:
+            stated = read_json(folder / f"{cls.file_stem}.json").get("experiment")
+        except RecordingError:
+            return found
+        return found if stated is None else replace(found, experiment=folder / str(stated))
+
+    @property
+    def spec(self) -> Any:
+        """A new `mujoco.MjSpec` of the user's model with the estimates.
+
+        Raises:
+            ExperimentError: The estimate does not know its experiment.
+            ModelError: No MJCF expresses the estimates.
+        """
+        return import_module(MODELS).identified_spec(self)
+
+    @property
+    def model(self) -> Any:
+        """The `mujoco.MjModel` of `spec`."""
+        return self.spec.compile()
+
+    def save_model(self, path: str | Path, *, force: bool = False) -> list[str]:
+        """Write the user's MJCF with the estimates, and the URDF from which it came beside it.
+
+        A comment at its head states data, date, version, the accuracy of each value and the
+        verdict. Files that mjfim did not write are not replaced.
+
+        Args:
+            path: The new file, which ends in .xml.
+            force: Whether files of the user are replaced; files of the experiment never are.
+
+        Returns:
+            Sentences about everything that a user would not expect.
+
+        Raises:
+            OutputError: A file may not be replaced.
+            ExperimentError: The estimate does not know its experiment.
+            ModelError: No MJCF expresses the estimates.
+        """
+        found: list[str] = import_module(MODELS).save_identified(self, path, force=force)
+        return found
+
     @property
     def guess_sizes(self) -> Array:
         """(p,) sizes of the guess, of which its difference from the estimate is a share.
@@ -642,6 +700,20 @@ class Estimate(ShownRecord):
         if not len(self.prediction):
             return np.full(len(self.theta), np.nan)
         return np.sqrt(np.diag(self.prediction))
+
+    def each(self) -> Iterator[ParameterValue]:
+        """Estimates with the honest σ and the 95 % interval, the formal σ and the guess."""
+        std = self.honest_std
+        return listed_values(
+            self.parameters,
+            self.units,
+            self.theta,
+            std,
+            self.labels.targets,
+            np.where(np.isfinite(std)[:, None], self.interval, np.nan),
+            formal_std=self.std,
+            guess=self.initial_theta,
+        )
 
     def with_prediction(self, prediction: Design | Check) -> Estimate:
         """Return the estimate beside the accuracy that was predicted before the recording.

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array, record
-from mjfim.records.base import Record, ShownRecord, no_array
+from mjfim.records.base import Record, no_array
 from mjfim.records.check import join_names
+from mjfim.records.values import ParameterResult, ParameterValue, listed_values
 
 
 @record
@@ -149,7 +151,7 @@ class ResidualForce(Record):
 
 
 @record
-class InverseDynamicsFit(ShownRecord):
+class InverseDynamicsFit(ParameterResult):
     """Result of `mjfim.inverse_dynamics`: parameters fitted to the equation of motion.
 
     Attributes:
@@ -169,7 +171,7 @@ class InverseDynamicsFit(ShownRecord):
         condition: Condition number of the determined part of the regressor with columns of unit
             length.
         iterations: Number of linearisations.
-        success: True where the last step changed nothing.
+        converged: True where the last step changed nothing.
         status: How the fit ended, in words.
         residual_forces: What the fitted model does not explain at each joint; none for a fit that
             was the start of another one.
@@ -189,7 +191,7 @@ class InverseDynamicsFit(ShownRecord):
     absent: tuple[str, ...] = ()
     condition: float = 1.0
     iterations: int = 0
-    success: bool = True
+    converged: bool = True
     status: str = ""
     residual_forces: tuple[ResidualForce, ...] = ()
     seconds: float = 0.0
@@ -211,12 +213,17 @@ class InverseDynamicsFit(ShownRecord):
         "absent",
         "condition",
         "iterations",
-        "success",
+        "converged",
         "status",
         "residual_forces",
         "seconds",
         "steps",
     )
+    json_names = {"converged": "success"}
+
+    def each(self) -> Iterator[ParameterValue]:
+        """Estimates with the formal σ, and the values at which the fit began."""
+        return listed_values(self.parameters, self.units, self.theta, self.std, start=self.start)
 
     @property
     def degrees_of_freedom(self) -> tuple[EquationFit, ...]:

@@ -385,7 +385,9 @@ class RobotComparison(ShownRecord):
         size = np.abs(self.values[0])
         return self.detectable / np.where(size > 0.0, size, np.nan)
 
-    def __str__(self) -> str:
+    @property
+    def words(self) -> str:
+        """The result in a sentence or two."""
         first, second = self.names
         if not self.parameters:
             return f"There is no parameter that both {first} and {second} determine."

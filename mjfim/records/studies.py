@@ -139,8 +139,8 @@ class Comparison(ShownRecord):
     file_stem = "compare"
     made_by = "`mjfim compare EXPERIMENT -o DIR`"
     in_json = (
-        "ok",
-        "verdict",
+        "verdict.ok",
+        "findings",
         "interrupted",
         "criterion",
         "seed",
@@ -150,7 +150,7 @@ class Comparison(ShownRecord):
         "nuisance",
         "rows",
     )
-    json_names = {"rows": "methods"}
+    json_names = {"findings": "verdict", "rows": "methods"}
 
     @property
     def wanted(self) -> tuple[int, ...]:
@@ -205,15 +205,9 @@ class Comparison(ShownRecord):
         return 1.0 - row.cost / other.cost
 
     @property
-    def ok(self) -> bool:
-        """True if all methods ran, the design is sound, and no baseline is better."""
-        design = self.design
-        return not self.interrupted and design is not None and design.sound and not self.beating
-
-    @property
-    def verdict(self) -> tuple[str, ...]:
-        """Sentences for the user, the most important one first."""
-        sentences = [_verdict(self)]
+    def findings(self) -> tuple[str, ...]:
+        """What was found, in sentences, the most important one first."""
+        sentences = [_is_best(self)]
         if self.interrupted:
             sentences.append(
                 "Interrupted: methods are missing, or have not used their whole budget."
@@ -230,7 +224,7 @@ class Comparison(ShownRecord):
         }
 
 
-def _verdict(comparison: Comparison) -> str:
+def _is_best(comparison: Comparison) -> str:
     """Return a sentence that says whether the design is the best."""
     design = comparison.design
     rival = comparison.rival
@@ -321,7 +315,7 @@ class MonteCarloStudy(ShownRecord):
         measure_rate: Rate of the measurements [Hz].
         sets: Statistics by name of the trajectory (`initial`, `final`).
         information: (p, p) Fisher information of each trajectory, with the keys of `sets`.
-        labels: Names and units for figures and tables; None in records of earlier versions.
+        labels: Names and units for figures and tables.
     """
 
     parameters: tuple[str, ...]
@@ -329,7 +323,7 @@ class MonteCarloStudy(ShownRecord):
     measure_rate: float
     sets: dict[str, TrialStatistics]
     information: dict[str, Array]
-    labels: Labels | None = None
+    labels: Labels
 
     file_stem = "montecarlo"
     made_by = "`mjfim montecarlo EXPERIMENT DESIGN.npz -o DIR`"

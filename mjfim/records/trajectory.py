@@ -40,6 +40,7 @@ class Labels(Record):
         wanted: (p,) stated standard deviations to reach, infinite without one [theta-unit].
         published: (p,) values with which estimates are compared, NaN without one [theta-unit].
         bounds: (p, 2) lower and upper bounds [theta-unit].
+        targets: The paths that each parameter sets in the model.
     """
 
     qpos: tuple[str, ...]
@@ -52,6 +53,7 @@ class Labels(Record):
     wanted: Array = no_array()
     published: Array = no_array()
     bounds: Array = no_array(0, 2)
+    targets: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         names, units = len(self.parameters), len(self.parameter_units)
@@ -73,19 +75,6 @@ class Labels(Record):
     def output(self, column: str) -> str:
         """Return the label of a measured column."""
         return self.outputs.get(column, f"{column} [model unit]")
-
-    def check(self, **sizes: int) -> None:
-        """Raise MjfimError where a field does not have the length of the data.
-
-        Args:
-            sizes: Length of the data by the name of the field.
-        """
-        for name, size in sizes.items():
-            have = len(getattr(self, name))
-            if have != size:
-                raise MjfimError(
-                    f"labels.{name} has {have} entries, the data has {size}; give exactly {size}"
-                )
 
 
 @record

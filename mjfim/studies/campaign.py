@@ -561,5 +561,5 @@ def _doubts(estimate: Estimate, wanted: Array) -> Iterator[str]:
     ]
     if at_bound:
         yield f"at a bound are the estimates of these parameters with a target: {listed(at_bound)}"
-    elif not estimate.success and not estimate.combinations:
+    elif not estimate.converged and not estimate.combinations:
         yield f"the fit did not succeed: {estimate.status}"

@@ -61,7 +61,7 @@ from mjfim.records.check import (
     ConfoundedPair,
     ParameterCheck,
     SelfTest,
-    verdict_of_check,
+    findings_of_check,
 )
 from mjfim.records.design import LimitViolation
 from mjfim.records.events import begin_stage, shown_progress
@@ -578,7 +578,7 @@ def _checked(
         worth=worth,
         valley=robots,
         is_start=is_start,
-        verdict=(),
+        findings=(),
         combined=() if not_excited else found.combinations(information, values, total, total),
         missing=tuple(missing),
         refused=refused,
@@ -586,7 +586,7 @@ def _checked(
     )
     degrees = probable_degrees(task.experiment, task.system.source)
     warnings = [warning] if warning else []
-    return replace(check, verdict=(*warnings, *verdict_of_check(check), *degrees))
+    return replace(check, findings=(*warnings, *findings_of_check(check), *degrees))
 
 
 def _refusals(
@@ -632,6 +632,7 @@ def _rows(
             stated=parameter.wanted is not None,
             repetitions=repetitions,
             seconds=repetitions * duration,
+            targets=tuple(target.path for target in parameter.targets),
         )
 
 

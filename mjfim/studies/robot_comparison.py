@@ -117,7 +117,7 @@ def compare_estimates(
         joint_p=float(corrected[-1]),
         level=LEVEL,
         remarks=tuple(_remarks(robots, common)),
-        is_reliable=all(each.success and not each.misfit for each, _ in both),
+        is_reliable=all(each.converged and not each.misfit for each, _ in both),
     )
 
 
@@ -238,7 +238,7 @@ def _why_not_compared(name: str, robots: Mapping[str, Estimate]) -> str:
 def _remarks(robots: Mapping[str, Estimate], common: Sequence[str]) -> Iterator[str]:
     """Sentences that limit the comparison, the most serious ones first."""
     for robot, estimate in robots.items():
-        if not estimate.success:
+        if not estimate.converged:
             yield f"the estimate of {robot} is not reliable: {estimate.status}"
         if estimate.misfit:
             yield (

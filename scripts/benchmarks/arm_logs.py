@@ -544,7 +544,7 @@ def _of_estimate(system: System, estimate: Estimate, torques: Sequence[str]) -> 
         rms=np.array([estimate.residual_rms[name] for name in torques]),
         equations=None if by_equation is None else by_equation.theta,
         misfit=estimate.misfit,
-        success=estimate.success,
+        success=estimate.converged,
         terms=tuple(term.description for term in added),
     )
 

@@ -438,7 +438,7 @@ def identified(job: tuple[int, int, Path]) -> CleanLog:
         robot=name,
         misfit="; ".join(found.reasons) if found.misfit else "",
         poor_data="; ".join(poor),
-        failure="" if found.success else found.status,
+        failure="" if found.converged else found.status,
         seconds=time.perf_counter() - clock,
     )
 

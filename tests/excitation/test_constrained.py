@@ -15,7 +15,7 @@ from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import spline_basis
 from mjfim.output.pages import page_of
-from mjfim.records.design import Design, Status
+from mjfim.records.design import Design, Status, keeps_limits
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.limits import ARM, HARD, cart_inside, distances_of_arm, played
 from tests.support.numerics import (
@@ -38,7 +38,7 @@ def test_the_study_of_the_paper_under_hard_limits_beats_a_general_solver() -> No
     hard = {"control": {"force": [-5.0, 5.0]}, "position": {"slide": [-1.0, 1.0]}}
     paper = mjfim.design(experiment.replace(cost={"control": 0.0, "tracking": {}}, limits=hard))
     assert paper.status is Status.CONVERGED
-    assert paper.success
+    assert paper.status.success and keeps_limits(paper)
     assert paper.warnings == ()
 
     # Information per second, independent of the package: finite differences of plain loops.

@@ -23,7 +23,6 @@ from mjfim.model.coordinates import control_names
 from mjfim.optimize.cost_models import BarrierDerivatives
 from mjfim.output.pages.files import experiment_page
 from mjfim.output.plots.design import limits as limits_picture
-from mjfim.output.words import complete_labels
 from mjfim.studies.inventory import stated_experiment
 from tests.support.limits import along_control, barrier_check, barrier_problem
 from tests.support.numerics import Array, make_task
@@ -552,7 +551,7 @@ def test_a_quadrotor_flies_inside_its_box_speeds_and_tilt(tmp_path: Path) -> Non
     said = [str(violation) for violation in design.initial_violations]
     assert any(text.startswith("tilt of float is 0.3") for text in said)
 
-    picture = limits_picture(design, complete_labels(design))
+    picture = limits_picture(design, design.labels)
     titles = [panel.title for panel in picture.panels]
     assert any(title.startswith("tilt: smallest margin") for title in titles)
     assert any(title.startswith("angular velocity: smallest margin") for title in titles)

@@ -23,12 +23,12 @@ from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
 from mjfim.files import write_json
 from mjfim.output.folders import find_experiment_file
-from mjfim.output.page import Level
 from mjfim.output.pages import page_of
 from mjfim.output.plots.studies import fan_panels
 from mjfim.output.words import format_number
-from mjfim.records.design import Design
+from mjfim.records.design import Design, keeps_limits
 from mjfim.records.rehearsal import FiniteSteps
+from mjfim.records.verdict import Level
 from tests.support.cli import run
 from tests.support.paths import MODELS
 
@@ -353,7 +353,7 @@ def test_the_verdict_counts_robots(
     chosen = {key: exact if value is None else value for key, value in numbers.items()}
     experiment, design = played(tmp_path, **chosen)
     page = page_of(design, experiment="cart.toml", design=tmp_path)
-    assert words in page.verdict.text
+    assert words in page.verdict.sentence
     is_good = not numbers
     assert (page.verdict.level is Level.BAD) is not is_good and design.rehearsal is not None
     assert design.rehearsal.is_safe is is_good
@@ -467,7 +467,7 @@ def test_a_reserve_leaves_room_for_the_initial_state(tmp_path: Path) -> None:
         descent={"max_iterations": 4},
     )
     found = mjfim.design(experiment, threads=1, progress=False)
-    assert found.within_limits and found.rehearsal is not None
+    assert keeps_limits(found) and found.rehearsal is not None
     assert float(found.rehearsal.margins[0].min()) >= 0.05 - 1e-9
 
 
@@ -521,7 +521,7 @@ def test_what_falls_below_the_floor_is_not_played(
     fallen = 0.5 * (9.81 - thrust) * 2.0**2
     assert found.lowest[0] == pytest.approx(0.95 - fallen - level, abs=0.02)
     assert found.is_safe is is_safe
-    assert ("pass through" in page_of(design).verdict.text) is not is_safe
+    assert ("pass through" in page_of(design).verdict.sentence) is not is_safe
     stated = experiment.replace(rehearsal={"floor": "none"})
     assert mjfim.rehearse(stated, design).is_safe
 
@@ -529,8 +529,8 @@ def test_what_falls_below_the_floor_is_not_played(
     checked = mjfim.check(experiment, progress=False)
     page = page_of(checked, experiment="drone.toml")
     assert (page.verdict.level is Level.BAD) is not is_safe and checked.is_dangerous is not is_safe
-    assert not checked.ok or is_safe
-    assert ("4 pass through" in page.verdict.text) is not is_safe
+    assert not checked.verdict.ok or is_safe
+    assert ("4 pass through" in page.verdict.sentence) is not is_safe
     assert ("floor" in page.next_steps[0]) is not is_safe
     if not is_safe:
         box = {"position": {"base": [[-1.0, 1.0], [-1.0, 1.0], [0.5, 2.0]]}}
@@ -750,7 +750,7 @@ def test_shipped_designs_are_safe_because_of_what_their_files_state(
         descent={"starts": 1, "max_iterations": iterations}
     )
     design = mjfim.design(experiment, progress=False)
-    assert design.rehearsal is not None and design.rehearsal.is_safe and design.within_limits
+    assert design.rehearsal is not None and design.rehearsal.is_safe and keeps_limits(design)
     stated = experiment.model_dump(exclude_unset=True)
     del stated["boundary"]
     stated["limits"].pop("reserve")

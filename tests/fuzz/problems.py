@@ -15,7 +15,7 @@ import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_design
-from mjfim.records.design import Design
+from mjfim.records.design import Design, keeps_limits
 from tests.fuzz.outcome import Case, Outcome
 from tests.fuzz.plants import Plant, Range, Rng, about_zero, random_plant
 from tests.fuzz.player import (
@@ -92,7 +92,7 @@ def attempt(
         return Outcome(case=case, group="refused", description=description, complaint=complaint)
 
     # Without a design inside the limits nothing is claimed, but a limit has to be named.
-    if not design.within_limits:
+    if not keeps_limits(design):
         return Outcome(case=case, group="infeasible", description=problem.description)
 
     system = System.resolve(experiment, threads=1)

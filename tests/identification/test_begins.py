@@ -49,7 +49,7 @@ def test_a_log_that_begins_elsewhere_is_fitted_and_said(
         initial = experiment.initial.model_copy(update=aside)
         log = swung(experiment.model_copy(update={"initial": initial}))
     estimate = mjfim.identify(experiment, [log], progress=False)
-    assert not estimate.misfit and estimate.success
+    assert not estimate.misfit and estimate.converged
     assert any("does not begin where [initial] says" in each for each in estimate.warnings)
     assert any(said in each for each in estimate.warnings)
     low, high = estimate.interval.T
@@ -131,7 +131,7 @@ def test_a_hanging_quadruped_whose_knees_are_bent_is_fitted(tmp_path: Path) -> N
     control = 0.8 * np.sin(2.0 * np.pi * (0.7 + 0.1 * np.arange(8)) * t)
     robot = stated.replace(initial={"qpos": [0.0, -1.1] * 4})
     estimate = mjfim.identify(stated, [mjfim.simulate(robot, control, 1)], progress=False)
-    assert estimate.success and not estimate.misfit
+    assert estimate.converged and not estimate.misfit
     (said,) = [each for each in estimate.warnings if "does not begin where" in each]
     assert all(f"{leg}_knee -1.1 rad" in said for leg in LEGS) and "hip -" not in said
     low, high = estimate.interval.T

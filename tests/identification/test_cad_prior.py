@@ -211,7 +211,7 @@ def test_an_inertia_that_contradicts_the_model_is_named(tmp_path: Path) -> None:
 def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Recording) -> None:
     experiment = arm(tmp_path)
     estimate = mjfim.identify(experiment, [log], progress=False)
-    assert estimate.success and not estimate.misfit
+    assert estimate.converged and not estimate.misfit
     assert np.isfinite(estimate.std).all()
 
     # The first link turns about a vertical axis: its mass has no effect.

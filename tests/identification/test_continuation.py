@@ -63,7 +63,7 @@ def swings(system: System, seconds: float) -> Recording:
 def is_found(system: System, estimate: Estimate) -> bool:
     """Whether the true parameters are found and nothing is doubted."""
     near = np.abs(estimate.theta - system.parameters.true) < 4.0 * estimate.std
-    return bool(near.all() and estimate.success and not estimate.misfit)
+    return bool(near.all() and estimate.converged and not estimate.misfit)
 
 
 @pytest.mark.slow

@@ -86,7 +86,7 @@ def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> 
 
     found = mjfim.identify(experiment, [recorded(experiment, 400, 1)], progress=False)
 
-    assert found.success
+    assert found.converged
     assert not found.misfit
     assert np.abs((found.theta - true) / found.std).max() < 4.0
     assert (found.std < 0.05 * np.abs(true))[[0, 2, 3, 5]].all()
@@ -427,7 +427,7 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
 
     found = mjfim.inverse_dynamics(experiment, [log])
 
-    assert found.success
+    assert found.converged
     np.testing.assert_allclose(found.theta[:3], true[:3], rtol=0.05)
     assert found.absent == ("kp",)
 
@@ -440,7 +440,7 @@ def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Pat
 
     found = mjfim.identify(experiment, [recorded(experiment, 500, 5)], progress=False)
 
-    assert found.success and not found.misfit
+    assert found.converged and not found.misfit
     assert found.inverse_dynamics is not None
     assert np.abs((found.theta - true) / found.std).max() < 4.0
 

@@ -37,7 +37,7 @@ def estimate(folder: Path, log: Recording) -> Estimate:
 @pytest.mark.slow
 def test_the_estimate_starts_from_the_equation_of_motion(folder: Path, estimate: Estimate) -> None:
     true = true_of(cart(folder))
-    assert estimate.success and not estimate.misfit
+    assert estimate.converged and not estimate.misfit
     assert (np.abs(estimate.theta - true) < 5.0 * estimate.std).all()
     assert estimate.restart is None
 
@@ -84,7 +84,7 @@ def test_a_model_that_diverges_at_the_start_begins_at_the_equation_of_motion(
     true = true_of(experiment)
     wrong = true * np.array([10.0, 0.1, 10.0, 0.1])
     found = mjfim.identify(experiment, [log], start=wrong, progress=False)
-    assert found.success and not found.misfit
+    assert found.converged and not found.misfit
     assert (np.abs(found.theta - true) < 5.0 * found.std).all()
     assert found.restart is None
     assert found.inverse_dynamics is not None

@@ -69,7 +69,7 @@ def test_an_estimate_with_estimated_noise_is_that_of_searches_in_turn(
     """There are as much squares as degrees of freedom."""
     experiment = task.system.experiment.replace(fit={"segments": "whole"})
     found = mjfim.identify(experiment, task.recordings, threads=1)
-    assert found.success
+    assert found.converged
     assert abs(found.chi2 / found.dof - 1.0) < 1e-3
     theta, _, sigma = in_turn(problem, found.theta)
     assert (np.abs(found.theta - theta) < 1e-2 * sigma).all()

@@ -23,7 +23,7 @@ def test_a_held_parameter_keeps_its_guess_and_the_others_are_fitted(tmp_path: Pa
     logs = logs_of(stated(()), 0)
     found = mjfim.identify(stated(("c",)), logs, threads=1)
     free = mjfim.identify(stated(()), logs, threads=1)
-    assert found.success
+    assert found.converged
     assert found.held == ("c",)
     j = found.parameters.index("c")
     assert found.theta[j] == 1.0

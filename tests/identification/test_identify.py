@@ -78,7 +78,7 @@ def test_noise_free_data_give_the_true_parameters(
 ) -> None:
     estimate = identify_system(task.system, [noiseless(task, recording)], method=method)
     np.testing.assert_allclose(estimate.theta, task.parameters.true, rtol=1e-7)
-    assert estimate.success
+    assert estimate.converged
 
 
 def test_both_methods_find_the_minimum_of_the_weighted_squares(
@@ -176,7 +176,7 @@ def test_divergence_at_the_start_is_an_error(task: DesignTask, recording: Record
 def test_newton_outside_the_bounds_is_no_success(recording: Recording) -> None:
     tight = cart_pendulum(parameters={"c": {"bounds": [1.2, 10.0], "true": 1.3}})
     estimate = identify(tight, [recording], method="newton")
-    assert not estimate.success
+    assert not estimate.converged
     assert any("outside its bounds" in sentence for sentence in estimate.warnings)
 
 
@@ -201,7 +201,7 @@ def test_an_interrupted_search_keeps_the_best_result_so_far(
             signal.raise_signal(signal.SIGINT)
 
     found = identify_system(task.system, [recording], callback=show)
-    assert found.interrupted and not found.success
+    assert found.interrupted and not found.converged
     assert found.status.startswith("interrupted")
     assert found.chi2 == pytest.approx(2.0 * min(costs), rel=1e-9)
     assert found.predictions == ()
@@ -323,7 +323,7 @@ def test_an_interruption_before_the_last_search_ends_all_searches(
             signal.raise_signal(signal.SIGINT)
 
     found = identify_system(segmented.system, [recording], callback=show)
-    assert found.interrupted and not found.success
+    assert found.interrupted and not found.converged
     assert set(seen) == {"initial states"}
     np.testing.assert_array_equal(found.theta, task.parameters.guess)
 
@@ -340,7 +340,9 @@ def test_a_robust_fit_tests_the_size_of_its_residuals(
     assert not any("stated σ is too large" in sentence for sentence in right.warnings)
     truth = noiseless(task, recording).y
     loud = replace(recording, y=truth + 3.0 * (recording.y - truth))
-    assert "times what you stated" in page_of(identify_system(robust.system, [loud])).verdict.text
+    assert (
+        "times what you stated" in page_of(identify_system(robust.system, [loud])).verdict.sentence
+    )
 
 
 @pytest.mark.slow
@@ -387,7 +389,7 @@ def test_a_parameter_that_the_logs_do_not_determine_is_named_with_the_reason() -
     for words in (f"{low:.3g} to {high:.3g} N m", "at the guess", "at the estimate", "; it is"):
         assert words in sentence
     assert sentence not in estimate.details
-    assert "rub (not determined)" in page_of(estimate).verdict.text
+    assert "rub (not determined)" in estimate.verdict.sentence
 
 
 @pytest.mark.slow
@@ -434,6 +436,4 @@ def test_an_entry_of_a_vector_is_known_compared_with_the_whole_vector(tmp_path: 
     assert estimate.sizes[0] >= 0.4
     assert not estimate.sloppy
     assert not any("by these logs" in text or "known to" in text for text in estimate.warnings)
-    assert re.search(
-        r"every parameter is known to ± [\d.]+ % or better", page_of(estimate).verdict.text
-    )
+    assert re.search(r"every parameter is known to ± [\d.]+ % or better", estimate.verdict.sentence)

@@ -13,7 +13,6 @@ from mjfim.experiment.system import System
 from mjfim.output.page import Table
 from mjfim.output.pages import page_of
 from mjfim.output.plots.estimate import deciding_seconds
-from mjfim.output.words import complete_labels
 from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import InformationInTime
 from tests.identification.test_inverse_dynamics import cart, cart_log
@@ -125,7 +124,7 @@ def test_residuals_that_are_larger_than_noise_are_marked(
     """A block with 30 % of the information draws by 0.55 σ, from which 1.64 σ is marked."""
     recording = replace(estimate.recordings[0], t=2.0 * estimate.recordings[0].t)
     shown = replace(estimate, in_time=made(pull), recordings=(recording,))
-    (panel,) = deciding_seconds(shown, complete_labels(shown)).panels
+    (panel,) = deciding_seconds(shown, shown.labels).panels
     assert {mark.symbol for mark in panel.marks} == symbols
     assert [mark.x.tolist() for mark in panel.marks] == [[2.5]] * len(symbols)
 
@@ -141,14 +140,14 @@ def test_the_title_leaves_out_what_a_prior_tells(estimate: Estimate) -> None:
         scatter=1.0,
     )
     shown = replace(estimate, in_time=found)
-    picture = deciding_seconds(shown, complete_labels(shown))
+    picture = deciding_seconds(shown, shown.labels)
     assert "comes from 1 s (l) of 2 s" in picture.title
     assert picture.panels[0].beside[1] == ("priors", "muted", ["90 %", "0 %"])
 
 
 def test_picture_table_and_json_have_the_same_numbers(estimate: Estimate, tmp_path: Path) -> None:
     found = in_time(estimate)
-    picture = deciding_seconds(estimate, complete_labels(estimate))
+    picture = deciding_seconds(estimate, estimate.labels)
     (panel,) = picture.panels
     assert panel.cells is not None and panel.cells.edges is not None
     total = panel.cells.values @ np.diff(panel.cells.edges)

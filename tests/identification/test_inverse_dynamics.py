@@ -83,7 +83,7 @@ def test_cart_pendulum_is_found_from_starts_wrong_by_ten(tmp_path: Path) -> None
     signs = np.random.default_rng(5).choice([-1.0, 1.0], (3, len(true)))
     for start in (true, *(true * 10.0**signs)):
         fit = inverse_dynamics(experiment, [log], start=start)
-        assert fit.success
+        assert fit.converged
         assert errors(fit, true).max() < 5e-3
     assert fit.degrees_of_freedom == fit.equations
     assert [each.name for each in fit.equations] == ["slide", "hinge"]
@@ -209,7 +209,7 @@ def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_p
         elif coordinates == "barycentric":
             start[j] *= 4.0
     fit = inverse_dynamics(experiment, [log], start=start)
-    assert fit.success
+    assert fit.converged
     assert fit.iterations == 1
     assert fit.determined < len(true) - 10
 
@@ -406,4 +406,4 @@ def test_a_term_without_unknown_speeds_leaves_the_speeds_of_others_to_be_tried(
         terms={"a": friction | {"joint": "slide"}, "b": friction | {"joint": "hinge"}},
     )
     fit = inverse_dynamics(experiment, [cart_log(experiment, 1e-6)])
-    assert fit.success
+    assert fit.converged

@@ -18,9 +18,9 @@ from mjfim.identification.assessment.residual_tests import (
     misfit_reasons,
     worst_residual,
 )
-from mjfim.output.page import Level
 from mjfim.output.pages.estimate import estimate_page
 from mjfim.records.estimate import Whiteness, WorstResidual
+from mjfim.records.verdict import Level
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
 
@@ -221,10 +221,10 @@ def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, 
     assert found.misfit == filtered
     page = estimate_page(found)
     verdict = page.verdict
-    assert said in verdict.text or any(said in warning for warning in found.warnings)
+    assert said in verdict.sentence or any(said in warning for warning in found.warnings)
     # It is said once.
-    assert sum(each.count("noise is") for each in (verdict.text, *page.warnings)) <= 1
+    assert sum(each.count("noise is") for each in (verdict.sentence, *page.warnings)) <= 1
     assert (verdict.level is Level.GOOD) != filtered
-    assert (f"the noise is {np.sqrt(found.chi2 / found.dof):.2f} times" in verdict.text) == (
+    assert (f"the noise is {np.sqrt(found.chi2 / found.dof):.2f} times" in verdict.sentence) == (
         said.startswith("the noise")
     )

@@ -14,7 +14,7 @@ from scipy.stats import chi2, kstest, truncnorm
 import mjfim
 from mjfim.arrays import scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError
-from mjfim.experiment.system import System
+from mjfim.experiment.system import System, labels_of_system
 from mjfim.identification import complete_theta
 from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.assessment.parameter_draws import (
@@ -44,6 +44,7 @@ def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimat
     guess = system.parameters.guess
     values = {
         "parameters": system.parameters.names,
+        "labels": labels_of_system(system),
         "theta": guess,
         "std": np.sqrt(np.diag(covariance)),
         "covariance": covariance,
@@ -51,7 +52,7 @@ def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimat
         "chi2": 1.0,
         "dof": 1,
         "status": "",
-        "success": True,
+        "converged": True,
         "misfit": False,
         "iterations": 1,
         "residual_rms": {},

@@ -259,7 +259,7 @@ def test_an_initial_position_that_no_output_shows_does_not_disturb_the_fit(
     found = identify_system(
         unseen.system, [Recording(t=t, ctrl=unseen.control, y=y, outputs=names)]
     )
-    assert found.success, found.status
+    assert found.converged, found.status
     assert not found.misfit, found.reasons
     assert (np.abs(found.theta - theta) < 4.0 * found.std).all()
 

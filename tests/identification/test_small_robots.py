@@ -74,7 +74,7 @@ def complete_fits(experiment: Experiment, count: int = 1) -> list[Estimate]:
     found = [mjfim.identify(experiment, [log]) for log in logs_of(experiment, *range(count))]
     for each in found:
         assert (each.misfit, each.missing_terms, each.reasons) == (False, (), ())
-        assert each.success
+        assert each.converged
     return found
 
 

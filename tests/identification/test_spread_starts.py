@@ -51,7 +51,7 @@ def test_a_start_that_diverges_is_left(experiment: Experiment, log: Recording) -
     true = true_of(experiment)
     wrong = true * np.array([10.0, 0.1, 10.0, 0.1])
     found = mjfim.identify(experiment, [log], start=wrong, progress=False)
-    assert found.success and not found.misfit
+    assert found.converged and not found.misfit
     assert (np.abs(found.theta - true) < 5.0 * found.std).all()
     assert found.inverse_dynamics is None
     assert found.warnings[0].startswith("the model diverges at the start (m = 15, l = 0.08, ")
@@ -75,7 +75,7 @@ def test_starts_are_spread_where_the_restart_explains_no_motion(
     rng = np.random.default_rng([7, 2])
     factors = np.exp(rng.uniform(np.log(10.0), np.log(30.0), 4)) ** rng.choice([-1.0, 1.0], 4)
     found = mjfim.identify(experiment, [log], start=true * factors, progress=False)
-    assert found.success and not found.misfit
+    assert found.converged and not found.misfit
     assert (np.abs(found.theta - true) < 5.0 * found.std).all()
     assert found.restart is not None
     assert found.restart.starts == SPREAD_STARTS

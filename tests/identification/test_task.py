@@ -59,7 +59,7 @@ def test_a_minimal_experiment_identifies_its_parameters(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:
     estimate = mjfim.identify(experiment, [recording], threads=1)
-    assert estimate.success and not estimate.misfit
+    assert estimate.converged and not estimate.misfit
     assert (np.abs(estimate.theta - [2.0, 1.0]) < 4.0 * estimate.std).all()
 
     (errors,) = mjfim.predict(experiment, estimate.theta, [recording], threads=1)

@@ -250,7 +250,7 @@ def test_a_fit_with_the_lines_of_a_cure_explains_the_log(tmp_path: Path) -> None
     lines = before.causes[0].partition(":\n")[2]
     file.write_text(file.read_text(encoding="utf-8") + lines, encoding="utf-8")
     after = mjfim.identify(mjfim.Experiment.from_file(file), [log], progress=False)
-    assert after.success and not after.misfit
+    assert after.converged and not after.misfit
     low, high = after.interval[after.parameters.index("slide_frictionloss")]
     assert low < 0.5 < high
 

@@ -73,7 +73,7 @@ def test_a_fit_is_not_trapped_where_a_touch_comes_or_goes(
     control = np.array([1.28530862, 0.6053238]) * np.sin(2.0 * np.pi * frequencies * t)
     log = mjfim.simulate(experiment, control, 1)
     found = mjfim.identify(experiment, [log], start=start, progress=False)
-    assert found.success and not found.misfit
+    assert found.converged and not found.misfit
     assert ((found.interval[:, 0] < TRUE) & (found.interval[:, 1] > TRUE)).all()
     assert any("stops or contacts act: limit of j2" in each for each in found.warnings)
 
@@ -129,7 +129,7 @@ def test_a_contact_without_any_stop_is_found_and_named(tmp_path: Path) -> None:
     assert 0 < touched < 300
 
     found = mjfim.identify(experiment, [log], progress=False)
-    assert found.success and not found.misfit
+    assert found.converged and not found.misfit
     true = np.array([1.5, 0.3])
     assert ((found.interval[:, 0] < true) & (found.interval[:, 1] > true)).all()
     (said,) = [each for each in found.warnings if "stops or contacts act" in each]

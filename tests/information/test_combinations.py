@@ -104,7 +104,7 @@ def test_an_estimate_keeps_what_no_recording_shows_and_determines_the_rest(tmp_p
     recording = simulate_system(task.system, task.initial, seed=3)
     estimate = identify_system(task.system, [recording])
     assert lost(estimate.parameters, estimate.std) == {"m1r1", "I1", "m2"}
-    assert not estimate.success  # declared one by one, not all of them can be told
+    assert not estimate.converged  # declared one by one, not all of them can be told
     assert "m1r1" in estimate.combinations[0]
     assert not estimate.misfit
     assert abs(estimate.theta[4] - 0.1) < 4.0 * estimate.std[4]
@@ -144,8 +144,8 @@ def test_parameters_that_are_all_invisible_are_reported(tmp_path) -> None:
     found = check_task(
         pendulum(tmp_path, parameters={"wind": {"target": "option:wind[0]", "guess": 1.0}})
     )
-    assert not found.ok
-    assert any("no parameter can be identified" in sentence for sentence in found.verdict)
+    assert not found.verdict.ok
+    assert any("no parameter can be identified" in sentence for sentence in found.findings)
 
 
 def test_a_prior_on_one_member_makes_the_others_identifiable(tmp_path) -> None:
@@ -153,8 +153,8 @@ def test_a_prior_on_one_member_makes_the_others_identifiable(tmp_path) -> None:
     found = check_task(pendulum(tmp_path, parameters=parameters))
     assert all(np.isfinite(row.std) for row in found.rows)
     assert found.rows[2].std == pytest.approx(0.01, rel=1e-3)
-    assert found.ok
-    assert any("by priors only" in sentence for sentence in found.verdict)
+    assert found.verdict.ok
+    assert any("by priors only" in sentence for sentence in found.findings)
 
 
 @pytest.mark.slow

@@ -196,7 +196,7 @@ def check(size: Size) -> Check:
         eigenvalues=np.ones(count),
         correlation=correlation,
         confounded=(),
-        verdict=(
+        findings=(
             f"{count} parameters miss their wanted sigma; the worst is {rows[-1].name}. Stop",
         ),
         combined=(

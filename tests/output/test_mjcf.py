@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mjfim
-from mjfim.errors import MjfimError
+from mjfim.errors import MjfimError, OutputError
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.packing import with_model
 from mjfim.experiment.system import System
+from mjfim.files import write_json
 from mjfim.model.paths import KINDS, fields_of
+from mjfim.output.archive import summary_with_origin
 from mjfim.output.export.mjcf import same_dynamics, write_identified
+from mjfim.records.estimate import Estimate
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.examples import design_file
+from tests.support.made_records import bare_estimate
 from tests.support.numerics import shared_model
 from tests.support.paths import MODELS, SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
@@ -618,3 +625,114 @@ def test_what_counts_as_rounding_does_not_depend_on_units(
     first.dof_invweight0[:] = second.dof_invweight0
     first.dof_M0[:] = second.dof_M0
     assert same_dynamics(first, second) == same
+
+
+# ---- models of an estimate
+
+TETRAHEDRON = """
+v 0 0 0
+v .1 0 0
+v 0 .1 0
+v 0 0 .1
+f 1 3 2
+f 1 2 4
+f 1 4 3
+f 2 3 4
+"""
+MESH_ARM = """<mujoco>
+  <asset><mesh name="t" file="tetra.obj"/></asset>
+  <worldbody>
+    <body><joint name="j" damping="0.1"/><geom type="mesh" mesh="t" mass="1"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory: pytest.TempPathFactory) -> Estimate:
+    """An estimate whose model file exists in the memory only."""
+    folder = tmp_path_factory.mktemp("user")
+    for file in MODELS.glob("cart_pendulum*"):
+        (folder / file.name).write_bytes(file.read_bytes())
+    stated = mjfim.Experiment.from_file(folder / "cart_pendulum_guess.toml").replace(horizon=1.0)
+    experiment = with_model(stated)
+    (folder / experiment.model).unlink()
+    recording = mjfim.simulate(experiment, DesignTask.resolve(experiment).initial, seed=0)
+    named = replace(recording, name="log --\x07.csv")
+    return replace(mjfim.identify(experiment, [named], threads=1), causes=())
+
+
+def test_an_estimate_gives_its_model(identified: Estimate, tmp_path: Path) -> None:
+    mass = float(identified["body/bob:mass"])
+    spec = identified.spec
+    assert spec.body("bob").mass == pytest.approx(mass, rel=PRECISE)
+    spec.body("bob").mass = 7.0  # each call makes a new one
+    assert identified.model.body("bob").mass == pytest.approx(mass, rel=PRECISE)
+
+    file = tmp_path / "arm.xml"
+    assert identified.save_model(file) == []
+    written = mujoco.MjModel.from_xml_path(str(file))
+    assert same_dynamics(written, identified.model)
+    head = file.read_text(encoding="utf-8").partition("-->")[0]
+    assert f"mjfim {mjfim.__version__} and MuJoCo {mujoco.__version__}" in head
+    assert "Data: log - - .csv (101 rows)" in head
+    for each in identified.each():
+        assert f"{each.name} {' '.join(each.targets)} = {each}, σ {each.std:.3g}" in head
+    assert f"Verdict: {identified.verdict.level}." in head
+
+
+def test_meshes_of_the_memory_are_written_beside_the_model(tmp_path: Path) -> None:
+    (tmp_path / "tetra.obj").write_text(TETRAHEDRON)
+    (tmp_path / "arm.xml").write_text(MESH_ARM)
+    experiment = with_model(
+        mjfim.Experiment(
+            model="arm.xml",
+            directory=tmp_path,
+            rate=100.0,
+            horizon=1.0,
+            parameters={"d": {"target": "joint/j:damping"}},
+            noise={"qpos:j": 1e-3},
+        )
+    )
+    for file in tmp_path.iterdir():
+        file.unlink()
+    estimate = bare_estimate(("d",), np.array([0.3]), np.array([0.1]), experiment=experiment)
+    spec = estimate.spec
+    assert [*spec.assets] == ["tetra.obj"]
+    assert spec.compile().dof_damping[0] == 0.3
+
+    new = tmp_path / "new"
+    assert estimate.save_model(new / "first.xml") == estimate.save_model(new / "second.xml") == []
+    names = {file.name for file in new.glob("[!.]*")}
+    assert names == {"first.xml", "first_tetra.obj", "second.xml", "second_tetra.obj"}
+    assert mujoco.MjModel.from_xml_path(str(new / "second.xml")).dof_damping[0] == 0.3
+    (new / "third_tetra.obj").write_text("mine")
+    with pytest.raises(OutputError, match="third_tetra"):
+        estimate.save_model(new / "third.xml")
+
+
+def test_files_of_a_user_are_not_replaced(identified: Estimate, tmp_path: Path) -> None:
+    file = tmp_path / "arm.xml"
+    file.write_text("mine")
+    with pytest.raises(OutputError, match="not listed in"):
+        identified.save_model(file)
+    identified.save_model(file, force=True)
+    assert file.read_text(encoding="utf-8").startswith("<mujoco")
+    identified.save_model(file)  # what mjfim wrote is replaced
+    for wrong in (tmp_path / "arm.urdf", tmp_path, 3, None):
+        with pytest.raises(OutputError, match="save_model writes an MJCF"):
+            identified.save_model(wrong)  # type: ignore[arg-type]
+
+
+def test_an_estimate_of_a_folder_finds_its_experiment(identified: Estimate, tmp_path: Path) -> None:
+    identified.save(tmp_path)
+    with pytest.raises(MjfimError, match="does not know its experiment"):
+        mjfim.Estimate.load(tmp_path).spec  # noqa: B018 - a property
+
+    stated = cart_pendulum()
+    system = System.resolve(stated)
+    write_json(tmp_path / "estimate.json", summary_with_origin(identified, system, tmp_path))
+    found = mjfim.Estimate.load(tmp_path / "estimate.npz")
+    assert same_dynamics(found.model, identified.model)
+    other = replace(found, parameters=("a", "b", "c"))
+    with pytest.raises(MjfimError, match="has the parameters"):
+        other.spec  # noqa: B018 - a property

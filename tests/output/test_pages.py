@@ -14,7 +14,7 @@ from rich.console import Console
 import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
-from mjfim.output.page import Emphasis, Level, Listing, Row, Table, Verdict, named, number
+from mjfim.output.page import Emphasis, Listing, Row, Table, named, number
 from mjfim.output.pages import page_of
 from mjfim.output.pages.estimate import selection_parts
 from mjfim.output.rerun.documents import as_markdown
@@ -22,7 +22,7 @@ from mjfim.output.terminal import TerminalPage
 from mjfim.output.words import improvement, relative
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import CampaignStatus
-from mjfim.records.check import verdict_of_check
+from mjfim.records.check import findings_of_check
 from mjfim.records.design import CombinationAccuracy, LimitViolation, ScaledStart, Status
 from mjfim.records.terms import (
     AlternativeTerm,
@@ -33,6 +33,7 @@ from mjfim.records.terms import (
     TermNumber,
     TermTestData,
 )
+from mjfim.records.verdict import Level, Verdict
 from mjfim.studies.selected_models import possible_pools, selected_experiment
 from tests.support import results
 from tests.support.pages import page_with, printed, sentences
@@ -45,7 +46,7 @@ BEGUN = SelectionStep(decision=Decision.BEGUN, error=2.0)
 @pytest.mark.parametrize("verb", results.MAKERS)
 def test_every_page_has_tables_with_a_cell_for_every_column(verb: str) -> None:
     page = page_of(results.MAKERS[verb]())
-    assert page.tables and page.verdict.text and page.facts
+    assert page.tables and page.verdict.sentence and page.facts
     for table in page.tables:
         assert all(len(row.cells) == len(table.columns) for row in table.rows), table.title
         assert set(table.spare) - {"at bound"} <= set(table.columns), table.title
@@ -93,11 +94,11 @@ LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
         ("design", LENGTH_UNKNOWN, Level.DOUBTFUL, "length, damping: σ is 1000 % of its size for"),
         ("identify", {}, Level.GOOD, "explains the recordings"),
         ("identify", {"misfit": True, "chi2": 800.0}, Level.DOUBTFUL, "2.01 times the noise"),
-        ("identify", {"success": False, "status": "stopped early"}, Level.BAD, "stopped early."),
-        ("identify", {"success": False, "combinations": ("a b",)}, Level.BAD, "combination only"),
+        ("identify", {"converged": False, "status": "stopped early"}, Level.BAD, "stopped early."),
+        ("identify", {"converged": False, "combinations": ("a b",)}, Level.BAD, "combination only"),
         ("check", {}, Level.GOOD, "σ of 2 %"),
         ("check", {"rehearsal": results.rehearsal(**UNSTABLE)}, Level.DOUBTFUL, "σ of 2 %"),
-        ("check", {"refused": ("too long",), "verdict": ("a b",)}, Level.DOUBTFUL, "A b."),
+        ("check", {"refused": ("too long",), "findings": ("a b",)}, Level.DOUBTFUL, "A b."),
         ("compare", {}, Level.GOOD, "The design is the best"),
         ("montecarlo", {}, Level.GOOD, "scatter as predicted"),
         ("rehearse", {}, Level.GOOD, "20 of 20 robots whose parameters are up to 20 % off keep"),
@@ -123,7 +124,7 @@ LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
 def test_the_verdict(verb: str, changes: dict[str, Any], level: Level, words: str) -> None:
     verdict = page_of(results.MAKERS[verb](**changes)).verdict
     assert verdict.level is level
-    assert words in verdict.text
+    assert words in verdict.sentence
 
 
 @pytest.mark.parametrize(
@@ -147,15 +148,15 @@ def test_fits_that_failed_or_scatter_too_much_put_a_study_in_doubt() -> None:
     def verdict(**changed: Any) -> Any:
         return page_of(results.study(sets={**sets, **changed})).verdict
 
-    assert "3 of 200 (designed)" in verdict(final=replace(sets["final"], failed=3)).text
+    assert "3 of 200 (designed)" in verdict(final=replace(sets["final"], failed=3)).sentence
     # One interval of six may miss 1 by chance, and the verdict says so.
     intervals = np.array([[1.01, 1.2], [0.9, 1.1], [0.9, 1.1]])
     by_chance = replace(sets["final"], efficiency_interval=intervals)
     inside = replace(sets["initial"], efficiency_interval=np.tile([0.9, 1.1], (3, 1)))
     lucky = verdict(initial=inside, final=by_chance)
-    assert lucky.level is Level.GOOD and "1 of 6 intervals of 95 % misses it" in lucky.text
+    assert lucky.level is Level.GOOD and "1 of 6 intervals of 95 % misses it" in lucky.sentence
     wide = verdict(final=replace(sets["final"], efficiency_interval=np.tile([0.1, 0.2], (3, 1))))
-    assert wide.level is Level.DOUBTFUL and "the designed trajectory" in wide.text
+    assert wide.level is Level.DOUBTFUL and "the designed trajectory" in wide.sentence
 
 
 def test_missing_terms_say_on_how_much_of_the_data_they_were_tested() -> None:
@@ -263,7 +264,7 @@ def test_alternatives_of_a_removed_term_are_not_named() -> None:
 
 def test_the_verdict_names_the_added_terms() -> None:
     verdict = page_of(results.estimate(selection=selection())).verdict
-    assert verdict.text.startswith("With dry friction of slide added, the model explains")
+    assert verdict.sentence.startswith("With dry friction of slide added, the model explains")
 
 
 def test_rows_that_changed_the_model_stand_out_and_useless_ones_have_no_numbers() -> None:
@@ -343,7 +344,7 @@ def test_a_start_outside_its_limits_is_equal_to_its_scaled_control() -> None:
     outside = {"initial_violations": (violation,), **STOPPED}
     for start, is_equal in ((scaled, True), (replace(scaled, min_eigenvalue=0.9), False)):
         design = results.design(scaled_start=start, **outside)
-        assert (design.is_start, design.sound) == (is_equal, not is_equal)
+        assert (design.is_start, design.verdict.ok) == (is_equal, not is_equal)
     assert not results.design(**outside).is_start
 
 
@@ -370,13 +371,13 @@ def test_what_nothing_limits_and_every_end_in_motion_is_said() -> None:
         unlimited=("hinge",),
         unplaced=joints,
     )
-    text = page_of(rehearsal).verdict.text
+    text = page_of(rehearsal).verdict.sentence
     places = "up to 2.1 rad (hinge) and 0.8 m (cart) from the start."
     assert f"3 positions have no limit, {places}" in text
     assert "1 speed has no limit, up to 3 rad/s (hinge)." in text
     assert "It ends in motion: hinge at 0.85 rad/s, cart at 0.56 m/s." in text
     resting = replace(rehearsal, end_speed=0.01 * rehearsal.speed, unlimited=(), unplaced=())
-    text = page_of(resting).verdict.text
+    text = page_of(resting).verdict.sentence
     assert text.endswith("It ends at rest.") and "no limit" not in text
 
 
@@ -434,8 +435,8 @@ def test_the_step_after_a_check_agrees_with_its_findings(
     check = results.check()
     rows = [replace(row, repetitions=changes.get("repetitions", 1)) for row in check.rows]
     changes.pop("repetitions", None)
-    check = replace(check, rows=tuple(rows), verdict=(), **changes)
-    check = replace(check, verdict=tuple(verdict_of_check(check)))
+    check = replace(check, rows=tuple(rows), findings=(), **changes)
+    check = replace(check, findings=tuple(findings_of_check(check)))
     page = page_of(check, experiment="my.toml", design=Path("made"))
     assert words in page.next_steps[0]
     text = printed(page, verbose=True)

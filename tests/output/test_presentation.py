@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -80,13 +79,6 @@ def test_a_campaign_before_its_first_round_is_shown_in_words() -> None:
     assert begun.pictures == ()
     with pytest.raises(MjfimError, match="no results yet"):
         begun.plot()
-
-
-@pytest.mark.parametrize("verb", ["design", "identify", "montecarlo"])
-def test_records_of_earlier_versions_are_drawn_without_names(verb: str) -> None:
-    earlier: Any = results.MAKERS[verb](labels=None)
-    assert isinstance(earlier.plot(), Figure)
-    assert texts(earlier._repr_html_())
 
 
 def test_every_part_of_a_page_is_escaped() -> None:

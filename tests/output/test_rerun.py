@@ -28,7 +28,6 @@ from mjfim.output.rerun.camera import (
 )
 from mjfim.output.rerun.plots import round_numbers
 from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses, entity_path
-from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
 from mjfim.records.estimate_parts import InformationInTime, ResidualForce
@@ -153,7 +152,7 @@ def test_a_design_opens_on_limits_information_and_the_motion_nearest_to_its_limi
 
 
 def test_accuracy_over_time_is_that_of_the_picture(file: Path, design: Design) -> None:
-    panel = accuracy_over_time(design, complete_labels(design)).panels[0]
+    panel = accuracy_over_time(design, design.labels).panels[0]
     curves = [(k, mark) for k, mark in enumerate(panel.marks) if mark.kind == "line" and mark.label]
     assert len(curves) == 2
     for j, (k, mark) in enumerate(curves):

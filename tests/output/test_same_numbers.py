@@ -55,7 +55,7 @@ def estimate(task: DesignTask, design: Design) -> Estimate:
     """An estimate from one recording of this design."""
     recording = mjfim.simulate(task.experiment, design.trajectory, seed=0)
     found = mjfim.identify(task.experiment, [recording])
-    return replace(found, success=True, misfit=False)
+    return replace(found, converged=True, misfit=False)
 
 
 def in_terminal(record: ShownRecord) -> str:
@@ -121,7 +121,7 @@ def test_the_accuracy_of_an_entry_of_a_vector_is_a_share_of_the_whole(estimate: 
     of_vectors = replace(estimate, sizes=sizes)
     half = 0.5 * np.diff(estimate.interval, axis=1)[:, 0]
 
-    (share,) = re.findall(r"± (\S+ %)", page_of(of_vectors).verdict.text)
+    (share,) = re.findall(r"± (\S+ %)", page_of(of_vectors).verdict.sentence)
     assert share == relative(float((half / sizes).max()), 1.0)
 
     # The difference from the guess is a share of the same size.
@@ -143,7 +143,7 @@ def test_an_estimate_states_the_same_accuracy_everywhere(
         assert missing(sigmas, text) == []
 
     # The verdict is one sentence with one percentage.
-    verdict = page_of(estimate).verdict.text
+    verdict = estimate.verdict.sentence
     (share,) = re.findall(r"± (\S+ %)", verdict)
     half = 2.0 * np.array(honest) / np.abs(stored["theta"])
     assert share == relative(float(half.max()), 1.0)

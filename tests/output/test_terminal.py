@@ -34,7 +34,7 @@ def test_nothing_is_cut(verb: str, width: int, verbose: bool) -> None:
     page = page_of(results.MAKERS[verb](parameters=LONG, **names))
     text = printed(page, width, verbose=verbose)
     assert max(map(cell_len, text.splitlines())) <= width
-    assert letters(text).startswith(letters(page.verdict.text)[1:], 1)
+    assert letters(text).startswith(letters(page.verdict.sentence)[1:], 1)
     assert not page.next_steps or letters(f"Next: {page.next_steps[0]}") in letters(text)
     assert "…" not in text
     if verbose:

@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.output.page import Level, Page, as_sentence
+from mjfim.output.page import Page, as_sentence
 from mjfim.output.pages import page_of
 from mjfim.output.plots.pictures import pictures_of
 from mjfim.output.report import as_html
 from mjfim.output.words import relative
 from mjfim.records.campaign import CampaignStatus
-from mjfim.records.check import verdict_of_check
+from mjfim.records.check import findings_of_check
 from mjfim.records.design import Status
 from mjfim.records.studies import DESIGN
+from mjfim.records.verdict import Level
 from tests.support import results
 from tests.support.pages import printed
 from tests.support.results import THETA
@@ -78,10 +79,10 @@ def test_robots_are_equal_only_where_the_numbers_are(
         joint_p=max(p, 0.1) if p > 0.05 else p,
     )
     verdict = page_of(found).verdict
-    assert (verdict.level, words in verdict.text) == (level, True), verdict.text
+    assert (verdict.level, words in verdict.sentence) == (level, True), verdict.sentence
     low, high = found.interval[0]
     excludes_zero = low > 0.0 or high < 0.0
-    assert not (excludes_zero and "no difference" in verdict.text)
+    assert not (excludes_zero and "no difference" in verdict.sentence)
 
 
 @pytest.mark.parametrize("held_out", [True, False])
@@ -103,7 +104,7 @@ def test_a_share_of_a_whole_vector_names_the_size() -> None:
 def test_the_accuracy_in_the_verdict_is_of_a_parameter_that_was_asked_for() -> None:
     std = np.array([0.01, 0.2, 0.01]) * THETA
     asked, all_of_them = (
-        page_of(results.estimate(std=std, nuisance=nuisance)).verdict.text
+        page_of(results.estimate(std=std, nuisance=nuisance)).verdict.sentence
         for nuisance in (("length",), ())
     )
     assert "widest for length" in all_of_them
@@ -122,9 +123,9 @@ def test_a_misfit_says_only_what_is_wrong(
 ) -> None:
     estimate = results.estimate(misfit=True, chi2=chi2, reasons=reasons)
     verdict = page_of(estimate).verdict
-    assert verdict.level is Level.DOUBTFUL and words in verdict.text
-    assert " or are no " not in verdict.text
-    assert ("times the" in verdict.text) == (chi2 > estimate.dof)
+    assert verdict.level is Level.DOUBTFUL and words in verdict.sentence
+    assert " or are no " not in verdict.sentence
+    assert ("times the" in verdict.sentence) == (chi2 > estimate.dof)
 
 
 @pytest.mark.parametrize(
@@ -140,9 +141,9 @@ def test_an_accuracy_is_missed_only_where_one_was_wanted(
         for row in check.rows
     )
     found = replace(check, rows=rows)
-    text = "; ".join(verdict_of_check(found))
+    text = "; ".join(findings_of_check(found))
     assert words in text and others not in text
-    page = page_of(replace(found, verdict=tuple(verdict_of_check(found))))
+    page = page_of(replace(found, findings=tuple(findings_of_check(found))))
     assert (page.verdict.level is Level.GOOD) is not stated
 
 
@@ -165,10 +166,10 @@ def test_a_design_and_a_fit_agree_on_what_is_determined(share: float) -> None:
     verdict = page_of(replace(design, final=replace(design.final, std=std))).verdict
     words = DETERMINED[share]
     assert verdict.level is (Level.GOOD if words is None else Level.DOUBTFUL)
-    assert (words or "determines every parameter") in verdict.text
+    assert (words or "determines every parameter") in verdict.sentence
 
-    fit = page_of(results.estimate(std=std)).verdict.text
-    is_undetermined = "does not determine" in verdict.text
+    fit = page_of(results.estimate(std=std)).verdict.sentence
+    is_undetermined = "does not determine" in verdict.sentence
     assert ("except length (not determined)" in fit) == is_undetermined
 
 
@@ -176,7 +177,7 @@ def test_what_is_not_determined_has_no_green_box() -> None:
     check = results.check()
     rows = (replace(check.rows[0], relative=4.0, std=4.0 * check.rows[0].size), *check.rows[1:])
     verdict = page_of(replace(check, rows=rows)).verdict
-    assert verdict.level is Level.DOUBTFUL and "does not determine mass" in verdict.text
+    assert verdict.level is Level.DOUBTFUL and "does not determine mass" in verdict.sentence
 
 
 @pytest.mark.parametrize(
@@ -188,7 +189,7 @@ def test_equal_methods_are_called_equal(cost: float, words: str) -> None:
         row if row.method == DESIGN else replace(row, cost=cost) for row in comparison.rows
     )
     found = replace(comparison, rows=rows)
-    assert words in page_of(found).verdict.text
+    assert words in page_of(found).verdict.sentence
     assert not found.beating
 
 
@@ -197,7 +198,7 @@ def test_a_campaign_that_waits_with_a_missed_target_has_no_green_box() -> None:
     for wanted, level in ((0.005, Level.DOUBTFUL), (0.015, Level.GOOD)):
         page = page_of(results.campaign(wanted=wanted * THETA, **waiting))
         assert page.verdict.level is level
-        assert ("wanted" in page.verdict.text) == (level is Level.DOUBTFUL)
+        assert ("wanted" in page.verdict.sentence) == (level is Level.DOUBTFUL)
 
 
 # ---- what stands together
@@ -397,3 +398,38 @@ def test_a_live_meter_says_what_is_missing(std: list[float], said: str) -> None:
     )
     text = " ".join(printed(page_of(result), 100).split())
     assert said.replace("c needs", f"{results.PARAMETERS[2]} needs") in text
+
+
+# ---- in Python
+
+
+@pytest.mark.parametrize("verb", results.MAKERS)
+def test_a_printed_result_is_its_page_on_a_small_terminal(verb: str) -> None:
+    record = results.MAKERS[verb]()
+    verdict, lines = record.verdict, str(record).splitlines()
+    assert verdict.sentence.startswith(lines[0].rstrip())
+    assert max(map(len, lines)) <= 80 and len(lines) > 4
+    shown = [line for line in lines if line in printed(page_of(record), 80)]
+    assert len(shown) >= len(lines) - 1
+    assert str(verdict).startswith(f"{verdict.level.upper()}: {verdict.sentence}")
+    page = page_of(record)
+    assert (verdict.reasons, verdict.next) == ((*page.causes, *page.warnings), page.next_steps)
+
+
+@pytest.mark.parametrize(
+    ("record", "level", "ok"),
+    [
+        (results.design(), Level.GOOD, True),
+        (results.design(status=Status.INTERRUPTED), Level.DOUBTFUL, False),
+        (results.design(rehearsal=None), Level.DOUBTFUL, True),
+        (results.design(limits={"position": -0.1}), Level.BAD, False),
+        (results.estimate(misfit=True), Level.DOUBTFUL, False),
+        (results.estimate(converged=False), Level.BAD, False),
+        (results.campaign(status=CampaignStatus.WAITING), Level.GOOD, False),
+        (results.robots(), Level.DOUBTFUL, False),
+    ],
+)
+def test_what_was_asked_for_is_reached_only_where_a_person_would_say_so(
+    record: Any, level: Level, ok: bool
+) -> None:
+    assert (record.verdict.level, record.verdict.ok) == (level, ok)

@@ -114,7 +114,7 @@ def _check(experiment: Any, study: Study, setting: Setting) -> Verdict:
     tested = checked.self_test
     said = ""
     if not tested.passed:
-        said = next(s for s in checked.verdict if "not smooth" in s or "derivatives" in s)
+        said = next(s for s in checked.findings if "not smooth" in s or "derivatives" in s)
     ctrl = DesignTask.of(system).initial.ctrl
     return _claim("check", checked.information, said, study, ctrl, setting)
 
@@ -148,8 +148,8 @@ def _identify(experiment: Any, study: Study, setting: Setting) -> Verdict:
         f"{worst:.1f} sigma from the truth, chi2/dof {estimate.chi2 / estimate.dof:.3f}, "
         f"sigma {relative.min():.1e} to {relative.max():.1e} of the value, {estimate.status}"
     )
-    if estimate.misfit or not estimate.success or estimate.warnings:
-        said = "; ".join((*estimate.warnings, "" if estimate.success else estimate.status))
+    if estimate.misfit or not estimate.converged or estimate.warnings:
+        said = "; ".join((*estimate.warnings, "" if estimate.converged else estimate.status))
         return Verdict(verb="identify", word="said", detail=f"{said} [{about}]")
     good = worst < MAX_ERROR and abs(excess) < MAX_ERROR
     return Verdict(verb="identify", word="works" if good else "WRONG", detail=about)

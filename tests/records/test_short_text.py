@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from enum import Enum
+from typing import Any
 
 import numpy as np
+import pytest
 
 import mjfim
 from mjfim.arrays import Array, record
@@ -28,10 +30,10 @@ class Thing(Record):
 
 
 def test_each_field_is_one_short_line() -> None:
-    text = repr(Thing(table={"a": 1}, array=np.zeros((400, 3))))
+    text = repr(Thing(table={"a": 1}, array=np.arange(1200.0).reshape(400, 3)))
     lines = text.splitlines()
     assert lines[0] == "Thing("
-    assert "  array=<array of shape (400, 3)>" in lines
+    assert "  array=<400 × 3 numbers, 0 to 1.2e+03>" in lines
     assert "  colour=Colour.RED" in lines
     assert "  few=(1, 2)" in lines
     assert "  many=(0, 1, 2, 3, ...)" in lines
@@ -48,7 +50,21 @@ def test_saved_records_use_it() -> None:
         ctrl=np.zeros((1000, 1)),
     )
     assert len(repr(trajectory)) < 400
-    assert "<array of shape (1000, 1)>" in repr(trajectory)
+    assert "<1000 × 1 numbers, 0 to 0>" in repr(trajectory)
+
+
+@pytest.mark.parametrize(
+    ("array", "text"),
+    [
+        ([0.203, 12345.0], "[0.203, 12345]"),
+        ([[1.0, 0.5], [0.5, np.inf]], "[[1, 0.5], [0.5, inf]]"),
+        ([], "[]"),
+        (np.full(40, np.nan), "<40 numbers>"),
+        (np.linspace(1.0, 9.0, 13), "<13 numbers, 1 to 9>"),
+    ],
+)
+def test_a_small_array_shows_its_numbers(array: Any, text: str) -> None:
+    assert f"  array={text}" in repr(Thing(table={}, array=np.array(array))).splitlines()
 
 
 def test_only_public_names_are_listed() -> None:

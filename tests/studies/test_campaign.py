@@ -204,7 +204,7 @@ def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
     found = after_two(campaign, replace(whole, t=whole.t[:3], ctrl=whole.ctrl[:2], y=whole.y[:3]))
     assert found.status is CampaignStatus.EXHAUSTED and not found.reached
     assert any("round 2: no progress" in sentence for sentence in found.warnings)
-    assert "wanted 0.008" in found.short and "wanted 0.008" in str(found)
+    assert "wanted 0.008" in found.short and "wanted 0.008" in found.words
 
 
 def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:

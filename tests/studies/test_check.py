@@ -68,7 +68,7 @@ def test_sigmas_are_those_of_evaluate_also_with_priors_and_nuisance(tmp_path) ->
 def test_factors_of_a_product_are_named_with_their_combination(tmp_path) -> None:
     gear = {"gear": {**PRODUCT["gear"], "guess": 4.0}}
     found = check_task(cart_task(tmp_path, parameters=CART_PARAMETERS | PRODUCT | gear))
-    assert not found.ok
+    assert not found.verdict.ok
     [group] = found.not_separable
     assert set(group.members) == {"gear", "gain"}
     [combination] = group.combinations
@@ -81,7 +81,7 @@ def test_factors_of_a_product_are_named_with_their_combination(tmp_path) -> None
     unknown = [row.name in ("gear", "gain") for row in found.rows]
     assert np.isnan(found.correlation[unknown]).all()
     assert np.isfinite([alone["m"], alone["l"], alone["c"]]).all()
-    assert any("gear" in sentence and "gain" in sentence for sentence in found.verdict)
+    assert any("gear" in sentence and "gain" in sentence for sentence in found.findings)
 
 
 def test_parameters_that_only_this_control_does_not_excite_are_named_as_such(tmp_path) -> None:
@@ -93,8 +93,8 @@ def test_parameters_that_only_this_control_does_not_excite_are_named_as_such(tmp
     found = check_task(cart_task(tmp_path, initial=rest, parameters=CART_PARAMETERS))
     assert not found.not_separable
     assert {name for group in found.not_excited for name in group.members} == {"m", "l", "c"}
-    assert not found.ok
-    assert any("another control would show" in sentence for sentence in found.verdict)
+    assert not found.verdict.ok
+    assert any("another control would show" in sentence for sentence in found.findings)
 
 
 def test_repetitions_are_the_least_that_reach_the_wanted_sigma(tmp_path) -> None:

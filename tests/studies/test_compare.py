@@ -131,31 +131,31 @@ def test_the_verdict_names_the_methods_that_beat_the_design() -> None:
     assert [r.method for r in c.beating] == [
         "b"
     ]  # not what leaves the limits, nor what is no better
-    assert not c.ok
-    assert "beaten by b (J 50 % lower)" in c.verdict[0]
+    assert not c.verdict.ok
+    assert "beaten by b (J 50 % lower)" in c.findings[0]
     assert c.best is not None
     assert c.best.method == "b"
     won = made(row("a", 2.0), row(DESIGN, 1.0))
-    assert won.ok
-    assert "J 50 % lower than that of the best baseline, a" in won.verdict[0]
-    assert "as good as" in made(row("a", 1.0), row(DESIGN, 1.0)).verdict[0]
-    assert made(row("a", 1.0), row(DESIGN, 1.0)).ok
+    assert won.verdict.ok
+    assert "J 50 % lower than that of the best baseline, a" in won.findings[0]
+    assert "as good as" in made(row("a", 1.0), row(DESIGN, 1.0)).findings[0]
+    assert made(row("a", 1.0), row(DESIGN, 1.0)).verdict.ok
 
 
 def test_a_design_that_violates_limits_has_lost() -> None:
     c = made(row("a", 2.0), row(DESIGN, 1.0, MethodOutcome.OUTSIDE))
-    assert not c.ok
+    assert not c.verdict.ok
     assert [r.method for r in c.beating] == ["a"]
-    assert "violates a limit" in c.verdict[0]
+    assert "violates a limit" in c.findings[0]
     assert not made(
         row("a", 2.0, MethodOutcome.NOTHING), row(DESIGN, 1.0, MethodOutcome.OUTSIDE)
-    ).ok
-    assert not made(row("a", 2.0)).ok  # no design, no win
+    ).verdict.ok
+    assert not made(row("a", 2.0)).verdict.ok  # no design, no win
 
 
 def test_logarithms_are_compared_by_their_difference() -> None:
     c = made(row("a", -1.0), row(DESIGN, -3.0), nats=2.0)
-    assert c.ok
+    assert c.verdict.ok
     assert c.gain(c.rows[1], c.rows[0]) == pytest.approx(1.0 - np.exp(-1.0))
 
 
@@ -185,9 +185,9 @@ def test_a_request_to_stop_keeps_finished_methods_and_the_best_of_the_last() -> 
     assert [(r.method, r.note) for r in c.rows] == [("chirp", ""), ("steps", "interrupted")]
     assert np.isfinite(c.rows[1].cost)
     assert c.interrupted
-    assert not c.ok
-    assert "not run" in c.verdict[0]
-    assert "nterrupted" in c.verdict[1]
+    assert not c.verdict.ok
+    assert "not run" in c.findings[0]
+    assert "nterrupted" in c.findings[1]
 
 
 @pytest.mark.parametrize("budget", [{"seconds": 0.0}, {"seconds": np.inf}])

@@ -75,8 +75,8 @@ def test_a_check_refuses_what_a_design_refuses_in_the_same_words(name: str, tmp_
 
     found = check_task(task)
     assert str(error.value) in found.refused
-    assert not found.ok
-    assert any(str(error.value) in sentence for sentence in found.verdict)
+    assert not found.verdict.ok
+    assert any(str(error.value) in sentence for sentence in found.findings)
     assert found.summary()["refused"] == list(found.refused)
 
 
@@ -105,11 +105,11 @@ def test_parameters_that_do_the_same_are_named_by_both(tmp_path: Path) -> None:
     )
     found, design = check_task(task), design_task(task)
     assert not found.refused
-    assert not found.ok
-    assert not design.separable
+    assert not found.verdict.ok
+    assert not design.verdict.ok
     assert any("a and b" in text for text in design.combinations)
     for text in design.combinations:
-        assert any(text in sentence for sentence in found.verdict)
+        assert any(text in sentence for sentence in found.findings)
 
 
 def test_a_check_says_which_limits_the_start_violates_and_when(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_a_check_says_which_limits_the_start_violates_and_when(tmp_path: Path) -
     found = check_task(task)
     assert {violation.name for violation in found.violations} == {"shoulder", "elbow"}
     assert not found.refused
-    assert any("the initial control violates limits: force of" in text for text in found.verdict)
+    assert any("the initial control violates limits: force of" in text for text in found.findings)
 
     quiet = check_task(stiff_arm_task(tmp_path, amplitude=1e-3))
     assert not quiet.violations
@@ -134,7 +134,7 @@ def test_a_motion_without_a_regulator_fails_the_self_test_without_a_traceback(
     found = check_task(stiff_arm_task(tmp_path, amplitude=1e-3))
     assert np.isinf(found.self_test.slope)
     assert not found.self_test.passed
-    assert not found.ok
+    assert not found.verdict.ok
 
 
 @pytest.mark.parametrize(("angle", "grows"), [(0.0, True), (3.0, False)], ids=["up", "down"])
@@ -151,6 +151,6 @@ def test_a_check_warns_of_growing_disturbances_in_the_words_of_a_design(
         descent={"max_iterations": 0, "coarse": 1},
     )
     found, design = check_task(task), design_task(task)
-    said = [text for text in found.verdict if "a small disturbance grows up to" in text]
+    said = [text for text in found.findings if "a small disturbance grows up to" in text]
     assert len(said) == grows
     assert said == [text for text in design.warnings if "a small disturbance grows" in text]

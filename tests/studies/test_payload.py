@@ -205,7 +205,7 @@ def test_a_load_on_links_whose_inertia_the_model_tells_in_part(tmp_path: Path) -
     estimate = mjfim.identify_payload(robot, [log(loaded, 2)], body="hand", robot=earlier)
     payload = estimate.payload
     assert payload is not None
-    assert estimate.success and payload.is_seen
+    assert estimate.converged and payload.is_seen
     assert sum(inside(estimate).values()) >= 3
 
     # Single inertias of the links are hardly known, but the load is.
@@ -222,7 +222,7 @@ def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
         estimate = mjfim.identify_payload(
             robot, [log(loaded, 100 + seed)], body="hand", robot=robots
         )
-        assert estimate.success
+        assert estimate.converged
         assert estimate.payload is not None
         assert estimate.payload.is_seen
         found.append(list(inside(estimate).values()))

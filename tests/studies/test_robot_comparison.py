@@ -19,11 +19,11 @@ from mjfim.identification.assessment.robust_covariance import (
     recording_evidence,
     robust_uncertainty,
 )
-from mjfim.output.page import Level
 from mjfim.output.pages import page_of
 from mjfim.records.estimate import PriorDirections
 from mjfim.records.robots import RobotComparison
 from mjfim.records.trajectory import Recording
+from mjfim.records.verdict import Level
 from mjfim.studies.robot_comparison import compare_estimates, holm, honest_std
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
 from tests.support.made_records import bare_estimate
@@ -71,7 +71,7 @@ def test_a_worn_joint_is_named() -> None:
     sentence = found.sentence(1)
     assert sentence.startswith("damping of friday is 40 % above that of monday: 0.21 ± 0.02 ag")
     assert "0.15 ± 0.02 N m s/rad, p = " in sentence
-    assert str(found) == "There is a difference between monday and friday in damping."
+    assert found.words == "There is a difference between monday and friday in damping."
     assert page_of(found).verdict.level is Level.DOUBTFUL
 
     # The distance is 4.2 standard deviations; four tests are made.
@@ -89,9 +89,9 @@ def test_a_worn_joint_is_named() -> None:
 def test_equal_robots_say_what_would_have_been_found() -> None:
     found = compare_estimates(estimate(), estimate(1, theta=np.array([2.01, 0.152, 0.998])))
     assert not found.differs
-    assert "no difference between A and B. A change of" in str(found)
-    assert "% in mass" in str(found)
-    assert "with 80 % power" in str(found)
+    assert "no difference between A and B. A change of" in found.words
+    assert "% in mass" in found.words
+    assert "with 80 % power" in found.words
     assert page_of(found).verdict.level is Level.GOOD
 
     # 2.50 standard deviations for significance, and 0.84 for the power.
@@ -118,7 +118,7 @@ def test_combinations_may_differ_although_no_parameter_does() -> None:
     assert found.changed == ()
     assert found.joint_p < 1e-3
     assert found.differs
-    assert "do not say in which single parameter" in str(found)
+    assert "do not say in which single parameter" in found.words
 
 
 def test_wide_intervals_count_and_bounds_do_not() -> None:
@@ -135,7 +135,7 @@ def test_wide_intervals_count_and_bounds_do_not() -> None:
     ("changes", "said"),
     [
         ({"misfit": True}, "does not explain the recordings of B (misfit)"),
-        ({"success": False, "status": "stopped"}, "the estimate of B is not reliable: stopped"),
+        ({"converged": False, "status": "stopped"}, "the estimate of B is not reliable: stopped"),
         ({"units": ("g", "N m s/rad", "m")}, "mass is not compared: its units differ (kg and g)"),
         ({"std": np.array([np.inf, 0.1, 0.1])}, "recordings of B do not determine it"),
         ({"per_recording": {"mass": (1.0, 2.0)}}, "B has a value for each recording"),
@@ -147,7 +147,7 @@ def test_wide_intervals_count_and_bounds_do_not() -> None:
 def test_remarks(changes: dict[str, Any], said: str) -> None:
     found = compare_estimates(estimate(), estimate(**{"seed": 1, **changes}))
     assert any(said in remark for remark in found.remarks), found.remarks
-    is_poor = "misfit" in changes or "success" in changes
+    is_poor = "misfit" in changes or "converged" in changes
     assert found.is_reliable is not is_poor
 
 

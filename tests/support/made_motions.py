@@ -17,7 +17,7 @@ from mjfim.records.design import (
 )
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording, Trajectory
-from tests.support.made_records import falling, make_row
+from tests.support.made_records import falling, make_row, plain_labels
 from tests.support.paths import ROOT, SHARED_MODELS
 
 MODELS = {
@@ -132,6 +132,7 @@ def designed(model: mujoco.MjModel) -> Design:
         ),
         status=Status.MAX_ITERATIONS,
         parameters=("mass", "gear/ratio"),
+        labels=plain_labels(("mass", "gear/ratio"), model.nq, model.nv, model.nu),
         theta=np.array([2.0, 1.0]),
         initial=evaluated(model, initial, 1.0),
         final=evaluated(model, final, 16.0),
@@ -161,6 +162,7 @@ def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
     )
     return Estimate(
         parameters=("mass", "gear/ratio"),
+        labels=plain_labels(("mass", "gear/ratio")),
         theta=np.array([2.0, 1.0]),
         std=np.array([0.1, 0.2]),
         covariance=np.diag([0.01, 0.04]),
@@ -168,7 +170,7 @@ def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
         chi2=500.0,
         dof=80,
         status="the residuals no longer fall",
-        success=True,
+        converged=True,
         misfit=True,
         iterations=4,
         residual_rms={"qpos:slide": 0.01, "hinge_angle": 0.01},

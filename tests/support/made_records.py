@@ -110,12 +110,30 @@ def ten_iterates() -> tuple[HistoryRow, ...]:
     )
 
 
+def plain_labels(parameters: Sequence[str], nq: int = 0, nv: int = 0, nu: int = 0) -> Labels:
+    """Labels without units, of columns that have numbers."""
+
+    def numbered(word: str, count: int) -> tuple[str, ...]:
+        return tuple(f"{word} {i} [model unit]" for i in range(count))
+
+    return Labels(
+        qpos=numbered("qpos", nq),
+        positions=numbered("position", nv),
+        velocities=numbered("velocity", nv),
+        controls=numbered("control", nu),
+        parameters=tuple(parameters),
+        parameter_units=("",) * len(parameters),
+    )
+
+
 def make_design(dofs: int = 2, count: int = 3) -> Design:
     """Make a design of ten iterations from a small to a large motion."""
     rows = ten_iterates()
+    names = tuple(f"link_{j}.damping" for j in range(count))
     return Design(
         status=Status.CONVERGED,
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        parameters=names,
+        labels=plain_labels(names, dofs, dofs, 1),
         theta=np.linspace(1.0, 2.0, count),
         initial=make_evaluation(dofs, count, 0.1),
         final=make_evaluation(dofs, count, 1.0),
@@ -155,8 +173,10 @@ def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
         "final": make_trials(theta, 0.004, failed, 1),
     }
     information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
+    names = tuple(f"link_{j}.damping" for j in range(count))
     return MonteCarloStudy(
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        parameters=names,
+        labels=plain_labels(names),
         theta=theta,
         measure_rate=25.0,
         sets=sets,
@@ -168,6 +188,7 @@ def bare_estimate(parameters: Sequence[str], theta: Array, std: Array, **changes
     """An estimate that converged with independent errors, from no recording."""
     fields: dict[str, Any] = {
         "parameters": tuple(parameters),
+        "labels": plain_labels(parameters),
         "theta": theta,
         "std": std,
         "covariance": np.diag(std**2),
@@ -175,7 +196,7 @@ def bare_estimate(parameters: Sequence[str], theta: Array, std: Array, **changes
         "chi2": 1.0,
         "dof": 1,
         "status": "converged",
-        "success": True,
+        "converged": True,
         "misfit": False,
         "iterations": 4,
         "residual_rms": {},

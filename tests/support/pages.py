@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from mjfim.output.page import Level, Page, Part, Section, Text, Verdict
+from mjfim.output.page import Page, Part, Section, Text
 from mjfim.output.terminal import TerminalPage
+from mjfim.records.verdict import Level, Verdict
 
 
 def printed(page: Page, width: int = 200, *, verbose: bool = False) -> str:

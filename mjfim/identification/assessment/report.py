@@ -202,7 +202,7 @@ def estimate_from(
     comparison = compare_recordings(result)
 
     undetermined = accuracy.singular or accuracy.single_unidentifiable
-    success = solution.success and not (undetermined or outside)
+    converged = solution.success and not (undetermined or outside)
     interrupted = budget.stop.requested
     groups = (
         f"not identifiable separately: {group.short}; what the recordings do not determine was "
@@ -211,7 +211,7 @@ def estimate_from(
     )
     stated = (*probable_degrees(system.experiment, system.source), *groups)
     causes: tuple[str, ...] = ()
-    if reasons or quality.unexplained or not success:
+    if reasons or quality.unexplained or not converged:
         causes = (*_causes(result, tests, is_selected=refuted is not None), *stated)
     if outside:
         names = listed(at_bound)
@@ -247,7 +247,7 @@ def estimate_from(
         chi2=quality.chi2,
         dof=quality.dof,
         status=solution.status,
-        success=success,
+        converged=converged,
         misfit=bool(reasons),
         iterations=solution.iterations,
         residual_rms=quality.rms,
@@ -291,6 +291,7 @@ def estimate_from(
         recording_comparison=comparison,
         prior_directions=accuracy.prior_directions,
         in_time=accuracy.in_time,
+        experiment=system.experiment,
     )
     return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
 

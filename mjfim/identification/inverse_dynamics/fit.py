@@ -649,7 +649,7 @@ def _record(search: EquationSearch, found: FoundEquations) -> InverseDynamicsFit
         absent=tuple(parameters.names[j] for j in absent),
         condition=condition,
         iterations=found.count,
-        success=found.success,
+        converged=found.success,
         status=status,
         sizes=parameters.magnitude,
     )

@@ -6,9 +6,12 @@ numbers differ states those of the identified one. A file is written only if it 
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from copy import deepcopy
+from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -16,7 +19,9 @@ import scipy
 from lxml import etree
 
 from mjfim.arrays import Array
-from mjfim.errors import ModelError, first_ones, listed
+from mjfim.errors import ExperimentError, ModelError, OutputError, first_ones, listed
+from mjfim.experiment.packing import input_files
+from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import remove_numbers
 from mjfim.model.elements import element_count, element_name
@@ -35,6 +40,7 @@ from mjfim.output.export.model_xml import (
     all_digits,
     child,
     floats,
+    held_name,
     loading,
     nearly_equal,
     own_child,
@@ -43,6 +49,11 @@ from mjfim.output.export.model_xml import (
     set_numbers,
 )
 from mjfim.output.export.urdf import urdf_files, write_identified_urdfs
+from mjfim.output.manifest import OutputGuard, claimed
+from mjfim.parallel.workers import own_versions
+from mjfim.records.estimate import Estimate
+
+T = TypeVar("T")
 
 # By kind of element, the arrays of MjModel whose numbers its attributes state, and those of an
 # <inertial>.
@@ -329,7 +340,75 @@ OF_SENSORS = (OutputBiasField, OutputScaleField, OutputDelayField)
 REMARK_TEXT = 120
 
 
-def write_identified(path: Path, system: System, theta: Array) -> list[str]:
+def save_identified(estimate: Estimate, path: str | Path, *, force: bool) -> list[str]:
+    """Write the identified model of an estimate. See `Estimate.save_model`."""
+    if not isinstance(path, str | Path) or Path(path).suffix != ".xml":
+        raise OutputError(f"{path!r}: save_model writes an MJCF; name a file that ends in .xml")
+    path, system = Path(path), _system_of(estimate)
+    guard = OutputGuard(input_files(system.experiment), force=force)
+    names = identified_files(path, system.model_path)
+    names += tuple(held_name(path, name) for name in _held(system))
+    guard.check([path, *(path.with_name(name) for name in names)])
+    with claimed(path.parent, guard, exclusive=False):
+        return write_identified(path, system, estimate.theta, estimate)
+
+
+def identified_spec(estimate: Estimate) -> Any:
+    """The identified MjSpec of an estimate. See `Estimate.spec`."""
+    system = _without_floor(_system_of(estimate))
+    wanted = system.model_at(estimate.theta, at_keyframe=False)
+
+    def compiled(xml: ModelXml, tolerance: float) -> Any:
+        """The MjSpec of a text."""
+        spec, model = xml.compiled()
+        _require_equal(model, wanted, tolerance)
+        return spec
+
+    return _expressed(system, estimate.theta, wanted, {}, compiled)[0]
+
+
+def _system_of(estimate: Estimate) -> System:
+    """The experiment of an estimate, resolved against its model."""
+    experiment = estimate.experiment
+    if isinstance(experiment, Path):
+        experiment = Experiment.from_file(experiment)
+    if experiment is None:
+        raise ExperimentError(
+            "this estimate does not know its experiment: load it from the folder of `mjfim "
+            "identify`, or state it: dataclasses.replace(estimate, experiment=experiment)"
+        )
+    system = System.resolve(experiment)
+    if system.parameters.names != estimate.parameters:
+        raise ExperimentError(
+            f"{experiment.source}: has the parameters {listed(system.parameters.names)}, but the "
+            f"estimate has {listed(estimate.parameters)}; after --select, state "
+            "dataclasses.replace(estimate, experiment=mjfim.selected_experiment(experiment, "
+            "estimate.selection))"
+        )
+    return system
+
+
+def _held(system: System) -> dict[str, bytes]:
+    """Assets of a model that are in the memory only, by their names in its main file."""
+    main = system.model_path
+    return {
+        Path(os.path.relpath(file, main.parent)).as_posix(): content
+        for file, content in system.source.stated.contents.items()
+        if not file.is_file() and file != main
+    }
+
+
+def _without_floor(system: System) -> System:
+    """A system without a floor that only the experiment states, which is no part of the model."""
+    if system.experiment.limits.floor is None:
+        return system
+    bare = system.experiment.replace(limits={"floor": None})
+    return System.resolve(bare, source=system.source.stated)
+
+
+def write_identified(
+    path: Path, system: System, theta: Array, estimate: Estimate | None = None
+) -> list[str]:
     """Write the user's model with parameter values, as MJCF, and as URDF where one came in.
 
     Included files that change are written beside the main file. Where the text cannot express the
@@ -340,6 +419,8 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
             its name with another ending.
         system: The experiment with its model.
         theta: (p,) parameter values.
+        estimate: The estimate whose data and accuracy the first comment states; None for no such
+            comment.
 
     Returns:
         Sentences about everything that a user would not expect.
@@ -347,31 +428,40 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
     Raises:
         ModelError: No MJCF expresses the values.
     """
-    # A floor that only the experiment states is no part of the model.
-    if system.experiment.limits.floor is not None:
-        bare = system.experiment.replace(limits={"floor": None})
-        system = System.resolve(bare, source=system.source.stated)
+    system = _without_floor(system)
     wanted = system.model_at(theta, at_keyframe=False)
     urdfs, remarks = write_identified_urdfs(path, system, theta)
     texts = {file.resolve() for file, _ in elements_of(system.model_path)}
-    changed = [x for x in changed_files(system.source.stated.contents) if x.resolve() not in texts]
+    contents = {file: each for file, each in system.source.stated.contents.items() if file.exists()}
+    changed = [file for file in changed_files(contents) if file.resolve() not in texts]
     if changed:
         remarks.append(
             f"{first_ones([file.name for file in changed])} changed while this ran; {path.name} "
             "reads what is there now, but the parameters belong to what was loaded"
         )
+
+    def save(xml: ModelXml, tolerance: float) -> None:
+        """Write a text if it compiles to the wanted model."""
+        if estimate is not None:
+            add_comment(xml.root, provenance(estimate), first=True)
+
+        def check(written: Path) -> None:
+            """Raise ModelError if the file gives another model."""
+            with loading("MuJoCo does not load the text"):
+                found = mujoco.MjModel.from_xml_path(str(written))
+            _require_equal(found, wanted, tolerance)
+
+        xml.save(path, check)
+
     try:
-        xml = _edited(system, theta, wanted, urdfs)
-        _save(xml, path, wanted, TOLERANCE)
-    except ModelError as error:
-        try:
-            _save(_printed(system, theta, wanted), path, wanted, PRINTED_TOLERANCE)
-        except ModelError as reason:
-            why = "; ".join([str(reason), *remarks])
-            raise ModelError(f"{path}: not written: {why}") from None
+        _, fault = _expressed(system, theta, wanted, urdfs, save)
+    except ModelError as reason:
+        why = "; ".join([str(reason), *remarks])
+        raise ModelError(f"{path}: not written: {why}") from None
+    if fault:
         remarks.append(
             f"{path.name}: it is printed by MuJoCo, without comments and, where elements have no "
-            f"name, with six digits: {error}"
+            f"name, with six digits: {fault}"
         )
     if system.laws is not None:
         names = first_ones([law.actuator for law in system.laws.laws], longest=REMARK_TEXT)
@@ -380,6 +470,24 @@ def write_identified(path: Path, system: System, theta: Array) -> list[str]:
             "has no laws with a rate; estimate.json holds their numbers"
         )
     return remarks
+
+
+def provenance(estimate: Estimate) -> str:
+    """State in lines from which data values come, when, by which version, and how accurate."""
+    values = [
+        f"{' '.join(dict.fromkeys([each.name, *each.targets]))} = {each}, σ {each.std:.3g}"
+        for each in estimate.each()
+    ]
+    data = [f"{each.name} ({len(each.t)} rows)" for each in estimate.recordings]
+    version, engine = own_versions()
+    lines = [
+        f"Identified with mjfim {version} and MuJoCo {engine}, written on {date.today()}.",
+        f"Data: {listed(data)}.",
+        "Values with their 95 % intervals, and their honest standard deviations:",
+        *values,
+        f"Verdict: {estimate.verdict.level}. {estimate.verdict.sentence}",
+    ]
+    return "\n     ".join(lines)
 
 
 def identified_files(path: Path, model: Path) -> tuple[str, ...]:
@@ -404,7 +512,7 @@ def same_dynamics(a: Any, b: Any, tolerance: float = TOLERANCE) -> bool:
 def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) -> ModelXml:
     """The user's text with the values."""
     source = system.source
-    xml = ModelXml(system.model_path, source.read)
+    xml = ModelXml(system.model_path, source.read, _held(system))
     if xml.root.tag != "mujoco":
         raise ModelError(f"the model is no MJCF but <{xml.root.tag}>")
     if source.terms:
@@ -436,25 +544,38 @@ def _printed(system: System, theta: Array, wanted: Any) -> ModelXml:
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     spec.compiler.settotalmass = -1.0
     compile_spec(spec, system.model_path, files=system.source.files)
-    xml = ModelXml(system.model_path, lambda _: spec.to_xml().encode())
+    spec.assets = held = _held(system)
+    xml = ModelXml(system.model_path, lambda _: spec.to_xml().encode(), held)
     state_differences(xml, xml.compiled(), wanted, names_needed=False)
     return xml
 
 
-def _save(xml: ModelXml, path: Path, wanted: Any, tolerance: float) -> None:
-    """Write a text if it compiles to the wanted model."""
+def _expressed(
+    system: System,
+    theta: Array,
+    wanted: Any,
+    urdfs: dict[Path, Path],
+    use: Callable[[ModelXml, float], T],
+) -> tuple[T, str]:
+    """Use the user's text with the values; where it cannot have them, that which MuJoCo prints.
 
-    def check(written: Path) -> None:
-        """Raise ModelError if the file gives another model."""
-        with loading("MuJoCo does not load the text"):
-            found = mujoco.MjModel.from_xml_path(str(written))
-        different = _differences(found, wanted, tolerance)
-        if different:
-            raise ModelError(
-                f"with the identified values the text compiles to a different {listed(different)}"
-            )
+    Returns:
+        What `use` returns, which gets the text and the relative tolerance of its numbers; and the
+        reason why the text is printed, empty where it is the user's.
+    """
+    try:
+        return use(_edited(system, theta, wanted, urdfs), TOLERANCE), ""
+    except ModelError as error:
+        return use(_printed(system, theta, wanted), PRINTED_TOLERANCE), str(error)
 
-    xml.save(path, check)
+
+def _require_equal(found: Any, wanted: Any, tolerance: float) -> None:
+    """Raise ModelError if two models differ."""
+    different = _differences(found, wanted, tolerance)
+    if different:
+        raise ModelError(
+            f"with the identified values the text compiles to a different {listed(different)}"
+        )
 
 
 def _differences(a: Any, b: Any, tolerance: float) -> list[str]:

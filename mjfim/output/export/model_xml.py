@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -53,6 +54,9 @@ ROUNDING = 1e-12
 # What some editors of Windows put before a text in UTF-8.
 BYTE_ORDER_MARK = "\ufeff".encode()
 
+# No assets in the memory.
+NOTHING: Mapping[str, bytes] = MappingProxyType({})
+
 # An element, an attribute of it that names a file or a folder, and the name as the user wrote it.
 Reference = tuple[Any, str, str]
 
@@ -92,18 +96,24 @@ class ModelXml:
         root: The main element: `mujoco` or `robot`.
     """
 
-    def __init__(self, path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> None:
+    def __init__(
+        self,
+        path: Path,
+        read: Callable[[Path], bytes] = Path.read_bytes,
+        held: Mapping[str, bytes] = NOTHING,
+    ) -> None:
         """Read a model.
 
         Args:
             path: The main file.
             read: Gives the bytes of a file.
+            held: Assets that are in the memory only, by their names in the main file.
 
         Raises:
             ModelError: The text is no XML. The message is a clause.
         """
         main = _source_file(path.resolve(), read)
-        self._read = read
+        self._read, self._held = read, held
         self.root = main.root
         self._main = main
         self._included: list[SourceFile] = []
@@ -160,13 +170,13 @@ class ModelXml:
 
         text = etree.tostring(root, encoding="unicode")
         with loading("MuJoCo does not load the text with the identified values"):
-            spec = mujoco.MjSpec.from_string(text)
+            spec = mujoco.MjSpec.from_string(text, assets=dict(self._held))
             return spec, spec.compile()
 
     def save(self, path: Path, check: Callable[[Path], None]) -> None:
         """Write the model for the folder of a new file; afterwards it cannot be edited.
 
-        Included files that change are written first, beside the main file.
+        Included files that change, and assets of the memory, are written first beside the main one.
 
         Args:
             path: The new main file.
@@ -189,6 +199,11 @@ class ModelXml:
                 temporary.write_bytes(file.text())
             copies.append(folder / name)
 
+        for element, attribute, name in self._main.references:
+            if name in self._held:
+                element.set(attribute, held_name(path, name))
+                with replacing(folder / held_name(path, name)) as temporary:
+                    temporary.write_bytes(self._held[name])
         paths = [element.get(attribute) for element, attribute, _ in self._main.references]
         _make_relative(self._main, paths, assets, [folder])
         try:
@@ -248,6 +263,8 @@ class ModelXml:
         """Replace the names of existing files and folders by absolute paths."""
         home, own = self._main.path.parent, file.path.parent
         for element, attribute, name in file.references:
+            if name in self._held:
+                continue
             places = [home, own]
             if element.tag in ASSETS:
                 folder = self._asset_folder(element.tag) or home
@@ -276,6 +293,11 @@ def loading(fault: str) -> Iterator[None]:
             yield
     except (ValueError, mujoco.FatalError) as error:
         raise ModelError(f"{fault} ({' '.join(str(error).split())})") from None
+
+
+def held_name(path: Path, name: str) -> str:
+    """Name that an asset of the memory has beside a new main file."""
+    return f"{path.stem}_{Path(name).name}"
 
 
 # ---- elements
@@ -325,8 +347,9 @@ def add_element(
 
 
 def add_comment(parent: Any, comment: str, *, first: bool = False) -> None:
-    """Add a comment as the last or the first child; two hyphens in a row are separated."""
-    added = etree.Comment(f" {comment.replace('--', '- -')} ")
+    """Add a comment as the last or the first child, without what XML does not allow in it."""
+    allowed = "".join(each if each.isprintable() or each == "\n" else " " for each in comment)
+    added = etree.Comment(f" {allowed.replace('--', '- -')} ")
     _insert(parent, added, first=first)
 
 

@@ -18,6 +18,7 @@ PAGES = {
     "Check": ("design", "check_page"),
     "Comparison": ("studies", "comparison_page"),
     "Design": ("design", "design_page"),
+    "DesignComparison": ("design", "designs_page"),
     "Estimate": ("estimate", "estimate_page"),
     "InverseDynamicsFit": ("studies", "equation_page"),
     "MonteCarloStudy": ("studies", "study_page"),

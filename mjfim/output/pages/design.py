@@ -11,7 +11,6 @@ from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, Arra
 from mjfim.errors import first_ones, listed
 from mjfim.output.page import (
     Emphasis,
-    Level,
     Listing,
     Page,
     Part,
@@ -20,7 +19,6 @@ from mjfim.output.page import (
     Section,
     Table,
     Text,
-    Verdict,
     as_sentence,
     capitalised,
     named,
@@ -33,14 +31,21 @@ from mjfim.output.pages.worth import worth_parts
 from mjfim.output.words import (
     BEST_CASE,
     NOT_ALONE,
-    complete_labels,
     improvement,
     relative,
     when_learnt,
 )
-from mjfim.records.check import Check, ParameterCheck, ParameterGroup
-from mjfim.records.design import Design, ScaledStart
+from mjfim.records.check import Check, ParameterCheck, ParameterGroup, unknown_groups
+from mjfim.records.design import (
+    TIE_TOLERANCE,
+    Design,
+    DesignComparison,
+    ScaledStart,
+    is_playable,
+    keeps_limits,
+)
 from mjfim.records.rehearsal import REST_SHARE, Rehearsal, RehearsedLimit, Valley
+from mjfim.records.verdict import Level, Verdict
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
@@ -81,7 +86,7 @@ def design_page(design: Design) -> Page:
     if design.limits:
         margins = numbers(design.limits.values())
         columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
-        table = tabulated("Limits", columns, detail=True)
+        table = tabulated("Limits", columns, detail=design.rehearsal is not None)
         sections.insert(2, Section("Limits", [Plot("limits"), table]))
     if design.rehearsal is not None:
         sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
@@ -125,16 +130,17 @@ def _verdict(design: Design) -> Verdict:
     if violated:
         text = f"Do not play this motion: it violates limits ({first_ones(violated)})."
         return Verdict(text, Level.BAD)
-    rehearsal = design.rehearsal
+    rehearsal, separable = design.rehearsal, _is_separable(design)
+    ok = is_playable(design) and separable
     if rehearsal is None:
         text = f"The design was {design.outcome}. It was not rehearsed on robots."
-        return Verdict(text, Level.DOUBTFUL)
+        return Verdict(text, Level.DOUBTFUL, ok)
     if not rehearsal.is_safe:
         return _danger(rehearsal)
     seen = " ".join(_observed(rehearsal))
     if design.is_start and not design.status.success:
         return Verdict(f"The design is no better than its start. {seen}", Level.DOUBTFUL)
-    if not design.separable:
+    if not separable:
         text = (
             "The design is made for combinations of parameters, because no control separates all "
             f"of them. {seen}"
@@ -144,11 +150,18 @@ def _verdict(design: Design) -> Verdict:
     poorly = _with_interval(design, POORLY_KNOWN_SHARE)
     if poorly and not reservation:
         reservation = f"it hardly determines {_with_widest(design, poorly)}"
+    if not (ok or reservation):
+        reservation = "the search was interrupted"
     equal = "It is no better than its start. " if design.is_start else ""
     if reservation:
         text = f"This motion can be played, but {reservation}. {equal}{seen}"
-        return Verdict(text, Level.DOUBTFUL)
-    return Verdict(f"Ready to play: {_accuracy(design)}. {equal}{seen}", Level.GOOD)
+        return Verdict(text, Level.DOUBTFUL, ok)
+    return Verdict(f"Ready to play: {_accuracy(design)}. {equal}{seen}", Level.GOOD, ok)
+
+
+def _is_separable(design: Design) -> bool:
+    """Whether every wanted parameter is identifiable alone, from data or with its prior."""
+    return bool(np.isfinite(design.final.std[list(design.wanted)]).all())
 
 
 def _danger(rehearsal: Rehearsal) -> Verdict:
@@ -328,7 +341,7 @@ def _accuracy(design: Design) -> str:
 
 
 def _next_steps(design: Design) -> Iterator[str]:
-    if not design.within_limits:
+    if not keeps_limits(design):
         yield "Widen the limit that is violated, or begin with an initial control that is smaller."
         return
     if design.rehearsal is not None and not design.rehearsal.is_safe:
@@ -336,13 +349,14 @@ def _next_steps(design: Design) -> Iterator[str]:
         return
     if design.is_start and not design.status.success:
         yield "Allow more time or iterations in the table `[descent]` for a better design."
-    if not design.separable:
+    separable = _is_separable(design)
+    if not separable:
         groups = first_ones(design.combinations, "; ")
         yield (
             f"Remove or fix one parameter of each group, give it a prior, or measure another "
             f"output: {groups}."
         )
-    wide = _with_interval(design, POORLY_KNOWN_SHARE) if design.separable else []
+    wide = _with_interval(design, POORLY_KNOWN_SHARE) if separable else []
     if wide:
         names = first_ones([design.parameters[j] for j in wide])
         yield (
@@ -351,7 +365,7 @@ def _next_steps(design: Design) -> Iterator[str]:
         )
     if _tells_less(design):
         yield "Lower `cost.control` and `cost.tracking` for a design that tells more."
-    if design.sound:
+    if is_playable(design):
         yield from PLAY
 
 
@@ -425,9 +439,10 @@ def rehearsal_page(rehearsal: Rehearsal) -> Page:
     if not rehearsal.is_safe:
         verdict = _danger(rehearsal)
     elif reservation:
-        verdict = Verdict(f"This motion can be played, but {reservation}. {seen}", Level.DOUBTFUL)
+        text = f"This motion can be played, but {reservation}. {seen}"
+        verdict = Verdict(text, Level.DOUBTFUL, ok=True)
     else:
-        verdict = Verdict(f"Safe to play. {seen}", Level.GOOD)
+        verdict = Verdict(f"Safe to play. {seen}", Level.GOOD, ok=True)
     control = "with feedback" if rehearsal.feedback else "open loop"
     return Page(
         kind="Rehearsal of a design",
@@ -531,8 +546,8 @@ def _margin_table(rehearsal: Rehearsal) -> Table:
 
 
 def _accuracy_parts(design: Design) -> Iterator[Part]:
-    if design.outcome.lower() not in _verdict(design).text.lower():
-        yield Text(capitalised(design.outcome), detail=design.sound)
+    if design.outcome.lower() not in _verdict(design).sentence.lower():
+        yield Text(capitalised(design.outcome), detail=is_playable(design))
     yield _accuracy_table(design)
     learnt = when_learnt(design)
     if learnt:
@@ -572,7 +587,7 @@ def _accuracy_parts(design: Design) -> Iterator[Part]:
 def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
     """Compare a design with the initial control, scaled until it keeps all limits."""
     share = f"The initial control scaled by {scaled.share:.2g} keeps all limits"
-    if not design.within_limits:
+    if not keeps_limits(design):
         return f"{share}; the design does not."
     after = float(design.final.eigenvalues[0])
     times = after / max(scaled.min_eigenvalue, TINY)
@@ -588,7 +603,7 @@ def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
 def _accuracy_table(design: Design) -> Table:
     """Tabulate the predicted standard deviations before and after a design."""
     wanted, combined = list(design.wanted), design.combined
-    units = complete_labels(design).parameter_units
+    units = design.labels.parameter_units
     names = [named(design.parameters[j], units[j]) for j in wanted]
     values = [*design.theta[wanted], *(each.value for each in combined)]
     sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
@@ -686,21 +701,34 @@ def _check_verdict(check: Check) -> Verdict:
             return _danger(rehearsal)
         text = f"The start falls, and no limit keeps a design from it. {_faults_of(rehearsal)}."
         return Verdict(text, Level.BAD)
-    if check.ok:
+    if _has_no_fault(check):
         shares = {row.name: row.relative for row in check.rows if not row.nuisance}
         worst = max(shares, key=lambda name: shares[name])
         sigma = relative(shares[worst], 1.0)
         if NORMAL_95 * shares[worst] >= UNDETERMINED_SHARE:
             text = f"{check.source} does not determine {worst}: its σ is {sigma} of its size."
-            return Verdict(text, Level.DOUBTFUL)
+            return Verdict(text, Level.DOUBTFUL, ok=True)
         text = (
             f"All parameters can be identified with {check.source}; the least accurate is {worst} "
             f"with a σ of {sigma}."
         )
         is_doubtful = rehearsal is not None and rehearsal.is_unstable
-        return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD)
-    first = check.verdict[0] if check.verdict else "the check found a fault"
-    return Verdict(as_sentence(first), Level.DOUBTFUL)
+        return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD, ok=True)
+    return Verdict(as_sentence(check.findings[0]), Level.DOUBTFUL)
+
+
+def _has_no_fault(check: Check) -> bool:
+    """Whether a check found no fault.
+
+    The derivatives agree, all parameters are identifiable, one repetition reaches every stated
+    accuracy, and a design would not refuse the experiment. Limits that a start violates are no
+    fault, because a design looks for a motion inside. A fall that no limit forbids is one.
+    """
+    stated = [row for row in check.rows if row.stated and not row.nuisance]
+    reached = all(row.repetitions == 1 for row in stated)
+    passed = check.self_test.passed and not check.missing and not check.refused
+    is_separable = not (unknown_groups(check) or check.not_excited)
+    return passed and not check.is_dangerous and is_separable and reached
 
 
 def _check_warnings(check: Check) -> Iterator[str]:
@@ -709,8 +737,8 @@ def _check_warnings(check: Check) -> Iterator[str]:
     if check.is_start and rehearsal is not None and not (rehearsal.is_safe or check.is_dangerous):
         cure = next(_known_cures(rehearsal, is_designed=False), "A design looks for a better one.")
         yield f"The start itself is not to be played. {_faults_of(rehearsal)}. {cure}"
-    if not check.ok:
-        yield from (as_sentence(each) for each in check.verdict[1:])
+    if not _has_no_fault(check):
+        yield from (as_sentence(each) for each in check.findings[1:])
 
 
 def _check_next(check: Check) -> Iterator[str]:
@@ -723,7 +751,7 @@ def _check_next(check: Check) -> Iterator[str]:
             "Remove or fix one parameter of each group that is identifiable only in combination, "
             "give it a prior, or measure another output."
         )
-    elif not (check.ok and check.reaches_all):
+    elif not (_has_no_fault(check) and check.reaches_all):
         yield "Design a motion that tells more: `mjfim design EXPERIMENT -o FOLDER`."
     elif check.is_start:
         yield "Design a motion that a robot can play: `mjfim design EXPERIMENT -o FOLDER`."
@@ -734,8 +762,8 @@ def _check_next(check: Check) -> Iterator[str]:
 
 
 def _check_parts(check: Check) -> Iterator[Part]:
-    if check.ok:
-        yield Listing("Findings", tuple(as_sentence(each) for each in check.verdict))
+    if _has_no_fault(check):
+        yield Listing("Findings", tuple(as_sentence(each) for each in check.findings))
     yield Table(
         title=f"Accuracy that {check.source} ({check.horizon:g} s) can give",
         columns=("parameter", "value", "σ", "relative σ", "wanted σ", "repetitions", "time"),
@@ -788,4 +816,37 @@ def _about_self_test(check: Check) -> str:
     return (
         f"derivative self-test {'passed' if test.passed else 'FAILED'}: relative error of psi "
         f"{test.recursion:.1e}, of the slope {test.slope:.1e}{acting}"
+    )
+
+
+def designs_page(comparison: DesignComparison) -> Page:
+    """Describe which of two designs determines which parameter better."""
+    both = comparison.design, comparison.other
+    first, second = ({each.name: each for each in design.each()} for design in both)
+    names = [both[0].parameters[j] for j in both[0].wanted]
+    shown = [first[name] for name in names if name in second]
+    own = np.array([each.std for each in shown])
+    other = np.array([second[each.name].std for each in shown])
+    worse = [shown[j].name for j in np.flatnonzero(own > (1.0 + TIE_TOLERANCE) * other)]
+    better = int(np.sum(other > (1.0 + TIE_TOLERANCE) * own))
+    text = "Both designs determine every parameter equally well."
+    if worse:
+        text = f"The other design determines {first_ones(worse)} better."
+    elif better:
+        text = f"This design determines {better} of {len(own)} parameters better, and none worse."
+    durations = " s, and of ".join(f"{_seconds(design):.3g}" for design in both)
+    table = tabulated(
+        f"Predicted σ after one experiment of {durations} s",
+        {
+            "parameter": [named(each.name, each.unit) for each in shown],
+            "σ": numbers(own, infinite=NOT_ALONE),
+            "σ of the other": numbers(other, infinite=NOT_ALONE),
+            "change of σ": list(map(improvement, other, own)),
+        },
+    )
+    costs = "Cost J {:.4g} against {:.4g}".format(*(design.final.cost for design in both))
+    return Page(
+        kind="Comparison of two designs",
+        verdict=Verdict(text, Level.DOUBTFUL if worse else Level.GOOD, ok=not worse),
+        sections=[Section("Accuracy", [table, Text(costs), Text(BEST_CASE, Emphasis.WEAK)])],
     )

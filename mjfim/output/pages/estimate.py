@@ -16,7 +16,6 @@ from mjfim.output.page import (
     IDENTIFIED,
     NOMINAL,
     Emphasis,
-    Level,
     Listing,
     Page,
     Part,
@@ -25,7 +24,6 @@ from mjfim.output.page import (
     Section,
     Table,
     Text,
-    Verdict,
     capitalised,
     named,
     number,
@@ -34,11 +32,12 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.pages.studies import residual_parts
-from mjfim.output.words import NOT_ALONE, complete_labels, predicted_data, relative, share_note
+from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.estimate_parts import MOST, InformationInTime
 from mjfim.records.robots import RecordingComparison, p_text
 from mjfim.records.terms import Decision, Selection, SelectionStep, as_toml
+from mjfim.records.verdict import Level, Verdict
 
 # Largest number of digits of an estimate.
 MAX_DIGITS = 9
@@ -114,12 +113,13 @@ def _verdict(estimate: Estimate) -> Verdict:
     fit = _verdict_on_fit(estimate)
     if estimate.payload is None or fit.level is Level.BAD:
         return fit
-    return Verdict(f"{estimate.payload}. {fit.text}", fit.level)
+    ok = fit.ok and estimate.payload.is_seen
+    return Verdict(f"{estimate.payload}. {fit.sentence}", fit.level, ok)
 
 
 def _verdict_on_fit(estimate: Estimate) -> Verdict:
     ratio = np.sqrt(estimate.chi2 / max(estimate.dof, 1))
-    if not estimate.success:
+    if not estimate.converged:
         why = estimate.status.removesuffix(".")
         if estimate.combinations:
             why = "the recordings determine some parameters in combination only"
@@ -148,7 +148,7 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
             f"{model} explains the recordings: the noise is {ratio:.2f} times what you stated, "
             "which the intervals use"
         )
-    return Verdict(f"{text}{_worst_estimate(estimate)}.", Level.GOOD)
+    return Verdict(f"{text}{_worst_estimate(estimate)}.", Level.GOOD, ok=True)
 
 
 def _worst_estimate(estimate: Estimate) -> str:
@@ -187,7 +187,7 @@ def _next_steps(estimate: Estimate) -> Iterator[str]:
             "Keep a recording out of the fit with `--held-out FILE`: a prediction of new data is "
             "the best test of a model."
         )
-    if estimate.success and not estimate.misfit:
+    if estimate.converged and not estimate.misfit:
         yield "Use `identified.xml`, the model with the estimated parameters."
 
 
@@ -195,7 +195,7 @@ def _next_steps(estimate: Estimate) -> Iterator[str]:
 
 
 def _parameter_parts(estimate: Estimate) -> Iterator[Part]:
-    if estimate.status.lower().rstrip(".") not in _verdict(estimate).text.lower():
+    if estimate.status.lower().rstrip(".") not in _verdict(estimate).sentence.lower():
         yield Text(capitalised(estimate.status))
     yield _estimate_table(estimate)
     yield Plot("accuracy")
@@ -242,7 +242,7 @@ def _estimate_table(estimate: Estimate) -> Table:
         "95 % low": list(map(_as_accurate, np.where(known, low, np.nan), std)),
         "high": list(map(_as_accurate, np.where(known, high, np.nan), std)),
     }
-    published = complete_labels(estimate).published
+    published = estimate.labels.published
     for name, values in (("predicted σ", estimate.predicted_std), ("published", published)):
         if np.isfinite(values).any():
             columns[name] = numbers(values, 4 if name == "published" else 2)

@@ -9,19 +9,18 @@ import numpy as np
 
 from mjfim.output.page import (
     NOMINAL,
-    Level,
     Listing,
     Page,
     Part,
     Row,
     Section,
     Table,
-    Verdict,
     named,
     number,
 )
 from mjfim.recordings.read import ColumnSummary, LogSummary
 from mjfim.records.inventory import Inventory, StatedExperiment
+from mjfim.records.verdict import Level, Verdict
 
 # Jitter of a log below this fraction of the sample period is round-off of the time stamps.
 JITTER_ROUND_OFF = 1e-6
@@ -40,7 +39,7 @@ def _page(kind: str, verdict: str, tables: Sequence[Table], further: Sequence[Pa
     """A page of the tables that have rows."""
     parts = [*(table for table in tables if table.rows), *further]
     sections = [Section("", parts)]
-    return Page(kind=kind, verdict=Verdict(verdict, Level.GOOD), sections=sections)
+    return Page(kind=kind, verdict=Verdict(verdict, Level.GOOD, ok=True), sections=sections)
 
 
 # ---- model

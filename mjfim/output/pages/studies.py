@@ -13,7 +13,6 @@ from mjfim.output.page import (
     IDENTIFIED,
     NOMINAL,
     Emphasis,
-    Level,
     Listing,
     Page,
     Part,
@@ -22,7 +21,6 @@ from mjfim.output.page import (
     Section,
     Table,
     Text,
-    Verdict,
     as_sentence,
     capitalised,
     named,
@@ -32,7 +30,7 @@ from mjfim.output.page import (
     tabulated,
     warned,
 )
-from mjfim.output.words import BEST_CASE, NOT_ALONE, complete_labels, relative
+from mjfim.output.words import BEST_CASE, NOT_ALONE, relative
 from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.estimate_parts import InverseDynamicsFit, ResidualForce
 from mjfim.records.robots import RobotComparison, p_text
@@ -43,6 +41,7 @@ from mjfim.records.studies import (
     MonteCarloStudy,
     TrialStatistics,
 )
+from mjfim.records.verdict import Level, Verdict
 from mjfim.records.watch import Watch
 
 # What to do after a campaign, by how it ended.
@@ -90,7 +89,7 @@ def campaign_page(campaign: Campaign, true: Array | None = None) -> Page:
         level = Level.DOUBTFUL
     return Page(
         kind="Campaign of designs and recordings",
-        verdict=Verdict(as_sentence(str(campaign)), level),
+        verdict=Verdict(as_sentence(campaign.words), level, campaign.reached),
         next_steps=() if step is None else (step.format(len(campaign.rounds) + 1),),
         warnings=campaign.warnings,
         facts=facts,
@@ -150,13 +149,14 @@ def robots_page(comparison: RobotComparison) -> Page:
 
 
 def _robots_verdict(comparison: RobotComparison) -> Verdict:
-    text = str(comparison)
+    text = comparison.words
     if not comparison.parameters:
         return Verdict(text, Level.BAD)
     if not comparison.is_reliable:
         return Verdict(f"With reservations (see the warnings): {text}", Level.DOUBTFUL)
     is_doubtful = comparison.differs or comparison.doubtful
-    return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD)
+    ok = not comparison.differs
+    return Verdict(text, Level.DOUBTFUL if is_doubtful else Level.GOOD, ok)
 
 
 def _steps_after_robots(comparison: RobotComparison) -> Iterator[str]:
@@ -231,11 +231,14 @@ def comparison_page(comparison: Comparison) -> Page:
             f"Begin a design at the control of {name}: state its table as `initial.control`.",
             "Give all methods more time with `--seconds`.",
         )
+    design = comparison.design
+    is_sound = design is not None and design.sound and not comparison.interrupted
+    ok = is_sound and not comparison.beating
     return Page(
         kind="Comparison with other excitations",
-        verdict=Verdict(comparison.verdict[0], Level.GOOD if comparison.ok else Level.DOUBTFUL),
+        verdict=Verdict(comparison.findings[0], Level.GOOD if ok else Level.DOUBTFUL, ok),
         next_steps=steps,
-        warnings=comparison.verdict[1:],
+        warnings=comparison.findings[1:],
         facts={
             "criterion": comparison.criterion,
             "methods": str(len(comparison.rows)),
@@ -315,7 +318,7 @@ def study_page(study: MonteCarloStudy) -> Page:
     """Describe the observed scatter of estimates beside the Cramér-Rao bound."""
     names = [
         named(name, unit)
-        for name, unit in zip(study.parameters, complete_labels(study).parameter_units, strict=True)
+        for name, unit in zip(study.parameters, study.labels.parameter_units, strict=True)
     ]
     ranges = [
         f"{min(trials.efficiency):.2f} to {max(trials.efficiency):.2f} in {trials.trials:,} trials "
@@ -368,7 +371,7 @@ def _study_verdict(study: MonteCarloStudy) -> Verdict:
             f"Along the {' and '.join(below)} trajectory, the scatter of some estimates differs "
             "from the Cramér-Rao bound by more than chance."
         )
-        return Verdict(text, Level.DOUBTFUL)
+        return Verdict(text, Level.DOUBTFUL, ok=True)
     agreement = "every efficiency agrees with 1"
     missing = sum(_missing_one(trials) for trials in study.sets.values())
     if missing:
@@ -381,7 +384,7 @@ def _study_verdict(study: MonteCarloStudy) -> Verdict:
         f"The estimates scatter as predicted: {agreement}, so the σ of the design can be trusted "
         "if the model and the noise are right."
     )
-    return Verdict(text, Level.GOOD)
+    return Verdict(text, Level.GOOD, ok=True)
 
 
 def _missing_one(trials: TrialStatistics) -> int:
@@ -476,13 +479,13 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
 def _equation_verdict(fit: InverseDynamicsFit) -> Verdict:
     worst = max(fit.equations, key=lambda each: float(np.nan_to_num(each.share)))
     share = f"{100.0 * worst.share:.2g} %"
-    if not fit.success:
+    if not fit.converged:
         return Verdict(f"The fit to the equation of motion {fit.status}.", Level.BAD)
     if not worst.share <= LARGE_SHARE:
         text = f"The equation of motion of {worst.name} does not hold: residuals are {share} of it."
         return Verdict(text, Level.DOUBTFUL)
     text = f"The equation of motion holds: residuals are at most {share} of the forces."
-    return Verdict(text, Level.GOOD)
+    return Verdict(text, Level.GOOD, ok=True)
 
 
 def equation_parts(fit: InverseDynamicsFit) -> Iterator[Part]:
@@ -569,7 +572,11 @@ def watch_page(watch: Watch) -> Page:
     table = tabulated(title, columns, marked, spare=("of the value",), note=note)
     return Page(
         kind="Live meter",
-        verdict=Verdict(progress_of_watch(watch), Level.GOOD if watch.enough else Level.DOUBTFUL),
+        verdict=Verdict(
+            progress_of_watch(watch),
+            Level.GOOD if watch.enough else Level.DOUBTFUL,
+            watch.enough,
+        ),
         warnings=watch.warnings,
         facts={"rows": str(watch.rows), "duration": f"{watch.seconds:.1f} s"},
         sections=[Section("Accuracy so far", [table, Plot("watch")])],

@@ -9,14 +9,12 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import listed
 from mjfim.output.page import (
-    Level,
     Page,
     Part,
     Plot,
     Section,
     Table,
     Text,
-    Verdict,
     capitalised,
     named,
     numbers,
@@ -24,6 +22,7 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.words import NOT_ALONE, improvement
+from mjfim.records.verdict import Level, Verdict
 from mjfim.records.worth import Price, SensorWorth, Worth
 
 # Increase of σ up to which a sensor is hardly needed, and from which its row is marked (factors).
@@ -40,7 +39,7 @@ def worth_page(worth: Worth) -> Page:
         steps.append("See what limits cost: `mjfim worth DESIGN_FOLDER`, after `mjfim design`.")
     return Page(
         kind="What would help",
-        verdict=Verdict(headline(worth), Level.GOOD),
+        verdict=Verdict(headline(worth), Level.GOOD, ok=True),
         next_steps=tuple(steps),
         facts={"motion": worth.source, "duration": f"{worth.horizon:g} s"},
         sections=[Section("What would help", worth_parts(worth))],

@@ -23,7 +23,6 @@ from mjfim.output.panels import Picture
 from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
 from mjfim.output.plots import estimate_studies, studies
-from mjfim.output.words import complete_labels
 from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -189,7 +188,7 @@ def pictures_of(record: ShownRecord) -> Pictures:
 
 @pictures_of.register
 def _(design: Design) -> Pictures:
-    labels = complete_labels(design)
+    labels = design.labels
     pictures: Pictures = {
         "trajectories": partial(of_design.trajectories, design, labels),
         "accuracy_over_time": partial(of_design.accuracy_over_time, design, labels),
@@ -210,7 +209,7 @@ def _(design: Design) -> Pictures:
 
 @pictures_of.register
 def _(estimate: Estimate) -> Pictures:
-    labels = complete_labels(estimate)
+    labels = estimate.labels
     held = sum(prediction.recording is not None for prediction in estimate.predictions)
     fits = {
         name: partial(of_estimate.fit, estimate, i, labels)
@@ -267,7 +266,7 @@ def _(result: InverseDynamicsFit) -> Pictures:
 
 @pictures_of.register
 def _(study: MonteCarloStudy) -> Pictures:
-    labels = complete_labels(study)
+    labels = study.labels
     return {
         "overview": partial(studies.overview, study, labels),
         **{

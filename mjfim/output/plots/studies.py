@@ -143,8 +143,7 @@ def check(result: Check) -> Picture:
         note = f"No parameter is identifiable alone, so there are no correlations. {note}"
     if not all(row.stated for row in rows):
         note += " Without a stated one, the wanted σ is 5 %."
-    verdict = result.verdict[0] if result.verdict else "all parameters are identifiable"
-    title = verdict.replace("`", "").removesuffix(".")
+    title = result.findings[0].replace("`", "").removesuffix(".")
     if len(title) > MAX_TITLE:
         title = re.sub(r" \([^()]*\)", "", title)
     return Picture(
@@ -304,10 +303,10 @@ def compare(comparison: Comparison) -> Picture:
         [row.title for row in rows],
         [role if row.sound else "muted" for role, row in zip(roles, rows, strict=True)],
     )
-    verdict = comparison.verdict or ("The design compared with other methods",)
+    first, *others = comparison.findings
     has_margins = any(row.tightest[0] for row in rows)
     note = (
-        f"{' '.join(verdict[1:])} Each method had {budget_in_words(comparison)}. "
+        f"{' '.join(others)} Each method had {budget_in_words(comparison)}. "
         "Predicted standard deviations are the best case. Sorted by the cost J, best first. "
     )
     if has_margins:
@@ -321,7 +320,7 @@ def compare(comparison: Comparison) -> Picture:
             "buys a smaller σ."
         )
     return Picture(
-        title=verdict[0].removesuffix("."),
+        title=first.removesuffix("."),
         panels=[
             _ratios(comparison, rows, names, methods),
             _worst_combinations(comparison, rows, roles, has_margins=has_margins),

@@ -77,7 +77,6 @@ from mjfim.output.rerun.scene import (
     pale_shapes,
     time_column,
 )
-from mjfim.output.words import complete_labels
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal
@@ -121,7 +120,7 @@ def log_design(
         INITIAL: design.initial.trajectory,
         DESIGNED: design.final.trajectory,
     }
-    learning = accuracy_over_time(design, complete_labels(design))
+    learning = accuracy_over_time(design, design.labels)
     motion = motion_panels(labels, both, design.usage)
     asked: Tabs = {"limits": limit_panels(design, labels, rows=False)} if design.usage else {}
     if design.rehearsal is not None and design.rehearsal.fans:
@@ -206,7 +205,7 @@ def log_estimate(
     states: Tabs = motion_panels(labels, shown)
     asked: Tabs = {}
     if estimate.in_time is not None:
-        ribbons = deciding_seconds(estimate, complete_labels(estimate)).panels
+        ribbons = deciding_seconds(estimate, estimate.labels).panels
         asked["information [% per s]"] = [with_curves(panel) for panel in ribbons]
     planes = []
     if estimate.residual_forces:
@@ -568,7 +567,7 @@ def as_markdown(page: Page, *further: str) -> str:
         if sentences
     )
     parts = [*remarks, *map(_rendered, page.parts)]
-    texts = (f"### {escape(page.kind)}", f"**{escape(page.verdict.text)}**", *parts, *further)
+    texts = (f"### {escape(page.kind)}", f"**{escape(page.verdict.sentence)}**", *parts, *further)
     return "\n\n".join(text for text in texts if text)
 
 
