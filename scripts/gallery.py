@@ -8,7 +8,7 @@ parameters differ from the model, or are logs of a real SO-101. A design ends af
 of iterations or where it has converged, so that its numbers do not depend on the speed of the
 computer.
 
-`--shared` is a folder with `models/so101`, `models/go2` and the logs `data/sage_so101`.
+`--shared` is a folder with `models/so101` and the logs `data/sage_so101`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ import numpy as np
 import tomlkit
 from PIL import Image
 
-from mjfim.output.page import TERMS
 from mjfim.output.plots.pictures import kind_of_picture
 from scripts.verbs import call_verb
 
@@ -50,13 +49,6 @@ PAGE_WIDTH, PAGE_COLOURS = 1000, 64
 # Relative difference of the simulated robots from their models.
 ROBOT_DIFFERENCE = 0.1
 
-# Model of a robot on a floor.
-FLOOR = """<mujoco>
-  <include file="../{}"/>
-  <worldbody><geom name="floor" type="plane" size="0 0 1"/></worldbody>
-</mujoco>
-"""
-
 # Joints of the SO-101, in the order of its logs, and number of rows of a log that are fitted, 50 a
 # second.
 JOINTS = (
@@ -69,27 +61,27 @@ JOINTS = (
 )
 LOG_ROWS = 500
 
-# What the pictures of the page show, by their names, in the order of the page. Others follow.
+# What the pictures of the page show, by their names, in the order of the page.
 CAPTIONS = {
-    "check": "Predicted and wanted σ of every parameter, and the correlations of the estimates",
-    "accuracy_over_time": "σ of every parameter by the measurements up to each time",
-    "accuracy": "Predicted, achieved and wanted σ of every parameter, and published values",
+    "check": "σ of each parameter, and correlations",
+    "accuracy_over_time": "σ over the time of the experiment",
+    "accuracy": "Predicted, achieved and wanted σ",
     "trajectories": "Motion and controls",
-    "limits": "How much of each limit the design uses",
-    "rehearsal": "What happens to robots that differ from the model",
-    "worth": "What each sensor tells, and what limits cost",
-    "valley": "Two robots that a poor motion does not tell apart",
-    "parameters": "Estimates with their 95 % intervals, relative to the nominal values",
-    "fit": "Measured outputs, the identified and the nominal model, and the residuals",
-    "held_out": "A recording that was not fitted, and its predictions",
-    "predictions": "Errors of the predictions of what was not fitted, over the noise",
-    "deciding_seconds": "Which seconds of the recordings decide each parameter",
-    "residual_torque": "Torque of each joint that the model does not explain",
-    "pairs": "Joint uncertainty of the estimates of pairs of parameters",
-    "overview": "Scatter of the estimates of many simulated recordings, and the Cramér–Rao bound",
-    "histogram": "Estimates of one parameter in many simulated recordings",
-    "compare": "The design beside other excitations with the same time",
-    "campaign": "σ and estimate of every parameter over the rounds",
+    "limits": "Use of the limits",
+    "rehearsal": "Robots that differ from the model",
+    "worth": "Value of each sensor, price of each limit",
+    "valley": "Two robots that look alike",
+    "parameters": "Estimates with 95 % intervals",
+    "fit": "Measured, identified and nominal motion",
+    "held_out": "Prediction of a held-out recording",
+    "predictions": "Errors of predictions",
+    "deciding_seconds": "Seconds that decide each parameter",
+    "residual_torque": "Unexplained torque",
+    "pairs": "Uncertainty of pairs",
+    "overview": "Scatter of estimates, and Cramér–Rao bound",
+    "histogram": "Estimates of one parameter",
+    "compare": "Methods in equal time",
+    "campaign": "σ over the rounds",
 }
 
 # Numbers of a text, and their exponents in small digits.
@@ -124,7 +116,6 @@ class Robot:
         source: Experiment file, or the model for which `mjfim init` writes one.
         steps: Calls of the command line.
         iterations: Number of iterations of a design for an experiment of `init`; 0 for none.
-        needs_floor: Whether a floor is added to the model.
         log: Folder of a measured log, which the calls find as `{out}/log.csv`; empty for none.
     """
 
@@ -133,7 +124,6 @@ class Robot:
     source: str
     steps: tuple[Step, ...]
     iterations: int = 0
-    needs_floor: bool = False
     log: str = ""
 
     @property
@@ -175,7 +165,7 @@ RECORDING = (
 ROBOTS = (
     Robot(
         title="Cart-pendulum",
-        text="The study of the paper: mass, length and damping of a pendulum on a cart.",
+        text="The study of the paper, without limits.",
         source="models/cart_pendulum.toml",
         steps=(
             CHECK,
@@ -188,27 +178,20 @@ ROBOTS = (
     ),
     Robot(
         title="Servo arm",
-        text="Four joints with position servos, whose gains are known to a tenth only.",
+        text="Four joints with position servos. The simulated robot is 10 % off the model.",
         source="models/servo_arm.toml",
         steps=(CHECK, DESIGN, *RECORDING),
     ),
     Robot(
         title="SO-101",
-        text="A table-top arm with six servos, with the experiment that `mjfim init` writes.",
+        text="The experiment of `mjfim init`, 10 iterations. The robot is 10 % off the model.",
         source="shared/models/so101/so101_nomesh.xml",
         iterations=10,
         steps=(CHECK, DESIGN, *RECORDING),
     ),
     Robot(
-        title="Go2",
-        text="A robot on legs on a floor, with the experiment that `mjfim init` writes.",
-        source="shared/models/go2/go2_nomesh.xml",
-        needs_floor=True,
-        steps=(Step(words=CHECK.words),),
-    ),
-    Robot(
         title="Measured SO-101",
-        text="A log of a real SO-101, a chirp of all joints, and the model as it is published.",
+        text="A chirp of a real SO-101, and the published model.",
         source="shared/models/so101/so101_nomesh.xml",
         log="shared/data/sage_so101/chirp_sweep",
         steps=(Step(words="identify {experiment} {out}/log.csv -o {out}/identify"),),
@@ -234,13 +217,10 @@ def show_robot(robot: Robot, root: Path, *, is_quick: bool = False) -> Iterator[
     if not steps:
         return
     (root / robot.name).mkdir()
-    experiment = model = robot.source
-    if robot.needs_floor:
-        model = f"{robot.name}/scene.xml"
-        (root / model).write_text(FLOOR.format(robot.source), encoding="utf-8")
-    if model.endswith(".xml"):
+    experiment = robot.source
+    if experiment.endswith(".xml"):
         experiment = f"{robot.name}/experiment.toml"
-        yield _call(["init", model, "-o", experiment], root)
+        yield _call(["init", robot.source, "-o", experiment], root)
         if robot.iterations:
             _end_after(root / experiment, robot.iterations)
     if robot.log:
@@ -337,28 +317,14 @@ hide:
 
 # Gallery
 
-What mjfim prints and draws for several robots. Every result also has a `report.html`, whose plots
-can be hovered and zoomed, and a design or an estimate a file for the viewer. The page is made by
+All pictures of several robots. Open "Terminal" for the command and its text. Every result also has
+an interactive `report.html`. `python -m scripts.gallery` makes this page.
 
-<!-- not run: needs models and logs of others -->
+Colours: blue initial, red designed, orange nominal, teal measured, purple identified.
 
-```sh
-python -m scripts.gallery
-```
-
-The colours mean the same everywhere: {colours}
-([words and colours](reference/words-and-colours.md)).
 """
 
-# What is said of the simulated recordings of a robot, and of its designs.
-SIMULATED = (
-    "Its recordings are simulated: the robot's parameters differ from the model by "
-    f"{100 * ROBOT_DIFFERENCE:.0f} % of their sizes, unless they are known beforehand."
-)
-ITERATIONS = (
-    "So that its numbers do not depend on the computer, the design ends after {} iterations, far "
-    "from the best one."
-)
+FOLD = '<details markdown="1"><summary>Terminal</summary>'
 
 
 def write_page(page: Path, shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> None:
@@ -373,23 +339,9 @@ def write_page(page: Path, shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> No
         shutil.rmtree(images)
     images.mkdir(parents=True)
 
-    *most, last = [f"{term.colour_name} for {term}" for term in TERMS]
-    colours = f"{', '.join(most)} and {last}"
-    parts = [
-        "\n".join(textwrap.wrap(line, 100)) for line in HEAD.format(colours=colours).split("\n")
-    ]
-    parts += ["| robot | results |", "|---|---|"]
+    parts = [HEAD]
     for robot, calls in shown:
-        links = [f"[{call.verb}](#{robot.name}-{call.verb})" for call in calls]
-        parts.append(f"| {robot.title} | {', '.join(links)} |")
-    parts.append("")
-    for robot, calls in shown:
-        text = robot.text
-        if any("robot.toml" in call.command for call in calls):
-            text += f" {SIMULATED}"
-        if robot.iterations:
-            text += f" {ITERATIONS.format(robot.iterations)}"
-        parts += [f"## {robot.title}", "", *textwrap.wrap(text, 100), ""]
+        parts += [f"## {robot.title}", "", robot.text, ""]
         parts += [_section(robot, call, images) for call in calls]
     page.write_text("\n".join(parts), encoding="utf-8")
 
@@ -409,33 +361,26 @@ def command_of(call: Shown) -> str:
 
 def _section(robot: Robot, call: Shown, images: Path) -> str:
     """Describe one call: the command, what the terminal printed, and the pictures."""
-    lines = [f"### {robot.title}: {call.verb}", "", "```text", command_of(call)]
+    lines = [f"### {robot.title}: {call.verb}", "", FOLD, "", "```text", command_of(call)]
     for line in call.terminal.splitlines():
         indent = " " * (len(line) - len(line.lstrip()))
         lines += textwrap.wrap(line, COLUMNS, subsequent_indent=indent) or [""]
-    lines += ["```", ""]
-    if call.code == 1:
-        lines += ["Exit code 1: the run is complete, and did not reach its goal.", ""]
+    lines += ["```", "", *(["Exit code 1."] if call.code else []), "</details>", ""]
 
     # Of several pictures of a kind, such as one for each recording, the first one is shown.
-    kinds: dict[str, list[str]] = {kind: [] for kind in CAPTIONS}
-    for name in call.pictures:
-        kinds.setdefault(kind_of_picture(name), []).append(name)
-    for kind, found in kinds.items():
+    for kind, caption in CAPTIONS.items():
+        found = [file for name, file in call.pictures.items() if kind_of_picture(name) == kind]
         if not found:
             continue
         target = images / f"{robot.name}-{call.verb}-{kind}.png"
-        with Image.open(call.pictures[found[0]]) as opened:
+        with Image.open(found[0]) as opened:
             image = opened.convert("RGB")
         image.thumbnail((PAGE_WIDTH, image.height))
         image.quantize(PAGE_COLOURS).save(target, optimize=True)
-        caption = CAPTIONS.get(kind, f"{kind}.png")
-        more = f" (one of {len(found)})" if len(found) > 1 else ""
-        alt = f"{robot.title}, {call.verb}: {caption}"
         lines += [
             '<figure markdown="span">',
-            f'![{alt}](images/gallery/{target.name}){{ width="{image.width}" loading="lazy" }}',
-            f"<figcaption>{caption}{more}</figcaption>",
+            f'![{caption}](images/gallery/{target.name}){{ width="{image.width}" loading="lazy" }}',
+            f"<figcaption>{caption}</figcaption>",
             "</figure>",
             "",
         ]

@@ -1,6 +1,6 @@
 """Reproduce the study of Wilson & Murphey (2014): the numbers of Tables I-III and Figures 2-6.
 
-    python scripts/reproduce_paper.py -o out/paper
+    python -m scripts.reproduce_paper -o out/paper
 
 The paper does not print its weights. The experiment file holds weights that reproduce its optimized
 matrices to a few percent. Its Monte-Carlo tables are those of measurements at 25 Hz, although its
@@ -9,7 +9,6 @@ text says 100 Hz; both rates are run here.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,6 +35,7 @@ from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.studies import MonteCarloStudy
 from mjfim.records.trajectory import Labels, Trajectory
+from scripts.benchmarks.child import new_table, options_of
 
 # Experiment of the study.
 EXPERIMENT = Path(__file__).resolve().parents[1] / "models" / "cart_pendulum.toml"
@@ -116,14 +116,6 @@ def difference(printed: float, ours: float) -> str:
     return f"{100 * (ours / printed - 1):+.1f} %"
 
 
-def new_table(title: str, *headings: str) -> Table:
-    """Make an empty table whose first column is text."""
-    table = Table(title=title, title_justify="left")
-    for i, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
-    return table
-
-
 def table_one(design: Design) -> Table:
     """Compare eigenvalues and cost.
 
@@ -183,28 +175,6 @@ def matrix_table(name: str, trials: int, covariance: Array, information: Array) 
         for theirs, computed in pairs:
             cells += [f"{theirs:.3g}", f"{computed:.3g}", difference(theirs, float(computed))]
         table.add_row(*cells)
-
-    return table
-
-
-def efficiency_table(study: MonteCarloStudy) -> Table:
-    """Compare variances of the estimates with the Cramer-Rao bound that mjfim computes."""
-    title = f"Monte Carlo at {study.measure_rate:g} Hz against mjfim's own bound"
-    headings = ("trajectory", "parameter", "variance", "bound", "variance / bound", "failed")
-    table = new_table(title, *headings)
-
-    for name, trials in study.sets.items():
-        for i, parameter in enumerate(study.parameters):
-            variance = trials.covariance[i, i]
-            bound = trials.crlb[i, i]
-            table.add_row(
-                TITLES[name],
-                parameter,
-                f"{variance:.3e}",
-                f"{bound:.3e}",
-                f"{variance / bound:.3f}",
-                str(trials.failed),
-            )
 
     return table
 
@@ -270,9 +240,7 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
 
 def main() -> None:
     """Run the study and print every comparison."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/paper"))
     parser.add_argument("--trials", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
@@ -297,8 +265,6 @@ def main() -> None:
         covariance = studies[25.0].sets[name].covariance
         console.print(matrix_table(name, args.trials, covariance, information))
     console.print(NOTE)
-    for study in studies.values():
-        console.print(efficiency_table(study))
 
     # Files.
     args.output.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,6 @@ def made_call(folder: Path) -> Shown:
         ("histogram_b", (60, 40)),
         ("fit_1", (60, 40)),
         ("fit_2", (60, 40)),
-        ("a_new_one", (60, 40)),
         ("check", (1100, 100)),
     ):
         pictures[name] = folder / f"{name}.png"
@@ -38,7 +37,7 @@ def made_call(folder: Path) -> Shown:
     )
 
 
-def test_the_page_has_short_lines_links_and_small_pictures(tmp_path: Path) -> None:
+def test_the_page_has_short_lines_and_small_pictures(tmp_path: Path) -> None:
     robot = Robot(title="Some arm", text="An arm.", source="arm.toml", steps=())
     page = tmp_path / "docs" / "gallery.md"
     page.parent.mkdir()
@@ -47,13 +46,13 @@ def test_the_page_has_short_lines_links_and_small_pictures(tmp_path: Path) -> No
     (block,) = [block for block in code_blocks(page) if block.language == "text"]
     assert max(map(len, block.text.splitlines())) <= COLUMNS
     assert str(tmp_path) not in text
-    assert "(#some-arm-check)" in text and "### Some arm: check\n" in text
+    assert "### Some arm: check\n" in text
     assert "Exit code 1" in text
 
-    # Pictures of a kind are shown once, and those without a caption as well.
+    # Pictures of a kind are shown once.
     found = re.findall(r"!\[(.+)\]\((.+)\)\{ width=\"(\d+)\"", text)
     kinds = [Path(target).stem.removeprefix("some-arm-check-") for _, target, _ in found]
-    assert kinds == ["check", "fit", "histogram", "a_new_one"]
+    assert kinds == ["check", "fit", "histogram"]
     for _, target, width in found:
         with Image.open(page.parent / target) as picture:
             assert picture.width == int(width) <= PAGE_WIDTH

@@ -1,7 +1,7 @@
-"""J against seconds: the design beside its baselines at every budget, as a table and a picture.
+"""J against seconds: the design beside its baselines at every budget, as a table.
 
     python -m scripts.benchmarks anytime FOLDER [--seconds 2 3 5 10]
-    [--examples cart_pendulum_limits] [--methods fourier5 fourier15] [--arms panda so_arm100]
+    [--examples cart_pendulum_limits] [--methods fourier5 fourier15]
     python -m scripts.benchmarks anytime FOLDER --show        # the results in FOLDER
 
 Each method runs anew for each budget, in one thread, because a search plans with its budget. The
@@ -18,11 +18,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import StrMethodFormatter
 from rich.console import Console
 from rich.table import Table
 
@@ -30,11 +27,9 @@ import mjfim
 from mjfim.arrays import record
 from mjfim.errors import MjfimError
 from mjfim.experiment.schema import Experiment
-from mjfim.output.page import DESIGNED, OTHER
 from mjfim.parallel.budget import measured_by, stop_on_interrupt
 from mjfim.records.studies import DESIGN
 from mjfim.studies.baselines import TITLES
-from scripts.benchmarks import arms
 from scripts.benchmarks.child import ROOT, new_table, options_of
 
 # Folder of the examples.
@@ -48,9 +43,6 @@ METHODS = ("multisine", "fourier5", "fourier15", "splines")
 
 # Relative difference of two costs below which they count as equal.
 TIE = 1e-3
-
-# Horizon of the arms [s].
-HORIZON = 5.0
 
 
 @record
@@ -182,95 +174,20 @@ def verdicts(results: list[Results], budgets: list[float]) -> Iterator[str]:
         yield f"{sentence}; a baseline wins in {', '.join(beaten)}" if beaten else sentence
 
 
-def picture(results: list[Results], path: Path) -> None:
-    """Draw J against seconds, divided by the lowest J of the experiment.
-
-    Where this is not positive, such as for D-optimality, the difference from it is drawn.
-
-    Args:
-        results: Results of all experiments.
-        path: The PNG file.
-    """
-    columns = min(len(results), 4)
-    rows = -(-len(results) // columns)
-    figure = Figure(figsize=(3.6 * columns, 2.8 * rows + 0.4), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for axis in axes.flat[len(results) :]:
-        axis.set_visible(False)
-
-    for each, axis in zip(results, axes.flat, strict=False):
-        _draw(each, axis)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("J over the lowest J")
-    for axis in axes.flat[: len(results)]:
-        axis.set_xlabel("budget [s of the processor]")
-
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    figure.savefig(path, dpi=120)
-
-
-def _draw(results: Results, axis: Any) -> None:
-    """Draw the curves of one experiment."""
-    budgets = results.budgets
-    finite = [row.cost for row in results.rows if np.isfinite(row.cost)]
-    lowest = min(finite, default=1.0)
-
-    label: str | None = "baselines"
-    for method in results.methods:
-        costs = np.array([results.cost(method, seconds) for seconds in budgets])
-        if method != DESIGN:
-            axis.plot(
-                budgets, _beside(costs, lowest), color=OTHER.colour, lw=1.0, marker=".", label=label
-            )
-            label = None
-    mine = np.array([results.cost(DESIGN, seconds) for seconds in budgets])
-    shown = _beside(mine, lowest)
-    axis.plot(budgets, shown, color=DESIGNED.colour, lw=2.0, marker="o", label="design")
-
-    title = results.case if lowest > 0.0 else f"{results.case} (J minus the lowest J)"
-    axis.set_title(title, fontsize=10)
-    axis.set_xscale("log")
-    axis.set_xticks(budgets, [f"{seconds:g}" for seconds in budgets])
-    axis.minorticks_off()
-    if lowest > 0.0:
-        axis.set_yscale("log")
-        for formatter in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
-            formatter(StrMethodFormatter("{x:g}"))
-    axis.grid(alpha=0.3)
-
-
-def _beside(costs: np.ndarray, lowest: float) -> np.ndarray:
-    """Costs divided by the lowest one; their differences from it where it is not positive."""
-    return costs / lowest if lowest > 0.0 else costs - lowest
-
-
 def main() -> int:
-    """Run what is missing, print the table and draw the picture; 1 if a baseline is better."""
+    """Run what is missing and print the table; 1 if a baseline is better."""
     parser = options_of(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seconds", nargs="+", type=float, default=list(SECONDS))
     parser.add_argument("--examples", nargs="*", help="names of examples; default: all")
     parser.add_argument("--methods", nargs="+", choices=list(TITLES), default=list(METHODS))
-    parser.add_argument(
-        "--arms", nargs="*", choices=list(arms.ARMS), help="default: all whose models are there"
-    )
     parser.add_argument("--show", action="store_true", help="only show the results in the folder")
     args = parser.parse_args()
-
-    cases = list(examples(args.examples))
-    wanted = args.arms
-    if wanted is None:
-        wanted = list(arms.ARMS) if arms.MODELS.is_dir() and args.examples is None else []
-    for arm in wanted:
-        for dry, joints in ((False, "smooth"), (True, "dry")):
-            stated = arms.experiment(arm, HORIZON, dry, args.folder / "models")
-            cases.append((f"{arm}_{joints}", stated))
 
     args.folder.mkdir(parents=True, exist_ok=True)
     results: list[Results] = []
     with stop_on_interrupt() as stop:
-        for case, experiment in cases:
+        for case, experiment in examples(args.examples):
             rows: list[Found] = []
             for seconds in args.seconds:
                 file = args.folder / f"{case}_{seconds:g}s.json"
@@ -287,7 +204,6 @@ def main() -> int:
     Console(highlight=False, width=60 + 24 * len(args.seconds)).print(table(results, args.seconds))
     for verdict in verdicts(results, args.seconds):
         print(verdict)
-    picture(results, args.folder / "anytime.png")
     beaten = [each.is_beaten(seconds) for each in results for seconds in each.budgets]
     return int(any(beaten))
 

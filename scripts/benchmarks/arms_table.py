@@ -23,20 +23,21 @@ from pathlib import Path
 from rich.console import Console
 
 import mjfim
-from mjfim.parallel import cores
 from mjfim.parallel.budget import stop_on_interrupt
-from mjfim.records.studies import Comparison, MethodResult
+from mjfim.records.studies import DESIGN, Comparison
 from scripts.benchmarks import arms
 from scripts.benchmarks.child import options_of
 
 # Methods with five and with fifteen harmonics.
-FEW, MANY = ("fourier5",), ("fourier15",)
+FEW, MANY = "fourier5", "fourier15"
 
 # Frequency of the series that is one start of the design [Hz].
 FUNDAMENTAL = 0.2
 
-# Smallest wanted gain over five harmonics.
-WANTED = 0.1
+
+HEAD = """\
+| robot, friction of the joints | seconds | unknowns | 5 harmonics | 15 harmonics | mjfim | gain |
+|---|---|---|---|---|---|---|"""
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,6 @@ class Case:
         few: Worst relative sigma with five harmonics, infinite where no control keeps the limits.
         many: Worst relative sigma with fifteen harmonics.
         design: Worst relative sigma of the design.
-        tightest: Kind of limit with the smallest margin of the design.
-        share: This margin as a share of half the range.
         kept: Whether the design keeps all limits.
         seconds: Time of the design [s].
         budget: Time of every method [s].
@@ -66,8 +65,6 @@ class Case:
     few: float
     many: float
     design: float
-    tightest: str
-    share: float
     kept: bool
     seconds: float
     budget: float
@@ -75,14 +72,13 @@ class Case:
 
     @property
     def gain(self) -> float:
-        """Share by which sigma is smaller than that of five harmonics."""
-        return 1.0 - self.design / self.few
+        """Share by which sigma is smaller than the best of the series."""
+        return 1.0 - self.design / min(self.few, self.many)
 
     @property
     def met(self) -> bool:
-        """Whether the design is feasible, better than five harmonics and not worse than fifteen."""
-        is_not_worse = self.design <= self.many * (1.0 + 1e-3)
-        return self.kept and self.gain >= WANTED and is_not_worse
+        """Whether the design keeps all limits and is better than both series."""
+        return self.kept and self.gain > 0.0
 
 
 def run(
@@ -104,7 +100,7 @@ def run(
     experiment = stated.replace(descent={"fourier": [FUNDAMENTAL], "max_iterations": 100_000})
     with mjfim.Pool() as executor:
         found = mjfim.compare(
-            experiment, seconds=args.seconds, methods=args.methods, executor=executor
+            experiment, seconds=args.seconds, methods=[FEW, MANY], executor=executor
         )
 
     for row in found.rows:
@@ -115,17 +111,14 @@ def run(
     if design is None:
         return None
 
-    kind, share = design.tightest
     return Case(
         arm=arm,
         horizon=horizon,
         dry=dry,
         parameters=len(found.parameters),
-        few=best(found, FEW),
-        many=best(found, MANY),
-        design=sound_sigma(design),
-        tightest=kind,
-        share=share,
+        few=sigma_of(found, FEW),
+        many=sigma_of(found, MANY),
+        design=sigma_of(found, DESIGN),
         kept=design.sound,
         seconds=design.seconds,
         budget=args.seconds,
@@ -133,50 +126,18 @@ def run(
     )
 
 
-def sound_sigma(row: MethodResult) -> float:
+def sigma_of(found: Comparison, method: str) -> float:
     """Return the worst relative sigma of a method, infinite if its control violates a limit."""
+    row = next(row for row in found.rows if row.method == method)
     return row.worst_relative_std if row.sound else float("inf")
 
 
-def best(found: Comparison, methods: tuple[str, ...]) -> float:
-    """Return the smallest worst relative sigma of some methods."""
-    sigmas = [sound_sigma(row) for row in found.rows if row.method in methods]
-    return min(sigmas, default=float("inf"))
-
-
-def markdown(cases: list[Case]) -> str:
-    """Write one table for each arm as Markdown."""
-    lines = [
-        f"Worst relative σ; every method with {cases[0].budget:g} s on {cores()} cores. 'Inside': "
-        "the design keeps all limits at every engine step of the unchanged model, with at least "
-        "this share of half the range as margin.",
-    ]
-
-    for arm in dict.fromkeys(case.arm for case in cases):
-        lines += [
-            "",
-            f"| {arm} | horizon | unknowns | Fourier, 5 harmonics | 15 harmonics | mjfim | "
-            "smaller than 5 by | inside |",
-            "|---|---|---|---|---|---|---|---|",
-        ]
-        lines += [markdown_row(case) for case in cases if case.arm == arm]
-
-    return "\n".join(lines)
-
-
 def markdown_row(case: Case) -> str:
-    """Write the row of a case as Markdown."""
-    margin = f"{100 * case.share:.2g} % ({case.tightest.replace('_', ' ')})"
-    cells = [
-        "dry" if case.dry else "smooth",
-        f"{case.horizon:g} s",
-        str(case.parameters),
-        *(f"{sigma:.3g}" if isfinite(sigma) else "none" for sigma in (case.few, case.many)),
-        f"**{case.design:.3g}**",
-        f"{100 * case.gain:.0f} %",
-        margin if case.kept else "no",
-    ]
-    return f"| {' | '.join(cells)} |"
+    """Write a case as a row of Markdown."""
+    series = [f"{sigma:.3g}" if isfinite(sigma) else "none" for sigma in (case.few, case.many)]
+    robot = f"{case.arm}, {'dry' if case.dry else 'smooth'}"
+    result = f"**{case.design:.3g}** | {100 * case.gain:.0f} %" if case.kept else "none |"
+    return f"| {robot} | {case.horizon:g} | {case.parameters} | {' | '.join(series)} | {result} |"
 
 
 def main() -> None:
@@ -186,15 +147,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0, help="time of every method")
     parser.add_argument("--arms", nargs="+", choices=list(arms.ARMS), default=list(arms.ARMS))
     parser.add_argument("--horizons", nargs="+", type=float, default=[5.0, 10.0])
-    parser.add_argument("--joints", nargs="+", choices=["smooth", "dry"], default=["smooth", "dry"])
-    parser.add_argument("--methods", nargs="+", choices=[*FEW, *MANY], default=[*FEW, *MANY])
     parser.add_argument("--show", action="store_true", help="only print the results in the folder")
     args = parser.parse_args()
 
     console = Console(highlight=False, width=150)
     cases = []
     with stop_on_interrupt() as stop:
-        for arm, joints, horizon in itertools.product(args.arms, args.joints, args.horizons):
+        for arm, joints, horizon in itertools.product(args.arms, ("smooth", "dry"), args.horizons):
             file = args.folder / f"{arm}_{joints}_{horizon:g}s.json"
             if not file.is_file():
                 if args.show or stop.requested:
@@ -209,6 +168,5 @@ def main() -> None:
 
             cases.append(Case(**json.loads(file.read_text(encoding="utf-8"))))
 
-    if cases:
-        print(markdown(cases))
+    print(*[HEAD, *map(markdown_row, cases)], sep="\n")
     sys.exit(0 if cases and all(case.met for case in cases) else 1)

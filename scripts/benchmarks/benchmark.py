@@ -1,7 +1,7 @@
 """Where the time of a design goes: mjfim beside the engine, CasADi and its own metric descent.
 
     python -m scripts.benchmarks benchmark                  # all tables, some minutes
-    python -m scripts.benchmarks benchmark --quick          # case a only, few trials
+    python -m scripts.benchmarks benchmark --quick          # case a only
 
 All comparisons are made within one run:
 
@@ -9,7 +9,6 @@ All comparisons are made within one run:
 (b) time until J is within 1e-6 (relative) of the best J of all solvers, beside CasADi on the
     hand-derived model
 (c) iterations and time to an equal J, beside the metric descent of the paper
-(d) 1500 Monte-Carlo trials at 100 Hz
 """
 
 from __future__ import annotations
@@ -233,12 +232,6 @@ def best_cost(runs: list[Run]) -> float:
     return min(run.cost for run in runs) * (1 + CLOSE)
 
 
-def time_of_mjfim(runs: list[Run]) -> float:
-    """Return the time of mjfim to the best J of the runs of one case [s]."""
-    mine = next(run for run in runs if run.solver == "mjfim")
-    return mine.time_to(best_cost(runs))
-
-
 def by_case(runs: list[Run]) -> dict[str, list[Run]]:
     """Return the runs of each case."""
     found: dict[str, list[Run]] = {}
@@ -256,14 +249,12 @@ def peer_table(runs: list[Run]) -> Table:
         "J",
         "iterations",
         "to 1e-6",
-        "mjfim is",
         "before the first iterate",
         texts=2,
     )
 
     for case, group in by_case(runs).items():
         goal = best_cost(group)
-        mine = time_of_mjfim(group)
 
         for run in group:
             seconds = run.time_to(goal)
@@ -273,20 +264,10 @@ def peer_table(runs: list[Run]) -> Table:
                 f"{run.cost:.9g}",
                 str(run.iterations),
                 f"{seconds:.3f} s" if np.isfinite(seconds) else "never",
-                "" if run.solver == "mjfim" else comparison(mine, seconds),
                 f"{run.prepared:.2f} s",
             )
 
     return table
-
-
-def comparison(mine: float, theirs: float) -> str:
-    """Compare the time of mjfim with that of a peer in words."""
-    if not np.isfinite(mine):
-        return "never there"
-    if theirs >= mine:
-        return f"{theirs / mine:.1f} × faster"
-    return f"{mine / theirs:.1f} × slower"
 
 
 def metric_table(pairs: list[tuple[Run, Run]]) -> Table:
@@ -313,26 +294,6 @@ def metric_table(pairs: list[tuple[Run, Run]]) -> Table:
     return table
 
 
-def monte_carlo_table(design: Design, trials: int) -> Table:
-    """Measure a Monte-Carlo study, table (d).
-
-    Args:
-        design: Design whose two trajectories are studied.
-        trials: Number of trials of each.
-
-    Returns:
-        Table with one row for each trajectory.
-    """
-    title = f"(d) {trials} Monte-Carlo trials at 100 Hz (target 15 s)"
-    table = new_table(title, "trajectory", "failed", "seconds", texts=2)
-
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = mjfim.monte_carlo(experiment("b"), curves, trials=trials, seed=0)
-    for name, result in study.sets.items():
-        table.add_row(name, str(result.failed), f"{result.seconds:.1f} s")
-    return table
-
-
 def compare_descents(cases: list[str], flat: list[tuple[Run, Design]]) -> Table:
     """Run the metric descent of the paper and compare it with designs on one level, table (c).
 
@@ -355,11 +316,11 @@ def compare_descents(cases: list[str], flat: list[tuple[Run, Design]]) -> Table:
 def main() -> None:
     """Run all comparisons and print their tables."""
     parser = options_of(__doc__)
-    parser.add_argument("--quick", action="store_true", help="case a only, 100 trials, one repeat")
+    parser.add_argument("--quick", action="store_true", help="case a only, one repeat")
     args = parser.parse_args()
 
     console = Console(highlight=False, width=130)
-    cases, repeats, trials = (["a"], 1, 100) if args.quick else (list(CASES), 3, 1500)
+    cases, repeats = (["a"], 1) if args.quick else (list(CASES), 3)
 
     # (a), after a first design that is not measured.
     mjfim_run(cases[0], "warm-up")
@@ -373,10 +334,6 @@ def main() -> None:
 
     # (c)
     console.print(compare_descents(cases, flat))
-
-    # (d), with the design of case b.
-    design = default[-1][1] if args.quick else default[1][1]
-    console.print(monte_carlo_table(design, trials))
 
 
 if __name__ == "__main__":
