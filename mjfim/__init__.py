@@ -1,8 +1,9 @@
 """mjfim: optimal experiment design and system identification with MuJoCo.
 
-`check` says which parameters can be identified, `design` finds the excitation that gives the most
-information about them, `simulate` makes a synthetic recording, `identify` estimates the parameters
-from recordings, and `monte_carlo` compares the estimates with the Cramér-Rao bound.
+`propose` makes a first experiment of a model, `check` says which parameters can be identified,
+`design` finds the excitation that gives the most information about them, `simulate` makes a
+synthetic recording, `identify` estimates the parameters from recordings, and `monte_carlo` compares
+the estimates with the Cramér-Rao bound.
 """
 
 from importlib import import_module
@@ -16,20 +17,19 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from mjfim.errors import MjfimError
     from mjfim.excitation.design import design, design_jointly
-    from mjfim.excitation.evaluation import evaluate
+    from mjfim.excitation.evaluation import evaluate, simulate
     from mjfim.excitation.rehearsal import rehearse
     from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
     from mjfim.experiment.schema import Experiment
-    from mjfim.experiment.system import simulate
     from mjfim.identification.assessment.parameter_draws import draw_parameters
     from mjfim.identification.identify import identify
     from mjfim.identification.inverse_dynamics import inverse_dynamics
     from mjfim.identification.left_out import predict
     from mjfim.identification.meter import Meter
     from mjfim.output.export.design import export_design
-    from mjfim.output.export.sysid import export_sysid
-    from mjfim.output.live import live
-    from mjfim.output.video import save_video
+    from mjfim.output.export.sysid import export_sysid, sysid_control
+    from mjfim.output.film import save_video
+    from mjfim.output.rerun.live import live
     from mjfim.parallel import ExecutorLike, Pool, Workers
     from mjfim.parallel.budget import Budget, StopToken
     from mjfim.records.campaign import Campaign
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from mjfim.studies.campaign import run_campaign
     from mjfim.studies.check import check
     from mjfim.studies.compare import compare
+    from mjfim.studies.first_experiment import propose
     from mjfim.studies.monte_carlo import monte_carlo
     from mjfim.studies.payload import identify_payload
     from mjfim.studies.robot_comparison import compare_estimates
@@ -91,6 +92,7 @@ __all__ = [
     "live",
     "monte_carlo",
     "predict",
+    "propose",
     "rehearse",
     "run_campaign",
     "save_video",
@@ -98,6 +100,7 @@ __all__ = [
     "selected_experiment",
     "shortest_experiment",
     "simulate",
+    "sysid_control",
     "worth",
 ]
 __version__ = "0.1.0"
@@ -115,7 +118,7 @@ MODULES = {
     "ShortestExperiment": "mjfim.excitation.shortest_horizon",
     "shortest_experiment": "mjfim.excitation.shortest_horizon",
     "Experiment": "mjfim.experiment.schema",
-    "simulate": "mjfim.experiment.system",
+    "simulate": "mjfim.excitation.evaluation",
     "predict": "mjfim.identification.left_out",
     "identify": "mjfim.identification.identify",
     "Meter": "mjfim.identification.meter",
@@ -123,8 +126,9 @@ MODULES = {
     "draw_parameters": "mjfim.identification.assessment.parameter_draws",
     "export_design": "mjfim.output.export.design",
     "export_sysid": "mjfim.output.export.sysid",
-    "live": "mjfim.output.live",
-    "save_video": "mjfim.output.video",
+    "sysid_control": "mjfim.output.export.sysid",
+    "live": "mjfim.output.rerun.live",
+    "save_video": "mjfim.output.film",
     "ExecutorLike": "mjfim.parallel",
     "Pool": "mjfim.parallel",
     "Workers": "mjfim.parallel",
@@ -149,6 +153,7 @@ MODULES = {
     "select_terms": "mjfim.studies.selection",
     "selected_experiment": "mjfim.studies.selected_models",
     "worth": "mjfim.studies.worth",
+    "propose": "mjfim.studies.first_experiment",
 }
 
 

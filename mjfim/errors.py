@@ -142,6 +142,16 @@ def shortened(text: str) -> str:
     return f"{text[:SHOWN_TEXT]} (the beginning of {len(text)} characters)"
 
 
+def in_words(value: object) -> str:
+    """Describe a wrong argument for a message: a short value itself, else its type.
+
+    Args:
+        value: The argument.
+    """
+    is_short = value is None or isinstance(value, (str, int, float))
+    return shortened(repr(value)) if is_short else f"an object of type {type(value).__name__}"
+
+
 def listed(names: Sequence[str]) -> str:
     """List names for a message; of a long list the beginning and the number of the others.
 

@@ -14,11 +14,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mjfim.excitation.design import design
+from mjfim.excitation.evaluation import simulate
 from mjfim.excitation.initial_controls import series_of
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import simulate
 from mjfim.identification.identify import identify
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording

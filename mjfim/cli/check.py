@@ -30,16 +30,15 @@ def check(
     if has_folder:
         draw_elsewhere()
 
+    from mjfim.experiment.given import recordings_of
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
     from mjfim.output.folders import CHECK_FILES
-    from mjfim.recordings.read import read_recording, recording_paths
 
     system = System.resolve(stated, threads=run.threads)
     with progress("reading"):
-        paths = recording_paths(recordings or [], system.channels)
-        loaded = [read_recording(path, system.channels) for path in paths]
+        loaded = recordings_of(system, recordings or [])
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]

@@ -50,12 +50,24 @@ if TYPE_CHECKING:
     from mjfim.parallel import Workers
     from mjfim.records.base import ShownRecord
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Design the experiment that identifies a MuJoCo model's parameters, then identify them.",
-)
+# Verbs by the step of an experiment, with an example of each step, as the help shows them.
+STEPS: Mapping[str, tuple[str, ...]] = {
+    "Start: mjfim init arm.xml -o arm.toml": ("init", "list", "validate", "check"),
+    "Design: mjfim design arm.toml -o out/design": ("design", "rehearse", "worth", "compare"),
+    "Learn: mjfim identify arm.toml log.csv -o out/arm": (
+        "watch",
+        "identify",
+        "payload",
+        "campaign",
+    ),
+    "Prove: mjfim montecarlo arm.toml out/design -o out/study": (
+        "simulate",
+        "montecarlo",
+        "compare-robots",
+    ),
+    "Hand over: mjfim export out/design --to player -o play.py": ("export", "report", "replay"),
+}
+ORDER = tuple(name for names in STEPS.values() for name in names)
 
 # Number of tasks where it is not known before the work begins: as many processes as there may be.
 MAX_PARTS = 1_000_000
@@ -124,24 +136,41 @@ ExperimentOfDesign = Annotated[
     ),
 ]
 
-ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (MJCF or URDF).")]
-
-Verbose = Annotated[
-    bool,
-    typer.Option("--verbose", "-v", help="Print all tables and sentences, not only the essential."),
+ModelFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="MODEL",
+        help="Model file (MJCF or URDF), or a name of the package robot_descriptions.",
+    ),
 ]
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
+# Options of most verbs. The help of `mjfim` explains them once; that of a verb names them.
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Print all tables and sentences.", hidden=True),
+]
+
+AsJson = Annotated[
+    bool,
+    typer.Option("--json", help="Print the result as JSON instead of tables.", hidden=True),
+]
 
 Pictures = Annotated[
-    PictureFormat, typer.Option("--format", help="Format of the pictures.", case_sensitive=False)
+    PictureFormat,
+    typer.Option(
+        "--format",
+        help="Format of the pictures: png, svg or pdf.",
+        case_sensitive=False,
+        hidden=True,
+    ),
 ]
 
 Force = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="Replace files that mjfim did not write, or that were changed since; inputs never.",
+        help="Replace files that you changed or that mjfim did not write; inputs never.",
+        hidden=True,
     ),
 ]
 
@@ -183,15 +212,22 @@ class Run:
     force: Force = False
     threads: Annotated[
         int | None,
-        typer.Option(min=1, max=MAX_THREADS, help="Threads for MuJoCo; default: all cores."),
+        typer.Option(
+            "--threads",
+            min=1,
+            max=MAX_THREADS,
+            help="Threads for MuJoCo; default: all cores.",
+            hidden=True,
+        ),
     ] = None
     executor: Annotated[
         str,
         typer.Option(
             "--executor",
             metavar="WHERE",
-            help="Where the work is done: local, local:N (processes), dask://HOST:PORT, "
-            "dask:FILE.json, or python:MODULE:FACTORY (an executor of your own).",
+            help="Where to compute: local, local:N (processes), dask://HOST:PORT, dask:FILE.json "
+            "or python:MODULE:FACTORY.",
+            hidden=True,
         ),
     ] = LOCAL
 
@@ -420,13 +456,52 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+def _option(parameter: inspect.Parameter) -> Any:
+    """The option of Typer that a parameter of a verb is annotated with."""
+    return parameter.annotation.__metadata__[0]
+
+
+def _names_of(parameter: inspect.Parameter) -> list[str]:
+    """The names of an option. Typer holds the first of them as its default."""
+    option = _option(parameter)
+    return [option.default, *option.param_decls]
+
+
+def _shared_options() -> str:
+    """What the shared options do, one line each, for the help of `mjfim`."""
+    options = inspect.signature(Run, eval_str=True).parameters.values()
+    lines = [f"{', '.join(_names_of(each))}: {_option(each).help}" for each in options]
+    return "\n\n".join(["Options of most verbs:", *lines])
+
+
+@app.callback(invoke_without_command=True, epilog=_shared_options())
 def root(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Design the experiment that identifies a MuJoCo model's parameters, then identify them."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        if proposed := _first_command(Path()):
+            say_from_program(f"in this folder: {proposed}")
+        raise typer.Exit(2)
+
+
+def _first_command(folder: Path) -> str:
+    """The first command for the only experiment or model of a folder; may be empty."""
+    experiments = [file for file in folder.glob("*.toml") if file.name != "pyproject.toml"]
+    models = [file for ending in ("xml", "urdf") for file in folder.glob(f"*.{ending}")]
+    if len(experiments) == 1:
+        return f"mjfim check {shlex.quote(str(experiments[0]))}"
+    if len(models) == 1 and not experiments:
+        file = models[0].with_suffix(".toml")
+        return f"mjfim init {shlex.quote(str(models[0]))} -o {shlex.quote(str(file))}"
+    return ""
 
 
 Verb = Callable[..., None]
@@ -469,7 +544,13 @@ def verb(*, without: Collection[str] = (), needs_folder: bool = True) -> Callabl
         ]
         vars(wrapped)["__signature__"] = inspect.Signature(parameters)
         name = function.__name__.rstrip("_").replace("_", "-")
-        app.command(name, cls=VerbCommand)(wrapped)
+        hidden = [_names_of(each)[0] for each in parameters if _option(each).hidden]
+        app.command(
+            name,
+            cls=VerbCommand,
+            rich_help_panel=next(step for step, names in STEPS.items() if name in names),
+            epilog=f"Also {', '.join(hidden)}: see `mjfim --help`." if hidden else None,
+        )(wrapped)
         return wrapped
 
     return register

@@ -69,10 +69,12 @@ def init(
 ) -> None:
     """Write a first experiment file for a model, with a comment for every choice."""
     from mjfim.cli.questions import ask as ask_for
+    from mjfim.model.given import packed
     from mjfim.model.model_files import is_urdf
     from mjfim.studies.first_candidates import Wishes
     from mjfim.studies.first_experiment import experiment_text, propose_experiment
 
+    model = Path(packed(str(model), Path())[0])
     file = output or Path(f"{model.stem}.toml")
     companion = file.with_name(f"{file.stem}_motors.xml")
     packages = {}

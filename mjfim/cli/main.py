@@ -1,7 +1,4 @@
-"""The command line: one function per verb.
-
-The verbs are listed in the order of an experiment, as the help shows them.
-"""
+"""The command line: one function per verb."""
 
 from __future__ import annotations
 
@@ -9,29 +6,8 @@ import importlib
 import sys
 from typing import NoReturn
 
-from mjfim.cli.common import app, permit_processes
+from mjfim.cli.common import ORDER, app, permit_processes
 from mjfim.cli.progress import lose_what_cannot_be_written
-
-ORDER = (
-    "init",
-    "list",
-    "validate",
-    "check",
-    "design",
-    "worth",
-    "rehearse",
-    "simulate",
-    "watch",
-    "identify",
-    "payload",
-    "montecarlo",
-    "compare",
-    "compare-robots",
-    "campaign",
-    "export",
-    "report",
-    "replay",
-)
 
 
 def load_verbs() -> None:

@@ -141,7 +141,7 @@ def _asked(question: str, default: str, value_of: Callable[[str], Answer]) -> An
         try:
             return value_of(text.strip())
         except ExperimentError as error:
-            raise typer.BadParameter(str(error).removeprefix("--payload: ")) from None
+            raise typer.BadParameter(str(error).removeprefix("payload: ")) from None
 
     try:
         answer: Answer = typer.prompt(question, default=default, value_proc=checked, err=True)

@@ -23,7 +23,9 @@ def rehearse(
     ] = None,
     wrong: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Largest relative error; overrides rehearsal.wrong."),
+        typer.Option(
+            min=0.0, help="How wrong the model may be: 0.2 is ±20 %. Overrides rehearsal.wrong."
+        ),
     ] = None,
     latency: Annotated[
         float | None,

@@ -46,8 +46,7 @@ def simulate(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.excitation.task import DesignTask
-    from mjfim.excitation.task_parts import require_design_keys, stated_motion
+    from mjfim.excitation.evaluation import motion_of
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System, simulate_system
     from mjfim.output import archive
@@ -57,11 +56,8 @@ def simulate(
     inputs = input_files(stated, [design_file])
     claim_video(video, inputs, force=force)
     claim_file(output, inputs, force=force)
-    if design_file is None and system.laws is not None:
-        trajectory = stated_motion(system)
-    elif design_file is None:
-        require_design_keys(system, "simulate without a design")
-        trajectory = DesignTask.of(system).initial
+    if design_file is None:
+        trajectory = motion_of(system, None, "simulate without a design")
     else:
         trajectory = archive.read_design(design_file)["final"]
         archive.check_fits(design_file, trajectory, system)

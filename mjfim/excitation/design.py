@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
@@ -38,7 +39,7 @@ from mjfim.excitation.search.search import Search
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_system
 from mjfim.information.criteria import shared
 from mjfim.information.finite_steps import valley
@@ -68,9 +69,11 @@ RESERVE_ROUNDS = 3
 EVALUATED_STOPPED = 4
 
 
+@checked
 def design(
-    experiment: Experiment,
+    experiment: ExperimentLike,
     *,
+    seconds: float | None = None,
     callback: DesignCallback | None = None,
     initial_control: Array | None = None,
     threads: int | None = None,
@@ -84,7 +87,8 @@ def design(
     the best trajectory so far.
 
     Args:
-        experiment: The experiment.
+        experiment: The experiment, or the path of its file.
+        seconds: Time budget [s]; default: that of the experiment.
         callback: Called with a `DesignEvent` for every iterate.
         initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's. The
             experiment's initial control remains the reference x_d of the tracking term.
@@ -108,6 +112,8 @@ def design(
         stop_on_interrupt(stop) as token,
         shown_progress("designing", callback, progress) as show,
     ):
+        if seconds is not None:
+            experiment = experiment_of(experiment).replace(descent={"seconds": seconds})
         task = DesignTask.resolve(experiment, threads=threads)
         return design_task(
             task,
@@ -453,8 +459,9 @@ def consume(
         events.close()
 
 
+@checked
 def design_jointly(
-    experiments: Sequence[Experiment],
+    experiments: Sequence[ExperimentLike],
     *,
     callback: DesignCallback | None = None,
     rounds: int = 5,

@@ -11,8 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError, UnidentifiableError, first_ones, listed
+from mjfim.errors import (
+    ExperimentError,
+    RecordingError,
+    SimulationDivergedError,
+    UnidentifiableError,
+    first_ones,
+    listed,
+)
 from mjfim.excitation.limits.limits import unsupported_ranges
 from mjfim.excitation.limits.verification import (
     SAME_STATE_TOLERANCE,
@@ -21,17 +29,18 @@ from mjfim.excitation.limits.verification import (
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.schema import Experiment
+from mjfim.excitation.task_parts import require_design_keys, stated_motion
+from mjfim.experiment.given import TrajectoryLike, trajectory_of
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees
+from mjfim.experiment.system import System, simulate_system
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import GROUPS_TEXT, groups_in_words
-from mjfim.records.design import (
-    Evaluation,
-)
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.design import Design, Evaluation
+from mjfim.records.trajectory import Recording, Trajectory
 
 # Growth of a disturbance along a trajectory without feedback above which the user is warned.
 UNSTABLE_GROWTH = 1e3
@@ -123,8 +132,83 @@ def growth_warning(growth: float) -> str | None:
 # ---- a given control
 
 
+@checked
+def simulate(
+    experiment: ExperimentLike,
+    trajectory: TrajectoryLike | Array | None = None,
+    seed: int | np.random.Generator = 0,
+    *,
+    threads: int | None = None,
+) -> Recording:
+    """Simulate a recording at the `true` parameter values.
+
+    The trajectory's control is applied open loop, and noise is added to the measured samples. The
+    motion begins at the initial state of the experiment. Where a design chooses the release, it
+    begins at the first state of the trajectory.
+
+    Args:
+        experiment: The experiment, or the path of its file.
+        trajectory: The trajectory or design whose control is applied, or (N, nu) controls. With
+            control laws, these are the columns of a log that the laws read. Default: the initial
+            motion of the experiment.
+        seed: Seed of the noise, or a generator of random numbers.
+        threads: Threads for the engine; default: one per core.
+
+    Returns:
+        The recording; outputs that are not measured at a sample are NaN.
+
+    Raises:
+        ExperimentError: Something is wrong in the experiment, or the controls have a wrong shape.
+        SimulationDivergedError: The simulation diverges under this control.
+    """
+    system = System.resolve(experiment, threads=threads)
+    if not (trajectory is None or isinstance(trajectory, (Trajectory, Design))):
+        inputs = np.asarray(trajectory, dtype=np.float64)
+        if inputs.ndim != 2 or inputs.shape[1] != len(system.inputs):
+            raise ExperimentError(
+                f"{system.experiment.source}: simulate: controls of shape {inputs.shape}; expected "
+                f"a row for each sample with {len(system.inputs)} columns: {listed(system.inputs)}"
+            )
+        at_rest = np.tile(system.nominal_initial_state, (len(inputs) + 1, 1))
+        trajectory = system.plant.trajectory(at_rest, inputs)
+    motion = motion_of(system, trajectory, "simulate without a design")
+    return simulate_system(system, motion, seed)
+
+
+def motion_of(system: System, given: TrajectoryLike | None, work: str) -> Trajectory:
+    """The trajectory of a motion; without one, the initial motion of the experiment.
+
+    Args:
+        system: The system.
+        given: The motion, or None.
+        work: Name of the work that needs it, for messages.
+
+    Raises:
+        ExperimentError: The experiment states no initial motion.
+        RecordingError: The motion is one of another model.
+    """
+    if given is None:
+        if system.laws is not None:
+            return stated_motion(system)
+        require_design_keys(system, work)
+        return DesignTask.of(system).initial
+    found = trajectory_of(given)
+    columns = (found.state.shape[1], found.ctrl.shape[1])
+    wanted = (len(system.nominal_initial_state), len(system.inputs))
+    if columns != wanted:
+        raise RecordingError(
+            f"{system.experiment.source}: the motion has (states, controls) = {columns}, but the "
+            f"model {wanted}; give a motion of this experiment"
+        )
+    return found
+
+
+@checked
 def evaluate(
-    experiment: Experiment, trajectory: Trajectory, *, threads: int | None = None
+    experiment: ExperimentLike,
+    trajectory: TrajectoryLike | None = None,
+    *,
+    threads: int | None = None,
 ) -> Evaluation:
     """Evaluate the information and the cost along the control of a given trajectory.
 
@@ -132,7 +216,8 @@ def evaluate(
 
     Args:
         experiment: The experiment.
-        trajectory: The trajectory whose control is simulated.
+        trajectory: The trajectory or design whose control is simulated; default: the initial
+            motion.
         threads: Threads for the engine; default: one per core.
 
     Returns:
@@ -143,7 +228,8 @@ def evaluate(
         ModelError: The model cannot be used.
         SimulationDivergedError: The simulation diverges under this control.
     """
-    return evaluate_task(DesignTask.resolve(experiment, threads=threads), trajectory)
+    task = DesignTask.resolve(experiment, threads=threads)
+    return evaluate_task(task, motion_of(task.system, trajectory, "evaluate"))
 
 
 @one_blas_thread()

@@ -16,12 +16,13 @@ import mujoco
 import numpy as np
 import scipy
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices, record, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_model
 from mjfim.information.finite_steps import finite_steps
 from mjfim.model.clearance import (
@@ -97,7 +98,10 @@ JOINT_AT_STOP = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
 LEVEL_FLOOR = 0.99
 
 
-def rehearse(experiment: Experiment, design: Design, *, threads: int | None = None) -> Rehearsal:
+@checked
+def rehearse(
+    experiment: ExperimentLike, design: Design, *, threads: int | None = None
+) -> Rehearsal:
     """Play a design on simulated robots, and check its standard deviations by finite steps.
 
     The table `[rehearsal]` states the robots. Their parameters are drawn from the priors. Those
@@ -115,6 +119,7 @@ def rehearse(experiment: Experiment, design: Design, *, threads: int | None = No
         ExperimentError: The experiment is faulty, or no physical robot can be drawn.
         RecordingError: The design does not fit the experiment.
     """
+    experiment = experiment_of(experiment)
     if experiment.limits.reserve == "auto" and design.rehearsal is not None:
         experiment = experiment.replace(limits={"reserve": design.reserve})
     task = DesignTask.resolve(experiment, threads=threads)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from mjfim import recordings
+from mjfim.arguments import checked
 from mjfim.arrays import Array, record
 from mjfim.errors import (
     ExperimentError,
@@ -32,7 +33,7 @@ from mjfim.excitation.search.levels import MIN_COARSE_SAMPLES, SAMPLE_FACTORS
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.packing import opened
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import Experiment, ExperimentLike
 from mjfim.experiment.system_tables import Signal
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
@@ -350,8 +351,9 @@ class ShortestExperiment(SavedRecord):
         return f"shortest horizon: {self.horizon:g} s ({below}){ending}"
 
 
+@checked
 def shortest_experiment(
-    experiment: Experiment,
+    experiment: ExperimentLike,
     *,
     longest: float | None = None,
     tolerance: float | None = None,
@@ -389,6 +391,8 @@ def shortest_experiment(
         ExperimentError: No parameter states a target, or an argument is out of range.
         NoResultError: The search was stopped before there was any design.
     """
+    if longest is not None and not 0.0 < longest < np.inf:
+        raise ExperimentError(f"shortest_experiment: longest {longest:g} s; it must be finite, > 0")
     if tolerance is not None and not tolerance > 0.0:
         raise ExperimentError(f"shortest_experiment: tolerance {tolerance:g} s; it must be > 0")
 

@@ -30,7 +30,7 @@ from mjfim.excitation.task_parts import (
 )
 from mjfim.experiment.initial import keyframe, multisine
 from mjfim.experiment.packing import opened
-from mjfim.experiment.schema import Experiment, by_name
+from mjfim.experiment.schema import Experiment, ExperimentLike, by_name
 from mjfim.experiment.system import System
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import IdentifiabilityTest
@@ -97,7 +97,7 @@ class DesignTask:
     @classmethod
     def resolve(
         cls,
-        experiment: Experiment,
+        experiment: ExperimentLike,
         *,
         threads: int | None = None,
         added_information: Array | None = None,

@@ -10,7 +10,7 @@ from pathlib import Path
 from mjfim.errors import ModelError
 from mjfim.experiment.schema import Experiment
 from mjfim.model.loading import ModelSource, packed_model
-from mjfim.model.model_files import PackedFiles, files_of_model, is_present
+from mjfim.model.model_files import PackedFiles, files_of_model
 
 
 def input_files(experiment: Experiment, further: Iterable[Path | None] = ()) -> tuple[Path, ...]:
@@ -56,15 +56,10 @@ def with_model(experiment: Experiment) -> Experiment:
         ModelError: There is no such model file.
     """
     path = experiment.directory / experiment.model
-    packed = experiment.files or PackedFiles.of({})
-    if packed.content(path) is not None:
-        return experiment
-    if not is_present(path):
-        raise ModelError(
-            f"{experiment.source}: model: {path}: no such model file; state the path of an MJCF or "
-            "URDF, which begins in the folder of the experiment file"
-        )
-    files = PackedFiles.read([*map(Path, packed.contents), *files_of_model(path)], packed)
+    try:
+        files = (experiment.files or PackedFiles.of({})).with_model(path)
+    except ModelError as error:
+        raise ModelError(f"{experiment.source}: {error}") from None
     return experiment.model_copy(update={"files": files})
 
 

@@ -12,8 +12,10 @@ from pydantic import Field, InstanceOf, ValidationError
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticSerializationError
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, unknown
+from mjfim.experiment.sysid import parameter_tables
 from mjfim.experiment.system_tables import (
     ControllerSpec,
     Correlated,
@@ -32,7 +34,10 @@ from mjfim.experiment.task_tables import (
     RehearsalSpec,
     Robust,
 )
-from mjfim.model.model_files import PackedFiles, files_of_model
+from mjfim.model.given import packed
+from mjfim.model.loading import packed_model
+from mjfim.model.model_files import PackedFiles
+from mjfim.model.paths import matches
 from mjfim.recordings.section import (
     Hertz,
     PositiveWithUnit,
@@ -58,7 +63,12 @@ class Experiment(Section):
 
     only_in_python = ("directory", "source", "files")
 
-    model: str = Field(description="Path of the MJCF file, relative to the experiment file.")
+    model: str = Field(
+        description=(
+            "Path of the MJCF or URDF file, relative to the experiment file, or a name of the "
+            "package robot_descriptions, such as `so_arm100_mj_description`."
+        )
+    )
     rate: Hertz = Field(
         description=(
             "Rate of the samples and of the control updates [Hz]. One sample is a whole number of "
@@ -179,18 +189,27 @@ class Experiment(Section):
         """Check the values of an experiment.
 
         Args:
-            **values: Keys and tables, with the names of the experiment file.
+            **values: Keys and tables, with the names of the experiment file. `model` is a path, the
+                text of an MJCF or URDF, an MjSpec, an MjModel, or a name of robot_descriptions.
+                `parameters` is a table, in which a path stands for `{"target": path}`, a
+                `ParameterDict` of mujoco.sysid, or a list of paths, in which `*` stands for any
+                text and each match is a parameter with the path as its name.
 
         Raises:
             ExperimentError: A key or a value is not valid; the message has one line per fault.
         """
+        source = str(values.get("source", "experiment"))
+        values = _plain(values)
+        _hold_model(values, source)
+        if "parameters" in values:
+            values["parameters"] = _tables(values["parameters"])
         try:
             super().__init__(**values)
         except ValidationError as error:
-            source = str(values.get("source", "experiment"))
             raise ExperimentError(explain(error, source, values)) from None
 
     @staticmethod
+    @checked
     def from_file(path: str | Path) -> Experiment:
         """Read an experiment file (TOML); its folder becomes `directory`.
 
@@ -223,18 +242,21 @@ class Experiment(Section):
         """Make a changed copy, which is checked again.
 
         Tables merge into the old ones, one level deep: `experiment.replace(cost={"control": 1e-2})`
-        keeps the other keys of `cost`. The table `parameters` merges parameter by parameter; a
-        parameter cannot be removed.
+        keeps the other keys of `cost`. The table `parameters` merges parameter by parameter. None
+        removes what is stated: `replace(parameters={"m": None}, noise={"qvel:slide": None})`. A
+        list of parameters replaces all of them.
 
         Args:
-            **tables: Keys and tables to change, with the names of the experiment file.
+            **tables: Keys and tables to change, as for `Experiment`.
 
         Raises:
             ExperimentError: A new value is not valid.
         """
         values = self.model_dump(exclude_unset=True)
         for key, value in tables.items():
-            values[key] = _merged(values.get(key), value, levels=2 if key == "parameters" else 1)
+            is_named = key == "parameters"
+            given = _tables(_plain(value)) if is_named else value
+            values = _merged(values, {key: given}, levels=3 if is_named else 2)
         return self.restated(values)
 
     def restated(self, values: Mapping[str, Any]) -> Experiment:
@@ -277,17 +299,12 @@ class Experiment(Section):
             ModelError: There is no such model file.
         """
         before = self.files or PackedFiles.of({})
-        model = self.directory / self.model
         tables = [self.directory / name for name in self.tables]
-        if all(before.content(file) is not None for file in (model, *tables)):
-            return self
-        # A packed model contains what it includes.
-        needed = [*map(Path, before.contents), *tables]
-        if before.content(model) is None:
-            if not model.is_file():
-                raise ModelError(f"{model}: no such model file")
-            needed += files_of_model(model)
-        return self.model_copy(update={"files": PackedFiles.read(needed, before)})
+        files = before.with_model(self.directory / self.model)
+        if all(files.content(file) is not None for file in tables):
+            return self if files is before else self.model_copy(update={"files": files})
+        needed = [*map(Path, files.contents), *tables]
+        return self.model_copy(update={"files": PackedFiles.read(needed, files)})
 
     @property
     def tables(self) -> tuple[str, ...]:
@@ -295,6 +312,59 @@ class Experiment(Section):
         control = self.initial.control
         files = [control] if isinstance(control, str) else []
         return tuple(dict.fromkeys([*self.descent.previous, *self.earlier, *files]))
+
+
+# An experiment, or the path of its file.
+ExperimentLike = Experiment | str | Path
+
+
+def experiment_of(given: ExperimentLike) -> Experiment:
+    """The experiment, read where its path is given."""
+    return given if isinstance(given, Experiment) else Experiment.from_file(given)
+
+
+def _plain(value: Any) -> Any:
+    """A value with lists and numbers in place of arrays and numbers of NumPy."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _hold_model(values: dict[str, Any], source: str) -> None:
+    """Replace a model that Python gives by its name and files, and a list of paths by tables."""
+    directory, files = values.get("directory", "."), values.get("files")
+    is_placed = isinstance(directory, (str, Path)) and isinstance(files, PackedFiles | None)
+    if "model" not in values or not is_placed:
+        return
+    try:
+        values["model"], given = packed(values["model"], Path(directory))
+        if given is not None:
+            held = {} if files is None else files.contents
+            contents = {Path(name): each for name, each in {**held, **given.contents}.items()}
+            values["files"] = files = PackedFiles.of(contents)
+
+        patterns = values.get("parameters")
+        if isinstance(patterns, list) and all(isinstance(each, str) for each in patterns):
+            path = Path(directory) / values["model"]
+            found = packed_model((files or PackedFiles.of({})).with_model(path), path)
+            paths = [p for each in patterns for p in matches(each, found.model, found.decoration)]
+            values["parameters"] = {each: {"target": each} for each in paths}
+    except (ExperimentError, ModelError) as error:
+        raise type(error)(f"{source}: {error}") from None
+
+
+def _tables(parameters: Any) -> Any:
+    """The tables of parameters by name; a path stands for its table."""
+    if hasattr(parameters, "as_nominal_vector"):
+        return parameter_tables(parameters)
+    if not isinstance(parameters, Mapping):
+        return parameters
+    return {
+        name: {"target": table} if isinstance(table, str) else table
+        for name, table in parameters.items()
+    }
 
 
 def json_schema() -> dict[str, Any]:
@@ -336,7 +406,9 @@ def by_name(
 
 
 def _merged(old: Any, new: Any, levels: int) -> Any:
-    """A value with its changes; tables merge down to some levels."""
+    """A value with its changes; tables merge down to some levels, and None removes a key."""
     if levels == 0 or not isinstance(old, Mapping) or not isinstance(new, Mapping):
         return new
-    return {**old, **{key: _merged(old.get(key), v, levels - 1) for key, v in new.items()}}
+    removed = {key for key, value in new.items() if value is None and key in old}
+    changed = {key: _merged(old.get(key), value, levels - 1) for key, value in new.items()}
+    return {key: value for key, value in {**old, **changed}.items() if key not in removed}

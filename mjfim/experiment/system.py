@@ -16,6 +16,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError, listed
@@ -24,7 +25,7 @@ from mjfim.experiment.initial import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.packing import for_workers, model_of
 from mjfim.experiment.parameters import resolve_parameters
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.clearance import with_floor
@@ -86,7 +87,7 @@ class System:
     @classmethod
     def resolve(
         cls,
-        experiment: Experiment,
+        experiment: ExperimentLike,
         *,
         threads: int | None = None,
         source: ModelSource | None = None,
@@ -94,7 +95,7 @@ class System:
         """Resolve an experiment against its model.
 
         Args:
-            experiment: The experiment as the user states it.
+            experiment: The experiment as the user states it, or the path of its file.
             threads: Threads for the engine; default: one per core.
             source: The model of the experiment, if it is parsed already, with or without its terms.
 
@@ -104,6 +105,7 @@ class System:
             ModelError: The model cannot be used.
         """
         require_threads(threads)
+        experiment = experiment_of(experiment)
         try:
             return cls._resolved(experiment, threads, source)
         except ExperimentError as error:
@@ -369,6 +371,20 @@ class System:
         at_true = self.experiment.cost.linearize_at == "true"
         return self.parameters.true if at_true else self.parameters.guess
 
+    def theta_of(self, key: str, given: ArrayLike | None) -> Array:
+        """(p,) parameter values that a user gives; the guess where none are given.
+
+        Raises:
+            ExperimentError: They are not one number for each parameter; the message names the key.
+        """
+        theta = np.asarray(self.parameters.guess if given is None else given, dtype=np.float64)
+        if theta.shape != self.parameters.guess.shape:
+            names = listed(self.parameters.names)
+            raise ExperimentError(
+                f"{key}: {theta.shape} numbers; expected one per parameter: {names}"
+            )
+        return theta
+
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the p parameters; empty text if none is stated."""
@@ -502,46 +518,6 @@ def _terms_of(experiment: Experiment, stated: ModelSource) -> tuple[Term, ...]:
         except ExperimentError as error:
             raise ExperimentError(f"terms.{name}: {error}") from None
     return tuple(terms)
-
-
-def simulate(
-    experiment: Experiment,
-    trajectory: Trajectory | Array,
-    seed: int | np.random.Generator = 0,
-    *,
-    threads: int | None = None,
-) -> Recording:
-    """Simulate a recording at the `true` parameter values.
-
-    The trajectory's control is applied open loop, and noise is added to the measured samples. The
-    motion begins at the initial state of the experiment. Where a design chooses the release, it
-    begins at the first state of the trajectory.
-
-    Args:
-        experiment: The experiment.
-        trajectory: The trajectory whose control is applied, or (N, nu) controls. With control laws,
-            these are the columns of a log that the laws read.
-        seed: Seed of the noise, or a generator of random numbers.
-        threads: Threads for the engine; default: one per core.
-
-    Returns:
-        The recording; outputs that are not measured at a sample are NaN.
-
-    Raises:
-        ExperimentError: Something is wrong in the experiment, or the controls have a wrong shape.
-        SimulationDivergedError: The simulation diverges under this control.
-    """
-    system = System.resolve(experiment, threads=threads)
-    if not isinstance(trajectory, Trajectory):
-        inputs = np.asarray(trajectory, dtype=np.float64)
-        if inputs.ndim != 2 or inputs.shape[1] != len(system.inputs):
-            raise ExperimentError(
-                f"{experiment.source}: simulate: controls of shape {inputs.shape}; expected a row "
-                f"for each sample with {len(system.inputs)} columns: {listed(system.inputs)}"
-            )
-        at_rest = np.tile(system.nominal_initial_state, (len(inputs) + 1, 1))
-        trajectory = system.plant.trajectory(at_rest, inputs)
-    return simulate_system(system, trajectory, seed)
 
 
 def simulate_system(

@@ -13,9 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, WrongLogError, listed
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.given import Arrays, RecordingsLike, recordings_of
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.poor_fit import touched_in
@@ -45,6 +47,7 @@ from mjfim.identification.starts import (
     start_beyond_stops,
     start_from_segments,
 )
+from mjfim.information.criteria import standard_deviations
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -83,24 +86,29 @@ SHORTER_DIFFERENCES = 0.01
 # How a search ends whose next step would lead over a jump of the residuals.
 AT_JUMP = "converged: next to a jump of the residuals, where a stop or a contact comes or goes"
 
+# Largest deviation of an encoder's scale that is tried as the cause of another begin.
+MAX_SHARE = 0.5
+
 # Reason for an estimate over whole recordings, although segments predict left-out data better.
 DIVERGED = "the fit over this length diverged"
 
 Callback = Callable[[FitEvent], None]
 
 
+@checked
 def identify(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
+    experiment: ExperimentLike,
+    recordings: RecordingsLike = (),
     *,
     method: Method = "least_squares",
     start: Array | None = None,
-    held_out: Sequence[Recording] = (),
+    held_out: RecordingsLike = (),
     callback: Callback | None = None,
     threads: int | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
     executor: ExecutorLike | None = None,
+    **arrays: Arrays,
 ) -> Estimate:
     """Estimate parameters from recordings, with the settings of the table `[fit]`.
 
@@ -109,8 +117,10 @@ def identify(
     autocorrelated. Ctrl-C ends the search with the best result so far.
 
     Args:
-        experiment: Model, parameters and noise; nothing else needs to be stated.
-        recordings: Recordings to which the parameters are fitted.
+        experiment: Model, parameters and noise, or the path of its file; nothing else needs to be
+            stated.
+        recordings: Recordings to which the parameters are fitted: recordings, paths of logs, tables
+            of arrays, or a `ModelSequences` of mujoco.sysid; one needs no list.
         method: `least_squares` (inside the bounds) or `newton` (the paper's method, without
             bounds).
         start: (p,) parameters at which the search starts; default: the guess.
@@ -122,6 +132,9 @@ def identify(
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
             simulates parts of much data, searches from several starts, and predicts parts of the
             data from the others side by side.
+        **arrays: One recording as MuJoCo's arrays, or as tables of columns by joint, actuator or
+            sensor: (M,) `t`, (M or M-1, nu) `ctrl`, (M, nq) `qpos`, (M, nv) `qvel` and
+            (M, nsensordata) `sensordata`; NaN where nothing was measured.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -134,12 +147,13 @@ def identify(
         SimulationDivergedError: The model diverges at the start.
     """
     with shown_progress("identifying", callback, progress) as show:
+        system = System.resolve(experiment, threads=threads)
         return identify_system(
-            System.resolve(experiment, threads=threads),
-            recordings,
+            system,
+            recordings_of(system, recordings, arrays),
             method=method,
             start=start,
-            held_out=held_out,
+            held_out=recordings_of(system, held_out),
             callback=show,
             stop=stop,
             executor=executor,
@@ -221,7 +235,7 @@ def fit_task(
     begin_stage("testing what the recordings determine")
     subset = quick_subset(problem)
     begin = problem.begin(task.start)
-    null_space = _unseen_directions(task, problem.of_segments(subset))
+    null_space = _unseen_directions(task, problem.of_segments(subset), task.start)
     problem = problem.pinned(task.start, null_space)
 
     # With much data, the search begins on a subset. A request to stop ends it there.
@@ -248,7 +262,7 @@ def fit_task(
     )
 
     if checks_log and repeats and stated.elsewhere and is_doubtful(fit):
-        _refuse_other_zero(search, fit)
+        _refuse_other_reading(search, fit)
 
     # A result that does not explain the data may be a local minimum: fits over short segments give
     # other starts, the second time from many starts where most of the motion is unexplained.
@@ -262,6 +276,8 @@ def fit_task(
 
     if repeats:
         fit = _beyond_stops(search, fit)
+
+    fit = _with_lost_held(search, fit)
 
     # Where the model does not explain whole recordings, the length of the segments matters.
     chooses_length = task.settings.segments is None and task.method != "newton"
@@ -279,54 +295,78 @@ def _check_log(problem: FitProblem, task: FitTask) -> None:
         refuse_gross_error(problem.system, problem.recordings, task.start)
 
 
-def _refuse_other_zero(search: FitSearch, fit: FitResult) -> None:
-    """Refuse recordings that another zero of their encoders explains, and the model alone not.
+def _refuse_other_reading(search: FitSearch, fit: FitResult) -> None:
+    """Refuse recordings that another zero or scale of their encoders explains, the model alone not.
 
     At rest, a log with such an error begins elsewhere in positions only. A fit from the stated
-    initial state finds the zeros beside the parameters.
+    initial state finds the zeros, or the scales, beside the parameters.
 
     Raises:
         WrongLogError: The fit explains the recordings. The message has the lines that cure them.
     """
     task = fit.task
     system, begins = task.system, task.elsewhere
-    places = measured_states(system, fit.problem.recordings[0])
-    positions = {system.outputs.names[j] for x, j in places.items() if x < system.space.nq}
-    names = {name for begin in begins for name in begin.by}
+    first = fit.problem.recordings[0]
+    places = measured_states(system, first)
+    columns = {system.outputs.names[j]: j for x, j in places.items() if x < system.space.nq}
+    names = sorted({name for begin in begins for name in begin.by})
     paths = {target.path for each in system.parameters.parameters for target in each.targets}
     if paths & {f"output/{name}:bias" for name in names}:
         return
-    if not names <= positions or len(begins) < len(task.recordings) + len(task.held_out):
+    if not {*names} <= {*columns} or len(begins) < len(task.recordings) + len(task.held_out):
         return
 
-    zeros = {name: float(np.mean([each.by.get(name, 0.0) for each in begins])) for name in names}
-    unknown = {
-        f"?{name}": {"target": f"output/{name}:bias", "guess": zero, "scale": abs(zero)}
-        for name, zero in zeros.items()
-    }
+    zeros = np.array([np.mean([each.by.get(name, 0.0) for each in begins]) for name in names])
+    stated_begin = first.y[0, [columns[name] for name in names]] - zeros
+    guesses = {"bias": zeros}
+    if (np.abs(zeros) < MAX_SHARE * np.abs(stated_begin)).all():
+        guesses["scale"] = zeros / stated_begin
     initial = system.experiment.initial.model_copy(update={"free": {}})
     experiment = system.experiment.model_copy(update={"initial": initial})
-    shifted = System.resolve(
-        experiment.replace(parameters=unknown), threads=system.threads, source=system.source
-    )
-    other = FitTask.of(shifted, task.recordings)
-    problem = other.problem()
-    try:
-        solved = replace(search, task=other).solve(problem, problem.begin(other.start), "zeros")
-    except SimulationDivergedError:
+    cures: dict[float, tuple[str, Array]] = {}
+    for kind, sizes in guesses.items():
+        unknown = {
+            f"?{name}": {"target": f"output/{name}:{kind}", "guess": size, "scale": abs(size)}
+            for name, size in zip(names, sizes.tolist(), strict=True)
+        }
+        shifted = System.resolve(
+            experiment.replace(parameters=unknown), threads=system.threads, source=system.source
+        )
+        other = FitTask.of(shifted, task.recordings)
+        problem = other.problem()
+        try:
+            solved = replace(search, task=other).solve(problem, problem.begin(other.start), kind)
+        except SimulationDivergedError:
+            continue
+        explained = _with_solution(replace(fit, task=other), *solved)
+        if not other.elsewhere and not is_doubtful(explained):
+            cures[explained.solution.cost] = kind, explained.solution.unknowns.theta[-len(names) :]
+    if not cures:
         return
-    if other.elsewhere or is_doubtful(_with_solution(replace(fit, task=other), *solved)):
-        return
-    found = dict(zip(shifted.parameters.names, solved[1].unknowns.theta.tolist(), strict=True))
+    kind, found = cures[min(cures)]
     stated = experiment.recording.sources
-    lines = [
-        column_line(name, stated.get(name, ColumnSpec(column=name)), offset=-found[f"?{name}"])
-        for name in sorted(names)
-    ]
+    lines = []
+    for name, value in zip(names, found.tolist(), strict=True):
+        change = {"offset": -value} if kind == "bias" else {"factor": 1.0 / (1.0 + value)}
+        lines.append(column_line(name, stated.get(name, ColumnSpec(column=name)), **change))
+    word = "zero" if kind == "bias" else kind
     raise WrongLogError(
-        f"{listed([each.name for each in begins])}: another zero of {listed(sorted(names))}; "
+        f"{listed([each.name for each in begins])}: another {word} of {listed(names)}; "
         f"without this error the model explains the motion. {STATE}{'; '.join(lines)}"
     )
+
+
+def _with_lost_held(search: FitSearch, fit: FitResult) -> FitResult:
+    """The fit in which combinations are held that the recordings do not determine at the estimate.
+
+    The speed of a Stribeck friction, for example, has no effect where the friction vanishes.
+    """
+    if np.isfinite(standard_deviations(fit.solution.condensed.information())).all():
+        return fit
+    lost = _unseen_directions(search.task, fit.problem, fit.theta)
+    held = fit.problem.pinned(fit.theta, lost)
+    found = _fitted_from(search, held, fit.solution.unknowns, "all data, held", fit)
+    return fit if found is None else replace(found, null_space=lost)
 
 
 def _beyond_stops(search: FitSearch, fit: FitResult) -> FitResult:
@@ -469,7 +509,7 @@ def refit_task(
     task = search.task
     problem, held_out = _problems(task, workers)
     subset = quick_subset(problem)
-    null_space = _unseen_directions(task, problem.of_segments(subset))
+    null_space = _unseen_directions(task, problem.of_segments(subset), task.start)
     problem = problem.pinned(task.start, null_space)
     starts = [task.start] if other_start is None else [task.start, other_start]
     begins = [_begin_near(problem, problem.begin(start), near) for start in starts]
@@ -547,8 +587,8 @@ def least_squares(
     return found
 
 
-def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
-    """Directions of theta, at the start, about which the data contain no information."""
+def _unseen_directions(task: FitTask, problem: FitProblem, theta: Array) -> NullSpace:
+    """Directions at theta about which the data contain no information."""
     parameters = task.system.parameters
     tested = ~np.isin(parameters.names, task.settings.hold)
     tested[CadPrior.of(parameters).columns] = False
@@ -562,7 +602,7 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
         (problem, False),
         (problem, True),
     ):
-        begin = part.begin(task.start)
+        begin = part.begin(theta)
         rows = sensitivity_rows(part, begin, with_error=with_error, wanted=tested)
         # Priors are further rows, which have no error of finite differences.
         prior = parameters.prior_rows

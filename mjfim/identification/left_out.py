@@ -16,8 +16,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices, record
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.given import RecordingsLike, recordings_of
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import jackknife_std
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
@@ -33,7 +35,6 @@ from mjfim.parallel import one_blas_thread
 from mjfim.parallel.budget import Budget
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.events import begin_stage
-from mjfim.records.trajectory import Recording
 
 T = TypeVar("T")
 
@@ -480,11 +481,12 @@ def losses_of(
     )
 
 
+@checked
 @one_blas_thread()
 def predict(
-    experiment: Experiment,
+    experiment: ExperimentLike,
     theta: Array,
-    recordings: Sequence[Recording],
+    recordings: RecordingsLike,
     *,
     threads: int | None = None,
 ) -> tuple[PredictionErrors, ...]:
@@ -507,8 +509,8 @@ def predict(
         RecordingError: A recording cannot be used.
     """
     system = System.resolve(experiment, threads=threads)
-    problem = FitProblem.of(system, recordings)
-    values = np.asarray(theta)
+    values = system.theta_of("theta", theta)
+    problem = FitProblem.of(system, recordings_of(system, recordings))
     return tuple(
         _predicted(problem, values, masks_of(problem.masks, [i]), recording.name, Budget())[0]
         for i, recording in enumerate(problem.recordings)

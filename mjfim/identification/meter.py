@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import (
     EDGE_TOLERANCE,
@@ -70,15 +71,16 @@ class Meter:
         system: The system. Its `inputs` and `outputs.names` are the order of the columns.
     """
 
-    def __init__(self, experiment: Experiment, *, threads: int | None = None) -> None:
+    @checked
+    def __init__(self, experiment: ExperimentLike, *, threads: int | None = None) -> None:
         self.system = System.resolve(experiment, threads=threads)
         if self.system.laws is not None:
             raise ExperimentError(
-                f"{experiment.source}: controllers: a stream is watched without control laws; "
-                "record it, and check the recording with `mjfim check`"
+                f"{self.system.experiment.source}: controllers: a stream is watched without "
+                "control laws; record it, and check the recording with `mjfim check`"
             )
         p = self.system.parameters
-        is_held = np.isin(p.names, experiment.fit.hold)
+        is_held = np.isin(p.names, self.system.experiment.fit.hold)
         self._asked = np.setdiff1d(p.interest, np.flatnonzero(is_held))
         self._sizes = p.sizes(p.guess)
         self._is_stated = bool(np.isfinite(p.wanted).any())

@@ -218,11 +218,7 @@ def _require_holdable(system: System, names: Sequence[str]) -> None:
 def _start(system: System, method: Method, start: Array | None) -> Array:
     """(p,) parameters at which the search starts; the guess where none are given."""
     parameters = system.parameters
-    theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
-    if theta.shape != parameters.guess.shape:
-        names = listed(parameters.names)
-        raise ExperimentError(f"start: {theta.shape} numbers; expected one per parameter: {names}")
-
+    theta = system.theta_of("start", start)
     if method == "least_squares":
         theta = np.clip(theta, parameters.lower, parameters.upper)
     return theta

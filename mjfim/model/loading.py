@@ -396,6 +396,16 @@ def collected_warnings(*, of_reader: bool = False) -> Iterator[list[str]]:
     found[:] = [text for text in found if not any(part in text for part in MEANINGLESS)]
 
 
+@contextmanager
+def refused(fault: str) -> Iterator[None]:
+    """Raise ModelError with a fault and MuJoCo's reason where it refuses a model; no warnings."""
+    try:
+        with collected_warnings():
+            yield
+    except (ValueError, mujoco.FatalError) as error:
+        raise ModelError(f"{fault} ({' '.join(str(error).split())})") from None
+
+
 def tell_once(path: Path, messages: Iterable[str]) -> None:
     """Warn about a model file, unless it was told before.
 

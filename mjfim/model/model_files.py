@@ -283,6 +283,22 @@ class PackedFiles:
         size = sum(map(len, self.held.values()))
         return PackedFiles(digest=self.digest, held=SharedValue.of(self.digest, self.held, size))
 
+    def with_model(self, path: Path) -> PackedFiles:
+        """Return these files with those of a model, which are read if it is not among them.
+
+        Raises:
+            ModelError: There is no such model file.
+            ExperimentError: A file cannot be read.
+        """
+        if self.content(path) is not None:
+            return self
+        if not is_present(path):
+            raise ModelError(
+                f"model: {path}: no such model file; state the path of an MJCF or URDF, which "
+                "begins in the folder of the experiment file"
+            )
+        return PackedFiles.read([*map(Path, self.contents), *files_of_model(path)], self)
+
     def content(self, path: Path) -> bytes | None:
         """Return the bytes of a file; None if it is not among the packed files."""
         return self.contents.get(name_of(path))

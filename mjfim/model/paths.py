@@ -6,7 +6,8 @@ The names of the fields are MuJoCo's.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -103,6 +104,26 @@ INERTIAL_FIELDS = {
 
 # Fields of a geom from which the compiler derives others, so that a change needs a compile.
 COMPILED_FIELDS = ("size", "pos", "mass", "density")
+
+# Name of the body that does not move and has no parameters.
+WORLD = "world"
+
+# Kinds of elements that parameter paths name, in the order of the list.
+NAMED_KINDS = ("body", "joint", "actuator", "geom", "pair", "site", "tendon")
+
+# Fields of an actuator with many entries of which most are unused; entries that are 0 are left out.
+SPARSE_FIELDS = ("gear", "gainprm", "biasprm", "dynprm")
+
+# Number of entries of the fields that are not arrays of MjModel.
+FURTHER_WIDTHS = {
+    **{field: width for field, (_, _, width) in INERTIAL_FIELDS.items()},
+    "rot": 3,
+    "size": 3,
+    "pos": 3,
+}
+
+# Stands for any text in a pattern of paths.
+WILDCARD = "*"
 
 # Fields of an actuator that stand for the gains of a position or velocity servo.
 SERVO_FIELDS = ("kp", "kv")
@@ -242,6 +263,63 @@ def resolve(
     if kind == "initial":
         return _initial_state_field(model, path)
     return _element_field(model, path, decoration)
+
+
+def paths_of(
+    model: Any, decoration: Collection[str] = frozenset()
+) -> Iterator[tuple[str, float | None]]:
+    """Yield the paths of all numbers of a model that a parameter can set, with their values.
+
+    The value is None where the model has none. Unused entries of actuators are left out.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        decoration: As for `resolve`.
+    """
+    for kind in (*NAMED_KINDS, "option"):
+        entries = list(_entries(model, kind))
+        for name in [""] if kind == "option" else names_of(model, kind):
+            for field, entry in entries if (kind, name) != ("body", WORLD) else ():
+                path = f"{kind}/{name}:{entry}" if name else f"{kind}:{entry}"
+                with suppress(ExperimentError):
+                    target, value = resolve(model, path, (), decoration), None
+                    with suppress(ExperimentError):
+                        value = target.read(model)
+                    if value != 0.0 or field not in SPARSE_FIELDS:
+                        yield path, value
+
+
+def matches(pattern: str, model: Any, decoration: Collection[str] = frozenset()) -> list[str]:
+    """List the paths of a model that match a pattern, in which `*` stands for any text.
+
+    Args:
+        pattern: The pattern, or one path, which need not be a path of this model.
+        model: The compiled model (`mujoco.MjModel`).
+        decoration: As for `resolve`.
+
+    Raises:
+        ExperimentError: No path matches.
+    """
+    if WILDCARD not in pattern:
+        return [pattern]
+    paths = [path for path, _ in paths_of(model, decoration)]
+    wanted = re.compile(re.escape(pattern).replace(r"\*", ".*"))
+    found = [path for path in paths if wanted.fullmatch(path)]
+    if not found:
+        raise ExperimentError(unknown("path", pattern, paths))
+    return found
+
+
+def _entries(model: Any, kind: str) -> Iterator[tuple[str, str]]:
+    """The fields of a kind of elements, each with the end of the path of each of its entries."""
+    for field in fields_of(kind):
+        width = FURTHER_WIDTHS.get(field, 1)
+        array = MODEL_ARRAYS[kind].get(field)
+        if array is not None:
+            holder = getattr(model.opt if kind == "option" else model, array)
+            has_entries = np.ndim(holder) == (1 if kind == "option" else 2)
+            width = int(np.shape(holder)[-1]) if has_entries else 1
+        yield from ((field, field if width == 1 else f"{field}[{i}]") for i in range(width))
 
 
 def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:

@@ -22,8 +22,10 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices, record
 from mjfim.errors import NoVideoError
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.model.elements import model_length
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, NOMINAL, OTHER, Term
@@ -38,6 +40,7 @@ from mjfim.output.rerun.camera import (
     view_direction,
 )
 from mjfim.output.rerun.scene import BodyPoses, body_poses, has_floor
+from mjfim.output.video import Video, require_format, write_video
 from mjfim.records.design import Design, round_share
 from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal
@@ -688,3 +691,26 @@ def _font(name: str, size: int) -> ImageFont.FreeTypeFont:
     assert spec is not None and spec.origin is not None
     fonts = Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf"
     return ImageFont.truetype(fonts / name, size)
+
+
+@checked
+def save_video(experiment: ExperimentLike, result: Filmed, path: str | Path) -> Video:
+    """Write a video of the robot, drawn by MuJoCo without a display.
+
+    A design is shown as the initial motion beside the designed one, an estimate as the measured
+    robot as a ghost behind the identified one.
+
+    Args:
+        experiment: The experiment of the result.
+        result: A design, an estimate, or a trajectory.
+        path: The file, which ends in .mp4 or .gif.
+
+    Returns:
+        The video, with a caption that says how fast it is played.
+
+    Raises:
+        NoVideoError: Nothing can be drawn on this computer, or a package is missing.
+        RecordingError: The ending of the file is another one.
+    """
+    require_format(Path(path))
+    return write_video(Path(path), System.resolve(experiment), result)

@@ -20,7 +20,6 @@ from urllib.parse import urlsplit
 from mjfim.errors import ExperimentError, MjfimError
 
 if TYPE_CHECKING:
-    from mjfim.experiment.schema import Experiment
     from mjfim.experiment.system import System
     from mjfim.output.rerun.live import LiveShow
     from mjfim.records.events import Callback
@@ -44,47 +43,10 @@ class NoViewerError(MjfimError):
 
 
 @contextmanager
-def live(
-    experiment: Experiment,
-    address: str | None = None,
-    *,
-    say: Callable[[str], object] | None = None,
-) -> Iterator[Callback]:
-    """Show in a Rerun viewer how a search proceeds; a context around the verb.
-
-    What it yields is the `callback` of `design`, `identify`, `monte_carlo` and the other verbs:
-
-        with mjfim.live(experiment) as show:
-            design = mjfim.design(experiment, callback=show)
-
-    The viewer shows the cost and the smallest eigenvalue of the information over the iterates, and
-    the motion of the best one so far: the robot, and its positions and controls over time. The
-    result is the same with and without it. Where there is no viewer, one sentence says so, and the
-    work goes on.
-
-    Args:
-        experiment: The experiment, whose model is shown.
-        address: Where a viewer listens, `HOST:PORT` or a URL `rerun+http://HOST:PORT/proxy`.
-            Default: the viewer of this computer, which is opened if there is none.
-        say: Takes the sentence; default: it is printed to stderr.
-
-    Yields:
-        The function that takes the events.
-
-    Raises:
-        ExperimentError: The address has another form.
-    """
-    from mjfim.experiment.system import System
-
-    with live_system(System.resolve(experiment), address, say=say) as show:
-        yield show
-
-
-@contextmanager
 def live_system(
     system: System, address: str | None = None, *, say: Callable[[str], object] | None = None
 ) -> Iterator[Callback]:
-    """Show how a search for a resolved system proceeds. See `live`."""
+    """Show how a search for a resolved system proceeds. See `mjfim.live`."""
     tell = say or (lambda sentence: sys.stderr.write(f"mjfim: {sentence}\n"))
     viewer = None
     try:

@@ -17,7 +17,6 @@ from mjfim.errors import NoVideoError, RecordingError
 from mjfim.files import replacing
 
 if TYPE_CHECKING:
-    from mjfim.experiment.schema import Experiment
     from mjfim.experiment.system import System
     from mjfim.output.film import Film, Filmed, Painter
 
@@ -74,32 +73,8 @@ class Video:
     height: int
 
 
-def save_video(experiment: Experiment, result: Filmed, path: str | Path) -> Video:
-    """Write a video of the robot, drawn by MuJoCo without a display.
-
-    A design is shown as the initial motion beside the designed one, an estimate as the measured
-    robot as a ghost behind the identified one.
-
-    Args:
-        experiment: The experiment of the result.
-        result: A design, an estimate, or a trajectory.
-        path: The file, which ends in .mp4 or .gif.
-
-    Returns:
-        The video, with a caption that says how fast it is played.
-
-    Raises:
-        NoVideoError: Nothing can be drawn on this computer, or a package is missing.
-        RecordingError: The ending of the file is another one.
-    """
-    from mjfim.experiment.system import System
-
-    require_format(Path(path))
-    return write_video(Path(path), System.resolve(experiment), result)
-
-
 def write_video(path: Path, system: System, result: Filmed) -> Video:
-    """Write a video of a result of a resolved experiment. See `save_video`."""
+    """Write a video of a result of a resolved experiment. See `mjfim.save_video`."""
     from mjfim.output.film import film_of
 
     video = render(film_of(system, result), require_format(path))

@@ -51,8 +51,7 @@ def require_threads(threads: int | None) -> None:
     Raises:
         ExperimentError: The number cannot be used.
     """
-    is_whole = hasattr(threads, "__index__") and not isinstance(threads, bool)
-    if threads is not None and not (is_whole and 1 <= threads <= MAX_THREADS):
+    if threads is not None and not 1 <= threads <= MAX_THREADS:
         raise ExperimentError(
             f"threads: {threads} is not possible; it must be a whole number from 1 to "
             f"{MAX_THREADS}, or None for one thread per core"

@@ -19,7 +19,7 @@ from concurrent.futures import (
 from contextlib import contextmanager, suppress
 from enum import Enum
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from mjfim.arrays import record
 from mjfim.errors import MAX_THREADS, ExperimentError, shortened
@@ -36,6 +36,7 @@ COUNT_NAMES = ("max_workers", "num_workers", "_max_workers")
 TASKS_PER_WORKER = 2
 
 
+@runtime_checkable
 class ExecutorLike(Protocol):
     """Executor of the work of a verb: one of `concurrent.futures`, a Dask client, or `Workers`.
 

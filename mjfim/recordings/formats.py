@@ -833,7 +833,7 @@ def _table(path: Path, rows: Any, spec: RecordingSpec) -> Table:
 
 def _read_npz(path: Path, spec: RecordingSpec) -> Table:
     """Read the numbers, vectors and matrices of an archive; nothing is unpickled."""
-    return _table_of_arrays(path, read_arrays(path, "log"), spec)
+    return table_of_arrays(path, read_arrays(path, "log"), spec)
 
 
 def _read_npy(path: Path, spec: RecordingSpec) -> Table:
@@ -845,7 +845,7 @@ def _read_npy(path: Path, spec: RecordingSpec) -> Table:
         arrays = (
             {name: values[name] for name in fields} if fields else {"": np.atleast_2d(values.T).T}
         )
-        return _table_of_arrays(path, arrays, spec)
+        return table_of_arrays(path, arrays, spec)
 
 
 def _read_mat(path: Path, spec: RecordingSpec) -> Table:
@@ -855,10 +855,10 @@ def _read_mat(path: Path, spec: RecordingSpec) -> Table:
     with _reading(path, kind, (Exception,)):
         contents = scipy.io.loadmat(path, simplify_cells=True)
         own = {name: values for name, values in contents.items() if name[:2] != "__"}
-        return _table_of_arrays(path, own, spec)
+        return table_of_arrays(path, own, spec)
 
 
-def _table_of_arrays(path: Path, arrays: Mapping[str, Any], spec: RecordingSpec) -> Table:
+def table_of_arrays(path: Path, arrays: Mapping[str, Any], spec: RecordingSpec) -> Table:
     """Columns of numbers, vectors, and matrices, which may lie on their side.
 
     Args:
@@ -998,7 +998,7 @@ def _read_torch(path: Path, spec: RecordingSpec) -> Table:
     with _reading(path, kind, (Exception,)), zipfile.ZipFile(path) as archive:
         tensors = _TensorReader(archive).read()
         arrays = tensors if isinstance(tensors, Mapping) else {"": tensors}
-        return _table_of_arrays(path, arrays, spec)
+        return table_of_arrays(path, arrays, spec)
 
 
 # Further endings of tables that are written as text.

@@ -83,7 +83,7 @@ def proposed_recording(table: Table, channels: Channels) -> str:
     found |= {name: (name, "by name") for name in channels.outputs if name in columns}
 
     # Columns that have mjfim's names need no line.
-    units, sensors = _units(table, channels, found, t), _sensors(channels)
+    units, sensors = _units(table, channels, found, t), sensors_of_joints(channels)
     usual = {name for name, (column, _) in found.items() if column == name and name not in units}
     if not usual.issuperset(name for name in found if name not in controls):
         usual &= set(controls)
@@ -105,7 +105,7 @@ def proposed_recording(table: Table, channels: Channels) -> str:
     return "\n".join(lines)
 
 
-def _sensors(channels: Channels) -> dict[str, str]:
+def sensors_of_joints(channels: Channels) -> dict[str, str]:
     """Sensors that are measured in place of the coordinates of joints, by the joints' columns."""
     model, found = channels.model, {}
     for name in channels.outputs:

@@ -14,16 +14,17 @@ from __future__ import annotations
 import csv
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow
 
 from mjfim.arrays import Array, record
 from mjfim.errors import RecordingError, RecordingWarning, listed, shortened, unknown
-from mjfim.model.coordinates import state_components, unknown_coordinate
+from mjfim.model.coordinates import sensor_columns, state_components, unknown_coordinate
 from mjfim.recordings.channels import (
     ANY,
     UNIT_FACTORS,
@@ -44,7 +45,7 @@ from mjfim.recordings.checks import (
     in_order,
 )
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
-from mjfim.recordings.proposal import proposed_recording
+from mjfim.recordings.proposal import proposed_recording, sensors_of_joints
 from mjfim.recordings.quantities import TURN, Unit
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
 from mjfim.records.base import Record
@@ -192,9 +193,13 @@ def read_log(path: Path, channels: Channels) -> Log:
         ExperimentError: The `[recording]` table does not fit the model.
         RecordingError: The log cannot be used; the message names file and column.
     """
+    return log_of(read_columns(path, channels.spec), channels)
+
+
+def log_of(table: Table, channels: Channels) -> Log:
+    """Make a recording of the columns of a log, and summarize the log. See `read_log`."""
     check_spec(channels)
-    spec = channels.spec
-    table = read_columns(path, spec)
+    spec, path = channels.spec, table.source
     if "time" not in spec.model_fields_set and spec.time not in table.names:
         raise _unfit(table, channels, f"column {spec.time!r} is missing")
     sources = _sources(table, channels)
@@ -425,20 +430,32 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
                 f"{len(parts)}: {listed(parts)}"
             )
         found |= dict(zip(parts, labels, strict=False))
-    return found | {name: name for name in table.names}
+    found |= {name: name for name in table.names}
+    # A sensor of a joint measures what the position or velocity of the joint is.
+    joints = sensors_of_joints(channels).items()
+    return {sensor: found[column] for column, sensor in joints if column in found} | found
 
 
 def _matrices(channels: Channels) -> dict[str, list[str]]:
-    """Default names of the columns of the matrices qpos, qvel and ctrl."""
+    """Default names of the columns of the matrices qpos, qvel, sensordata and ctrl."""
     stated = channels.spec.columns
     state = [component.name for component in state_components(channels.model)]
     nq = channels.model.nq
     matrices: dict[str, list[str]] = {}
     if all(name.startswith(INPUT_PREFIXES) for name in stated):
         matrices |= {"qpos": state[:nq], "qvel": state[nq:]}
+        matrices["sensordata"] = list(_all_sensor_columns(channels.model))
     if channels.laws is None and any(name not in stated for name in channels.control_columns):
         matrices["ctrl"] = list(channels.control_columns)
     return matrices
+
+
+def _all_sensor_columns(model: Any) -> Iterator[str]:
+    """Columns of MuJoCo's sensordata, also of sensors without a name, which are not used."""
+    for i in range(model.nsensor):
+        name = model.sensor(i).name
+        unused = [f"sensor {i}[{k}]" for k in range(model.sensor_dim[i])]
+        yield from sensor_columns(model, name) if name else unused
 
 
 # ---- values

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from mjfim.arrays import freeze
-from mjfim.errors import RecordingError
+from mjfim.errors import RecordingError, in_words
 from mjfim.files import read_arrays, write_arrays, write_json
 from mjfim.records.verdict import Verdict
 
@@ -76,7 +76,15 @@ class Record:
     __pydantic_config__: ClassVar[Mapping[str, Any]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
-        freeze(self, *(name for name in self.array_fields if getattr(self, name) is not None))
+        for name in self.array_fields:
+            value = getattr(self, name)
+            try:
+                freeze(self, *([] if value is None else [name]))
+            except (TypeError, ValueError):
+                kind = type(self).__name__
+                raise RecordingError(
+                    f"{kind}: {name}: needs an array of numbers; not {in_words(value)}"
+                ) from None
 
     def __repr__(self) -> str:
         names = [each.name for each in fields(self) if each.repr]  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
@@ -35,7 +36,8 @@ from mjfim.excitation.shortest_horizon import (
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.given import RecordingsLike, recordings_of
+from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.identification.identify import identify_system
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
@@ -167,11 +169,12 @@ NO_PROGRESS_RATIO = 0.99
 SUSPICIOUS_CHANGE = 4.0
 
 # Records the experiment that was designed for a round: (design, number of the round from 1).
-Measure = Callable[[Design, int], Recording | Sequence[Recording] | None]
+Measure = Callable[[Design, int], RecordingsLike | None]
 
 
+@checked
 def run_campaign(
-    experiment: Experiment,
+    experiment: ExperimentLike,
     measure: Measure,
     *,
     rounds: int = 10,
@@ -191,7 +194,7 @@ def run_campaign(
         measure: Plays a design and returns its recording or recordings: `measure(design, number)`,
             where the number of the first round is 1. It returns None where nothing is recorded yet;
             the campaign then ends with that design pending. For a simulated robot: `lambda design,
-            number: mjfim.simulate(robot, design.trajectory, seed=number)`.
+            number: mjfim.simulate(robot, design, seed=number)`.
         rounds: Largest number of rounds.
         callback: Called with the events of every design and estimation, and with a `StudyEvent`
             after every round, whose `result` is the `Round`.
@@ -207,6 +210,7 @@ def run_campaign(
         UnidentifiableError: A parameter with a target cannot be identified alone.
         MjfimError: As `mjfim.design` and `mjfim.identify` raise it.
     """
+    experiment = experiment_of(experiment)
     if rounds < 1:
         raise ExperimentError(f"run_campaign: {rounds} rounds; needs at least 1")
     if experiment.earlier:
@@ -296,7 +300,7 @@ class _CampaignRun:
         require_reachable(self.base, design, self.wanted)
 
         answer = measure(design, len(self.rounds) + 1)
-        recordings = (answer,) if isinstance(answer, Recording) else tuple(answer or ())
+        recordings = () if answer is None else recordings_of(self.base.system, answer)
 
         # A recording that the user interrupted is not used.
         if self.stop.requested:

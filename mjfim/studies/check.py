@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError
 from mjfim.excitation.evaluation import (
@@ -37,8 +38,9 @@ from mjfim.excitation.task import (
     DesignTask,
 )
 from mjfim.excitation.task_parts import require_design_keys
+from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of, trajectory_of
 from mjfim.experiment.initial import multisine
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, SystemOrder
 from mjfim.identification.fit_problem import FitProblem, sensitivity_rows
@@ -255,10 +257,11 @@ MAX_REPETITIONS = 1_000_000_000
 MAX_TESTED_SAMPLES = 2000
 
 
+@checked
 def check(
-    experiment: Experiment,
-    recordings: Sequence[Recording] = (),
-    trajectory: Trajectory | None = None,
+    experiment: ExperimentLike,
+    recordings: RecordingsLike = (),
+    trajectory: TrajectoryLike | None = None,
     *,
     threads: int | None = None,
     stop: StopToken | None = None,
@@ -283,15 +286,16 @@ def check(
         RecordingError: Recordings are unusable, or given together with a trajectory.
         SimulationDivergedError: The trajectory cannot be simulated.
     """
-    if recordings and trajectory is not None:
-        raise RecordingError("check either recordings or a designed trajectory, not both")
-
     with shown_progress("checking", None, progress):
         system = System.resolve(experiment, threads=threads)
-        if recordings:
-            return check_recordings(system, recordings, stop, executor)
+        logs = recordings_of(system, recordings)
+        if logs and trajectory is not None:
+            raise RecordingError("check either recordings or a designed trajectory, not both")
+        if logs:
+            return check_recordings(system, logs, stop, executor)
         require_design_keys(system, "check without recordings")
-        return check_task(DesignTask.of(system), trajectory, stop, executor)
+        motion = None if trajectory is None else trajectory_of(trajectory)
+        return check_task(DesignTask.of(system), motion, stop, executor)
 
 
 @one_blas_thread()

@@ -8,6 +8,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, record
 from mjfim.errors import (
     ExperimentError,
@@ -28,7 +29,7 @@ from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.packing import for_workers
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, carry_out
@@ -50,8 +51,9 @@ INTERRUPTED_NOTE = "interrupted"
 UNLIMITED_ITERATIONS = 100_000
 
 
+@checked
 def compare(
-    experiment: Experiment,
+    experiment: ExperimentLike,
     *,
     seconds: float = 60.0,
     seed: int = 0,

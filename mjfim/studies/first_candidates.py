@@ -28,9 +28,9 @@ from mjfim.model.elements import (
     translations,
 )
 from mjfim.model.inertia import body_inertia
-from mjfim.model.loading import NO_PACKAGES, load_spec
+from mjfim.model.loading import NO_PACKAGES, ModelSource, load_spec
 from mjfim.model.model_files import PACKAGE
-from mjfim.model.paths import unit_of
+from mjfim.model.paths import matches, unit_of
 from mjfim.model.units import servo_kind
 from mjfim.studies import GROUPS, Group
 
@@ -109,6 +109,7 @@ class Wishes:
 
     Attributes:
         groups: Groups of parameters that are wanted.
+        unknown: Patterns of paths of parameters, or paths by name, instead of the groups.
         payload: Body that carries an unknown payload; None without one.
         keyframe: Keyframe in which the experiment starts.
         rate: Rate of samples and controls [Hz].
@@ -120,6 +121,7 @@ class Wishes:
     """
 
     groups: Sequence[Group] = GROUPS
+    unknown: Sequence[str] | Mapping[str, str] | None = None
     payload: str | None = None
     keyframe: str | None = None
     rate: float | None = None
@@ -318,6 +320,39 @@ def candidates(
     return _tied(model, found)
 
 
+def stated_candidates(
+    source: ModelSource, unknown: Sequence[str] | Mapping[str, str], proposed: Sequence[Candidate]
+) -> list[Candidate]:
+    """Parameters that a user states, with sizes and bounds of those that would be proposed.
+
+    Args:
+        source: The model.
+        unknown: See `Wishes`.
+        proposed: Candidates of all groups. Those of a payload that is asked for stay.
+
+    Raises:
+        ExperimentError: A pattern matches no number of the model.
+    """
+    known = {path: each for each in proposed for path in each.paths}
+    named = (
+        unknown
+        if isinstance(unknown, Mapping)
+        else {
+            path: path
+            for pattern in unknown
+            for path in matches(pattern, source.model, source.decoration)
+        }
+    )
+    stated = []
+    for name, path in named.items():
+        field = path.rpartition(":")[2]
+        like = Candidate(name=name, group=GROUPS[0], paths=(path,), quantity=field)
+        stated.append(
+            replace(known.get(path, like), name=name, paths=(path,), owners=(), offset=0.0)
+        )
+    return [*(each for each in proposed if each.guess is not None and each.offset), *stated]
+
+
 def _tied(model: Any, found: Sequence[Candidate]) -> list[Candidate]:
     """The candidates without repeated paths, with one for all equal values of a large robot."""
     families: dict[tuple[str, ...], dict[str, Candidate]] = {}
@@ -360,10 +395,10 @@ def require_carrier(model: Any, name: str) -> int:
     """
     body = identifier(model, "body", name)
     if body < 0:
-        raise ExperimentError(f"--payload: {unknown('body', name, names_of(model, 'body'))}")
+        raise ExperimentError(f"payload: {unknown('body', name, names_of(model, 'body'))}")
     if not float(model.body_mass[body]) > 0.0:
         raise ExperimentError(
-            f"--payload: body {name!r} has no mass; name the body with mass that carries the load"
+            f"payload: body {name!r} has no mass; name the body with mass that carries the load"
         )
     return body
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
@@ -16,24 +17,33 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 from mjfim.errors import (
     ExperimentError,
     MjfimError,
     ModelError,
+    ModelWarning,
     SimulationDivergedError,
     first_ones,
 )
 from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.excitation.limits.verification import verify, violations_of
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import MAX_SAMPLES
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import joint_dofs
 from mjfim.model.elements import position_sizes, unnamed_count
+from mjfim.model.given import packed
 from mjfim.model.limited_elements import QUATERNION_PLACE
-from mjfim.model.loading import ModelSource, resolve_packages, silence_mujoco_log
-from mjfim.model.model_files import is_urdf
+from mjfim.model.loading import (
+    ModelSource,
+    packed_model,
+    resolve_packages,
+    silence_mujoco_log,
+)
+from mjfim.model.model_files import PackedFiles, is_urdf
 from mjfim.model.paths import unit_of
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.studies.first_candidates import (
@@ -45,6 +55,7 @@ from mjfim.studies.first_candidates import (
     read_urdf,
     require_rate,
     rounded,
+    stated_candidates,
 )
 from mjfim.studies.first_limits import playable_limits, played
 from mjfim.studies.first_motion import (
@@ -115,6 +126,9 @@ AT_REST = {"start": "rest"}
 # Begin of the remark about a start that cannot be used.
 NO_MOTION = "no motion about this start keeps all limits"
 
+# Begin of the remarks about what may make the experiment useless.
+WARNING = "Warning: "
+
 # Wishes of a user who has none.
 NO_WISHES = Wishes()
 
@@ -129,7 +143,7 @@ class Proposal:
     Attributes:
         model: Path of the model file, relative to the experiment file.
         companion: MJCF to be written beside the experiment file with the name `model`, or None.
-        compiled: The compiled model.
+        source: The model.
         times: Rate and horizon.
         start: Initial state and resting control.
         amplitudes: Amplitudes of the chirp by actuator.
@@ -146,7 +160,7 @@ class Proposal:
 
     model: str
     companion: str | None
-    compiled: Any
+    source: ModelSource
     times: TimeScale
     start: Start
     amplitudes: dict[str, float]
@@ -159,6 +173,11 @@ class Proposal:
     remarks: Sequence[str] = ()
     release: ProposedRelease | None = None
     flies: bool = False
+
+    @property
+    def compiled(self) -> Any:
+        """The compiled model."""
+        return self.source.model
 
     def values(self) -> dict[str, Any]:
         """Keys and tables of the experiment file."""
@@ -212,6 +231,46 @@ class Proposal:
         return control
 
 
+@checked
+def propose(
+    model: Any,
+    unknown: Sequence[str] | Mapping[str, str] | None = None,
+    *,
+    payload: str | None = None,
+    horizon: float | None = None,
+) -> Experiment:
+    """Propose a first experiment for a model, with the choices of `mjfim init`.
+
+    Args:
+        model: Path or text of an MJCF or URDF, an MjSpec, an MjModel, or a name of
+            robot_descriptions.
+        unknown: Paths of the unknown parameters, in which `*` stands for any text, or one path for
+            each name. Default: what the first motion identifies together.
+        payload: Body that carries a load of unknown mass and centre of mass.
+        horizon: Duration of the experiment [s]; default: it suits the size of the robot.
+
+    Returns:
+        An experiment for `check`, `design` and `identify`; `replace` changes its choices.
+
+    Raises:
+        ModelError: The model cannot be read.
+        ExperimentError: An argument is wrong, or nothing in the model can move or be identified.
+    """
+    name, files = packed(model, Path())
+    path = Path(name)
+    if horizon is not None and not 0.0 < horizon < np.inf:
+        raise ExperimentError(f"propose: horizon: {horizon} s; it must be positive and finite")
+    wishes = Wishes(unknown=unknown, payload=payload, horizon=horizon)
+    proposal = propose_experiment(path, path.parent, wishes, files=files)
+    for remark in proposal.remarks:
+        if remark.startswith(WARNING):
+            warnings.warn(f"{path}: {remark.removeprefix(WARNING)}", ModelWarning, stacklevel=3)
+    values = {**proposal.values(), "directory": path.parent, "files": files}
+    if proposal.companion is not None:
+        values["model"] = proposal.source.spec
+    return Experiment(**values)
+
+
 @silence_mujoco_log()
 def propose_experiment(
     path: Path,
@@ -219,6 +278,7 @@ def propose_experiment(
     wishes: Wishes = NO_WISHES,
     *,
     companion_name: str = "",
+    files: PackedFiles | None = None,
 ) -> Proposal:
     """Propose a first experiment for a model.
 
@@ -227,13 +287,14 @@ def propose_experiment(
         folder: Folder of the experiment file, to which the path of the model is relative.
         wishes: What the user wants; the rest is proposed.
         companion_name: Name of the MJCF that is written beside the experiment file for a URDF.
+        files: Files with the model; None for the disk.
 
     Raises:
         ModelError: The model cannot be read.
         ExperimentError: The model has neither an actuator nor a joint that can be released, or no
             parameter of the wanted groups, or a wish cannot be fulfilled.
     """
-    source, companion, velocities = _model(path, folder, wishes.packages)
+    source, companion, velocities = _model(path, folder, wishes.packages, files)
     model = source.model
     if not model.njnt:
         raise ExperimentError(f"{path}: the model has no joint, so that nothing in it can move")
@@ -250,15 +311,7 @@ def propose_experiment(
     times = wanted_times(time_scale(model, data), model, wishes)
 
     sizes = {"length": length, "period": times.period, "rate": times.rate}
-    every = candidates(model, wishes.groups, wishes.payload, **sizes)
-    absent = [each for each in every if each.is_absent]
-    found = [each for each in every if not each.is_absent][:MOST_CANDIDATES]
-    if not found:
-        raise ExperimentError(
-            f"{path}: no parameter of {', '.join(wishes.groups)} can be proposed: bodies and "
-            "joints need names, and friction and armature a value > 0"
-        )
-
+    found, absent = _candidates(source, wishes, sizes)
     controls = source.coordinates.controls
     release = None
     wanted = np.zeros(0)
@@ -290,7 +343,7 @@ def propose_experiment(
     draft = Proposal(
         model=os.path.relpath(path, folder) if companion is None else companion_name,
         companion=companion,
-        compiled=model,
+        source=source,
         times=times,
         start=start,
         amplitudes=dict(zip(controls, wanted.tolist(), strict=True)),
@@ -314,6 +367,22 @@ def propose_experiment(
         raise ModelError(f"{path}: {error}") from None
 
 
+def _candidates(
+    source: ModelSource, wishes: Wishes, sizes: Mapping[str, float]
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Parameters that may be chosen, and those of which the model has nothing."""
+    every = candidates(source.model, wishes.groups, wishes.payload, **sizes)
+    if wishes.unknown is not None:
+        return stated_candidates(source, wishes.unknown, every), []
+    found = [each for each in every if not each.is_absent][:MOST_CANDIDATES]
+    if not found:
+        raise ExperimentError(
+            f"{source.path}: no parameter of {', '.join(wishes.groups)} can be proposed: bodies "
+            "and joints need names, and friction and armature a value > 0"
+        )
+    return found, [each for each in every if each.is_absent]
+
+
 def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
     """The proposed times with the rate and the horizon that the user wants.
 
@@ -328,6 +397,10 @@ def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
     rate = times.rate if wishes.rate is None else require_rate(model, wishes.rate)
     horizon = times.horizon if wishes.horizon is None else wishes.horizon
     samples = round(horizon * rate)
+    if samples > MAX_SAMPLES:
+        raise ExperimentError(
+            f"a horizon of {horizon:g} s has {samples:g} samples; that is too long"
+        )
     if samples < 2:
         raise ExperimentError(
             f"a horizon of {horizon:g} s has less than two samples at {rate:g} Hz; it must be at "
@@ -339,9 +412,11 @@ def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
 
 
 def _model(
-    path: Path, folder: Path, packages: Mapping[str, str]
+    path: Path, folder: Path, packages: Mapping[str, str], files: PackedFiles | None
 ) -> tuple[ModelSource, str | None, dict[str, float]]:
     """The model with actuators, the MJCF that adds them to a URDF, and its velocity limits."""
+    if files is not None:
+        return packed_model(files, path), None, {}
     if not is_urdf(path):
         return ModelSource(path), None, {}
 
@@ -600,10 +675,12 @@ class _Refinement:
     def _identified(self, draft: Proposal) -> Sequence[int]:
         """Indices of the candidates that the chirp or the release identifies together.
 
-        Dry friction and contacts make derivatives inaccurate, so that parameters seem to differ
-        that never do. The test of a check knows the error of the derivatives; a parameter that it
-        cannot tell apart makes room for later ones.
+        Parameters that the user states are all chosen. Dry friction and contacts make derivatives
+        inaccurate, so that parameters seem to differ that never do. The test of a check knows the
+        error of the derivatives; a parameter that it cannot tell apart makes room for later ones.
         """
+        if self.wishes.unknown is not None:
+            return range(len(draft.chosen))
         task = self._own_task(draft)
         point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
         if point.information is None or point.sensitivity is None:
@@ -625,7 +702,7 @@ class _Refinement:
                 bare = replace(draft, chosen=[draft.chosen[i] for i in fewer])
                 return [fewer[i] for i in self._identified(bare)]
             raise ExperimentError(
-                f"--payload: the first motion does not show a load at {payload!r}; name a body "
+                f"payload: the first motion does not show a load at {payload!r}; name a body "
                 "that the motion accelerates or lifts"
             )
         while True:

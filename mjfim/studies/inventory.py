@@ -18,8 +18,9 @@ from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.report import laws_in_loop
 from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
+from mjfim.model.given import packed
 from mjfim.model.loading import ModelSource
-from mjfim.model.paths import INERTIAL_FIELDS, MODEL_ARRAYS, fields_of, resolve, unit_of
+from mjfim.model.paths import NAMED_KINDS, paths_of, unit_of
 from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import Term, TermTable
 from mjfim.model.units import control_unit, sensor_unit
@@ -36,26 +37,9 @@ from mjfim.records.inventory import (
     StatedParameter,
 )
 
-# Name of the body that does not move and has no parameters.
-WORLD = "world"
-
-# Kinds of elements that parameter paths name, in the order of the list.
-NAMED_KINDS = ("body", "joint", "actuator", "geom", "pair", "site", "tendon")
-
-# Fields of an actuator with many entries of which most are unused; entries that are 0 are left out.
-SPARSE_FIELDS = ("gear", "gainprm", "biasprm", "dynprm")
-
 # Name of a term that no model has, and timesteps of a sample, for terms that are only listed.
 FREE_NAME = "?"
 SAMPLE_STEPS = 10
-
-# Number of entries of the fields that are not arrays of MjModel.
-FURTHER_WIDTHS = {
-    **{field: width for field, (_, _, width) in INERTIAL_FIELDS.items()},
-    "rot": 3,
-    "size": 3,
-    "pos": 3,
-}
 
 # What an actuator acts on, by MuJoCo's type of transmission, with the kind of the element.
 TRANSMISSIONS = {
@@ -72,12 +56,12 @@ def list_model(path: str | Path) -> Inventory:
     """List what an experiment file can name in a model.
 
     Args:
-        path: MJCF or URDF file.
+        path: MJCF or URDF file, or a name of robot_descriptions.
 
     Raises:
         ModelError: The model cannot be read.
     """
-    source = ModelSource(Path(path))
+    source = ModelSource(Path(packed(path, Path())[0]))
     model = source.model
 
     return Inventory(
@@ -103,49 +87,12 @@ def list_model(path: str | Path) -> Inventory:
 def _parameters(source: ModelSource) -> Iterator[ListedParameter]:
     """Paths of all numbers that a parameter can set."""
     model = source.model
-    for kind in NAMED_KINDS:
-        entries = list(_entries(model, kind))
-        for name in names_of(model, kind):
-            for field, entry in entries if (kind, name) != ("body", WORLD) else ():
-                path = f"{kind}/{name}:{entry}"
-                yield from _entry(source, path, skip_zero=field in SPARSE_FIELDS)
-
-    for _, entry in _entries(model, "option"):
-        yield from _entry(source, f"option:{entry}", skip_zero=False)
+    for path, value in paths_of(model, source.decoration):
+        yield ListedParameter(path=path, value=value, unit=unit_of(model, path))
 
     for component in source.coordinates.deviations:
         if component.path:
             yield ListedParameter(path=component.path, value=0.0, unit=component.unit)
-
-
-def _entries(model: Any, kind: str) -> Iterator[tuple[str, str]]:
-    """The fields of a kind of elements, each with the end of the path of each of its entries."""
-    for field in fields_of(kind):
-        width = FURTHER_WIDTHS.get(field, 1)
-        array = MODEL_ARRAYS[kind].get(field)
-        if array is not None:
-            holder = getattr(model.opt if kind == "option" else model, array)
-            has_entries = np.ndim(holder) == (1 if kind == "option" else 2)
-            width = int(np.shape(holder)[-1]) if has_entries else 1
-        yield from ((field, field if width == 1 else f"{field}[{i}]") for i in range(width))
-
-
-def _entry(source: ModelSource, path: str, *, skip_zero: bool) -> Iterator[ListedParameter]:
-    """The entry of a path, if the element has this field."""
-    model = source.model
-    try:
-        field = resolve(model, path, (), source.decoration)
-    except ExperimentError:
-        return
-
-    try:
-        value = field.read(model)
-    except ExperimentError:
-        value = None
-    if skip_zero and value == 0.0:
-        return
-
-    yield ListedParameter(path=path, value=value, unit=unit_of(model, path))
 
 
 def _outputs(source: ModelSource) -> Iterator[ListedOutput]:

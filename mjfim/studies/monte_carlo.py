@@ -14,9 +14,12 @@ from typing import Any
 import numpy as np
 import scipy
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.experiment.schema import Experiment
+from mjfim.excitation.evaluation import motion_of
+from mjfim.experiment.given import TrajectoryLike
+from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import System, SystemOrder, labels_of_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
@@ -178,9 +181,10 @@ CHUNK_BYTES = 1e9
 CHUNK_STEPS = 5e6
 
 
+@checked
 def monte_carlo(
-    experiment: Experiment,
-    trajectory: Trajectory | Mapping[str, Trajectory],
+    experiment: ExperimentLike,
+    trajectory: TrajectoryLike | Mapping[str, TrajectoryLike] | None = None,
     *,
     trials: int = 1500,
     seed: int = 0,
@@ -198,7 +202,8 @@ def monte_carlo(
 
     Args:
         experiment: Experiment with the true values.
-        trajectory: One trajectory, which gets the name "final", or several by name.
+        trajectory: One trajectory or design, which gets the name "final", or several by name;
+            default: the initial motion.
         trials: Number of repetitions per trajectory.
         seed: Seed of the noise.
         measure_rate: Measurement rate [Hz] instead of that of the experiment.
@@ -215,19 +220,19 @@ def monte_carlo(
         UnidentifiableError: A parameter has no effect on the data.
     """
     if measure_rate is not None:
-        experiment = experiment.replace(measure_rate=measure_rate)
+        experiment = experiment_of(experiment).replace(measure_rate=measure_rate)
     system = System.resolve(experiment, threads=threads)
 
     if trials < 2:
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
-    named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
+    named = _motions(system, trajectory)
 
     # A trajectory that cannot be simulated fails before the first trial.
     calibrated = system.calibrated(system.theta, next(iter(named.values())).ctrl)
     trial_sets = {}
     for name, curve in named.items():
         suited = calibrated
-        if experiment.initial.free:
+        if system.experiment.initial.free:
             suited = system.released_as(curve.state[0]).calibrated(system.theta, curve.ctrl)
         trial_sets[name] = TrialSet.of(suited, curve.ctrl)
 
@@ -272,6 +277,16 @@ def monte_carlo(
         information=information,
         labels=labels_of_system(system),
     )
+
+
+def _motions(
+    system: System, given: TrajectoryLike | Mapping[str, TrajectoryLike] | None
+) -> dict[str, Trajectory]:
+    """The trajectories by name, at least one."""
+    stated = given if isinstance(given, Mapping) else {"final": given}
+    if not stated:
+        raise ExperimentError("monte_carlo: trajectory: the table of trajectories is empty")
+    return {name: motion_of(system, each, "monte_carlo") for name, each in stated.items()}
 
 
 def _estimates(

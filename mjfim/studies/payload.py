@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import NORMAL_95, Array, record, scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError, listed, unknown
+from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.packing import model_of
 from mjfim.experiment.parameters import BARYCENTRIC_FIELDS, LOGCHOLESKY_FIELDS
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import ParameterSpec
 from mjfim.identification.assessment.accuracy import FitResult
@@ -248,13 +250,14 @@ class KnownRobot:
     source: str
 
 
+@checked
 def identify_payload(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
+    experiment: ExperimentLike,
+    recordings: RecordingsLike,
     *,
     body: str | None = None,
     robot: Estimate | None = None,
-    without: Sequence[Recording] = (),
+    without: RecordingsLike = (),
     size: float | None = None,
     callback: Callback | None = None,
     threads: int | None = None,
@@ -290,8 +293,11 @@ def identify_payload(
         SimulationDivergedError: The model diverges at the start.
     """
     with shown_progress("identifying the payload", callback, progress) as show:
-        prepared = PayloadTask.of(experiment, body=body, robot=robot, size=size, threads=threads)
-        return prepared.identify(recordings, without=without, callback=show, stop=stop)[0]
+        stated = experiment_of(experiment)
+        prepared = PayloadTask.of(stated, body=body, robot=robot, size=size, threads=threads)
+        system = prepared.system()
+        loaded, empty = recordings_of(system, recordings), recordings_of(system, without)
+        return prepared.identify(loaded, without=empty, callback=show, stop=stop)[0]
 
 
 @record

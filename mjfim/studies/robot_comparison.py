@@ -14,6 +14,7 @@ from itertools import permutations
 import numpy as np
 import scipy
 
+from mjfim.arguments import checked
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import ExperimentError, first_ones
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
@@ -43,6 +44,7 @@ MANY_DEGREES = 1e6
 RANK_TOLERANCE = 1e-9
 
 
+@checked
 def compare_estimates(
     first: Estimate, second: Estimate, *, names: Sequence[str] = ("A", "B")
 ) -> RobotComparison:

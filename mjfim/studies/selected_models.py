@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, record
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import (
@@ -84,7 +85,8 @@ class FittedModel:
         return self.cost + sum(len(term.parameters) for term in self.terms)
 
 
-def selected_experiment(experiment: Experiment, selection: Selection) -> Experiment:
+@checked
+def selected_experiment(experiment: ExperimentLike, selection: Selection) -> Experiment:
     """The experiment of a selected model.
 
     Args:
@@ -98,6 +100,7 @@ def selected_experiment(experiment: Experiment, selection: Selection) -> Experim
     Raises:
         ExperimentError: The selection is one of another experiment.
     """
+    experiment = experiment_of(experiment)
     extended = experiment.replace(**selection.tables)
     if selection.segments is not None and experiment.fit.segments is None:
         extended = extended.replace(fit={"segments": selection.segments})

@@ -15,8 +15,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.errors import SimulationDivergedError, listed
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.given import RecordingsLike, recordings_of
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.report import estimate_from
@@ -78,11 +80,12 @@ INTERRUPTED = "The selection was interrupted."
 SMALL_EFFECT = 0.01
 
 
+@checked
 def select_terms(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
+    experiment: ExperimentLike,
+    recordings: RecordingsLike,
     *,
-    held_out: Sequence[Recording] = (),
+    held_out: RecordingsLike = (),
     max_terms: int = MAX_TERMS,
     callback: Callback | None = None,
     threads: int | None = None,
@@ -121,15 +124,16 @@ def select_terms(
     with shown_progress("selecting terms", callback, progress) as show:
         begun = time.perf_counter()
         system = System.resolve(experiment, threads=threads)
+        fitted, kept = recordings_of(system, recordings), recordings_of(system, held_out)
         with one_blas_thread(), stop_on_interrupt(stop) as token:
             selector = _Selector(
-                held_out=tuple(held_out),
+                held_out=kept,
                 budget=Budget(stop=token),
                 callback=show,
                 workers=None if executor is None else FitWorkers(executor),
                 max_terms=max_terms,
             )
-            found = selector.selected(FitTask.of(system, recordings, held_out=held_out))
+            found = selector.selected(FitTask.of(system, fitted, held_out=kept))
     seconds = time.perf_counter() - begun
     return replace(found, seconds=seconds, steps=system.plant.engine_steps)
 

@@ -15,6 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.excitation.evaluation import designable, identifiability_along, require_evaluated
@@ -24,7 +25,7 @@ from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
@@ -53,8 +54,9 @@ BARRIER = Barrier(first=1e-3, last=1e-3)
 SETTLED = 1e-3
 
 
+@checked
 def worth(
-    experiment: Experiment,
+    experiment: ExperimentLike,
     design: Design | None = None,
     *,
     add: Mapping[str, float] | None = None,
@@ -82,7 +84,7 @@ def worth(
     """
     with stop_on_interrupt(stop) as token, shown_progress("comparing", None, progress):
         budget = Budget(seconds=seconds, stop=token)
-        return _worth(experiment, design, dict(add or {}), threads, budget)
+        return _worth(experiment_of(experiment), design, dict(add or {}), threads, budget)
 
 
 @one_blas_thread()

@@ -424,6 +424,9 @@ def identified(job: tuple[int, int, Path]) -> CleanLog:
         system, rng = task.system, np.random.default_rng([seed, number])
         parameters = system.parameters
         moved = parameters.guess * rng.uniform(1.0 - WRONG, 1.0 + WRONG, len(parameters))
+        # A robot outside a stated prior is not one that the experiment describes.
+        near = rng.normal(parameters.guess, [each.prior or 0.0 for each in parameters.parameters])
+        moved = np.where([each.prior is None for each in parameters.parameters], moved, near)
         moved = np.clip(moved, parameters.lower, parameters.upper).tolist()
         true = dict(zip(parameters.names, moved, strict=True))
         stated = system.experiment

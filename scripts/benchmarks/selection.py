@@ -14,6 +14,7 @@ chosen where none is missing, and how often the 95 % intervals hold the true val
 
 from __future__ import annotations
 
+import re
 import tempfile
 import time
 from collections import Counter
@@ -28,6 +29,7 @@ from rich.table import Table
 
 import mjfim
 from mjfim.arrays import record
+from mjfim.errors import WrongLogError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
 from mjfim.files import write_json
@@ -219,9 +221,13 @@ def _run(job: Job, rng: np.random.Generator, experiment: mjfim.Experiment) -> Ou
 
     # Without a selection, whole recordings are compared: short segments would hide a misfit.
     whole = experiment.replace(fit={"segments": "whole"})
-    before = mjfim.identify(whole, recordings, threads=1, progress=False)
     begun = time.perf_counter()
-    found = mjfim.select_terms(experiment, recordings, threads=1, progress=False)
+    try:
+        before = mjfim.identify(whole, recordings, threads=1, progress=False)
+        begun = time.perf_counter()
+        found = mjfim.select_terms(experiment, recordings, threads=1, progress=False)
+    except WrongLogError as error:
+        return _refused(job, str(error), time.perf_counter() - begun)
     seconds = time.perf_counter() - begun
 
     selection = found.selection
@@ -241,6 +247,25 @@ def _run(job: Job, rng: np.random.Generator, experiment: mjfim.Experiment) -> Ou
         inside_before=_inside(before, true),
         seconds=seconds,
         passes=found.steps / steps,
+    )
+
+
+def _refused(job: Job, message: str, seconds: float) -> Outcome:
+    """The outcome where the log is refused, because an error of an encoder explains it."""
+    named = re.search(r"another (zero|scale) of (qpos:\w+);", message)
+    kind = {"zero": "bias", "scale": "scale"}.get(named[1] if named else "")
+    path = f"output/{named[2]}:{kind}" if named else "?"
+    return Outcome(
+        kind="" if job.kind is None else job.kind.words,
+        chosen=(path,),
+        is_right=job.kind is not None and job.kind.path == path,
+        is_alternative=False,
+        misfit=False,
+        misfit_before=True,
+        inside=(),
+        inside_before=(),
+        seconds=seconds,
+        passes=0.0,
     )
 
 
@@ -306,7 +331,7 @@ def share(flags: Sequence[bool]) -> float:
 
 def _percent(flags: Sequence[bool]) -> str:
     """Share of true values in percent."""
-    return f"{100.0 * share(flags):.0f} %"
+    return f"{100.0 * share(flags):.0f} %" if flags else "-"
 
 
 def main() -> int:

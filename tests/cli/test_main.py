@@ -40,6 +40,30 @@ def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("files", "proposed"),
+    [
+        (("arm.xml",), "mjfim init arm.xml -o arm.toml"),
+        (("my arm.urdf", "pyproject.toml"), "mjfim init 'my arm.urdf' -o 'my arm.toml'"),
+        (("arm.xml", "arm.toml"), "mjfim check arm.toml"),
+        (("arm.xml", "leg.xml"), ""),
+        ((), ""),
+    ],
+)
+def test_without_a_verb_the_first_command_is_proposed(
+    files: tuple[str, ...], proposed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the folder holds one experiment, or else one model."""
+    for name in files:
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    result = run()
+    assert result.exit_code == 2 and "Usage: " in result.stdout
+    assert " ".join(result.stderr.split()) == (
+        f"mjfim: in this folder: {proposed}" if proposed else ""
+    )
+
+
+@pytest.mark.parametrize(
     "words",
     [
         ("design", "study.toml"),

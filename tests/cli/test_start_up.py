@@ -161,4 +161,9 @@ def test_help_lists_every_verb_with_its_first_sentence() -> None:
     for name, command in verbs().items():
         paragraph = " ".join(command.help.split("\n\n")[0].split())
         assert f" {name} {paragraph}" in shown
-        assert "``" not in run(name, "--help").stdout, name
+        own = " ".join(run(name, "--help").stdout.split())
+        assert "``" not in own, name
+        for option in ("--json", "--verbose", "--threads"):
+            is_shared = any(option in each.opts for each in command.params)
+            assert (option in own.partition(" Also ")[2]) == is_shared, (name, option)
+            assert f"{option}" in shown

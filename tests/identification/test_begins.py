@@ -59,19 +59,25 @@ def test_a_log_that_begins_elsewhere_is_fitted_and_said(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("zero", [0.35, -0.2])
-def test_another_zero_of_an_encoder_is_named_with_the_line_that_cures_it(
-    experiment: mjfim.Experiment, zero: float
+@pytest.mark.parametrize(("zero", "scale"), [(0.35, 1.0), (-0.2, 1.0), (0.0, 1.1), (0.0, 0.9)])
+def test_another_reading_of_an_encoder_is_named_with_the_line_that_cures_it(
+    experiment: mjfim.Experiment, zero: float, scale: float
 ) -> None:
-    """The log begins at rest, elsewhere by the zero; the equation of motion is too noisy for it."""
+    """The log begins at rest, elsewhere by the error; equations of motion are too noisy for it.
+
+    The hinge hangs at an angle of pi, so that a wrong scale is seen at the begin as well.
+    """
     log = swung(experiment)
-    shifted = replace(log, y=log.y + zero * (np.array(log.outputs) == "qpos:hinge"))
-    with pytest.raises(WrongLogError, match="another zero of qpos:hinge") as error:
+    is_wrong = np.array(log.outputs) == "qpos:hinge"
+    shifted = replace(log, y=np.where(is_wrong, scale * log.y + zero, log.y))
+    word = "zero" if zero else "scale"
+    with pytest.raises(WrongLogError, match=f"another {word} of qpos:hinge") as error:
         mjfim.identify(experiment, [shifted], progress=False)
     line = str(error.value).partition("State in [recording.columns]: ")[2]
     (column,) = tomllib.loads(line).items()
     assert column[0] == "qpos:hinge"
-    assert column[1]["offset"] == pytest.approx(-zero, abs=0.02)
+    assert column[1].get("offset", 0.0) == pytest.approx(-zero, abs=0.02)
+    assert column[1]["scale"] == pytest.approx(1.0 / scale, abs=0.02)
 
 
 @pytest.mark.slow

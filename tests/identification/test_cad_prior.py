@@ -250,9 +250,9 @@ def test_no_data_are_simulated_to_test_inertias_with_a_prior(
     task = FitTask.of(System.resolve(arm(tmp_path), threads=1), [log])
     problem = task.problem()
     steps = problem.system.plant.engine_steps
-    assert _unseen_directions(task, problem).count == 0
+    assert _unseen_directions(task, problem, task.start).count == 0
     assert problem.system.plant.engine_steps == steps
 
     # Without the prior, hardly any single inertia is determined.
     task = FitTask.of(System.resolve(arm(tmp_path, cad_prior=False), threads=1), [log])
-    assert _unseen_directions(task, task.problem()).count > 5
+    assert _unseen_directions(task, task.problem(), task.start).count > 5

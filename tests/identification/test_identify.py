@@ -6,6 +6,7 @@ import re
 import signal
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -390,6 +391,33 @@ def test_a_parameter_that_the_logs_do_not_determine_is_named_with_the_reason() -
         assert words in sentence
     assert sentence not in estimate.details
     assert "rub (not determined)" in estimate.verdict.sentence
+
+
+def _squared(spec: Any, value: float) -> None:
+    """Damping of the slide as the square of a value."""
+    spec.joint("slide").damping = [value**2, 0.0, 0.0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "is_at_zero"), [(0, False), (2, True)])
+def test_a_parameter_whose_effect_vanishes_at_the_estimate_is_named_and_no_other(
+    seed: int, *, is_at_zero: bool
+) -> None:
+    """The derivative of the damping is proportional to the value, whose true value is 0."""
+    root = {"function": _squared, "guess": 1.5, "true": 0.0, "bounds": [0.0, 2.0]}
+    true = {"m": 2.0, "l": 1.0, "c": 1.0}
+    known = {name: {"guess": value, "prior": 1e-3} for name, value in true.items()}
+    stated = cart_pendulum(horizon=2.0, fit={"bootstrap": 0}, parameters={"root": root, **known})
+    task = DesignTask.resolve(stated)
+    log = simulate_system(task.system, task.initial, seed=seed)
+    estimate = identify_system(task.system, [log])
+    lost = "much less at the estimate than at the guess"
+    if is_at_zero:
+        lost = "not identifiable separately: root"
+        assert estimate.theta[-1] == 0.0 and np.isinf(estimate.std[-1])
+    (sentence,) = [text for text in estimate.warnings if lost in text]
+    assert "root" in sentence
+    np.testing.assert_allclose(estimate.std[:3], 1e-3, rtol=0.05)
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> N
     before = problem.system.plant.engine_steps
     sensitivity_rows(problem, problem.begin(task.start))
     between = problem.system.plant.engine_steps
-    assert _unseen_directions(task, problem).count == 0
+    assert _unseen_directions(task, problem, task.start).count == 0
     assert problem.system.plant.engine_steps - between < 0.2 * (between - before)
 
 
@@ -92,7 +92,7 @@ def test_what_all_recordings_determine_only_together_takes_one_difference_step()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mjfim.identification.identify.sensitivity_rows", rows)
-        assert _unseen_directions(task, whole).count == 0
+        assert _unseen_directions(task, whole, task.start).count == 0
     assert asked == [False, False]
 
 
@@ -111,4 +111,4 @@ def test_an_effect_that_may_be_round_off_is_tested_with_its_error(
         return [(J, 0.5 * J * (np.arange(count) == count - 1) * with_error)]
 
     monkeypatch.setattr("mjfim.identification.identify.sensitivity_rows", rows)
-    assert _unseen_directions(task, task.problem()).silent == (count - 1,)
+    assert _unseen_directions(task, task.problem(), task.start).silent == (count - 1,)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
+from mjfim.excitation.evaluation import simulate
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import System, simulate
+from mjfim.experiment.system import System
 from mjfim.identification.identify import identify
 from mjfim.model.parameters import ParameterSet
 from tests.support.paths import MODELS

@@ -215,6 +215,16 @@ def test_friction_grows_with_the_torque_of_the_motor(
     assert np.abs(without - expected)[:, 0].max() > 0.1 * np.ptp(expected[:, 0])
 
 
+def test_friction_of_the_load_needs_direct_drives_only(tmp_path: Path) -> None:
+    """The friction would contain the feedback of a servo beside the motor."""
+    experiment = experiment_of(tmp_path, "load_dependent_friction")
+    path = tmp_path / "pendulum.xml"
+    servo = '<position name="servo" joint="pivot"/></actuator>'
+    path.write_text(path.read_text(encoding="utf-8").replace("</actuator>", servo))
+    with pytest.raises(ExperimentError, match="'servo' is no direct drive at a hinge"):
+        System.resolve(experiment)
+
+
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
 def test_friction_with_an_offset_differs_by_direction(tmp_path: Path, direction: float) -> None:
     experiment = experiment_of(

@@ -25,8 +25,8 @@ from mjfim.cli.common import with_live_address
 from mjfim.errors import ExperimentError, InterruptedByUserError
 from mjfim.experiment.system import System
 from mjfim.output import live as live_module
-from mjfim.output.live import HERE, live, url_of
-from mjfim.output.rerun.live import OTHER_STARTS, UPDATE_SECONDS, LiveShow
+from mjfim.output.live import HERE, url_of
+from mjfim.output.rerun.live import OTHER_STARTS, UPDATE_SECONDS, LiveShow, live
 from mjfim.records.design import Design
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from tests.support import results

@@ -16,15 +16,18 @@ import mjfim
 from mjfim.errors import MjfimError, OutputError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import with_model
+from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import write_json
+from mjfim.model.comparison import same_dynamics
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.archive import summary_with_origin
-from mjfim.output.export.mjcf import same_dynamics, write_identified
+from mjfim.output.export.mjcf import write_identified
 from mjfim.records.estimate import Estimate
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.examples import design_file
 from tests.support.made_records import bare_estimate
+from tests.support.mesh_model import write_mesh_model
 from tests.support.numerics import shared_model
 from tests.support.paths import MODELS, SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
@@ -625,6 +628,28 @@ def test_what_counts_as_rounding_does_not_depend_on_units(
     first.dof_invweight0[:] = second.dof_invweight0
     first.dof_M0[:] = second.dof_M0
     assert same_dynamics(first, second) == same
+
+
+# An experiment with a model of several files.
+MESH_EXPERIMENT: dict[str, Any] = {
+    "rate": 50.0,
+    "parameters": {"mass": "body/tool:mass"},
+    "noise": {"angle": 0.01},
+}
+
+
+def test_a_model_in_memory_is_written_with_the_files_that_it_needs(tmp_path: Path) -> None:
+    """A spec with meshes, one of which is attached from a folder that it does not know any more."""
+    spec = mujoco.MjSpec.from_file(str(write_mesh_model(tmp_path / "robot")))
+    stated = {**MESH_EXPERIMENT, "model": spec, "directory": tmp_path / "nowhere"}
+    system = System.resolve(Experiment(**stated))
+    file = tmp_path / "out" / "identified.xml"
+
+    assert write_identified(file, system, np.array([1.5])) == []
+
+    found = mujoco.MjModel.from_xml_path(str(file))
+    assert same_dynamics(found, system.model_at(np.array([1.5])))
+    assert [each.name for each in file.parent.iterdir()] == [file.name]
 
 
 # ---- models of an estimate

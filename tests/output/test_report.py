@@ -200,6 +200,10 @@ def test_marks_become_traces_and_shapes() -> None:
     assert layouts[0]["xaxis"]["title"]["text"] == "time [s]"
     assert group.plots[0].data["linked"] == group.plots[1].data["linked"] != ""
     assert group.plots[1].height == 500
+    # A plot below two columns has an axis of its own.
+    below = replace(picture, panels=[*picture.panels[:1], replace(lower, is_wide=True)])
+    upper = group_of(replace(below, widths=(1.0, 1.0)), 1000).plots[0].data["layout"]
+    assert "title" not in upper["xaxis"]
     assert group_of(Picture(title="", panels=[panel]), 9).plots[0].data["layout"]["xaxis"][
         "range"
     ] == [-1.0, 1.0]

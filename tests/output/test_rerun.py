@@ -362,6 +362,16 @@ def test_the_camera_is_as_near_as_the_motion_permits(name: str) -> None:
     assert places.max() == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.parametrize(("name", "edge_on"), [("cart", True), ("panda", False)])
+def test_only_a_motion_in_an_upright_plane_is_seen_with_the_ground_edge_on(
+    name: str, edge_on: bool
+) -> None:
+    model = load(name)
+    trajectory = simulated(model, 1.0)
+    poses = body_poses(model, trajectory.t, trajectory.qpos)
+    assert place_camera(model, [poses], views=1, aspect=1.3).edge_on == edge_on
+
+
 def test_the_camera_follows_a_body_that_flies_away_except_in_the_common_view(
     tmp_path: Path,
 ) -> None:

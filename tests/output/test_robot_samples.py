@@ -14,8 +14,9 @@ import pytest
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.parameter_draws import complete_theta, draw_parameters_system
+from mjfim.model.comparison import same_dynamics
 from mjfim.output import folders
-from mjfim.output.export.mjcf import same_dynamics, write_identified
+from mjfim.output.export.mjcf import write_identified
 from mjfim.output.folders import clear_samples, sample_files, write_samples
 from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
 from mjfim.output.page import Text

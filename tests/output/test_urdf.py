@@ -12,8 +12,9 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.model.comparison import same_dynamics
 from mjfim.model.model_files import urdf_sources
-from mjfim.output.export.mjcf import identified_files, same_dynamics, write_identified
+from mjfim.output.export.mjcf import identified_files, write_identified
 from mjfim.output.manifest import MANIFEST
 from tests.output.test_mjcf import changes
 from tests.support.cli import names, run

@@ -287,9 +287,15 @@ def test_seconds_end_a_design(tmp_path: Path, limits: dict[str, object]) -> None
     assert design.final.cost <= design.initial.cost
 
 
-@pytest.mark.parametrize("threads", [0, -1, 1_000_000, 1.5, True])
-def test_impossible_numbers_of_threads_are_refused(threads: Any) -> None:
-    """The message states the bounds, before anything is allocated."""
+@pytest.mark.parametrize(
+    ("threads", "message"),
+    [
+        *((number, rf"threads: {number} .* from 1 to 1024") for number in (0, 1_000_000)),
+        *((wrong, rf"threads: needs int .*; not {wrong}") for wrong in (-1, 1.5, True)),
+    ],
+)
+def test_impossible_numbers_of_threads_are_refused(threads: Any, message: str) -> None:
+    """The message states the bounds or the kind, before anything is allocated."""
     experiment = cart_pendulum()
-    with pytest.raises(ExperimentError, match=rf"threads: {threads} .* from 1 to 1024"):
+    with pytest.raises(ExperimentError, match=message):
         mjfim.check(experiment, threads=threads)

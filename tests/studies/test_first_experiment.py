@@ -415,7 +415,7 @@ def test_what_equal_joints_lack_has_the_size_of_the_strongest(strong: str, force
 
 
 def test_faults_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match="--payload: unknown body 'hand'"):
+    with pytest.raises(ExperimentError, match="payload: unknown body 'hand'"):
         propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(payload="hand"))
     with pytest.raises(ExperimentError, match="no parameter of motors can be proposed"):
         propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(groups=("motors",)))

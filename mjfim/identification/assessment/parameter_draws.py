@@ -21,9 +21,10 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import MAX_SAMPLES, ExperimentError, first_ones, listed
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import inertia_combinations
 from mjfim.identification.assessment.honest_covariance import honest_covariance
@@ -169,8 +170,9 @@ def _draw_between(low: Array, high: Array, rng: np.random.Generator) -> Array:
 MAX_ROUNDS = 200
 
 
+@checked
 def draw_parameters(
-    experiment: Experiment, estimate: Estimate, count: int, rng: np.random.Generator
+    experiment: ExperimentLike, estimate: Estimate, count: int, rng: np.random.Generator
 ) -> ParameterDraws:
     """Draw robots that are compatible with an estimate, for domain randomisation.
 

@@ -206,7 +206,7 @@ def estimate_from(
     interrupted = budget.stop.requested
     groups = (
         f"not identifiable separately: {group.short}; what the recordings do not determine was "
-        "held at the start. Remove or fix one of them, give it a prior, or record other motions"
+        "held. Remove or fix one of them, give it a prior, or record other motions"
         for group in accuracy.groups
     )
     stated = (*probable_degrees(system.experiment, system.source), *groups)

@@ -18,9 +18,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, record, scaled_to_unit_diagonal
-from mjfim.errors import ExperimentError, MjfimError, RecordingError, listed
-from mjfim.experiment.schema import Experiment
+from mjfim.errors import MjfimError, RecordingError
+from mjfim.experiment.given import RecordingsLike, recordings_of
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.assessment.residual_tests import whiteness_of
@@ -33,7 +35,6 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate_parts import EquationFit, InverseDynamicsFit
-from mjfim.records.trajectory import Recording
 
 # Steps of differences, relative to the sizes of the parameters. Those of inertias may be long,
 # because the slopes by linear coordinates are exact.
@@ -505,9 +506,10 @@ def _force_sizes(system: System, rows: Array, equations: MotionEquations) -> Arr
 ROWS_PER_PARAMETER = 4.0
 
 
+@checked
 def inverse_dynamics(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
+    experiment: ExperimentLike,
+    recordings: RecordingsLike,
     *,
     start: Array | None = None,
     threads: int | None = None,
@@ -533,17 +535,13 @@ def inverse_dynamics(
         RecordingError: A recording cannot be used; a degree of freedom was not measured.
     """
     system = System.resolve(experiment, threads=threads)
-    if not recordings:
+    logs = recordings_of(system, recordings)
+    if not logs:
         raise RecordingError("inverse_dynamics needs at least one recording")
 
-    begun = system.parameters.guess if start is None else np.asarray(start, dtype=np.float64)
-    if begun.shape != system.parameters.guess.shape:
-        raise ExperimentError(
-            f"start: {begun.shape} numbers; expected one per parameter: "
-            f"{listed(system.parameters.names)}"
-        )
-    system = on_grid_of(system, recordings)
-    aligned = [align(system, each) for each in recordings]
+    begun = system.theta_of("start", start)
+    system = on_grid_of(system, logs)
+    aligned = [align(system, each) for each in logs]
     with one_blas_thread():
         found = fit_equations(system, aligned, begun)
         residuals = residual_forces(system, aligned, [found.theta] * len(aligned))

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mjfim.arguments import checked
 from mjfim.errors import ExperimentError, unknown
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.model.coordinates import state_names
@@ -72,8 +73,9 @@ def write_player(path: Path, plan: RobotPlan) -> None:
         temporary.write_text(program, encoding="utf-8")
 
 
+@checked
 def export_design(
-    experiment: Experiment,
+    experiment: ExperimentLike,
     design: Design,
     path: str | Path,
     *,

@@ -23,17 +23,23 @@ from mjfim.errors import ExperimentError, ModelError, OutputError, first_ones, l
 from mjfim.experiment.packing import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.model.comparison import (
+    ROUNDING,
+    TOLERANCE,
+    differ_in_inertia,
+    differences,
+    same_inertias,
+)
 from mjfim.model.control_laws import remove_numbers
 from mjfim.model.elements import element_count, element_name
-from mjfim.model.inertia import body_inertia
-from mjfim.model.loading import ModelSource, compile_spec
+from mjfim.model.given import exact_numbers
+from mjfim.model.loading import ModelSource, compile_spec, refused
 from mjfim.model.model_files import changed_files, elements_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS, POLYNOMIAL_ARRAYS
 from mjfim.model.targets import OutputBiasField, OutputDelayField, OutputScaleField, SpecField
 from mjfim.output.export.model_xml import (
     ALTERNATIVES,
-    ROUNDING,
     ModelXml,
     add_comment,
     add_element,
@@ -41,11 +47,9 @@ from mjfim.output.export.model_xml import (
     child,
     floats,
     held_name,
-    loading,
     nearly_equal,
     own_child,
     parent_of,
-    same_inertia,
     set_numbers,
 )
 from mjfim.output.export.urdf import urdf_files, write_identified_urdfs
@@ -100,16 +104,13 @@ SHORTHANDS: dict[str, dict[str, tuple[Places, ...]]] = {
 ROUNDS = (("geom",), *(tuple(ARRAYS),) * 4)
 
 
-def state_differences(
-    xml: ModelXml, compiled: tuple[Any, Any], wanted: Any, *, names_needed: bool = True
-) -> None:
+def state_differences(xml: ModelXml, compiled: tuple[Any, Any], wanted: Any) -> None:
     """State the numbers of all elements that differ from those of a wanted model.
 
     Args:
         xml: The text.
         compiled: Its MjSpec and MjModel.
         wanted: The wanted model.
-        names_needed: Whether a difference of an element without a name is a fault.
 
     Raises:
         ModelError: The text cannot state a number. The message is a clause.
@@ -119,20 +120,11 @@ def state_differences(
         statement = _Statement(xml, spec, found, wanted)
         for kind in kinds:
             for i in range(element_count(found, kind)):
-                if names_needed or element_name(found, kind, i):
-                    statement.state(kind, i)
+                statement.state(kind, i)
         if len(kinds) > 1:
             statement.state_options()
         if statement.is_changed:
             compiled = xml.compiled()
-
-
-def differ_in_inertia(a: Any, b: Any, body: int, tolerance: float) -> bool:
-    """Whether a body has different inertias in two models, by a share of its mass and size."""
-    pairs = [(getattr(a, array)[body], getattr(b, array)[body]) for array in INERTIAL.values()]
-    if all(np.array_equal(*pair) for pair in pairs):
-        return False
-    return not same_inertia(body_inertia(a, body), body_inertia(b, body), tolerance)
 
 
 class _Statement:
@@ -316,23 +308,6 @@ NAMED = (
     "//worldbody//*[@name] | /mujoco/*[self::actuator or self::tendon or self::contact]/*[@name]"
 )
 
-# Prefixes of the arrays that determine the motion, and of those among them that only speed it up,
-# follow from others, or are compared as matrices.
-COMPARED = (
-    *("body_", "jnt_", "dof_", "qpos", "actuator_", "tendon_", "pair_friction", "pair_solref"),
-    *("site_pos", "site_quat", "geom_pos", "geom_quat", "geom_size", "geom_friction"),
-    "geom_solref",
-)
-NOT_COMPARED = (
-    *("body_bvh", "body_simple", "body_sameframe", "body_margin", "body_inertia", "body_iquat"),
-    *("body_invweight0", "dof_simplenum"),
-)
-
-# Relative difference below which numbers count as equal: of the number itself, and of the largest
-# one of its array. MuJoCo prints six digits.
-TOLERANCE = 1e-9
-PRINTED_TOLERANCE = 1e-4
-
 # Errors of sensors, which no element can state.
 OF_SENSORS = (OutputBiasField, OutputScaleField, OutputDelayField)
 
@@ -358,10 +333,10 @@ def identified_spec(estimate: Estimate) -> Any:
     system = _without_floor(_system_of(estimate))
     wanted = system.model_at(estimate.theta, at_keyframe=False)
 
-    def compiled(xml: ModelXml, tolerance: float) -> Any:
+    def compiled(xml: ModelXml) -> Any:
         """The MjSpec of a text."""
         spec, model = xml.compiled()
-        _require_equal(model, wanted, tolerance)
+        _require_equal(model, wanted)
         return spec
 
     return _expressed(system, estimate.theta, wanted, {}, compiled)[0]
@@ -431,7 +406,8 @@ def write_identified(
     system = _without_floor(system)
     wanted = system.model_at(theta, at_keyframe=False)
     urdfs, remarks = write_identified_urdfs(path, system, theta)
-    texts = {file.resolve() for file, _ in elements_of(system.model_path)}
+    files = [system.model_path, *(file for file, _ in elements_of(system.model_path))]
+    texts = {file.resolve() for file in files}
     contents = {file: each for file, each in system.source.stated.contents.items() if file.exists()}
     changed = [file for file in changed_files(contents) if file.resolve() not in texts]
     if changed:
@@ -440,16 +416,16 @@ def write_identified(
             "reads what is there now, but the parameters belong to what was loaded"
         )
 
-    def save(xml: ModelXml, tolerance: float) -> None:
+    def save(xml: ModelXml) -> None:
         """Write a text if it compiles to the wanted model."""
         if estimate is not None:
             add_comment(xml.root, provenance(estimate), first=True)
 
         def check(written: Path) -> None:
             """Raise ModelError if the file gives another model."""
-            with loading("MuJoCo does not load the text"):
+            with refused("MuJoCo does not load the text"):
                 found = mujoco.MjModel.from_xml_path(str(written))
-            _require_equal(found, wanted, tolerance)
+            _require_equal(found, wanted)
 
         xml.save(path, check)
 
@@ -459,10 +435,7 @@ def write_identified(
         why = "; ".join([str(reason), *remarks])
         raise ModelError(f"{path}: not written: {why}") from None
     if fault:
-        remarks.append(
-            f"{path.name}: it is printed by MuJoCo, without comments and, where elements have no "
-            f"name, with six digits: {fault}"
-        )
+        remarks.append(f"{path.name}: it is printed by MuJoCo, without comments: {fault}")
     if system.laws is not None:
         names = first_ones([law.actuator for law in system.laws.laws], longest=REMARK_TEXT)
         remarks.append(
@@ -504,11 +477,6 @@ def identified_files(path: Path, model: Path) -> tuple[str, ...]:
     return (*copies, *urdf_files(path, model))
 
 
-def same_dynamics(a: Any, b: Any, tolerance: float = TOLERANCE) -> bool:
-    """Whether everything that determines the motion agrees in two MjModels."""
-    return not _differences(a, b, tolerance)
-
-
 def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) -> ModelXml:
     """The user's text with the values."""
     source = system.source
@@ -521,7 +489,7 @@ def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) 
 
     xml.attach(urdfs)
     is_changed = _state_others(xml, system.parameters, theta) or bool(urdfs)
-    if not _same_inertias(source.model, wanted, TOLERANCE):
+    if not same_inertias(source.model, wanted, TOLERANCE):
         # Inertias that are stated have to count.
         for compiler in xml.root.iter("compiler"):
             if compiler.get("inertiafromgeom") == "true":
@@ -533,7 +501,7 @@ def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) 
 
 
 def _printed(system: System, theta: Array, wanted: Any) -> ModelXml:
-    """The model as MuJoCo prints it, with all digits of the numbers of elements with names."""
+    """The model as MuJoCo prints it."""
     spec = system.source.spec.copy()
     remove_numbers(spec)
     for parameter, value in zip(system.parameters.parameters, theta, strict=True):
@@ -545,8 +513,10 @@ def _printed(system: System, theta: Array, wanted: Any) -> ModelXml:
     spec.compiler.settotalmass = -1.0
     compile_spec(spec, system.model_path, files=system.source.files)
     spec.assets = held = _held(system)
-    xml = ModelXml(system.model_path, lambda _: spec.to_xml().encode(), held)
-    state_differences(xml, xml.compiled(), wanted, names_needed=False)
+    with refused("MuJoCo does not print it"), exact_numbers():
+        text = spec.to_xml().encode()
+    xml = ModelXml(system.model_path, lambda _: text, held)
+    state_differences(xml, xml.compiled(), wanted)
     return xml
 
 
@@ -555,55 +525,26 @@ def _expressed(
     theta: Array,
     wanted: Any,
     urdfs: dict[Path, Path],
-    use: Callable[[ModelXml, float], T],
+    use: Callable[[ModelXml], T],
 ) -> tuple[T, str]:
     """Use the user's text with the values; where it cannot have them, that which MuJoCo prints.
 
     Returns:
-        What `use` returns, which gets the text and the relative tolerance of its numbers; and the
-        reason why the text is printed, empty where it is the user's.
+        What `use` returns; and the reason why the text is printed, empty where it is the user's.
     """
     try:
-        return use(_edited(system, theta, wanted, urdfs), TOLERANCE), ""
+        return use(_edited(system, theta, wanted, urdfs)), ""
     except ModelError as error:
-        return use(_printed(system, theta, wanted), PRINTED_TOLERANCE), str(error)
+        return use(_printed(system, theta, wanted)), str(error)
 
 
-def _require_equal(found: Any, wanted: Any, tolerance: float) -> None:
+def _require_equal(found: Any, wanted: Any) -> None:
     """Raise ModelError if two models differ."""
-    different = _differences(found, wanted, tolerance)
+    different = differences(found, wanted, TOLERANCE)
     if different:
         raise ModelError(
             f"with the identified values the text compiles to a different {listed(different)}"
         )
-
-
-def _differences(a: Any, b: Any, tolerance: float) -> list[str]:
-    """The arrays that determine the motion and differ between two models."""
-    names = [n for n in dir(a) if n.startswith(COMPARED) and not n.startswith(NOT_COMPARED)]
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in names}
-    pairs |= {n: (getattr(a.opt, n), getattr(b.opt, n)) for n in MODEL_ARRAYS["option"]}
-    found = [name for name, (x, y) in pairs.items() if not _is_equal(x, y, tolerance)]
-    return found if _same_inertias(a, b, tolerance) else [*found, "body_inertia"]
-
-
-def _same_inertias(a: Any, b: Any, tolerance: float) -> bool:
-    """Whether all bodies of two models have the same inertias, with axes named in any order."""
-    return a.nbody == b.nbody and not any(
-        differ_in_inertia(a, b, i, tolerance) for i in range(a.nbody)
-    )
-
-
-def _is_equal(x: Any, y: Any, tolerance: float) -> bool:
-    """Whether two arrays have the same shape and nearly the same numbers, in any unit."""
-    x, y = np.asarray(x), np.asarray(y)
-    if np.array_equal(x, y):
-        return True
-    if x.shape != y.shape:
-        return False
-    largest = float(np.abs(y[np.isfinite(y)]).max(initial=0.0))
-    rounding = largest * max(ROUNDING, tolerance * tolerance)
-    return bool(np.isclose(x, y, rtol=tolerance, atol=rounding).all())
 
 
 def _state_others(xml: ModelXml, parameters: ParameterSet, theta: Array) -> bool:

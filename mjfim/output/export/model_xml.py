@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +22,8 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.files import replacing
-from mjfim.model.inertia import BodyInertia
-from mjfim.model.loading import collected_warnings
+from mjfim.model.comparison import ROUNDING
+from mjfim.model.loading import refused
 from mjfim.model.model_files import included_file
 
 # Where the element that defines an object stands; other objects are elements of <worldbody>.
@@ -47,9 +46,6 @@ ALTERNATIVES = {
 # Attributes of <compiler> that name a folder, and elements whose files are in one of these folders.
 FOLDERS = ("meshdir", "texturedir", "assetdir")
 ASSETS = ("mesh", "hfield", "skin", "flexcomp", "texture")
-
-# Relative difference of numbers that is rounding.
-ROUNDING = 1e-12
 
 # What some editors of Windows put before a text in UTF-8.
 BYTE_ORDER_MARK = "\ufeff".encode()
@@ -169,7 +165,7 @@ class ModelXml:
             parent[place : place + 1] = list(include)
 
         text = etree.tostring(root, encoding="unicode")
-        with loading("MuJoCo does not load the text with the identified values"):
+        with refused("MuJoCo does not load the text with the identified values"):
             spec = mujoco.MjSpec.from_string(text, assets=dict(self._held))
             return spec, spec.compile()
 
@@ -285,16 +281,6 @@ class ModelXml:
         self._main.references.append((compiler, "assetdir", ""))
 
 
-@contextmanager
-def loading(fault: str) -> Iterator[None]:
-    """Raise ModelError with a fault and MuJoCo's reason where it refuses a model; no warnings."""
-    try:
-        with collected_warnings():
-            yield
-    except (ValueError, mujoco.FatalError) as error:
-        raise ModelError(f"{fault} ({' '.join(str(error).split())})") from None
-
-
 def held_name(path: Path, name: str) -> str:
     """Name that an asset of the memory has beside a new main file."""
     return f"{path.stem}_{Path(name).name}"
@@ -404,18 +390,6 @@ def all_digits(*values: float) -> str:
 def floats(text: str) -> Array:
     """(n,) numbers of an attribute."""
     return np.array([float(word) for word in text.split()])
-
-
-def same_inertia(a: BodyInertia, b: BodyInertia, tolerance: float = ROUNDING) -> bool:
-    """Whether two inertias differ by at most a share of the mass and the size of the body."""
-    if not (a.mass > 0.0 and b.mass > 0.0):
-        return a.mass == b.mass
-    radius, trace = b.gyration_radius, float(np.trace(b.inertia))
-    return (
-        abs(a.mass - b.mass) <= tolerance * b.mass
-        and bool((np.abs(a.com - b.com) <= tolerance * radius).all())
-        and bool((np.abs(a.inertia - b.inertia) <= tolerance * trace).all())
-    )
 
 
 # ---- files

@@ -18,11 +18,13 @@ import numpy as np
 from mujoco import sysid
 from scipy.interpolate import CubicSpline
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError
-from mjfim.experiment.schema import Experiment
+from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of, trajectory_of
+from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import AlignedRecording, align
+from mjfim.identification.aligned_recording import align
 from mjfim.model.loading import silence_mujoco_log
 from mjfim.records.trajectory import Recording
 
@@ -51,7 +53,8 @@ class SysidProblem:
     residual: Callable[..., Any]
 
 
-def export_sysid(experiment: Experiment, recordings: Sequence[Recording]) -> SysidProblem:
+@checked
+def export_sysid(experiment: ExperimentLike, recordings: RecordingsLike) -> SysidProblem:
     """State the fit of recordings for `mujoco.sysid`.
 
     sysid takes no priors, robust losses or estimated noise. A bound that is not stated is 1000
@@ -67,13 +70,34 @@ def export_sysid(experiment: Experiment, recordings: Sequence[Recording]) -> Sys
     Raises:
         MjfimError: sysid cannot express the problem, or is not installed.
     """
-    return sysid_problem(System.resolve(experiment), recordings)
+    system = System.resolve(experiment)
+    return sysid_problem(system, recordings_of(system, recordings))
+
+
+@checked
+def sysid_control(experiment: ExperimentLike, design: TrajectoryLike) -> Any:
+    """Control of a design as a `TimeSeries` of mujoco.sysid, one row for each engine step.
+
+    Args:
+        experiment: The experiment of the design, or the path of its file.
+        design: The design, or a trajectory.
+
+    Raises:
+        MjfimError: sysid is not installed.
+    """
+    require_sysid()
+    return _control(System.resolve(experiment), trajectory_of(design).ctrl)
+
+
+def require_sysid() -> None:
+    """Raise MjfimError where mujoco.sysid is not installed."""
+    if not hasattr(sysid, "ModelSequences"):
+        raise MjfimError("mujoco.sysid is not installed; pip install 'mjfim[sysid]'")
 
 
 def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProblem:
     """State the fit of recordings of a resolved experiment. See `export_sysid`."""
-    if not hasattr(sysid, "ModelSequences"):
-        raise MjfimError("mujoco.sysid is not installed; pip install 'mjfim[sysid]'")
+    require_sysid()
     _check_expressible(system)
     mapping = {
         name: (sysid.SignalType.CustomObs, np.array([i]))
@@ -90,7 +114,7 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
             system.source.spec.copy(),
             [recording.name for recording in aligned],
             [start] * len(aligned),
-            [_control(system, recording) for recording in aligned],
+            [_control(system, recording.ctrl) for recording in aligned],
             [sysid.TimeSeries(np.array(each.t), each.y, mapping) for each in aligned],
             allow_missing_sensors=True,
         )
@@ -124,9 +148,9 @@ def silenced() -> Iterator[None]:
         logger.setLevel(before)
 
 
-def _control(system: System, recording: AlignedRecording) -> Any:
+def _control(system: System, ctrl: Array) -> Any:
     """The control at every engine step as a TimeSeries, held over each sample."""
-    steps = np.repeat(recording.ctrl, system.grid.substeps, axis=0)
+    steps = np.repeat(ctrl, system.grid.substeps, axis=0)
 
     # sysid drops the last row. One more row makes it step past the end, so that the sensors at the
     # end are evaluated.

@@ -15,6 +15,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, first_ones
 from mjfim.experiment.system import System
+from mjfim.model.comparison import ROUNDING, same_inertia
 from mjfim.model.elements import identifier
 from mjfim.model.inertia import (
     INERTIA_COLUMNS,
@@ -25,6 +26,7 @@ from mjfim.model.inertia import (
     from_barycentric,
     to_barycentric,
 )
+from mjfim.model.loading import refused
 from mjfim.model.model_files import UrdfSource, urdf_sources
 from mjfim.model.parameters import Parameter
 from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath
@@ -35,14 +37,11 @@ from mjfim.model.targets import (
     OutputScaleField,
 )
 from mjfim.output.export.model_xml import (
-    ROUNDING,
     ModelXml,
     child,
     floats,
-    loading,
     nearly_equal,
     own_child,
-    same_inertia,
     set_numbers,
 )
 
@@ -185,7 +184,7 @@ def _check(
 
 def _loaded(path: Path, fault: str, files: Any = None) -> Any:
     """MjModel of a URDF in which every link is a body of its own, also where it is fixed."""
-    with loading(fault):
+    with refused(fault):
         spec = mujoco.MjSpec.from_file(path.as_posix(), vfs=files)
         spec.compiler.fusestatic = False
         return spec.compile(files)

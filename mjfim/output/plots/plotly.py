@@ -97,8 +97,13 @@ def group_of(picture: Picture, limit: int) -> Group:
         picture: The picture.
         limit: Largest number of points of a curve.
     """
-    # Only the lowest panel of a column names the axis that all panels of the column share.
-    shared = {panel.place[1]: panel.x.label for panel in picture.panels if panel.x.label}
+    # Only the lowest panel of a column names the axis that all panels of the column share. A panel
+    # below all columns has an axis of its own.
+    shared = {
+        panel.place[1]: panel.x.label
+        for panel in picture.panels
+        if panel.x.label and (len(picture.widths) == 1 or not panel.is_wide)
+    }
     keys = [
         Key(name=mark.label, role=mark.role, shape=SHAPES.get(mark.kind, "line"))
         for mark in picture.legend()

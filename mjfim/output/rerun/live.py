@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import mujoco
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from mjfim.arguments import checked
 from mjfim.arrays import Array, evenly_spread_indices
-from mjfim.experiment.system import labels_of_model
+from mjfim.experiment.schema import ExperimentLike
+from mjfim.experiment.system import System, labels_of_model
 from mjfim.output.archive import shown_positions
+from mjfim.output.live import live_system
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, NOMINAL, OTHER
 from mjfim.output.panels import line
 from mjfim.output.progress_text import design_stage, design_text, progress_line
@@ -37,7 +40,7 @@ from mjfim.output.rerun.scene import (
     log_robot,
 )
 from mjfim.records.design import HistoryRow
-from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
+from mjfim.records.events import Callback, DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.watch import Watch
 
 # Shortest time between two motions that are shown [s], samples of a motion, and motions in which
@@ -322,3 +325,39 @@ def _text_of(event: Event, best: DesignEvent | None) -> str:
 def _logarithm(value: float) -> float:
     """Logarithm to base 10; NaN where there is none."""
     return float(np.log10(value)) if value > 0.0 else float("nan")
+
+
+@checked
+@contextmanager
+def live(
+    experiment: ExperimentLike,
+    address: str | None = None,
+    *,
+    say: Callable[[str], object] | None = None,
+) -> Iterator[Callback]:
+    """Show in a Rerun viewer how a search proceeds; a context around the verb.
+
+    What it yields is the `callback` of `design`, `identify`, `monte_carlo` and the other verbs:
+
+        with mjfim.live(experiment) as show:
+            design = mjfim.design(experiment, callback=show)
+
+    The viewer shows the cost and the smallest eigenvalue of the information over the iterates, and
+    the motion of the best one so far: the robot, and its positions and controls over time. The
+    result is the same with and without it. Where there is no viewer, one sentence says so, and the
+    work goes on.
+
+    Args:
+        experiment: The experiment, whose model is shown.
+        address: Where a viewer listens, `HOST:PORT` or a URL `rerun+http://HOST:PORT/proxy`.
+            Default: the viewer of this computer, which is opened if there is none.
+        say: Takes the sentence; default: it is printed to stderr.
+
+    Yields:
+        The function that takes the events.
+
+    Raises:
+        ExperimentError: The address has another form.
+    """
+    with live_system(System.resolve(experiment), address, say=say) as show:
+        yield show

@@ -1,0 +1,208 @@
+"""Parameters and sequences of mujoco.sysid, which need its classes and not its installation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco import sysid
+
+import mjfim
+from mjfim.experiment.given import recordings_of
+from mjfim.experiment.sysid import parameter_tables
+from mjfim.experiment.system import System
+from mjfim.output.export.sysid import export_sysid, silenced
+from tests.support.paths import ROOT
+
+MODEL = ROOT / "models" / "cart_pendulum.xml"
+STATED: dict[str, Any] = {
+    "model": MODEL,
+    "rate": 50.0,
+    "horizon": 0.4,
+    "initial": {"control": {"kind": "multisine", "amplitude": 2.0}},
+    "parameters": {"m": "body/bob:mass"},
+    "noise": {"qpos:slide": 0.01, "qvel:hinge": 0.1},
+}
+installed = pytest.mark.skipif(
+    not hasattr(sysid, "ModelSequences"), reason="needs mujoco.sysid: pip install 'mjfim[sysid]'"
+)
+
+
+class SignalType(Enum):
+    """Kinds of signals as sysid has them."""
+
+    MjSensor = 0
+    CustomObs = 1
+    MjStateQPos = 2
+    MjStateQVel = 3
+    MjCtrl = 5
+
+
+@dataclass
+class TimeSeries:
+    """The attributes of sysid's class that are read."""
+
+    times: np.ndarray
+    data: np.ndarray
+    signal_mapping: Any = None
+
+
+@dataclass
+class Sequences:
+    """The attributes of sysid's `ModelSequences` that are read."""
+
+    sequence_name: list[str]
+    control: list[TimeSeries]
+    sensordata: list[TimeSeries]
+
+
+class Parameter:
+    """A parameter as sysid has it."""
+
+    def __init__(self, nominal: Any, low: Any, high: Any, modifier: Any = None) -> None:
+        self.value = np.atleast_1d(nominal).astype(float)
+        self.low, self.high = np.atleast_1d(low), np.atleast_1d(high)
+        self.modifier, self.frozen = modifier, False
+
+    @property
+    def size(self) -> int:
+        return self.value.size
+
+    def as_vector(self) -> np.ndarray:
+        return self.value.flatten()
+
+    def get_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.low.flatten(), self.high.flatten()
+
+    def update_from_vector(self, vector: np.ndarray) -> None:
+        self.value = vector.reshape(self.value.shape)
+
+
+@dataclass
+class Parameters:
+    """A `ParameterDict`."""
+
+    parameters: dict[str, Parameter] = field(default_factory=dict)
+
+    def items(self) -> Any:
+        return list(self.parameters.items())
+
+    def as_nominal_vector(self) -> np.ndarray:
+        return np.zeros(0)
+
+
+def set_body(spec: Any, parameter: Any) -> None:
+    """Set the mass and the place of the bob by one parameter of two numbers."""
+    body = spec.body("bob")
+    body.mass, body.ipos[2] = parameter.value
+
+
+def test_modifiers_become_functions_that_edit_as_sysid_does() -> None:
+    """All numbers of a parameter come together, as its modifier needs them."""
+    bob = Parameter([1.5, -0.2], [0.1, -1.0], [5.0, 1.0], set_body)
+    damping = Parameter(0.3, 0.0, 2.0)
+    frozen = Parameter(7.0, 0.0, 9.0)
+    frozen.frozen = True
+    given = Parameters({"bob": bob, "joint/hinge:damping": damping, "frozen": frozen})
+
+    experiment = mjfim.Experiment(**{**STATED, "parameters": given})
+    system = System.resolve(experiment)
+
+    assert system.parameters.names == ("bob[0]", "bob[1]", "joint/hinge:damping")
+    assert system.parameters.guess.tolist() == [1.5, -0.2, 0.3]
+    assert system.parameters.upper.tolist() == [5.0, 1.0, 2.0]
+    model = system.model_at(np.array([1.2, -0.4, 0.6]))
+    spec = mujoco.MjSpec.from_file(str(MODEL))
+    bob.update_from_vector(np.array([1.2, -0.4]))
+    set_body(spec, bob)
+    wanted = spec.compile()
+    np.testing.assert_allclose(model.body("bob").mass, wanted.body("bob").mass, rtol=1e-12)
+    np.testing.assert_allclose(model.body("bob").ipos, wanted.body("bob").ipos, rtol=1e-12)
+    assert model.joint("hinge").damping[0] == 0.6
+
+
+def test_parameters_without_modifier_change_those_of_an_experiment() -> None:
+    changed = mjfim.Experiment(**STATED).replace(
+        parameters=Parameters({"m": Parameter(1.4, 0.5, 3.0)})
+    )
+
+    spec = changed.parameters["m"]
+    assert (spec.target, spec.guess, spec.bounds) == ("body/bob:mass", 1.4, (0.5, 3.0))
+
+
+def test_sequences_are_recordings_at_the_times_of_both_series() -> None:
+    """Controls and measurements may have other times; a control is held."""
+    system = System.resolve(mjfim.Experiment(**STATED))
+    t = 0.02 * np.arange(11)
+    control = TimeSeries(t, np.sin(t)[:, None], {"force_ctrl": (SignalType.MjCtrl, np.array([0]))})
+    measured = TimeSeries(
+        t + 0.01,
+        np.stack([np.cos(t), np.sin(3 * t)], axis=1),
+        {
+            "slide_qpos": (SignalType.MjStateQPos, np.array([0])),
+            "qvel:hinge": (SignalType.CustomObs, np.array([1])),
+        },
+    )
+
+    one, two = recordings_of(system, Sequences(["a", "b"], [control] * 2, [measured] * 2))
+
+    assert (one.name, two.name) == ("a", "b")
+    assert one.outputs == ("qpos:slide", "qvel:hinge")
+    np.testing.assert_allclose(one.ctrl[:, 0], np.repeat(np.sin(t), 2)[:-1])
+    np.testing.assert_allclose(one.y[1::2, 0], np.cos(t))
+    assert np.isnan(one.y[::2]).all()
+
+
+@installed
+def test_what_is_exported_comes_back() -> None:
+    """The estimate from exported sequences is that from the recording."""
+    experiment = mjfim.Experiment(**STATED)
+    recording = mjfim.simulate(experiment, seed=1)
+    problem = export_sysid(experiment, recording)
+
+    found = mjfim.identify(experiment, problem.sequences, progress=False)
+
+    wanted = mjfim.identify(experiment, recording, progress=False)
+    np.testing.assert_allclose(found.theta, wanted.theta, rtol=1e-6)
+    tables = parameter_tables(problem.parameters)
+    assert tables["m"]["guess"] == experiment.replace(parameters=tables).parameters["m"].guess
+
+
+@installed
+def test_modifiers_of_sysid_run(tmp_path: Path) -> None:
+    modifier = lambda spec, p: spec.joint("hinge").damping.__setitem__(0, p.value[0])  # noqa: E731
+    given = sysid.ParameterDict()
+    given.add(sysid.Parameter("c", 0.5, 0.0, 2.0, modifier=modifier))
+
+    system = System.resolve(mjfim.Experiment(**{**STATED, "parameters": given}))
+
+    assert system.model_at(np.array([0.8])).joint("hinge").damping[0] == 0.8
+
+
+@installed
+def test_the_control_of_a_design_plays_in_sysid() -> None:
+    """One row for each engine step, by the names of the actuators."""
+    experiment = mjfim.Experiment(**STATED)
+    system = System.resolve(experiment)
+    motion = mjfim.evaluate(experiment).trajectory
+
+    series = mjfim.sysid_control(experiment, motion)
+
+    start = sysid.create_initial_state(system.model, motion.qpos[0], motion.qvel[0])
+    with silenced():
+        (played,) = sysid.sysid_rollout(
+            models=[system.model],
+            datas=mujoco.MjData(system.model),
+            control_signal=[series],
+            initial_states=[start],
+        )
+    step = round(motion.dt / system.model.opt.timestep)
+    assert list(series.signal_mapping) == ["force_ctrl"]
+    np.testing.assert_allclose(
+        played.state.data[step - 1 :: step][: len(motion.ctrl), 1:3], motion.qpos[1:], atol=1e-9
+    )
