@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,10 +35,7 @@ from mjfim.experiment.task_tables import (
     RehearsalSpec,
     Robust,
 )
-from mjfim.model.given import packed
-from mjfim.model.loading import packed_model
 from mjfim.model.model_files import PackedFiles
-from mjfim.model.paths import matches
 from mjfim.recordings.section import (
     Hertz,
     PositiveWithUnit,
@@ -46,6 +44,9 @@ from mjfim.recordings.section import (
     Section,
     explain,
 )
+
+# Texts that are paths of models, for which nothing needs to be read yet.
+MODEL_PATH = re.compile(r"[^<\0]*\.(xml|mjcf|urdf)", re.IGNORECASE)
 
 # Endings of files of other kinds, which are no experiments.
 MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")
@@ -338,18 +339,30 @@ def _hold_model(values: dict[str, Any], source: str) -> None:
     is_placed = isinstance(directory, (str, Path)) and isinstance(files, PackedFiles | None)
     if "model" not in values or not is_placed:
         return
+    model, patterns = values["model"], values.get("parameters")
+    listed = patterns if isinstance(patterns, list) else []
+    is_list = bool(listed) and all(isinstance(each, str) for each in listed)
+    is_path = isinstance(model, (str, Path)) and MODEL_PATH.fullmatch(str(model))
+    if is_path and not is_list:
+        values["model"] = str(model)
+        return
+
+    # They import the engine, which takes long where a key of a file is wrong.
+    from mjfim.model.given import packed
+    from mjfim.model.loading import packed_model
+    from mjfim.model.paths import matches
+
     try:
-        values["model"], given = packed(values["model"], Path(directory))
+        values["model"], given = packed(model, Path(directory))
         if given is not None:
             held = {} if files is None else files.contents
             contents = {Path(name): each for name, each in {**held, **given.contents}.items()}
             values["files"] = files = PackedFiles.of(contents)
 
-        patterns = values.get("parameters")
-        if isinstance(patterns, list) and all(isinstance(each, str) for each in patterns):
+        if is_list:
             path = Path(directory) / values["model"]
             found = packed_model((files or PackedFiles.of({})).with_model(path), path)
-            paths = [p for each in patterns for p in matches(each, found.model, found.decoration)]
+            paths = [p for each in listed for p in matches(each, found.model, found.decoration)]
             values["parameters"] = {each: {"target": each} for each in paths}
     except (ExperimentError, ModelError) as error:
         raise type(error)(f"{source}: {error}") from None

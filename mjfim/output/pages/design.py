@@ -142,8 +142,8 @@ def _verdict(design: Design) -> Verdict:
         return Verdict(f"The design is no better than its start. {seen}", Level.DOUBTFUL)
     if not separable:
         text = (
-            "The design is made for combinations of parameters, because no control separates all "
-            f"of them. {seen}"
+            "The design is made for combinations of parameters, because no control separates these "
+            f"parameters: {first_ones(design.combinations, '; ')}. {seen}"
         )
         return Verdict(text, Level.DOUBTFUL)
     reservation = _reservation(design) or _reservation_of_robots(rehearsal)
