@@ -75,21 +75,10 @@ bounds = [0.3, 200.0]
 target = "controller/JOINT:latency"
 guess = 0.015
 bounds = [0.0, 0.06]
-[parameters.limit_JOINT]
-targets = [
-  { path = "controller/JOINT:saturation[1]" },
-  { path = "controller/JOINT:saturation[0]", scale = -1.0 },
-]
-guess = 3.0
-bounds = [0.1, 30.0]
 [parameters.damping_JOINT]
 target = "joint/JOINT:damping"
 guess = 0.6
 bounds = [0.0, 10.0]
-[parameters.drag_JOINT]
-target = "joint/JOINT:damping[1]"
-guess = 0.1
-bounds = [0.0, 5.0]
 [parameters.friction_JOINT]
 target = "joint/JOINT:frictionloss"
 guess = 0.15
@@ -98,6 +87,17 @@ bounds = [0.0, 2.0]
 target = "joint/JOINT:armature"
 guess = 0.01
 bounds = [1e-4, 0.3]
+[parameters.drag_JOINT]
+target = "joint/JOINT:damping[1]"
+guess = 0.1
+bounds = [0.0, 5.0]
+[parameters.limit_JOINT]
+targets = [
+  { path = "controller/JOINT:saturation[1]" },
+  { path = "controller/JOINT:saturation[0]", scale = -1.0 },
+]
+guess = 3.0
+bounds = [0.1, 30.0]
 """
 
 
@@ -179,7 +179,8 @@ def main() -> int:
     held_out = [recording(name, slice(None)) for name in motions]
     found = mjfim.identify(experiment, fitted, held_out=held_out)
     console = Console(width=200)
-    console.print(found, f"{(time.perf_counter() - begun) / 60.0:.1f} minutes")
+    console.print(dict(zip(found.parameters, found.theta.tolist(), strict=True)))
+    console.print(f"{(time.perf_counter() - begun) / 60.0:.1f} minutes")
 
     table = new_table("rms error [mrad]", "motion", "all", *JOINTS, *PUBLISHED)
     predictions = found.predictions[-len(motions) :]
