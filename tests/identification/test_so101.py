@@ -36,12 +36,12 @@ def test_published_sets_have_their_known_errors(motion: str, expected: list[floa
 def test_a_fit_to_seconds_predicts_the_motion(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Three seconds of the multisine predict its first 12 better than published sets."""
-    whole = so101.read_motion(DATA / "multisine")[:600]
-    monkeypatch.setattr(so101, "FITTED", {"multisine": (0, 150)})
+    """Gains from two seconds of the multisine predict its first six better than published ones."""
+    whole = so101.read_motion(DATA / "multisine")[:300]
+    monkeypatch.setattr(so101, "FITTED", {"multisine": (0, 100)})
     monkeypatch.setattr(so101, "HELD_OUT", "")
-    # Gains, delays, damping and friction; armature, drag and limits stay.
-    monkeypatch.setattr(so101, "JOINT", so101.JOINT.split("[parameters.armature")[0])
+    # The gains alone; other numbers stay those of the model.
+    monkeypatch.setattr(so101, "JOINT", so101.JOINT.split("[parameters.latency")[0])
     monkeypatch.setattr(so101, "read_motion", lambda folder: whole)
     monkeypatch.setattr("sys.argv", ["so101", str(DATA), str(MODEL), str(tmp_path)])
 
@@ -51,4 +51,4 @@ def test_a_fit_to_seconds_predicts_the_motion(
         line for line in capsys.readouterr().out.splitlines() if "multisine" in line and "│" in line
     )
     numbers = [float(cell) for cell in row.split("│")[2:-1]]
-    assert 1.8 * numbers[0] < min(numbers[7:])
+    assert 1.2 * numbers[0] < min(numbers[7:])
