@@ -20,6 +20,7 @@ BENCHMARKS = {
     "prove_identification": "do the 95 % intervals hold the true values?",
     "selection": "does `identify --select` find the term that a model lacks, and no other?",
     "arm_logs": "do closed-loop logs of arms give base parameters and torques within intervals?",
+    "so101": "how well does a fit predict a real arm of six servos, beside published sets?",
     "measured_data": "how well are measured data of other groups predicted, with added terms?",
 }
 

@@ -1,0 +1,192 @@
+"""A real SO-101 arm: five motions are fitted in part, all are predicted beside published sets.
+
+    python -m scripts.benchmarks so101 DATA/sage_so101 MODEL/so101_nomesh.xml out/so101
+
+The folder of the data holds one folder for each motion, with position references and measured
+angles. The script writes model, experiment file and logs into the folder of the output, and prints
+the rms error of every motion, open loop from the references. Published sets have the best delay of
+0 to 60 ms and no contacts.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from rich.console import Console
+
+import mjfim
+from mjfim.arrays import Array
+from mjfim.experiment.system import System
+from mjfim.recordings.read import read_recording
+from scripts.benchmarks.child import new_table, options_of
+
+JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
+
+# Period of the logs [s].
+PERIOD = 0.02006
+
+# Motions, with the first and the last row that is fitted.
+FITTED = {
+    "multisine": (0, 600),
+    "prbs_excitation": (1500, 2100),
+    "friction_gravity": (1000, 1600),
+    "backlash_detection": (500, 900),
+    "single_joint_elbow": (900, 1600),
+}
+HELD_OUT = "chirp_sweep step_response hold_under_gravity random_waypoints slow_precision"
+
+# Published sets: rows of kp, -kp, -kd, armature, dry friction and viscous friction.
+PUBLISHED = {
+    "so101_new_calib": "998.22 | -998.22 | -2.731 | 0.028 | 0.052 | 0.60",
+    "joints_properties": "17.8 | -17.8 | 0 | 0.028 | 0.052 | 0.60",
+    "gtc_berlin": "48.9 51.3 18.6 43.0 47.1 50.8 | -48.9 -51.3 -18.6 -43.0 -47.1 -50.8 |"
+    "-2.31 -2.78 -0.53 -2.72 -1.79 -2.35 | 0.058 0.044 0.055 0.051 0.051 0.043 |"
+    "0.22 0.32 0.40 0.30 0.28 0.31 | 1.07 0.88 0.49 0.52 0.45 1.14",
+    "k-scale": "17.8 | -17.8 | 0 | 0.040 | 0.162 | 1.23",
+}
+
+# Five engine steps of 4.012 ms are a period of the logs.
+ARM = """model = "so101.xml"
+rate = 49.850448654037886
+initial.qpos = [0.0, 0.0, 0.5, 0.0, 0.0, 0.5]
+recording.time = "time"
+fit = { segments = "whole", start = "measured" }
+"""
+# Readings and references have different zeros.
+OUTPUT = """noise."qpos:JOINT" = 0.004
+nuisance.bias."qpos:JOINT" = 0.02
+"""
+JOINT = """
+[controllers.JOINT]
+kp = 12.0
+rate = 249.25224327018943
+latency = 0.015
+saturation = [-3.0, 3.0]            # the largest duty of the servo
+[parameters.kp_JOINT]
+target = "controller/JOINT:kp"
+guess = 12.0
+bounds = [0.3, 200.0]
+[parameters.latency_JOINT]
+target = "controller/JOINT:latency"
+guess = 0.015
+bounds = [0.0, 0.06]
+[parameters.damping_JOINT]
+target = "joint/JOINT:damping"
+guess = 0.6
+bounds = [0.0, 10.0]
+[parameters.friction_JOINT]
+target = "joint/JOINT:frictionloss"
+guess = 0.15
+bounds = [0.0, 2.0]
+[parameters.armature_JOINT]
+target = "joint/JOINT:armature"
+guess = 0.01
+bounds = [1e-4, 0.3]
+[parameters.drag_JOINT]
+target = "joint/JOINT:damping[1]"
+guess = 0.1
+bounds = [0.0, 5.0]
+[parameters.limit_JOINT]
+targets = [
+  { path = "controller/JOINT:saturation[1]" },
+  { path = "controller/JOINT:saturation[0]", scale = -1.0 },
+]
+guess = 3.0
+bounds = [0.1, 30.0]
+"""
+
+
+# Changes of the model: motors, what touches the table, and no creep in dry friction, which is 1 to
+# 2 mrad/s with the defaults of MuJoCo.
+TOUCHING = 'contype="1" conaffinity="1" friction="0.2"'
+CHANGES = {
+    "<worldbody>": '<option timestep="0.004012" integrator="implicitfast">'
+    '<flag clampctrl="disable"/></option><worldbody>'
+    f'<geom type="plane" size="1 1 1" pos="0 0 -0.0125" {TOUCHING}/>',
+    '<site group="3" name="gripperframe"': '<geom size="0.034" pos="0.024 0 -0.03" mass="0" '
+    f'{TOUCHING}/><site group="3" name="gripperframe"',
+    '<joint damping="0.60"': '<joint solimpfriction="0.9999 0.9999 0.001" '
+    'solreffriction="0.009 1" damping="0.60"',
+    '<position class="sts3215"': "<motor",
+    'forcerange="-3.35 3.35"': "",
+}
+
+
+def read_motion(folder: Path) -> Array:
+    """Read references and angles [rad] of a motion: (M, 12)."""
+    columns = []
+    for name in ("control", "state_motor"):
+        text = gzip.decompress((folder / f"{name}.csv.gz").read_bytes()).decode()
+        columns.append([json.loads(line.split('"')[1]) for line in text.splitlines()[1:]])
+    return np.hstack(columns)
+
+
+def rms(errors: Array, axis: int | None = None) -> Array:
+    """Return the root mean square [mrad] of errors [rad]."""
+    return 1e3 * np.sqrt(np.mean(errors**2, axis=axis))
+
+
+def published_rms(path: Path, numbers: str, motion: Array) -> Array:
+    """Return the error [mrad] of a published set at its best delay."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.timestep, model.opt.integrator = 0.004012, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    law = (model.actuator_gainprm[:, 0], *model.actuator_biasprm.T[1:3])
+    fields = (*law, model.dof_armature, model.dof_frictionloss, model.dof_damping)
+    for field, row in zip(fields, numbers.split("|"), strict=True):
+        field[:] = [float(number) for number in row.split()]
+    data, found = mujoco.MjData(model), np.empty((len(motion), 6))
+    data.qpos[:] = motion[0, 6:]
+    for row, data.ctrl[:] in enumerate(motion[:, :6]):
+        found[row] = data.qpos
+        mujoco.mj_step(model, data, 5)
+    return min(rms(found[: len(found) - rows] - motion[rows:, 6:]) for rows in range(4))
+
+
+def main() -> int:
+    """Fit, predict, and print the errors of all motions."""
+    parser = options_of(__doc__)
+    parser.add_argument("paths", type=Path, nargs=3, help="data, model in MJCF, output")
+    data, model, output = parser.parse_args().paths
+
+    output.mkdir(parents=True, exist_ok=True)
+    text = model.read_text(encoding="utf-8")
+    for change in CHANGES.items():
+        text = text.replace(*change)
+    (output / "so101.xml").write_text(text, encoding="utf-8")
+    texts = [text.replace("JOINT", joint) for text in (OUTPUT, JOINT) for joint in JOINTS]
+    (output / "so101.toml").write_text("".join([ARM, *texts]), encoding="utf-8")
+    experiment = mjfim.Experiment.from_file(output / "so101.toml")
+
+    columns = [f"{kind}:{joint}" for kind in ("reference", "qpos") for joint in JOINTS]
+    header = ",".join(["time", *columns])
+    motions = {name: read_motion(data / name) for name in [*FITTED, *HELD_OUT.split()]}
+    channels = System.resolve(experiment).channels
+
+    def recording(name: str, rows: slice) -> mjfim.Recording:
+        """Write rows of a motion as a log, and read it."""
+        log, part = output / f"{name}.csv", motions[name][rows]
+        timed = np.column_stack([PERIOD * np.arange(len(part)), part])
+        np.savetxt(log, timed, "%.6f", ",", header=header, comments="")
+        return read_recording(log, channels)
+
+    begun = time.perf_counter()
+    fitted = [recording(name, slice(*rows)) for name, rows in FITTED.items()]
+    held_out = [recording(name, slice(None)) for name in motions]
+    found = mjfim.identify(experiment, fitted, held_out=held_out)
+    console = Console(width=200)
+    console.print(dict(zip(found.parameters, found.theta.tolist(), strict=True)))
+    console.print(f"{(time.perf_counter() - begun) / 60.0:.1f} minutes")
+
+    table = new_table("rms error [mrad]", "motion", "all", *JOINTS, *PUBLISHED)
+    predictions = found.predictions[-len(motions) :]
+    for (name, motion), prediction in zip(motions.items(), predictions, strict=True):
+        errors = prediction.identified_outputs - motion[:, 6:]
+        theirs = [published_rms(model, each, motion) for each in PUBLISHED.values()]
+        table.add_row(name, *(f"{each:.1f}" for each in (rms(errors), *rms(errors, 0), *theirs)))
+    console.print(table)
+    return 0
