@@ -7,7 +7,7 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
@@ -66,7 +66,7 @@ class Video:
         height: Height [pixels].
     """
 
-    data: bytes
+    data: bytes = field(repr=False)
     media_type: str
     caption: str
     width: int
