@@ -118,7 +118,7 @@ def require_format(path: Path) -> Format:
     """
     kind = FILE_FORMATS.get(path.suffix.lower())
     if kind is None:
-        raise RecordingError(f"--video {path}: the name of a video ends in .mp4 or .gif")
+        raise RecordingError(f"{path}: the name of a video ends in .mp4 or .gif")
     if kind == "mp4" and find_spec("av") is None:
         raise NoVideoError(
             "mp4 needs the package av; install it with `pip install 'mjfim[video]'`, or write a "
