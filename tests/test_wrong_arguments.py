@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,9 +114,15 @@ def test_a_wrong_argument_is_refused_in_words(
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda e: mjfim.design(e, seconds="x"), r"seconds: needs float \| None; not 'x'"),
-        (lambda e: mjfim.simulate(e, seed=-1), r"seed: needs int .*whole numbers from 0\); not -1"),
+        (lambda e: mjfim.design(e, seconds="x"), r"seconds: needs number \| None; not 'x'"),
+        (lambda e: mjfim.simulate(e, seed=-1), r"seed: needs whole number from 0 \| .*; not -1"),
         (lambda e: mjfim.design(None), r"experiment: needs Experiment \| str \| Path; not None"),
+        (lambda e: mjfim.design(3), r"experiment: needs Experiment \| str \| Path; not 3"),
+        (lambda e: mjfim.identify(e, method="x"), "method: needs 'least_squares' .* 'newton'; not"),
+        (lambda e: mjfim.simulate(e, 3), r"needs Trajectory \| Design \| array of numbers \| None"),
+        (lambda e: mjfim.design(e, second=3), "design: got an unexpected .* 'second'"),
+        (lambda e: mjfim.evaluate(), "evaluate: missing a required argument: 'experiment'"),
+        (lambda e: e.replace(parameters=["geom/*:x"]), "unknown parameter path"),
         (lambda e: mjfim.predict(e, [1.0, 2.0], []), "theta: .* expected one per parameter: m"),
         (lambda e: mjfim.design("no.toml"), r"no\.toml: cannot read the experiment file"),
         (lambda e: mjfim.identify(e, t=[0.0], q=[0.0]), "unknown argument 'q'; valid: ctrl, qpos"),
@@ -130,3 +137,12 @@ def test_messages_say_what_would_be_right(
 ) -> None:
     with pytest.raises(ExperimentError, match=message):
         call(valid["experiment"])
+
+
+def test_a_design_of_another_model_is_refused(valid: dict[str, Any]) -> None:
+    design = valid["design"]
+    two_motors = replace(design.trajectory, ctrl=np.zeros((design.trajectory.samples, 2)))
+    other = replace(design, final=replace(design.final, trajectory=two_motors))
+    for verb in (mjfim.worth, mjfim.rehearse):
+        with pytest.raises(MjfimError, match=r"the design: made for .* = \(2, 2, 0, 2\)"):
+            verb(valid["experiment"], other)

@@ -30,7 +30,7 @@ def check(
     if has_folder:
         draw_elsewhere()
 
-    from mjfim.experiment.given import recordings_of
+    from mjfim.experiment.given import check_fits, recordings_of
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
@@ -42,7 +42,7 @@ def check(
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]
-        archive.check_fits(design_file, trajectory, system)
+        check_fits(design_file, trajectory, system)
     if has_folder:
         run.claim(CHECK_FILES, input_files(stated, [*(recordings or []), design_file]))
 

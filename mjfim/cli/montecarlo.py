@@ -30,6 +30,7 @@ def montecarlo(
     if measure_rate is not None:
         stated = stated.replace(measure_rate=measure_rate)
 
+    from mjfim.experiment.given import check_fits
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
@@ -38,7 +39,7 @@ def montecarlo(
     system = System.resolve(stated, threads=run.threads)
     named = archive.read_design(design_file)
     for trajectory in named.values():
-        archive.check_fits(design_file, trajectory, system)
+        check_fits(design_file, trajectory, system)
     run.claim(study_files(system.parameters.names), input_files(stated, [design_file]))
 
     with (

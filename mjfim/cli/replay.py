@@ -29,6 +29,7 @@ def replay(
     force: Force = False,
 ) -> None:
     """Show a result in the Rerun viewer."""
+    from mjfim.experiment.given import check_fits
     from mjfim.experiment.system import System, labels_of_system
     from mjfim.output import archive
     from mjfim.output import rerun as rerun_log
@@ -45,7 +46,7 @@ def replay(
         system = System.resolve(mjfim.Experiment.from_file(stated))
         named = archive.read_design(source)
         for trajectory in named.values():
-            archive.check_fits(source, trajectory, system)
+            check_fits(source, trajectory, system)
         rerun_log.log_trajectories(
             target, system.model_at(system.theta), named, labels_of_system(system)
         )

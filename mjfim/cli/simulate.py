@@ -47,6 +47,7 @@ def simulate(
     stated = mjfim.Experiment.from_file(experiment)
 
     from mjfim.excitation.evaluation import motion_of
+    from mjfim.experiment.given import check_fits
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System, simulate_system
     from mjfim.output import archive
@@ -60,7 +61,7 @@ def simulate(
         trajectory = motion_of(system, None, "simulate without a design")
     else:
         trajectory = archive.read_design(design_file)["final"]
-        archive.check_fits(design_file, trajectory, system)
+        check_fits(design_file, trajectory, system)
 
     recording = simulate_system(system, trajectory, seed)
     keep_result(output.parent)

@@ -88,7 +88,7 @@ def design(
 
     Args:
         experiment: The experiment, or the path of its file.
-        seconds: Time budget [s]; default: that of the experiment.
+        seconds: Time of the search, to which rehearsals come [s]; default: that of the experiment.
         callback: Called with a `DesignEvent` for every iterate.
         initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's. The
             experiment's initial control remains the reference x_d of the tracking term.

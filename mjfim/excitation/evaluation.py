@@ -14,7 +14,6 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
-    RecordingError,
     SimulationDivergedError,
     UnidentifiableError,
     first_ones,
@@ -30,7 +29,7 @@ from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys, stated_motion
 from mjfim.experiment.arguments import checked
-from mjfim.experiment.given import TrajectoryLike, trajectory_of
+from mjfim.experiment.given import TrajectoryLike, check_fits
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, simulate_system
@@ -185,21 +184,15 @@ def motion_of(system: System, given: TrajectoryLike | None, work: str) -> Trajec
 
     Raises:
         ExperimentError: The experiment states no initial motion.
-        RecordingError: The motion is one of another model.
+        RecordingError: The motion was made for another model or another rate.
     """
     if given is None:
         if system.laws is not None:
             return stated_motion(system)
         require_design_keys(system, work)
         return DesignTask.of(system).initial
-    found = trajectory_of(given)
-    columns = (found.state.shape[1], found.ctrl.shape[1])
-    wanted = (len(system.nominal_initial_state), len(system.inputs))
-    if columns != wanted:
-        raise RecordingError(
-            f"{system.experiment.source}: the motion has (states, controls) = {columns}, but the "
-            f"model {wanted}; give a motion of this experiment"
-        )
+    found = given.trajectory if isinstance(given, Design) else given
+    check_fits("the motion", found, system)
     return found
 
 

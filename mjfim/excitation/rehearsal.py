@@ -17,11 +17,12 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array, evenly_spread_indices, record, scaled_to_unit_diagonal
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_model
 from mjfim.information.finite_steps import finite_steps
@@ -81,9 +82,6 @@ BAND, MAX_FANS, CLOSE = (0.05, 0.95), 6, 0.5
 # the instants of these motions.
 MAX_AFTER, MAX_MOTIONS, MOTION_STEP = 30, 8, 2
 
-# Relative difference of two sample periods up to which they are equal.
-SAME_PERIOD = 1e-6
-
 # Largest number of values of the states that are simulated at once.
 MAX_VALUES = 1 << 22
 
@@ -124,13 +122,7 @@ def rehearse(
         experiment = experiment.replace(limits={"reserve": design.reserve})
     task = DesignTask.resolve(experiment, threads=threads)
     planned = design.trajectory
-    found = (planned.qpos.shape[1], planned.qvel.shape[1], planned.ctrl.shape[1])
-    wanted = (task.space.nq, task.space.nv, len(task.controls))
-    if found != wanted or abs(planned.dt - task.dt) > SAME_PERIOD * task.dt:
-        raise RecordingError(
-            f"the design has (nq, nv, nu) = {found} at {1.0 / planned.dt:g} Hz, but the experiment "
-            f"{wanted} at {1.0 / task.dt:g} Hz; give the experiment of the design"
-        )
+    check_fits("the design", planned, task.system)
     task = task.released_as(planned.state[0])
     return with_cures_tried(task, design.final, rehearse_task(task, design.final))
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from numbers import Integral, Real
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -18,8 +18,16 @@ from mjfim.errors import ExperimentError, OutputError, in_words
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# What the text of an annotation has without telling anything: modules, and shapes of arrays.
-NOISE = re.compile(r"[\w.]+\.(?=\w)|\[tuple\[Any, \.\.\.\], dtype\[float64\]\]")
+# Kinds whose names in Python say less than words.
+WORDS: dict[Any, str] = {
+    int: "whole number from 0",
+    float: "number",
+    np.ndarray: "array of numbers",
+    NoneType: "None",
+}
+
+# Modules in the text of an annotation.
+MODULES = re.compile(r"[\w.]+\.(?=\w)")
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -39,13 +47,15 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         """Check the arguments, and call the function."""
-        for name, value in signature.bind(*args, **kwargs).arguments.items():
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError as error:
+            raise ExperimentError(f"{function.__qualname__}: {error}") from None
+        for name, value in given.items():
             hint = hints().get(name, Any)
             if signature.parameters[name].kind not in variable and not _fits(value, hint):
-                kind = NOISE.sub("", inspect.formatannotation(hint))
-                limits = " (no NaN, and whole numbers from 0)" if isinstance(value, Real) else ""
                 raise ExperimentError(
-                    f"{function.__qualname__}: {name}: needs {kind}{limits}; not {in_words(value)}"
+                    f"{function.__qualname__}: {name}: needs {_kind(hint)}; not {in_words(value)}"
                 )
         try:
             return function(*args, **kwargs)
@@ -54,6 +64,16 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
             raise OutputError(f"{place}: {error.strerror or error}") from None
 
     return call
+
+
+def _kind(hint: Any) -> str:
+    """What an annotation allows, in words."""
+    kind, parts = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        return " | ".join(map(_kind, parts))
+    if kind is Literal:
+        return " | ".join(map(repr, parts))
+    return WORDS.get(kind) or MODULES.sub("", inspect.formatannotation(hint))
 
 
 def is_numeric(value: Any) -> bool:

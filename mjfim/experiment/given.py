@@ -45,13 +45,37 @@ TrajectoryLike = Trajectory | Design
 
 NO_ARRAYS: Mapping[str, Any] = MappingProxyType({})
 
+# Relative deviation of two sample periods that is round-off.
+PERIOD_TOLERANCE = 1e-6
+
 # Name of a recording that is given as arrays.
 ARRAYS_NAME = "arrays"
 
 
-def trajectory_of(given: TrajectoryLike) -> Trajectory:
-    """The trajectory of a motion."""
-    return given.trajectory if isinstance(given, Design) else given
+def check_fits(name: str | Path, trajectory: Trajectory, system: System) -> None:
+    """Check that a motion belongs to an experiment.
+
+    Args:
+        name: What it is, or its file, for the message.
+        trajectory: The motion.
+        system: The experiment.
+
+    Raises:
+        RecordingError: The motion was made for another model or another rate.
+    """
+    parts = (trajectory.qpos, trajectory.qvel, trajectory.act, trajectory.ctrl)
+    found = tuple(width for part in parts for width in part.shape[1:])
+    model = system.model
+    wanted = (model.nq, model.nv, model.na, len(system.inputs))
+    if found != wanted:
+        raise RecordingError(
+            f"{name}: made for (nq, nv, na, nu) = {found}, the experiment's model has {wanted}"
+        )
+
+    if abs(trajectory.dt - system.dt) > PERIOD_TOLERANCE * system.dt:
+        raise RecordingError(
+            f"{name}: sampled at {1 / trajectory.dt:g} Hz, the experiment at {1 / system.dt:g} Hz"
+        )
 
 
 def recordings_of(
@@ -104,8 +128,8 @@ def _by_column(name: str, columns: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, values in columns.items():
         prefix = "" if key == "sensordata" else f"{key}:"
-        inner = values if isinstance(values, Mapping) else None
-        found |= {key: values} if inner is None else {prefix + k: v for k, v in inner.items()}
+        is_table = isinstance(values, Mapping)
+        found |= {prefix + k: v for k, v in values.items()} if is_table else {key: values}
     for key, values in found.items():
         if not is_numeric(values) and not isinstance(values, (int, float)):
             raise RecordingError(

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -97,9 +97,6 @@ class FitTask:
             ExperimentError: Something is wrong in the arguments; the message names it.
             RecordingError: Two recordings hold the same data.
         """
-        if method not in get_args(Method):
-            raise ExperimentError(unknown("method", method, get_args(Method)))
-
         settings = system.experiment.fit
         if settings.noise == "estimated" and system.noise.correlated:
             raise ExperimentError(

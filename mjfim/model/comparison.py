@@ -32,9 +32,9 @@ TOLERANCE = 1e-9
 INERTIAL = ("body_ipos", "body_mass", "body_iquat", "body_inertia")
 
 
-def same_dynamics(a: Any, b: Any, tolerance: float = TOLERANCE) -> bool:
+def same_dynamics(a: Any, b: Any) -> bool:
     """Whether everything that determines the motion agrees in two MjModels."""
-    return not differences(a, b, tolerance)
+    return not differences(a, b, TOLERANCE)
 
 
 def differences(a: Any, b: Any, tolerance: float) -> list[str]:

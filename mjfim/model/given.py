@@ -69,7 +69,7 @@ def packed(given: Any, directory: Path) -> tuple[str, PackedFiles | None]:
     if isinstance(given, Path):
         return str(given), None
     if isinstance(given, str) and not given.lstrip().startswith("<"):
-        is_name = DESCRIPTION.fullmatch(given) and not (directory / given).exists()
+        is_name = DESCRIPTION.fullmatch(given) and not os.path.exists(directory / given)
         return _described(given) if is_name else given, None
     compiled = None
     if isinstance(given, str):

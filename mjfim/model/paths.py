@@ -306,7 +306,7 @@ def matches(pattern: str, model: Any, decoration: Collection[str] = frozenset())
     wanted = re.compile(re.escape(pattern).replace(r"\*", ".*"))
     found = [path for path in paths if wanted.fullmatch(path)]
     if not found:
-        raise ExperimentError(unknown("path", pattern, paths))
+        raise ExperimentError(unknown("parameter path", pattern, paths))
     return found
 
 

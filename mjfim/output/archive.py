@@ -187,10 +187,6 @@ MIN_ROWS = 3
 # Largest deviation of one sample period of a design from their mean, relative to the mean.
 SPACING_TOLERANCE = 1e-3
 
-# Largest relative difference between the sample periods of a design and of an experiment that
-# belong together.
-PERIOD_TOLERANCE = 1e-6
-
 
 def write_design(
     folder: Path, design: Design, system: System, further: Mapping[str, object] | None = None
@@ -352,27 +348,3 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Tr
             f"{periods.min():g} s to {periods.max():g} s"
         )
     return Trajectory(**found)
-
-
-def check_fits(path: Path, trajectory: Trajectory, system: System) -> None:
-    """Check that a design belongs to an experiment.
-
-    Args:
-        path: File of the design, for the message.
-        trajectory: Its trajectory.
-        system: The experiment.
-
-    Raises:
-        RecordingError: The design was made for another model or another rate.
-    """
-    wanted = (system.model.nq, system.model.nv, len(system.controls))
-    found = (trajectory.qpos.shape[1], trajectory.qvel.shape[1], trajectory.ctrl.shape[1])
-    if found != wanted:
-        raise RecordingError(
-            f"{path}: made for (nq, nv, nu) = {found}, the experiment's model has {wanted}"
-        )
-
-    if abs(trajectory.dt - system.dt) > PERIOD_TOLERANCE * system.dt:
-        raise RecordingError(
-            f"{path}: sampled at {1 / trajectory.dt:g} Hz, the experiment at {1 / system.dt:g} Hz"
-        )

@@ -18,11 +18,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, RecordingError, first_ones, listed, shortened
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.packing import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import as_json, read_json, replacing, write_json
-from mjfim.output.archive import check_fits, origin_of
+from mjfim.output.archive import origin_of
 from mjfim.output.export.mjcf import write_identified
 from mjfim.output.folders import (
     DESIGN_ARCHIVE,

@@ -7,7 +7,7 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
@@ -66,7 +66,7 @@ class Video:
         height: Height [pixels].
     """
 
-    data: bytes
+    data: bytes = field(repr=False)
     media_type: str
     caption: str
     width: int
@@ -118,7 +118,7 @@ def require_format(path: Path) -> Format:
     """
     kind = FILE_FORMATS.get(path.suffix.lower())
     if kind is None:
-        raise RecordingError(f"--video {path}: the name of a video ends in .mp4 or .gif")
+        raise RecordingError(f"{path}: the name of a video ends in .mp4 or .gif")
     if kind == "mp4" and find_spec("av") is None:
         raise NoVideoError(
             "mp4 needs the package av; install it with `pip install 'mjfim[video]'`, or write a "

@@ -163,6 +163,7 @@ def normal_density(x: Array, mean: float = 0.0, std: float = 1.0) -> Array:
     return np.asarray(np.exp(-0.5 * deviations**2) / (np.sqrt(2.0 * np.pi) * std))
 
 
+# Remark on predicted standard deviations.
 BEST_CASE = (
     "σ is the Cramér-Rao bound: the best case, reached if the model and the stated noise are right."
 )

@@ -82,10 +82,9 @@ class Workers(Executor):
                 "wrapped first"
             )
         if not callable(getattr(executor, "submit", None)):
-            is_count = isinstance(executor, int) and not isinstance(executor, bool)
             raise ExperimentError(
                 f"executor: {executor!r} has no method `submit`; pass an executor of the kind of "
-                f"concurrent.futures, such as mjfim.Pool({executor if is_count else ''}), or a "
+                f"concurrent.futures, such as mjfim.Pool(), or a "
                 "Dask Client"
             )
 

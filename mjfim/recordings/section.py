@@ -7,7 +7,7 @@ the columns of a log become a recording.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
@@ -92,6 +92,11 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     only_in_python: ClassVar[tuple[str, ...]] = ()
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """What is stated, without the many defaults."""
+        shown = self.model_fields_set - {*self.only_in_python}
+        return ((name, value) for name, value in super().__repr_args__() if name in shown)
 
     @model_validator(mode="wrap")
     @classmethod

@@ -19,6 +19,7 @@ from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError
 from mjfim.excitation.evaluation import (
     growth_warning,
+    motion_of,
     regulation_along,
     require_designable,
     require_evaluated,
@@ -38,7 +39,7 @@ from mjfim.excitation.task import (
 )
 from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.arguments import checked
-from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of, trajectory_of
+from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees
@@ -294,7 +295,7 @@ def check(
         if logs:
             return check_recordings(system, logs, stop, executor)
         require_design_keys(system, "check without recordings")
-        motion = None if trajectory is None else trajectory_of(trajectory)
+        motion = None if trajectory is None else motion_of(system, trajectory, "check")
         return check_task(DesignTask.of(system), motion, stop, executor)
 
 

@@ -25,6 +25,7 @@ from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint
@@ -106,6 +107,7 @@ def _worth(
     task = DesignTask.of(measured)
     trajectory, source = task.initial, "the initial control"
     if design is not None:
+        check_fits("the design", design.trajectory, system)
         task = task.released_as(design.trajectory.state[0])
         trajectory = task.plant.simulate(task.theta, design.trajectory.ctrl)
         source = "the design"

@@ -108,7 +108,7 @@ def test_design_of_another_model(archived: Path, tmp_path: Path) -> None:
     key = 'qpos="0 3.141592653589793 0"'
     xml = xml.replace("</worldbody>", more).replace('qpos="0 3.141592653589793"', key)
     (tmp_path / "cart_pendulum.xml").write_text(xml, encoding="utf-8")
-    said = ("design.npz: made for (nq, nv, nu) = (2, 2, 1)", "(3, 3, 1)")
+    said = ("design.npz: made for (nq, nv, na, nu) = (2, 2, 0, 1)", "(3, 3, 0, 1)")
     misused(run("simulate", path, archived, "-o", tmp_path / "out" / "r.csv"), *said)
     misused(run("montecarlo", path, archived, "-o", tmp_path / "out"), *said)
     assert "out" not in names(tmp_path)

@@ -722,7 +722,7 @@ def test_a_search_whose_motions_diverge_says_what_when_and_what_helps(
 
 def test_misuse_is_one_sentence(plain: Played) -> None:
     experiment, design = plain
-    with pytest.raises(RecordingError, match="give the experiment of the design"):
+    with pytest.raises(RecordingError, match="the design: sampled at"):
         mjfim.rehearse(experiment.replace(rate=100.0), design)
     silent = experiment.replace(rehearsal={"feedback": True})
     silent = silent.restated({**silent.model_dump(exclude_unset=True), "noise": {"x": 1.0}})

@@ -108,7 +108,7 @@ def test_lists_and_arrays_are_taken() -> None:
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        ({"parameters": ["joint/*:dampng"]}, "unknown path 'joint/*:dampng'"),
+        ({"parameters": ["joint/*:dampng"]}, "unknown parameter path 'joint/*:dampng'"),
         ({"parameters": [3]}, "parameters: should be a table"),
         ({"parameters": {"a": None}}, "parameters.a: should be a table"),
         ({"noise": {"qvel:slide": None}}, "noise.qvel:slide: should be a number or a table"),
@@ -314,7 +314,10 @@ def test_a_motion_of_another_model_is_refused(system: System) -> None:
     one = np.zeros((3, 1))
     motion = mjfim.Trajectory(t=[0.0, 0.02, 0.04], qpos=one, qvel=one, act=one, ctrl=one[1:])
 
-    with pytest.raises(MjfimError, match="give a motion of this experiment"):
-        mjfim.evaluate(system.experiment, motion)
+    for verb in (mjfim.evaluate, mjfim.simulate, mjfim.monte_carlo, mjfim.sysid_control):
+        with pytest.raises(MjfimError, match=r"made for|sysid is not installed"):
+            verb(system.experiment, motion)
+    with pytest.raises(MjfimError, match=r"the motion: made for .* = \(1, 1, 1, 1\), .* has"):
+        mjfim.check(system.experiment, trajectory=motion, progress=False)
     with pytest.raises(ExperimentError, match="expected a row for each sample with 1 columns"):
         mjfim.simulate(system.experiment, np.zeros((4, 2)))

@@ -15,7 +15,6 @@ import mjfim
 from mjfim.arrays import scaled_to_unit_diagonal
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System, labels_of_system
-from mjfim.identification import complete_theta
 from mjfim.identification.assessment.honest_covariance import honest_covariance
 from mjfim.identification.assessment.parameter_draws import (
     draw_parameters,
@@ -173,9 +172,6 @@ def test_initial_states_are_no_properties_of_a_robot() -> None:
     estimate = estimated(system, covariance)
     draws = drawn(system, estimate, 4)
     assert draws.parameters == ("m", "l", "c", "delay")
-    theta = complete_theta(system, estimate, draws, 2)
-    np.testing.assert_array_equal(theta[3:-1], estimate.theta[3:-1])
-    np.testing.assert_array_equal(theta[[0, 1, 2, -1]], draws.values[2])
 
 
 def test_unphysical_inertias_are_replaced() -> None:

@@ -141,8 +141,9 @@ def test_a_name_of_robot_descriptions_is_its_model_file(monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, module.__name__, module)
     assert packed("so_arm100_mj_description", Path()) == (str(ARM), None)
 
-    with pytest.raises(ModelError, match="'so_arm_description' is neither a file nor a name"):
-        packed("so_arm_description", Path())
+    for name in ("so_arm_description", f"{'a' * 300}_description"):
+        with pytest.raises(ModelError, match=f"'{name}' is neither a file nor a name"):
+            packed(name, Path())
 
 
 @pytest.mark.parametrize("given", [3, None, b"<mujoco/>", mujoco.MjData, ["arm.xml"]])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mjfim.errors import RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.system import simulate_system
 from mjfim.files import PREFIX, as_json, remove_temporary_files, replacing
 from mjfim.output import archive
@@ -312,20 +313,20 @@ def test_wrong_arrays_are_refused(
     """Arrays that do not fit are refused before they are simulated or drawn."""
     path = altered(folder / "design.npz", tmp_path / "odd.npz", **arrays)
     with pytest.raises(RecordingError, match=r"odd\.npz: "):
-        archive.check_fits(path, archive.read_design(path)["final"], task.system)
+        check_fits(path, archive.read_design(path)["final"], task.system)
 
 
 def test_designs_of_other_experiments_are_refused(folder: Path, task: DesignTask) -> None:
     """A design of another model or another rate is refused."""
     path, curve = folder / "design.npz", archive.read_design(folder / "design.npz")["final"]
-    archive.check_fits(path, curve, task.system)
+    check_fits(path, curve, task.system)
     wide = dataclasses.replace(curve, qpos=np.zeros((N + 1, 3)), qvel=np.zeros((N + 1, 3)))
-    said = r"design\.npz: made for \(nq, nv, nu\) = \(3, 3, 1\), .* has \(2, 2, 1\)"
+    said = r"design\.npz: made for \(nq, nv, na, nu\) = \(3, 3, 0, 1\), .* has \(2, 2, 0, 1\)"
     with pytest.raises(RecordingError, match=said):
-        archive.check_fits(path, wide, task.system)
+        check_fits(path, wide, task.system)
     slow = dataclasses.replace(curve, t=2 * curve.t)
     with pytest.raises(RecordingError, match=r"sampled at 50 Hz, the experiment at 100 Hz"):
-        archive.check_fits(path, slow, task.system)
+        check_fits(path, slow, task.system)
 
 
 # ---- whole or not at all

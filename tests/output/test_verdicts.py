@@ -168,9 +168,16 @@ def test_a_design_and_a_fit_agree_on_what_is_determined(share: float) -> None:
     assert verdict.level is (Level.GOOD if words is None else Level.DOUBTFUL)
     assert (words or "determines every parameter") in verdict.sentence
 
-    fit = page_of(results.estimate(std=std)).verdict.sentence
+    fit = page_of(results.estimate(std=std)).verdict
     is_undetermined = "does not determine" in verdict.sentence
-    assert ("except length (not determined)" in fit) == is_undetermined
+    assert ("except length (not determined)" in fit.sentence) == is_undetermined
+    assert (fit.level is Level.GOOD) is not is_undetermined and fit.ok
+
+
+def test_a_fit_that_determines_nothing_is_not_praised() -> None:
+    verdict = page_of(results.estimate(std=0.8 * THETA)).verdict
+    assert verdict.level is Level.DOUBTFUL
+    assert verdict.sentence.endswith("but the recordings determine no parameter.")
 
 
 def test_what_is_not_determined_has_no_green_box() -> None:

@@ -294,3 +294,8 @@ class TestVideo:
             picture.seek(1)
             picture.load()
             assert frames * picture.info["duration"] == pytest.approx(3000.0, rel=0.1)
+
+
+def test_a_video_is_not_printed_as_bytes() -> None:
+    video = Video(data=b"frames", media_type="image/gif", caption="slow", width=2, height=2)
+    assert "frames" not in repr(video) and "caption='slow'" in repr(video)

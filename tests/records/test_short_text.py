@@ -70,3 +70,9 @@ def test_a_small_array_shows_its_numbers(array: Any, text: str) -> None:
 def test_only_public_names_are_listed() -> None:
     listed = dir(mjfim)
     assert {name for name in listed if not name.startswith("__")} == set(mjfim.__all__)
+
+
+def test_an_experiment_shows_what_is_stated() -> None:
+    values = {"model": "arm.xml", "rate": 50.0, "parameters": {"a": "joint/a:damping"}}
+    shown = "parameters={'a': ParameterSpec(target='joint/a:damping')}"
+    assert str(mjfim.Experiment(**values)) == f"model='arm.xml' rate=50.0 {shown}"

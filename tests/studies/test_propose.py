@@ -79,7 +79,7 @@ def test_a_payload_is_proposed_beside_stated_unknowns() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"unknown": ["joint/*:dampng"]}, "unknown path 'joint/*:dampng'"),
+        ({"unknown": ["joint/*:dampng"]}, "unknown parameter path 'joint/*:dampng'"),
         ({"unknown": ["joint/x:damping"]}, "unknown joint 'x'"),
         ({"unknown": []}, "parameters"),
         ({"payload": "hand"}, "payload: unknown body 'hand'"),

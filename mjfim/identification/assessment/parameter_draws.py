@@ -275,23 +275,6 @@ def draw_parameters_system(
     )
 
 
-def complete_theta(system: System, estimate: Estimate, draws: ParameterDraws, robot: int) -> Array:
-    """Parameters of a drawn robot, with deviations of the initial state as estimated.
-
-    Args:
-        system: The system that was identified.
-        estimate: The estimate.
-        draws: Draws from its uncertainty.
-        robot: Index of the robot.
-
-    Returns:
-        (p,) values [theta-unit].
-    """
-    theta = np.array(estimate.theta)
-    theta[~system.parameters.initial_deviations] = draws.values[robot]
-    return theta
-
-
 def _physical_draws(
     system: System,
     estimate: Estimate,

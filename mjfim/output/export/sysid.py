@@ -20,8 +20,9 @@ from scipy.interpolate import CubicSpline
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError
+from mjfim.excitation.evaluation import motion_of
 from mjfim.experiment.arguments import checked
-from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of, trajectory_of
+from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align
@@ -86,7 +87,8 @@ def sysid_control(experiment: ExperimentLike, design: TrajectoryLike) -> Any:
         MjfimError: sysid is not installed.
     """
     require_sysid()
-    return _control(System.resolve(experiment), trajectory_of(design).ctrl)
+    system = System.resolve(experiment)
+    return _control(system, motion_of(system, design, "sysid_control").ctrl)
 
 
 def require_sysid() -> None:

@@ -35,11 +35,12 @@ import pyarrow.parquet
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.limits import limits_of
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.system import System
 from mjfim.files import remove_earlier_result, replacing, write_json
 from mjfim.model.coordinates import ScalarJoint, state_components
 from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
-from mjfim.output.archive import check_fits, reference_columns, simulate_playback
+from mjfim.output.archive import reference_columns, simulate_playback
 from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, rosbags_module
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Playback
@@ -103,7 +104,7 @@ class RobotPlan:
             RecordingError: The design was made for another model or another rate.
             SimulationDivergedError: The simulation diverges.
         """
-        check_fits(file or Path("the design"), design.trajectory, system)
+        check_fits(file or "the design", design.trajectory, system)
         playback = simulate_playback(system, design.trajectory, design.final.gain)
         return cls(
             name=Path(system.experiment.source).stem,

@@ -831,7 +831,8 @@ def designs_page(comparison: DesignComparison) -> Page:
     better = int(np.sum(other > (1.0 + TIE_TOLERANCE) * own))
     text = "Both designs determine every parameter equally well."
     if worse:
-        text = f"The other design determines {first_ones(worse)} better."
+        this = f", and this one {better} of {len(own)} parameters" if better else ""
+        text = f"The other design determines {first_ones(worse)} better{this}."
     elif better:
         text = f"This design determines {better} of {len(own)} parameters better, and none worse."
     durations = " s, and of ".join(f"{_seconds(design):.3g}" for design in both)

@@ -148,11 +148,12 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
             f"{model} explains the recordings: the noise is {ratio:.2f} times what you stated, "
             "which the intervals use"
         )
-    return Verdict(f"{text}{_worst_estimate(estimate)}.", Level.GOOD, ok=True)
+    accuracy, level = _accuracy(estimate)
+    return Verdict(f"{text}{accuracy}.", level, ok=True)
 
 
-def _worst_estimate(estimate: Estimate) -> str:
-    """The parameter whose interval is widest compared with its size, in words."""
+def _accuracy(estimate: Estimate) -> tuple[str, Level]:
+    """The parameter whose interval is widest compared with its size, in words; the level."""
     half_widths = 0.5 * (estimate.interval[:, 1] - estimate.interval[:, 0])
     sizes = estimate.sizes
     shares = half_widths / np.where(sizes > 0.0, sizes, np.nan)
@@ -160,15 +161,16 @@ def _worst_estimate(estimate: Estimate) -> str:
     is_asked = ~np.isin(estimate.parameters, estimate.nuisance)
     known = is_asked & (shares < UNDETERMINED_SHARE)
     uncertain = [estimate.parameters[j] for j in np.flatnonzero(is_asked & ~known).tolist()]
+    level = Level.DOUBTFUL if uncertain else Level.GOOD
     if not known.any():
-        return ""
+        return ", but the recordings determine no parameter" if uncertain else "", level
     worst = int(np.argmax(np.where(known, shares, -np.inf)))
     share = relative(half_widths[worst], sizes[worst])
     others = f" except {first_ones(uncertain)} (not determined)" if uncertain else ""
     return (
         f", and every parameter{others} is known to ± {share} or better (95 % interval, widest for "
         f"{estimate.parameters[worst]})"
-    )
+    ), level
 
 
 def _next_steps(estimate: Estimate) -> Iterator[str]:
