@@ -128,7 +128,7 @@ def read_motion(folder: Path) -> Array:
 
 def rms(errors: Array, axis: int | None = None) -> Array:
     """Return the root mean square [mrad] of errors [rad]."""
-    return 1e3 * np.sqrt(np.mean(errors**2, axis=axis))
+    return np.asarray(1e3 * np.sqrt(np.mean(errors**2, axis=axis)))
 
 
 def published_rms(path: Path, numbers: str, motion: Array) -> Array:
@@ -141,8 +141,8 @@ def published_rms(path: Path, numbers: str, motion: Array) -> Array:
         field[:] = [float(number) for number in row.split()]
     data, found = mujoco.MjData(model), np.empty((len(motion), 6))
     data.qpos[:] = motion[0, 6:]
-    for row, data.ctrl[:] in enumerate(motion[:, :6]):
-        found[row] = data.qpos
+    for step, data.ctrl[:] in enumerate(motion[:, :6]):
+        found[step] = data.qpos
         mujoco.mj_step(model, data, 5)
     return min(rms(found[: len(found) - rows] - motion[rows:, 6:]) for rows in range(4))
 
