@@ -322,7 +322,7 @@ class MethodEvaluation:
         nothing = MethodResult(
             method=method,
             title=METHOD_TITLES[method],
-            outcome=MethodOutcome.NONE if control is None else MethodOutcome.NOTHING,
+            outcome=MethodOutcome.NOTHING if found.steps else MethodOutcome.NONE,
             control=None,
             cost=np.nan,
             criterion=np.nan,

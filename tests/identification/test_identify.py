@@ -185,7 +185,7 @@ def test_misuse_is_refused(task: DesignTask, recording: Recording) -> None:
     with pytest.raises(RecordingError, match="at least one"):
         identify_system(task.system, [])
     with pytest.raises(ExperimentError, match="least_squares"):
-        identify_system(task.system, [recording], method="lm")  # type: ignore[arg-type]
+        identify(task.experiment, [recording], method="lm")  # type: ignore[arg-type]
     with pytest.raises(ExperimentError, match="m, l, c"):
         identify_system(task.system, [recording], start=np.ones(2))
 

@@ -32,7 +32,7 @@ from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResul
 from mjfim.studies import compare as compare_module
 from mjfim.studies.compare import chosen_methods
 from tests.support.baselines import pendulum, played
-from tests.support.cli import loads, names, read, run, write_experiment
+from tests.support.cli import MODELS, loads, names, read, run, write_experiment
 from tests.support.made_records import make_comparison, make_method_result
 
 LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\n"
@@ -314,3 +314,12 @@ def test_misuse(study: Path, tmp_path: Path) -> None:
         assert said in result.stderr
         assert "Traceback" not in result.stderr
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.slow
+def test_a_chirp_that_never_ends_at_rest_found_nothing() -> None:
+    """It was evaluated, and no size of it keeps all limits."""
+    rig = mjfim.Experiment.from_file(MODELS / "cart_pendulum_rig.toml").replace(horizon=1.0)
+    found = mjfim.compare(rig, methods=("chirp",), seconds=1.0, progress=False)
+    chirp = next(each for each in found.rows if each.method == "chirp")
+    assert chirp.outcome is MethodOutcome.NOTHING and chirp.steps > 0
