@@ -6,8 +6,8 @@ file is executed.
 A LeRobot dataset of format v2.x or v3.0 is a folder with `meta/info.json` and Parquet files, whose
 rows are the frames of all episodes. One episode is one recording.
 
-The library rosbags is an optional extra (`pip install 'mjfim[ros]'`); no ROS installation is
-needed. Messages of several topics or publishers are merged by their time stamps.
+The libraries rosbags and mcap are an optional extra (`pip install 'mjfim[ros]'`); no installation
+of ROS is needed. Messages of several topics or publishers are merged by their time stamps.
 """
 
 from __future__ import annotations
@@ -590,7 +590,7 @@ def rosbags_module(path: Path, name: str) -> Any:
         return import_module(name)
     except ImportError:
         raise RecordingError(
-            f"{path}: ROS 2 bags need the library rosbags; pip install 'mjfim[ros]'"
+            f"{path}: this log needs the library {name.partition('.')[0]}; pip install 'mjfim[ros]'"
         ) from None
 
 
@@ -661,6 +661,56 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
         column[np.searchsorted(stamps, own)] = np.frombuffer(numbers, dtype=np.float64)
         columns[f"{label}:{joint}"] = column
     return Table.of(path, columns, RecordingSpec(time="t"))
+
+
+def _read_mcap(path: Path, spec: RecordingSpec) -> Table:
+    """Read the JSON messages of an MCAP file; without any, its joint states of ROS 2.
+
+    Columns are `<topic>.<field>`, with the name of a joint or the number of an entry for lists, and
+    the time `t` at which messages were logged, since the first one [s].
+    """
+    reader = rosbags_module(path, "mcap.reader")
+    kind = "a readable MCAP file (damaged or truncated?)"
+    with _reading(path, kind, (Exception,)), path.open("rb") as file:
+        log = reader.make_reader(file)
+        channels = log.get_summary().channels.values()
+        topics = [each.topic for each in channels if each.message_encoding == "json"]
+        wanted = [topic for topic in topics if topic in (spec.topics or topics)]
+        messages = [
+            (channel.topic, message.log_time, json.loads(message.data))
+            for _, channel, message in (log.iter_messages(wanted) if wanted else ())
+        ]
+    if not topics:
+        return read_bag(path, spec)
+    if not messages:
+        fault = f"no message of {listed(spec.topics or topics)}; found: {listed(topics)}"
+        raise RecordingError(f"{path}: recording.topics: {fault}")
+    begin = messages[0][1]
+    rows = [
+        {"t": (stamp - begin) / NANOSECONDS, **dict(_numbers(content, topic))}
+        for topic, stamp, content in messages
+    ]
+    names = dict.fromkeys(name for row in rows for name in row)
+    return Table.of(path, {n: [row.get(n) for row in rows] for n in names}, RecordingSpec(time="t"))
+
+
+def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
+    """Names and values of all numbers inside a JSON message."""
+    if isinstance(value, Mapping):
+        labels = value.get("name")
+        for key, inner in value.items():
+            # A joint state has a list of names beside its lists of numbers.
+            is_parallel = isinstance(labels, list) and isinstance(inner, list)
+            entries = (
+                dict(zip(map(str, labels or ()), inner, strict=False)) if is_parallel else inner
+            )
+            yield from _numbers(entries, f"{name}.{key}")
+    elif isinstance(value, list):
+        for number, inner in enumerate(value):
+            label = inner.get("name", number) if isinstance(inner, Mapping) else number
+            yield from _numbers(inner, f"{name}.{label}")
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        yield name, float(value)
 
 
 Reader = Callable[[Path, RecordingSpec], Table]
@@ -1015,7 +1065,7 @@ READERS: dict[str, Reader] = {
     ".npy": _read_npy,
     ".mat": _read_mat,
     ".pt": _read_torch,
-    ".mcap": read_bag,
+    ".mcap": _read_mcap,
     ".db3": read_bag,
     **dict.fromkeys((f".{kind}{packed}" for kind in TEXT for packed in ("", ".gz")), _read_csv),
 }
