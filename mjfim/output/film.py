@@ -25,6 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 from mjfim.arrays import Array, evenly_spread_indices, record
 from mjfim.errors import NoVideoError
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.model.elements import model_length
@@ -710,7 +711,11 @@ def save_video(experiment: ExperimentLike, result: Filmed, path: str | Path) -> 
 
     Raises:
         NoVideoError: Nothing can be drawn on this computer, or a package is missing.
-        RecordingError: The ending of the file is another one.
+        RecordingError: The ending of the file is another one, or the result is of another model.
     """
     require_format(Path(path))
-    return write_video(Path(path), System.resolve(experiment), result)
+    system = System.resolve(experiment)
+    motion = result.trajectory if isinstance(result, Design) else result
+    if isinstance(motion, Trajectory):
+        check_fits("the motion of the video", motion, system)
+    return write_video(Path(path), system, result)

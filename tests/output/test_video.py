@@ -299,3 +299,11 @@ class TestVideo:
 def test_a_video_is_not_printed_as_bytes() -> None:
     video = Video(data=b"frames", media_type="image/gif", caption="slow", width=2, height=2)
     assert "frames" not in repr(video) and "caption='slow'" in repr(video)
+
+
+def test_a_motion_of_another_model_is_no_video(tmp_path: Path) -> None:
+    other = mjfim.Experiment.from_file(MODELS / "double_pendulum.toml")
+    motion = DesignTask.resolve(cart_pendulum(horizon=0.5)).initial
+    with pytest.raises(RecordingError, match="the motion of the video: made for"):
+        mjfim.save_video(other, motion, tmp_path / "x.gif")
+    assert not (tmp_path / "x.gif").exists()
