@@ -137,7 +137,8 @@ def test_a_name_in_the_legend_hides_its_curves(browser: Any, tmp_path: Path) -> 
     from playwright.sync_api import expect
 
     view = Viewed(browser, report_file(tmp_path, results.design()), WINDOWS[0], "light")
-    group = view.page.locator(".group", has_text="Initial and designed motion").first
+    initial = view.page.locator("button", has_text="initial")
+    group = view.page.locator(".group", has_text="hinge [rad]", has=initial).first
     group.scroll_into_view_if_needed()
     key = group.locator("button", has_text="initial")
     curves = group.locator(".plot").first.locator(".scatterlayer .trace")
