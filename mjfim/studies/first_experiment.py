@@ -557,7 +557,8 @@ class _Refinement:
                 )
                 return replace(draft, times=shorter), remark
 
-        return draft, f"Warning: {NO_MOTION}: {first}; choose another start."
+        cure = _touching(draft) or "choose another start"
+        return draft, f"Warning: {NO_MOTION}: {first}; {cure}."
 
     def released(self, draft: Proposal, length: float) -> Proposal:
         """The draft of a model without actuators, with a release that keeps all limits.
@@ -729,6 +730,21 @@ LEAST_SHARE = 1e-4
 
 # Largest number of proposed parameters, so that a design takes a minute.
 MOST_PARAMETERS = 10
+
+
+def _touching(draft: Proposal) -> str:
+    """How to prevent that bodies push each other apart at the start; empty where none touch."""
+    model = draft.compiled
+    data = mujoco.MjData(model)
+    data.qpos[:] = draft.start.qpos
+    mujoco.mj_forward(model, data)
+    geoms = data.contact.geom[data.contact.dist < 0.0]
+    pairs = {tuple(sorted(model.body(b).name for b in model.geom_bodyid[pair])) for pair in geoms}
+    lines = [f'<exclude body1="{a}" body2="{b}"/>' for a, b in sorted(pairs)]
+    if not lines:
+        return ""
+    added = first_ones(lines)
+    return f"bodies touch at the start: move it, or add to <contact> of the MJCF {added}"
 
 
 def identifiable(F: Array, sizes: Array, asked: Sequence[int] = ()) -> Sequence[int]:

@@ -901,3 +901,23 @@ def test_a_soft_range_that_the_state_at_rest_exceeds_is_written_wider(tmp_path: 
     wide = experiment.replace(limits={"tendon_length": {"string": [-1.0, 1.0]}})
     [limit] = [each for each in DesignTask.resolve(wide).limits if each.kind == "tendon_length"]
     assert (limit.lower, limit.upper) == (0.0, 0.3)
+
+
+def test_bodies_that_touch_at_the_start_are_named_with_the_line_that_parts_them(
+    tmp_path: Path,
+) -> None:
+    """A base that stands still collides with its child, which a moving one does not."""
+    leg = (
+        '<mujoco><worldbody><body name="base" pos="0 0 1"><geom size="0.1" pos="0.1 0 -0.15"/>'
+        '<body name="leg"><joint name="hip" axis="0 1 0" range="-0.04 0.04"/><geom type="capsule" '
+        'size="0.03" fromto="0 0 0 0 0 -0.3"/></body></body></worldbody>{}<actuator>'
+        '<motor name="m" joint="hip" ctrlrange="-5 5"/></actuator></mujoco>'
+    )
+    exclude = '<exclude body1="base" body2="leg"/>'
+    file = tmp_path / "leg.xml"
+    for contact, is_named in (("", True), (f"<contact>{exclude}</contact>", False)):
+        file.write_text(
+            leg.format(contact).replace("<mujoco>", '<mujoco><compiler angle="radian"/>')
+        )
+        remarks = " ".join(propose_experiment(file, tmp_path).remarks)
+        assert (exclude in remarks) == is_named, remarks
