@@ -471,7 +471,7 @@ def _names_of(parameter: inspect.Parameter) -> list[str]:
 
 
 def _shared_options() -> str:
-    """What the shared options do, one line each, for the help of `mjfim`."""
+    """The help of the shared options, one line each."""
     options = inspect.signature(Run, eval_str=True).parameters.values()
     lines = [f"{', '.join(_names_of(each))}: {_option(each).help}" for each in options]
     return "\n\n".join(["Options of most verbs:", *lines])

@@ -67,7 +67,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _kind(hint: Any) -> str:
-    """What an annotation allows, in words."""
+    """The kinds of values that an annotation allows, in words."""
     kind, parts = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return " | ".join(map(_kind, parts))

@@ -362,7 +362,7 @@ def _hold_model(values: dict[str, Any], source: str) -> None:
         if is_list:
             path = Path(directory) / values["model"]
             found = packed_model((files or PackedFiles.of({})).with_model(path), path)
-            paths = [p for each in listed for p in matches(each, found.model, found.decoration)]
+            paths = matches(listed, found.model, found.decoration)
             values["parameters"] = {each: {"target": each} for each in paths}
     except (ExperimentError, ModelError) as error:
         raise type(error)(f"{source}: {error}") from None

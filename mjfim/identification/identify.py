@@ -364,6 +364,8 @@ def _with_lost_held(search: FitSearch, fit: FitResult) -> FitResult:
     if np.isfinite(standard_deviations(fit.solution.condensed.information())).all():
         return fit
     lost = _unseen_directions(search.task, fit.problem, fit.theta)
+    if not lost.count:
+        return fit
     held = fit.problem.pinned(fit.theta, lost)
     found = _fitted_from(search, held, fit.solution.unknowns, "all data, held", fit)
     return fit if found is None else replace(found, null_space=lost)

@@ -289,24 +289,31 @@ def paths_of(
                         yield path, value
 
 
-def matches(pattern: str, model: Any, decoration: Collection[str] = frozenset()) -> list[str]:
-    """List the paths of a model that match a pattern, in which `*` stands for any text.
+def matches(
+    patterns: Iterable[str], model: Any, decoration: Collection[str] = frozenset()
+) -> list[str]:
+    """List the paths of a model that match patterns, in which `*` stands for any text.
 
     Args:
-        pattern: The pattern, or one path, which need not be a path of this model.
+        patterns: The patterns. One without `*` is a path, which need not be one of this model.
         model: The compiled model (`mujoco.MjModel`).
         decoration: As for `resolve`.
 
     Raises:
-        ExperimentError: No path matches.
+        ExperimentError: No path matches a pattern.
     """
-    if WILDCARD not in pattern:
-        return [pattern]
-    paths = [path for path, _ in paths_of(model, decoration)]
-    wanted = re.compile(re.escape(pattern).replace(r"\*", ".*"))
-    found = [path for path in paths if wanted.fullmatch(path)]
-    if not found:
-        raise ExperimentError(unknown("parameter path", pattern, paths))
+    paths: list[str] = []
+    found: list[str] = []
+    for pattern in patterns:
+        if WILDCARD not in pattern:
+            found.append(pattern)
+            continue
+        paths = paths or [path for path, _ in paths_of(model, decoration)]
+        wanted = re.compile(re.escape(pattern).replace(r"\*", ".*"))
+        matching = [path for path in paths if wanted.fullmatch(path)]
+        if not matching:
+            raise ExperimentError(unknown("parameter path", pattern, paths))
+        found += matching
     return found
 
 

@@ -556,12 +556,9 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
         RecordingError: The bag is damaged, has no joint states, or has several topics of them and
             none is chosen.
     """
-    if spec.time_unit != "s":
-        raise RecordingError(
-            f"{path}: recording.time_unit: the time of a bag is in seconds; leave this key out"
-        )
-    rosbag2 = rosbags_module(path, "rosbags.rosbag2")
-    typesys = rosbags_module(path, "rosbags.typesys")
+    _require_seconds(path, spec)
+    rosbag2 = module_of_extra(path, "rosbags.rosbag2")
+    typesys = module_of_extra(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     # The reader assumes an intact bag; a damaged one can cause any exception inside it.
     kind = "a readable ROS 2 bag (damaged or truncated?)"
@@ -576,11 +573,19 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
     return _merged(path, samples, with_topic=len(measured) > 1)
 
 
-def rosbags_module(path: Path, name: str) -> Any:
-    """Import a module of the optional library.
+def _require_seconds(path: Path, spec: RecordingSpec) -> None:
+    """Refuse a unit of the time, where the stamps of messages are the time."""
+    if spec.time_unit != "s":
+        raise RecordingError(
+            f"{path}: recording.time_unit: the time of a bag is in seconds; leave this key out"
+        )
+
+
+def module_of_extra(path: Path, name: str) -> Any:
+    """Import a module of a library of the extra `ros`.
 
     Args:
-        path: The bag, for the message.
+        path: The log, for the message.
         name: Name of the module.
 
     Raises:
@@ -669,7 +674,7 @@ def _read_mcap(path: Path, spec: RecordingSpec) -> Table:
     Columns are `<topic>.<field>`, with the name of a joint or the number of an entry for lists, and
     the time `t` at which messages were logged, since the first one [s].
     """
-    reader = rosbags_module(path, "mcap.reader")
+    reader = module_of_extra(path, "mcap.reader")
     kind = "a readable MCAP file (damaged or truncated?)"
     with _reading(path, kind, (Exception,)), path.open("rb") as file:
         log = reader.make_reader(file)
@@ -682,6 +687,7 @@ def _read_mcap(path: Path, spec: RecordingSpec) -> Table:
         ]
     if not topics:
         return read_bag(path, spec)
+    _require_seconds(path, spec)
     if not messages:
         fault = f"no message of {listed(spec.topics or topics)}; found: {listed(topics)}"
         raise RecordingError(f"{path}: recording.topics: {fault}")
@@ -690,8 +696,13 @@ def _read_mcap(path: Path, spec: RecordingSpec) -> Table:
         {"t": (stamp - begin) / NANOSECONDS, **dict(_numbers(content, topic))}
         for topic, stamp, content in messages
     ]
+    return Table.of(path, _columns_of_rows(rows), RecordingSpec(time="t"))
+
+
+def _columns_of_rows(rows: Records) -> dict[str, list[Any]]:
+    """Columns by name; None where a row does not have the name."""
     names = dict.fromkeys(name for row in rows for name in row)
-    return Table.of(path, {n: [row.get(n) for row in rows] for n in names}, RecordingSpec(time="t"))
+    return {name: [row.get(name) for row in rows] for name in names}
 
 
 def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
@@ -736,9 +747,8 @@ def _read_json(path: Path, spec: RecordingSpec) -> Table:
     if not lists and any(isinstance(value, list) for value in outside.values()):
         return Table.of(path, outside, spec)
     rows = [dict(leaves(record)) for record in _chosen(path, lists, spec.records)]
-    names = dict.fromkeys(name for row in rows for name in row)
     constants = {n: value for n, value in outside.items() if not isinstance(value, list)}
-    return Table.of(path, constants | {n: [row.get(n) for row in rows] for n in names}, spec)
+    return Table.of(path, constants | _columns_of_rows(rows), spec)
 
 
 def _lists_of_records(value: Any, place: str = "") -> Iterator[tuple[str, Records]]:

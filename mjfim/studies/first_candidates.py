@@ -334,15 +334,9 @@ def stated_candidates(
         ExperimentError: A pattern matches no number of the model.
     """
     known = {path: each for each in proposed for path in each.paths}
-    named = (
-        unknown
-        if isinstance(unknown, Mapping)
-        else {
-            path: path
-            for pattern in unknown
-            for path in matches(pattern, source.model, source.decoration)
-        }
-    )
+    named = unknown
+    if not isinstance(named, Mapping):
+        named = {path: path for path in matches(named, source.model, source.decoration)}
     stated = []
     for name, path in named.items():
         field = path.rpartition(":")[2]

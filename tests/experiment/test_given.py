@@ -16,18 +16,9 @@ from mjfim.experiment.given import recordings_of
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
+from tests.support.cart_pendulum import MODEL, STATED
 from tests.support.mesh_model import MESH
 from tests.support.paths import ROOT
-
-MODEL = ROOT / "models" / "cart_pendulum.xml"
-STATED: dict[str, Any] = {
-    "model": MODEL,
-    "rate": 50.0,
-    "horizon": 0.4,
-    "initial": {"control": {"kind": "multisine", "amplitude": 2.0}},
-    "parameters": {"m": "body/bob:mass", "c": "joint/hinge:damping"},
-    "noise": {"qpos:slide": 0.01, "qpos:hinge": 0.01, "qvel:hinge": 0.1},
-}
 
 
 @pytest.fixture(scope="module")

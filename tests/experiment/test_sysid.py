@@ -17,14 +17,11 @@ from mjfim.experiment.given import recordings_of
 from mjfim.experiment.sysid import parameter_tables
 from mjfim.experiment.system import System
 from mjfim.output.export.sysid import export_sysid, silenced
-from tests.support.paths import ROOT
+from tests.support import cart_pendulum
+from tests.support.cart_pendulum import MODEL
 
-MODEL = ROOT / "models" / "cart_pendulum.xml"
-STATED: dict[str, Any] = {
-    "model": MODEL,
-    "rate": 50.0,
-    "horizon": 0.4,
-    "initial": {"control": {"kind": "multisine", "amplitude": 2.0}},
+STATED = {
+    **cart_pendulum.STATED,
     "parameters": {"m": "body/bob:mass"},
     "noise": {"qpos:slide": 0.01, "qvel:hinge": 0.1},
 }

@@ -72,6 +72,12 @@ def test_a_log_of_two_topics_is_identified(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.theta, wanted.theta, rtol=1e-6)
 
 
+def test_stamps_of_messages_have_no_other_unit(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.mcap", {"/state": [{"data": 1}]})
+    with pytest.raises(RecordingError, match=r"recording\.time_unit"):
+        read_columns(path, RecordingSpec(time_unit="ms"))
+
+
 @pytest.mark.parametrize(
     ("topics", "said"), [(("/gone",), "found: /state"), ((), "not a readable MCAP file")]
 )

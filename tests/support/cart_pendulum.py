@@ -11,6 +11,17 @@ from mjfim.identification.search import FitTask
 from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS
 
+# A short study of the same model as Python states it.
+MODEL = MODELS / "cart_pendulum.xml"
+STATED: dict[str, Any] = {
+    "model": MODEL,
+    "rate": 50.0,
+    "horizon": 0.4,
+    "initial": {"control": {"kind": "multisine", "amplitude": 2.0}},
+    "parameters": {"m": "body/bob:mass", "c": "joint/hinge:damping"},
+    "noise": {"qpos:slide": 0.01, "qpos:hinge": 0.01, "qvel:hinge": 0.1},
+}
+
 
 def cart_pendulum(**tables: Any) -> Experiment:
     """The cart-pendulum with some tables changed."""

@@ -41,7 +41,7 @@ from mjfim.files import remove_earlier_result, replacing, write_json
 from mjfim.model.coordinates import ScalarJoint, state_components
 from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
 from mjfim.output.archive import reference_columns, simulate_playback
-from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, rosbags_module
+from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, module_of_extra
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Playback
 
@@ -537,8 +537,8 @@ def write_bag(folder: Path, plan: RobotPlan, trajectory: JointTrajectory, storag
     Raises:
         RecordingError: The library rosbags is not installed.
     """
-    rosbag2 = rosbags_module(folder, "rosbags.rosbag2")
-    typesys = rosbags_module(folder, "rosbags.typesys")
+    rosbag2 = module_of_extra(folder, "rosbags.rosbag2")
+    typesys = module_of_extra(folder, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     plugin = getattr(rosbag2.StoragePlugin, storage.upper())
     name = folder.absolute().name
