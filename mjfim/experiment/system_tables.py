@@ -157,6 +157,20 @@ class ControllerSpec(Section):
             "reference and its velocity [s]."
         ),
     )
+    acceleration: Positive | None = Field(
+        default=None,
+        description=(
+            "Largest acceleration of the motion profile from one reference to the next, as smart "
+            "servos compute it [rad/s^2 or m/s^2]. Default: no profile."
+        ),
+    )
+    jump: Positive | None = Field(
+        default=None,
+        description=(
+            "Change of the reference from one evaluation to the next above which it passes without "
+            "the profile [rad or m]. Default: the profile takes all changes."
+        ),
+    )
     feedback_latency: Delay = Field(
         default=0.0,
         description="Time from a measurement of the joint to the effect of the control [s].",

@@ -42,6 +42,8 @@ NUMBERS = (
     "time_constant",
     "feedback_latency",
     "velocity_time_constant",
+    "acceleration",
+    "jump",
 )
 
 # Field of a parameter path -> names of its numbers.
@@ -295,6 +297,9 @@ def law_unit(model: Any, actuator: str, field: str) -> str:
     first = first_number(model, actuator) - len(DESCRIPTION)
     joint, kind = (int(model.numeric_data[first + i]) for i in range(len(DESCRIPTION)))
     coordinate = joint_unit(model, joint)
+    profile = {"jump": coordinate, "acceleration": f"{coordinate}/s^2"}
+    if field in profile:
+        return profile[field]
     unit = unit_of_control(model, model.actuator(actuator).id, coordinate, KINDS[kind])
     if not unit:
         return ""

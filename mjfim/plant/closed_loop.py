@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar, NoReturn
 
+import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
@@ -32,6 +33,8 @@ from mjfim.plant.running_law import (
     memory_at_begin,
 )
 from mjfim.plant.state_space import StateSizes
+
+HINGE = mujoco.mjtJoint.mjJNT_HINGE
 
 # Number of batches that are kept, one for each of the latest numbers of simulations.
 KEPT_BATCHES = 6
@@ -69,7 +72,14 @@ class ClosedLoopSimulator(BatchSimulator):
         timestep = self.model.opt.timestep
         numbers = LawNumbers.of(models, self.laws.laws, len(models))
         longest = max(law.tick for law in self.laws.laws) * timestep
-        return int(np.ceil(lead_time(numbers, longest) / (self.substeps * timestep))) + 1
+        joints = [self.model.joint(law.joint) for law in self.laws.laws]
+        turns = [self.model.stat.extent, 2.0 * np.pi]
+        spans = [
+            np.ptp(joint.range) if np.ptp(joint.range) else turns[int(joint.type[0] == HINGE)]
+            for joint in joints
+        ]
+        seconds = lead_time(numbers, longest, np.array(spans))
+        return int(np.ceil(seconds / (self.substeps * timestep))) + 1
 
     def rollout(
         self,
@@ -237,9 +247,8 @@ class ClosedLoopSimulator(BatchSimulator):
 
         numbers = LawNumbers.of(models, laws, count)
         window = np.concatenate([context.before, ctrl, context.after], axis=1)
-        commands = LawCommands.of(laws, numbers, window, lead, ticks)
-
         known = None if context.memory is None else context.memory[index]
+        commands = LawCommands.of(laws, numbers, window, lead, ticks, known)
         if known is None:
             sums = self._measured_sums(laws, ctrl, context)
             velocities = [law.v + self.space.nq for law in laws]

@@ -8,7 +8,11 @@ Commands do not depend on the state, so that they are computed for all ticks bef
 with the latency d, the period T of the law, and the time constant tau. The width w is that of a
 tick, at most a sample: a held command that arrives inside a tick counts for the rest of the tick.
 So r depends continuously on d. References that are points of a continuous signal are interpolated
-linearly, which is w = one sample.
+linearly, which is w = one sample. A motion profile with the acceleration a goes to r_f in the
+shortest time, and takes its place:
+
+    w_k = min(sqrt((a T / 2)^2 + 2 a |e_k|) - a T / 2, |e_k| / T),     e_k = r_f,k - p_k-1
+    s_k = s_k-1 + (w_k sgn(e_k) - s_k-1 inside +-a T),     p_k = p_k-1 + T s_k
 
 At a tick k, with the measured position q and velocity v, and the commands of the log,
 
@@ -57,6 +61,8 @@ class LawNumbers:
         time_constant: Time constant of the filter of the reference [s].
         feedback_latency: Time from a measurement to the effect of the control [s].
         velocity_time_constant: Time constant of the filter of the velocity [s].
+        acceleration: Acceleration of the motion profile [rad/s^2 or m/s^2]; inf without a profile.
+        jump: Change of the reference above which it passes without the profile [rad or m].
     """
 
     kp: Array
@@ -71,6 +77,8 @@ class LawNumbers:
     time_constant: Array
     feedback_latency: Array
     velocity_time_constant: Array
+    acceleration: Array
+    jump: Array
 
     @classmethod
     def of(cls, models: Sequence[Any], laws: Sequence[ControlLaw], count: int) -> LawNumbers:
@@ -145,7 +153,8 @@ class LawCommands:
 
     Attributes:
         before: Number of evaluations before the first one of the curves.
-        reference: (K, m, c) filtered references [m or rad].
+        reference: (K, m, c) references, filtered and after the motion profile [m or rad].
+        profile_velocity: (K, m, c) velocities of the motion profiles [m/s or rad/s].
         reference_velocity: (K, m, c) velocities of the references [m/s or rad/s], or None.
         feedforward: (K, m, c) controls that are added [u-unit], or None.
         gain: (K, m, c) factors of the gains, or None.
@@ -157,6 +166,7 @@ class LawCommands:
 
     before: int
     reference: Array
+    profile_velocity: Array
     reference_velocity: Array | None
     feedforward: Array | None
     gain: Array | None
@@ -172,6 +182,7 @@ class LawCommands:
         window: Array,
         lead: int,
         ticks: Ticks,
+        memory: LawMemory | None,
     ) -> LawCommands:
         """Compute the commands.
 
@@ -182,13 +193,15 @@ class LawCommands:
                 window, the first one is held; after it, the last one.
             lead: Number of samples of the window before the curves.
             ticks: The evaluations.
+            memory: What the laws remember at the begin of the curves; None where these begin.
         """
         columns = _Columns(laws=laws, window=window, lead=lead, ticks=ticks)
         latency = numbers.latency / (ticks.substeps * ticks.timestep)
         shares = filter_shares(numbers.time_constant, ticks.seconds)
 
         received = columns.at("reference", columns.places - latency)
-        reference = _filtered(received, shares)
+        filtered = _filtered(received, shares)
+        reference, slope = _profiled(filtered, numbers, ticks, memory)
         velocity = columns.late("reference_velocity", latency)
         if velocity is not None:
             velocity = _filtered(velocity, shares)
@@ -199,17 +212,19 @@ class LawCommands:
         begin = -0.5 * ticks.period / ticks.substeps
         middle = columns.at("reference", lead + begin - 0.5 * latency[None])
         kept_back = ticks.seconds * (1.0 - shares) / shares
-        latest = reference[max(ticks.before - 1, 0)]
+        latest = filtered[max(ticks.before - 1, 0)]
+        behind = (filtered - reference)[: ticks.before].sum(axis=0)
 
         enabled = columns.at_once("enable")
         return cls(
             before=ticks.before,
             reference=reference,
+            profile_velocity=slope,
             reference_velocity=velocity,
             feedforward=columns.late("feedforward", latency),
             gain=columns.at_once("gain"),
             enabled=None if enabled is None else np.where(enabled >= ON, 1.0, 0.0),
-            lag=numbers.latency * middle[0] + kept_back * latest,
+            lag=numbers.latency * middle[0] + kept_back * latest + ticks.seconds * behind,
             lag_time=numbers.latency + kept_back,
         )
 
@@ -287,16 +302,20 @@ class _Columns:
         return np.where(reads, self.window[curves, sample, columns], otherwise)
 
 
-def lead_time(numbers: LawNumbers, period: float) -> float:
+def lead_time(numbers: LawNumbers, period: float, spans: Array) -> float:
     """Time before a curve whose inputs still have an effect on it [s].
 
     Args:
         numbers: Numbers of the laws.
         period: Longest period of a law [s].
+        spans: (c,) largest distances of two references [m or rad].
     """
     latest = float(numbers.latency.max(initial=0.0))
     filtered = FORGOTTEN_AFTER * float(numbers.time_constant.max(initial=0.0))
-    return latest + filtered + 2.0 * period
+    # A profile forgets its beginning when it rests, at the latest after a motion to the other end
+    # of the range and back.
+    profiled = 4.0 * float(np.sqrt(spans / numbers.acceleration).max(initial=0.0))
+    return latest + filtered + profiled + 2.0 * period
 
 
 def _filtered(values: Array, shares: Array) -> Array:
@@ -320,6 +339,51 @@ def _filtered(values: Array, shares: Array) -> Array:
         settled = (1.0 - share) * x[:1]
         filtered[:, chosen], _ = scipy.signal.lfilter(numerator, denominator, x, axis=0, zi=settled)
     return filtered
+
+
+def _profiled(
+    values: Array, numbers: LawNumbers, ticks: Ticks, memory: LawMemory | None
+) -> tuple[Array, Array]:
+    """References after the motion profiles of laws, and velocities of the profiles.
+
+    Args:
+        values: (K, m, c) references at successive ticks.
+        numbers: Numbers of the laws.
+        ticks: The ticks.
+        memory: Memory at the begin of the curves; None for profiles that begin at rest, with the
+            first tick.
+
+    Returns:
+        Both are (K, m, c). The velocity is 0 without a profile.
+    """
+    velocities = np.zeros_like(values)
+    chosen = np.isfinite(numbers.acceleration)
+    if not chosen.any():
+        return values, velocities
+
+    T = ticks.seconds
+    x, largest = values[:, chosen], numbers.acceleration[chosen] * T
+    jumps = np.abs(np.diff(x, axis=0, prepend=x[:1])) > numbers.jump[chosen]
+    first = 0 if memory is None else ticks.before
+    p, v = x[0], np.zeros_like(x[0])
+    if memory is not None:
+        p, v = memory.reference[chosen], memory.profile_velocity[chosen]
+    path, slopes = x.copy(), np.zeros_like(x)
+    path[max(first - 1, 0)] = p
+    square, twice = 0.25 * largest**2, 2.0 * largest / T
+    for k in range(first, len(x)):
+        error = x[k] - p
+        size = np.abs(error)
+        fastest = np.minimum(np.sqrt(square + twice * size) - 0.5 * largest, size / T)
+        wanted = np.copysign(fastest, error)
+        v = np.clip(wanted, v - largest, v + largest)
+        v[jumps[k]] = 0.0
+        p = np.where(jumps[k], x[k], p + T * v)
+        path[k], slopes[k] = p, v
+
+    reference = values.copy()
+    reference[:, chosen], velocities[:, chosen] = path, slopes
+    return reference, velocities
 
 
 def _with_differences(
@@ -347,6 +411,8 @@ class LawMemory:
 
     Attributes:
         held: (m, c) controls that the laws hold [u-unit].
+        reference: (m, c) references at the latest evaluation [m or rad].
+        profile_velocity: (m, c) velocities of the motion profiles [m/s or rad/s].
         integral: (m, c) integrals [u-unit].
         velocity: (m, c) filtered velocities [m/s or rad/s].
         measured: (m, c) measured positions at the latest evaluation [m or rad].
@@ -355,6 +421,8 @@ class LawMemory:
     """
 
     held: Array
+    reference: Array
+    profile_velocity: Array
     integral: Array
     velocity: Array
     measured: Array
@@ -505,8 +573,11 @@ class RunningLaws:
     def memory(self) -> LawMemory:
         """Present memory of the laws."""
         order = (self._latest + np.arange(len(self._positions))) % len(self._positions)
+        latest = max(self._next - 1, 0)
         return LawMemory(
             held=self.held,
+            reference=self._commands.reference[latest],
+            profile_velocity=self._commands.profile_velocity[latest],
             integral=self._integral,
             velocity=self._velocity,
             measured=self._measured,
@@ -649,8 +720,11 @@ def memory_at_begin(
         total = share * integral + numbers.ki * errors + late
         limited = _clipped(total, -numbers.integral_limit, numbers.integral_limit)
         integral = np.where(np.isnan(share), integral, limited)
+    latest = max(commands.before - 1, 0)
     return LawMemory(
         held=np.zeros_like(q),
+        reference=commands.reference[latest],
+        profile_velocity=commands.profile_velocity[latest],
         integral=integral,
         velocity=v,
         measured=q - v * (period + latency),

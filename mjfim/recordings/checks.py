@@ -178,7 +178,7 @@ def check_finite(where: str, values: Array, numbers: Sequence[int]) -> None:
         )
 
 
-def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
+def check_measured(where: str, t: Array, values: Array, gap: float, *, may_rest: bool) -> None:
     """Refuse a measured column that is empty or constant, or has gaps that are too long.
 
     Args:
@@ -186,6 +186,7 @@ def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
         t: (M,) times [s].
         values: (M,) numbers, NaN where the column is empty.
         gap: Longest accepted gap [s].
+        may_rest: True for a joint whose reference rests, so that its readings may be constant.
 
     Raises:
         RecordingError: The column cannot be used.
@@ -194,7 +195,8 @@ def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
     advice = "remove it from the file or from [recording.columns]"
     if not len(present):
         raise RecordingError(f"{where} holds no number; {advice}")
-    if len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0:
+    is_constant = len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0
+    if is_constant and not may_rest:
         raise RecordingError(
             f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, which suggests "
             f"a dead channel; {advice}"

@@ -215,8 +215,14 @@ def log_of(table: Table, channels: Channels) -> Log:
 
     # The recording begins at time 0.
     t = stamps[rows] - stamps[numbers[0]]
+    resting = set()
+    for law in channels.laws.laws if channels.laws is not None else ():
+        reference = channels.control_columns[law.columns["reference"]]
+        if reference in columns and np.nanmin(columns[reference]) == np.nanmax(columns[reference]):
+            resting |= {f"qpos:{law.joint}", f"qvel:{law.joint}"}
     for name in measured:
-        check_measured(f"{path}: column {sources[name].column!r}", t, columns[name], spec.gap)
+        where = f"{path}: column {sources[name].column!r}"
+        check_measured(where, t, columns[name], spec.gap, may_rest=name in resting)
     stated = {name for name, s in sources.items() if s.unit is not None or table.unit(s.column)}
     if table.unit_hint:
         _check_units_of_controls(table, sources)

@@ -30,6 +30,16 @@ LAWS: dict[str, dict[str, Any]] = {
     "late": {"kp": 60.0, "kd": 4.0, "rate": 250.0, "latency": 0.0137},
     "linear": {"kp": 60.0, "kd": 4.0, "rate": 1000.0, "latency": 0.0031, "interpolation": "linear"},
     "shaped": {"kp": 60.0, "kd": 4.0, "time_constant": 0.02, "latency": 0.005},
+    "profiled": {
+        "kp": 60.0,
+        "kd": 4.0,
+        "acceleration": 40.0,
+        "jump": 0.3,
+        "reference_velocity": "difference",
+        "time_constant": 0.002,
+        "latency": 0.005,
+    },
+    "profile of all changes": {"kp": 60.0, "kd": 4.0, "acceleration": 60.0, "latency": 0.003},
     "late feedback": {"kp": 40.0, "kd": 1.0, "rate": 250.0, "feedback_latency": 0.0063},
     "differences": {
         "kp": 40.0,
@@ -213,7 +223,7 @@ def test_intervals_equal_one_rollout(name: str) -> None:
         np.testing.assert_allclose(part.y[0], expected, atol=1e-11)
 
 
-@pytest.mark.parametrize("name", ["pd", "slow", "late", "linear", "shaped", "columns"])
+@pytest.mark.parametrize("name", ["pd", "slow", "late", "linear", "shaped", "profiled", "columns"])
 def test_a_curve_may_begin_inside_a_recording(name: str) -> None:
     """A curve that begins at a tick continues the motion; laws here remember commands only."""
     law = {**LAWS[name], "ki": 0.0}

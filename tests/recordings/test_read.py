@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
 from mjfim.output.archive import write_table
 from mjfim.recordings.read import Log, RowReader, read_log, read_recording
+from tests.support.closed_loop import arm_experiment
 from tests.support.paths import SHARED_DATA
 
 Array = NDArray[np.float64]
@@ -377,6 +379,25 @@ def test_dead_channels(read: Read) -> None:
     assert (
         len(read({"encoder": few, "qpos:pin": wave(), "ctrl:push": np.zeros(M)}).recording.t) == M
     )
+
+
+def test_a_joint_may_rest_where_its_reference_rests(tmp_path: Path) -> None:
+    """Its encoder shows one number then; where the reference moves, the channel is dead."""
+    system = System.resolve(arm_experiment({"shoulder": {"kp": 60.0, "kd": 4.0}}))
+    columns = {"t": np.arange(M) / 500.0, "ctrl:elbow": wave()}
+    columns |= {"reference:shoulder": np.full(M, 0.3), "qpos:shoulder": np.full(M, 0.29)}
+    log = tmp_path / "log.csv"
+
+    def written() -> Array:
+        """Write the columns, and read them."""
+        rows, header = np.column_stack([*columns.values()]), ",".join(columns)
+        np.savetxt(log, rows, "%.9g", ",", header=header, comments="")
+        return read_recording(log, system.channels).y
+
+    assert np.ptp(written()) == 0.0
+    columns["reference:shoulder"] = wave()
+    with pytest.raises(RecordingError, match="dead channel"):
+        written()
 
 
 @pytest.mark.parametrize("value", [np.inf, -1e300])

@@ -37,6 +37,8 @@ class PlainLaw:
     time_constant: float = 0.0
     feedback_latency: float = 0.0
     velocity_time_constant: float = 0.0
+    acceleration: float = math.inf
+    jump: float = math.inf
     linear: bool = False
     difference: bool = False
     reference_difference: bool = False
@@ -81,6 +83,7 @@ def simulate(
         v = float(data.joint(law.joint).qvel[0])
         memory[a] = {"t": [-1.0, 0.0], "q": [q - v, q], "v": [v, v]}
         memory[a] |= {"held": None, "integral": law.integral, "filtered": None}
+        memory[a] |= {"profile": None}
         memory[a] |= {"last": q - v * (law.tick * h + law.feedback_latency), "vf": v, "r": None}
 
     for step in range(samples * substeps):
@@ -117,6 +120,21 @@ def evaluate(
     r = command(t - law.latency, signals["reference"], dt, width)
     previous = r if memory["filtered"] is None else memory["filtered"]
     filtered = previous + share * (r - previous)
+    memory["filtered"] = filtered
+    if math.isfinite(law.acceleration):
+        p, s = memory["profile"] or (filtered, 0.0)
+        last, T = previous, law.tick * h
+        if abs(filtered - last) > law.jump:
+            p, s = filtered, 0.0
+        else:
+            e, a = filtered - p, law.acceleration
+            # The fastest velocity from which a T per tick brakes to zero at the reference.
+            braking = math.sqrt((a * T / 2) ** 2 + 2 * a * abs(e)) - a * T / 2
+            target = math.copysign(min(braking, abs(e) / T), e)
+            s = min(max(target, s - a * T), s + a * T)
+            p += T * s
+        previous = p if memory["profile"] is None else memory["profile"][0]
+        memory["profile"], filtered = (p, s), p
     velocity = 0.0
     if law.reference_difference:
         velocity = (filtered - previous) / T
@@ -124,7 +142,6 @@ def evaluate(
         rv = command(t - law.latency, signals["reference_velocity"], dt, width)
         before = rv if memory["r"] is None else memory["r"]
         velocity = memory["r"] = before + share * (rv - before)
-    memory["filtered"] = filtered
 
     q, v = state
     if t > 0.0:

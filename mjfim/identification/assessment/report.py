@@ -56,6 +56,7 @@ BEYOND_SERVOS = {
     "time_constant",
     "feedback_latency",
     "velocity_time_constant",
+    "acceleration",
 }
 
 
