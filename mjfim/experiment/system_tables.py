@@ -161,7 +161,7 @@ class ControllerSpec(Section):
         default=None,
         description=(
             "Largest acceleration of the motion profile from one reference to the next, as smart "
-            "servos compute it [rad/s^2 or m/s^2]. Default: no profile."
+            "servos compute it [rad/s² or m/s²]. Default: no profile."
         ),
     )
     jump: Positive | None = Field(

@@ -297,7 +297,7 @@ def law_unit(model: Any, actuator: str, field: str) -> str:
     first = first_number(model, actuator) - len(DESCRIPTION)
     joint, kind = (int(model.numeric_data[first + i]) for i in range(len(DESCRIPTION)))
     coordinate = joint_unit(model, joint)
-    profile = {"jump": coordinate, "acceleration": f"{coordinate}/s^2"}
+    profile = {"jump": coordinate, "acceleration": f"{coordinate}/s²"}
     if field in profile:
         return profile[field]
     unit = unit_of_control(model, model.actuator(actuator).id, coordinate, KINDS[kind])

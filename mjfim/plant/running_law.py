@@ -61,7 +61,7 @@ class LawNumbers:
         time_constant: Time constant of the filter of the reference [s].
         feedback_latency: Time from a measurement to the effect of the control [s].
         velocity_time_constant: Time constant of the filter of the velocity [s].
-        acceleration: Acceleration of the motion profile [rad/s^2 or m/s^2]; inf without a profile.
+        acceleration: Acceleration of the motion profile [rad/s² or m/s²]; inf without a profile.
         jump: Change of the reference above which it passes without the profile [rad or m].
     """
 

@@ -121,6 +121,7 @@ def test_designs_are_refused(verb: str) -> None:
 def test_laws_follow_the_experiment() -> None:
     """Names, units and numbers; another experiment on the same model has its own laws."""
     law = PD | {"feedforward": True, "latency": "3 ms", "slew": 100.0, "kind": "voltage"}
+    law |= {"acceleration": 40.0, "jump": 0.1}
     experiment = arm_experiment({"shoulder": law})
     system = System.resolve(experiment)
 
@@ -128,6 +129,7 @@ def test_laws_follow_the_experiment() -> None:
     assert system.laws is not None
     assert system.laws.period == 2
     paths = {"kp": "V/rad", "kd": "V s/rad", "latency": "s", "slew": "V/s", "saturation[1]": "V"}
+    paths |= {"acceleration": "rad/s²", "jump": "rad"}
     for path, unit in paths.items():
         parameters = {"x": {"target": f"controller/shoulder:{path}"}}
         found = System.resolve(experiment.replace(parameters=parameters), source=system.source)
