@@ -134,7 +134,7 @@ def test_laws_follow_the_experiment() -> None:
         parameters = {"x": {"target": f"controller/shoulder:{path}"}}
         found = System.resolve(experiment.replace(parameters=parameters), source=system.source)
         assert found.parameters.parameters[1].unit == unit
-    assert found.parameters.guess[1] == 20.0
+    assert found.parameters.guess[1] == 0.1
 
     # Laws with these numbers need no other model.
     assert System.resolve(experiment, source=system.source).source is system.source
