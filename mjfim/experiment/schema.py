@@ -200,7 +200,10 @@ class Experiment(Section):
             ExperimentError: A key or a value is not valid; the message has one line per fault.
         """
         source = str(values.get("source", "experiment"))
-        values = _plain(values)
+        try:
+            values = _plain(values)
+        except RecursionError:
+            raise ExperimentError(f"{source}: tables stand too deep inside each other") from None
         _hold_model(values, source)
         if "parameters" in values:
             values["parameters"] = _tables(values["parameters"])

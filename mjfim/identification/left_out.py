@@ -56,6 +56,9 @@ SEARCH = SearchSettings(
 )
 INITIAL_STATES = replace(SEARCH, rough_share=1e-3)
 
+# First rows of a segment that show its initial state. Later ones hardly do, and cost time.
+INITIAL_STATE_ROWS = 1000
+
 # Share of the predicted decrease of the cost that a step to the fit without a part may miss. The
 # errors of predictions hardly change with what is left of it.
 ALLOWED_SHARE = 0.1
@@ -187,6 +190,10 @@ def with_initial_states(
     # Deviations of the initial state that were fitted belong to other recordings.
     begin = replace(at, private=problem.begin(problem.parameters.guess).private)
     held = problem.masked(known).with_shared_held()
+    longest = max(segment.rows.stop - segment.rows.start for segment in held.segments)
+    first = held.of_first_parts(min(INITIAL_STATE_ROWS / longest, 1.0))
+    if len(first.segments_with_values) == len(held.segments):
+        held = first
     found = minimise(held, begin, INITIAL_STATES, budget)
     return problem, at if found is None else found.unknowns
 

@@ -825,6 +825,8 @@ def read_table(path: Path) -> dict[str, Array]:
     """
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
+    if not path.is_file():
+        raise RecordingError(f"{path}: this is no file; save the table in a CSV file")
     if READERS.get(path.suffix.lower(), _read_csv) is not _read_csv:
         raise RecordingError(f"{path}: not a CSV table; a design keeps its control in design.csv")
     table = _read_csv(path, RecordingSpec())

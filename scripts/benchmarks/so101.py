@@ -18,6 +18,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 import mjfim
 from mjfim.arrays import Array
@@ -144,13 +145,45 @@ def published_rms(path: Path, numbers: str, motion: Array) -> Array:
     law = (model.actuator_gainprm[:, 0], *model.actuator_biasprm.T[1:3])
     fields = (*law, model.dof_armature, model.dof_frictionloss, model.dof_damping)
     for field, row in zip(fields, numbers.split("|"), strict=True):
-        field[:] = [float(number) for number in row.split()]
+        field[:] = numbers_of(row)
     data, found = mujoco.MjData(model), np.empty((len(motion), 6))
     data.qpos[:] = motion[0, 6:]
     for step, data.ctrl[:] in enumerate(motion[:, :6]):
         found[step] = data.qpos
         mujoco.mj_step(model, data, 5)
     return min(rms(found[: len(found) - rows] - motion[rows:, 6:]) for rows in range(4))
+
+
+def numbers_of(row: str) -> Array:
+    """Numbers of six joints in a row of `PUBLISHED`."""
+    return np.broadcast_to([float(number) for number in row.split()], 6)
+
+
+def ratios_table(found: mjfim.Estimate) -> Table:
+    """Ratios that the motions determine, in the estimate and in the published sets.
+
+    Torques have no scale without a load, so that sets with other gains may move alike.
+    """
+    quantities = {"damping": ("ms", 1e3), "friction": ("mrad", 1e3), "armature": ("ms²", 1e6)}
+    heads = [f"{name} / kp [{unit}]" for name, (unit, _) in quantities.items()]
+    table = new_table(f"estimate | {', '.join(PUBLISHED)}", "joint", *heads)
+    places = {name: i for i, name in enumerate(found.parameters)}
+    published = [[numbers_of(row) for row in text.split("|")] for text in PUBLISHED.values()]
+    for number, joint in enumerate(JOINTS):
+        cells = []
+        for name, (_, scale) in quantities.items():
+            pair = [places[f"{name}_{joint}"], places["kp"]]
+            value, kp = found.theta[pair]
+            slope = np.array([1.0 / kp, -value / kp**2])
+            std = np.sqrt(slope @ found.honest_covariance[np.ix_(pair, pair)] @ slope)
+            theirs = []
+            for gain, _, kd, armature, friction, damping in published:
+                top = {"damping": damping - kd, "friction": friction, "armature": armature}[name]
+                theirs.append(f"{scale * top[number] / gain[number]:.3g}")
+            ours = f"{scale * value / kp:.3g} ± {scale * 1.96 * std:.2g}"
+            cells.append(f"{ours} | {', '.join(theirs)}")
+        table.add_row(joint, *cells)
+    return table
 
 
 def main() -> int:
@@ -199,4 +232,5 @@ def main() -> int:
         theirs = [published_rms(model, each, motion) for each in PUBLISHED.values()]
         table.add_row(name, *(f"{each:.1f}" for each in (rms(errors), *rms(errors, 0), *theirs)))
     console.print(table)
+    console.print(ratios_table(found))
     return 0
