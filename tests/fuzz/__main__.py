@@ -17,24 +17,10 @@ from tests.fuzz.workers import run_cases
 from tests.support.paths import ROOT
 
 
-def cases_of(counts: dict[str, int], seed: int) -> Iterator[Case]:
-    """Cases of every kind with successive seeds.
-
-    Args:
-        counts: Number of cases by kind.
-        seed: First seed.
-    """
-    for kind, count in counts.items():
-        for i in range(count):
-            yield Case(kind=kind, seed=seed + i)
-
-
 def report(outcome: Outcome, verbose: bool) -> None:
     """Print a case that failed; with `verbose` every case."""
     if outcome.complaint:
-        known = outcome.known
-        word = f"known failure ({known.reason})" if known else "FAILED"
-        print(f"{word}: --only {outcome.case}: {outcome.description}", flush=True)
+        print(f"FAILED: --only {outcome.case}: {outcome.description}", flush=True)
         print("    " + outcome.complaint.replace("\n", "\n    "), flush=True)
     elif verbose:
         about = f"{outcome.group}, {outcome.seconds:.1f} s, {outcome.description}"
@@ -52,13 +38,8 @@ def summarize(outcomes: list[Outcome], seconds: float) -> None:
         groups = ", ".join(f"{n} {group}" for group, n in Counter(o.group for o in own).items())
         print(f"{kind}: {len(own)} cases, seeds {min(seeds)} to {max(seeds)}: {groups}")
 
-        failed = [outcome for outcome in own if outcome.complaint]
-        for word, chosen in (
-            ("failed", [outcome for outcome in failed if outcome.known is None]),
-            ("known failures", [outcome for outcome in failed if outcome.known is not None]),
-        ):
-            listed = " ".join(str(outcome.case) for outcome in chosen)
-            print(f"  {word}: {len(chosen)} {listed}".rstrip())
+        failed = [str(outcome.case) for outcome in own if outcome.complaint]
+        print(f"  failed: {len(failed)} {' '.join(failed)}".rstrip())
 
 
 def main() -> int:
@@ -79,7 +60,9 @@ def main() -> int:
     args = parser.parse_args()
 
     counts = {kind: getattr(args, f"{kind}s") for kind in KINDS}
-    cases = args.only or list(cases_of(counts, args.seed))
+    cases = args.only or [
+        Case(kind=kind, seed=args.seed + i) for kind, count in counts.items() for i in range(count)
+    ]
     begin = time.monotonic()
     outcomes = []
     found = _here(cases) if args.here else run_cases(cases, args.workers, args.seconds)
@@ -88,7 +71,7 @@ def main() -> int:
         outcomes.append(outcome)
 
     summarize(outcomes, time.monotonic() - begin)
-    return int(any(outcome.complaint and not outcome.known for outcome in outcomes))
+    return int(any(outcome.complaint for outcome in outcomes))
 
 
 def _here(cases: list[Case]) -> Iterator[Outcome]:

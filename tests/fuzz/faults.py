@@ -15,18 +15,25 @@ import tomllib
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
-import scipy.io
 
 from tests.fuzz.bad_inputs import (
+    CHECK,
+    DESIGN,
+    DESIGN_VERBS,
+    IDENTIFY,
+    MONTECARLO,
+    SIMULATE,
+    WRITING_VERBS,
     Call,
     Rng,
+    in_format,
     pick,
+    rows_of,
     spoil_bytes,
     spoiled_design,
     spoiled_experiment,
@@ -34,10 +41,6 @@ from tests.fuzz.bad_inputs import (
     spoiled_recording,
     write_toml,
 )
-
-IDENTIFY = ("identify", "study.toml", "run.csv", "-o", "out", "--threads", "1")
-CHECK = ("check", "study.toml", "--threads", "1")
-SIMULATE = ("simulate", "study.toml", "design.npz", "-o", "new.csv")
 
 # Size of the array inside of a packed design that is far too large [bytes].
 BOMB_SIZE = 1 << 28
@@ -81,9 +84,8 @@ def fault(rng: Rng, folder: Path) -> Call:
 
 def log_columns(folder: Path) -> dict[str, list[float]]:
     """The columns of the recording of the study."""
-    lines = (folder / "run.csv").read_text(encoding="utf-8").splitlines()
-    rows = [[cell.strip('"') for cell in line.split(",")] for line in lines]
-    return {name: [float(row[i] or "nan") for row in rows[1:]] for i, name in enumerate(rows[0])}
+    header, *rows = rows_of(folder)
+    return {name: [float(row[i] or "nan") for row in rows] for i, name in enumerate(header)}
 
 
 def identify(*logs: str, held_out: str = "") -> list[str]:
@@ -98,43 +100,22 @@ def identify(*logs: str, held_out: str = "") -> list[str]:
 def infinite_number_in_model(rng: Rng, folder: Path) -> Call:
     """A mass or an inertia that is not a finite number, also in a file that is included."""
     file = folder / "cart_pendulum.xml"
-    text = file.read_text(encoding="utf-8")
     number = pick(rng, ("nan", "NaN", "-nan"))
-    changes = {
-        "a mass": ('mass="2"', f'mass="{number}"'),
-        "an inertia": ('diaginertia="0.01 0.01 0.01"', f'diaginertia="0.01 {number} 0.01"'),
-        "a density": ('mass="0"/>', f'density="{number}"/>'),
-        "a damping": ('damping="1"', f'damping="{number}"'),
-    }
-    what = pick(rng, tuple(changes))
-    spoiled = text.replace(*changes[what], 1)
+    changes = (
+        ('mass="2"', f'mass="{number}"'),
+        ('diaginertia="0.01 0.01 0.01"', f'diaginertia="0.01 {number} 0.01"'),
+        ('mass="0"/>', f'density="{number}"/>'),
+        ('damping="1"', f'damping="{number}"'),
+    )
+    old, new = pick(rng, changes)
+    spoiled, what = file.read_text(encoding="utf-8").replace(old, new, 1), new
     if rng.random() < 0.4:
         what += " in an included file"
         (folder / "inner.xml").write_text(spoiled, encoding="utf-8")
         spoiled = '<mujoco><include file="inner.xml"/></mujoco>'
     file.write_text(spoiled, encoding="utf-8")
     words = pick(rng, (CHECK, SIMULATE, IDENTIFY))
-    return Call(words=list(words), spoiled=f"model: {what} is {number}", refused=True)
-
-
-def doubled_columns(rng: Rng, folder: Path) -> Call:
-    """A Parquet file with two columns of one name."""
-    columns = log_columns(folder)
-    name = pick(rng, tuple(columns))
-    other = [2.0 * value for value in columns[name]]
-    table = pyarrow.table(columns).append_column(name, pyarrow.array(other))
-    pyarrow.parquet.write_table(table, folder / "log.parquet")
-    return Call(words=identify("log.parquet"), spoiled=f"Parquet: {name} twice", refused=True)
-
-
-def dictionary_column(rng: Rng, folder: Path) -> Call:
-    """A Parquet file with a column whose values are numbers of a dictionary of texts."""
-    columns: dict[str, Any] = dict(log_columns(folder))
-    name = pick(rng, tuple(columns))
-    texts = [f"{value:.6g}" for value in columns[name]]
-    columns[name] = pyarrow.array(texts).dictionary_encode()
-    pyarrow.parquet.write_table(pyarrow.table(columns), folder / "log.parquet")
-    return Call(words=identify("log.parquet"), spoiled=f"Parquet: codes in {name}", refused=True)
+    return Call(words=words, spoiled=f"model: {what}", refused=True)
 
 
 def same_log_twice(rng: Rng, folder: Path) -> Call:
@@ -147,33 +128,11 @@ def same_log_twice(rng: Rng, folder: Path) -> Call:
     elif how == "linked":
         (folder / name).symlink_to("run.csv")
     elif how == "converted":
-        arrays = {key: np.array(column) for key, column in log_columns(folder).items()}
-        np.savez(folder / name, **arrays)
+        (folder / name).write_bytes(in_format(name, rows_of(folder)))
     is_held_out = rng.random() < 0.5
     words = identify("run.csv", held_out=name) if is_held_out else identify("run.csv", name)
     place = "held-out" if is_held_out else "second"
     return Call(words=words, spoiled=f"the same log as {place}, {how}", refused=True)
-
-
-def boolean_measurement(rng: Rng, folder: Path) -> Call:
-    """A measured column of truth values, in each format."""
-    columns: dict[str, Any] = dict(log_columns(folder))
-    name = pick(rng, [key for key in columns if key.startswith("q")])
-    columns[name] = [value > 0.0 for value in columns[name]]
-    ending = pick(rng, (".csv", ".npz", ".parquet", ".json"))
-    file = folder / f"log{ending}"
-    if ending == ".npz":
-        np.savez(file, **{key: np.array(column) for key, column in columns.items()})
-    elif ending == ".parquet":
-        pyarrow.parquet.write_table(pyarrow.table(columns), file)
-    else:
-        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-        lines = [",".join(str(value).lower() for value in row.values()) for row in rows]
-        text = "\n".join([",".join(columns), *lines]) if ending == ".csv" else json.dumps(rows)
-        file.write_text(text, encoding="utf-8")
-    return Call(
-        words=identify(file.name), spoiled=f"{ending}: truth values in {name}", refused=True
-    )
 
 
 @functools.cache
@@ -206,56 +165,9 @@ def packed_bomb(rng: Rng, folder: Path) -> Call:
                 for i in range(20_000):
                     archive.writestr(f"{i}.npy", b"")
         return Call(words=identify(name), spoiled=f"a bomb {name}", refused=True)
-    words = pick(
-        rng,
-        (
-            SIMULATE,
-            (*CHECK, "--design", "design.npz"),
-            ("montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"),
-            ("replay", "design.npz", "--experiment", "study.toml", "--save", "new.rrd"),
-            identify("design.npz"),
-        ),
-    )
+    words = pick(rng, (*DESIGN_VERBS, identify("design.npz")))
     shutil.copy(_bomb(), folder / "design.npz")
-    return Call(words=list(words), spoiled="a packed bomb", refused=True)
-
-
-# Texts of `--executor` that name no executor.
-EXECUTORS = (
-    "",
-    "local:",
-    "local:0",
-    "local:-1",
-    "local:1.5",
-    "local:" + "9" * 5000,
-    "python:",
-    "python:.a:make",
-    "python:..:make",
-    "python:json:loads",
-    "python:os:nothing",
-    "dask:",
-    "dask:missing.json",
-    "dask:study.toml",
-    "dask://[::1",
-    "dask:tcp://",
-    "http://x",
-    "\u2028",
-)
-
-
-def wrong_executor(rng: Rng, folder: Path) -> Call:
-    """An executor that there is not."""
-    text = str(pick(rng, EXECUTORS))
-    words = ["montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"]
-    words = pick(rng, (words, list(IDENTIFY)))
-    return Call(words=[*words, "--executor", text], spoiled=f"executor {text[:20]!r}", refused=True)
-
-
-def no_methods(rng: Rng, folder: Path) -> Call:
-    """A comparison with no method."""
-    listed = pick(rng, ("", ",", " ", " , ,"))
-    words = ["compare", "study.toml", "-o", "out", "--seconds", "0.1", "--methods", listed]
-    return Call(words=words, spoiled=f"compare with methods {listed!r}", refused=True)
+    return Call(words=words, spoiled="a packed bomb", refused=True)
 
 
 # Two faults.
@@ -278,47 +190,6 @@ def two_faults(rng: Rng, folder: Path) -> Call:
 
 
 # Recordings.
-
-
-def short_log(rng: Rng, folder: Path) -> Call:
-    """A log of no, one or two rows, in each format."""
-    count = int(rng.integers(0, 3))
-    columns = {name: column[:count] for name, column in log_columns(folder).items()}
-    name, words = _write_log(rng, folder, columns)
-    return Call(words=words, spoiled=f"{name}: {count} rows", refused=count < 2)
-
-
-def odd_numbers(rng: Rng, folder: Path) -> Call:
-    """A log with infinities, huge numbers or missing numbers in a column or everywhere."""
-    columns = log_columns(folder)
-    names = tuple(columns) if rng.random() < 0.3 else (pick(rng, tuple(columns)),)
-    value = float(pick(rng, ("inf", "-inf", "nan", "1e300", "1e-300", "1e160", "0")))
-    share = float(rng.choice([0.01, 0.3, 1.0]))
-    for name in names:
-        columns[name] = [value if rng.random() < share else v for v in columns[name]]
-        columns[name][int(rng.integers(len(columns[name]) - 1))] = value
-    kind, words = _write_log(rng, folder, columns)
-    refused = any(np.isinf(columns[name]).any() for name in ("t", "ctrl:force"))
-    what = "all columns" if len(names) > 1 else names[0]
-    return Call(words=words, spoiled=f"{kind}: {value:g} in {what}", refused=refused)
-
-
-def _write_log(rng: Rng, folder: Path, columns: dict[str, list[float]]) -> tuple[str, list[str]]:
-    """Write a log in a random format; its name and the words that read it."""
-    name = pick(rng, ("log.csv", "log.npz", "log.parquet", "log.json"))
-    file = folder / name
-    rows = list(zip(*columns.values(), strict=True))
-    if name == "log.npz":
-        np.savez(file, **{key: np.array(column) for key, column in columns.items()})
-    elif name == "log.parquet":
-        pyarrow.parquet.write_table(pyarrow.table(columns), file)
-    elif name == "log.json":
-        file.write_text(json.dumps([dict(zip(columns, row, strict=True)) for row in rows]))
-    else:
-        lines = [",".join(repr(value) for value in row) for row in rows]
-        file.write_text("\n".join([",".join(columns), *lines]) + "\n", encoding="utf-8")
-    words = identify(name) if rng.random() < 0.8 else ["check", "study.toml", name]
-    return name, words
 
 
 def encoded_log(rng: Rng, folder: Path) -> Call:
@@ -352,27 +223,11 @@ def encoded_log(rng: Rng, folder: Path) -> Call:
         "spaces": lambda: text.replace(",", " , ").encode(),
         "an open quote": lambda: text.replace("\n", '\n"', 3).encode(),
     }
-    how = pick(rng, (*changes, ".npy", ".mat", ".jsonl"))
+    how = pick(rng, tuple(changes))
     refused = how in ("no header", "two headers")
-    if how in changes:
-        file.write_bytes(changes[how]())
-        accepted = not refused and how != "an open quote"
-        return Call(words=list(IDENTIFY), spoiled=f"CSV: {how}", refused=refused, accepted=accepted)
-
-    file = folder / f"log{how}"
-    if how == ".npy":
-        np.save(file, np.rec.fromarrays([*columns.values()], names=[*columns]))
-    elif how == ".mat":
-        scipy.io.savemat(file, columns)
-    else:
-        rows = zip(*columns.values(), strict=True)
-        records = (json.dumps(dict(zip(columns, row, strict=True))) for row in rows)
-        file.write_text("\n".join(records), encoding="utf-8")
-    is_spoiled = rng.random() < 0.5
-    if is_spoiled:
-        file.write_bytes(spoil_bytes(rng, file.read_bytes())[0])
-    spoiled = f"{how}{' with other bytes' if is_spoiled else ''}"
-    return Call(words=identify(file.name), spoiled=spoiled, accepted=not is_spoiled)
+    file.write_bytes(changes[how]())
+    accepted = not refused and how != "an open quote"
+    return Call(words=IDENTIFY, spoiled=f"CSV: {how}", refused=refused, accepted=accepted)
 
 
 def spoiled_bag(rng: Rng, folder: Path) -> Call:
@@ -457,7 +312,7 @@ def encoded_experiment(rng: Rng, folder: Path) -> Call:
     file.write_bytes(changes[how]())
     allowed = ("UTF-8 with a mark", "CRLF", "CR", "another number")
     words = pick(rng, (CHECK, SIMULATE))
-    return Call(words=list(words), spoiled=f"TOML: {how}", refused=how not in allowed)
+    return Call(words=words, spoiled=f"TOML: {how}", refused=how not in allowed)
 
 
 # Models with files of their own; %s is the name of the file.
@@ -502,7 +357,7 @@ def model_with_files(rng: Rng, folder: Path) -> Call:
     model.write_text(text.replace("<worldbody>", f"{element}<worldbody>", 1), encoding="utf-8")
     words = pick(rng, (CHECK, SIMULATE, IDENTIFY))
     refused = how not in ("itself",)
-    return Call(words=list(words), spoiled=f"model: {what} {name} {how}", refused=refused)
+    return Call(words=words, spoiled=f"model: {what} {name} {how}", refused=refused)
 
 
 URDF = """<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0.1 0 0"/>
@@ -539,7 +394,7 @@ def urdf_model(rng: Rng, folder: Path) -> Call:
     file = folder / "study.toml"
     text = file.read_text(encoding="utf-8").replace("cart_pendulum.xml", "robot.urdf")
     file.write_text(text, encoding="utf-8")
-    return Call(words=list(CHECK), spoiled=f"URDF: {key} {values.get(key, '')!r}", refused=True)
+    return Call(words=CHECK, spoiled=f"URDF: {key} {values.get(key, '')!r}", refused=True)
 
 
 # Files, folders and disks.
@@ -596,7 +451,7 @@ def odd_file(rng: Rng, folder: Path) -> Call:
     }
     words = pick(rng, readers.get(name, (CHECK, SIMULATE, IDENTIFY)))
     refused = how not in ("link", "unreadable")
-    return Call(words=list(words), spoiled=f"{name} is a {how}", refused=refused)
+    return Call(words=words, spoiled=f"{name} is a {how}", refused=refused)
 
 
 def odd_output(rng: Rng, folder: Path) -> Call:
@@ -616,22 +471,15 @@ def odd_output(rng: Rng, folder: Path) -> Call:
     else:
         target = {"link to a file": "run.csv", "link to nothing": "missing"}.get(how, "results")
         place.symlink_to(target)
-    words = pick(
-        rng,
-        (
-            ["check", "study.toml", "--threads", "1", "-o", output],
-            ["identify", "study.toml", "run.csv", "--threads", "1", "-o", output],
-            ["montecarlo", "study.toml", "design.npz", "--trials", "2", "-o", output],
-        ),
-    )
+    words = pick(rng, WRITING_VERBS[1:3])
     fails = how in ("file", "link to a file", "loop", "system", "pipe")
-    return Call(words=list(words), spoiled=f"output: {how}", fails=fails)
+    return Call(words=[*words[:-1], output], spoiled=f"output: {how}", fails=fails)
 
 
 def no_home(rng: Rng, folder: Path) -> Call:
     """A home folder in which nothing can be written; nothing else is wrong."""
     words = pick(rng, (SIMULATE, IDENTIFY, CHECK))
-    return Call(words=list(words), spoiled="no home", accepted=True, has_home=False)
+    return Call(words=words, spoiled="no home", accepted=True, has_home=False)
 
 
 def no_permission(rng: Rng, folder: Path) -> Call:
@@ -644,16 +492,14 @@ def no_permission(rng: Rng, folder: Path) -> Call:
         "results": results,
         "input": folder / str(pick(rng, ("study.toml", "cart_pendulum.xml"))),
     }
-    design = ("design", "study.toml", "-o", "out", "--threads", "1")
-    study = ("montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2")
-    words = pick(rng, (IDENTIFY, CHECK, (*CHECK, "run.csv", "-o", "out"), design, study))
+    words = pick(rng, (IDENTIFY, CHECK, (*CHECK, "run.csv", "-o", "out"), DESIGN, MONTECARLO))
     if how == "home":
         (folder / "home").mkdir()
     if how == "results":
         results.mkdir()
     fails = how == "input" or (how in ("current folder", "results") and "-o" in words)
     return Call(
-        words=list(words),
+        words=words,
         spoiled=f"no permission: {how}",
         forbidden=(forbidden[how],) if how in forbidden else (),
         has_home=how != "home",
@@ -692,34 +538,19 @@ def long_log(rng: Rng, folder: Path) -> Call:
 
 def full_disk(rng: Rng, folder: Path) -> Call:
     """A disk that is full after some bytes of a file."""
-    words = pick(
-        rng,
-        (
-            SIMULATE,
-            IDENTIFY,
-            ("design", "study.toml", "-o", "out", "--threads", "1"),
-            ("montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"),
-        ),
-    )
+    words = pick(rng, (SIMULATE, IDENTIFY, DESIGN, MONTECARLO))
     room = int(rng.choice([0, 100, 4000, 30_000, 100_000]))
     spoiled = f"files of at most {room} bytes"
-    return Call(words=list(words), spoiled=spoiled, room=room, fails=room <= 4000)
+    return Call(words=words, spoiled=spoiled, room=room, fails=room <= 4000)
 
 
 # What is spoiled, with the share of the cases.
 FAULTS: tuple[tuple[Callable[[Rng, Path], Call], float], ...] = (
     (infinite_number_in_model, 0.05),
-    (doubled_columns, 0.04),
-    (dictionary_column, 0.04),
     (same_log_twice, 0.05),
-    (boolean_measurement, 0.05),
     (packed_bomb, 0.04),
-    (wrong_executor, 0.05),
     (no_home, 0.02),
-    (no_methods, 0.02),
     (two_faults, 0.17),
-    (short_log, 0.06),
-    (odd_numbers, 0.07),
     (encoded_log, 0.06),
     (spoiled_bag, 0.07),
     (encoded_experiment, 0.06),

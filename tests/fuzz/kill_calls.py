@@ -16,10 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.fuzz.inputs import make_study
 from tests.support.cli import PROCESS, write_experiment
-from tests.support.cli import run as run_here
 from tests.support.contents import contents
 from tests.support.paths import MODELS, ROOT, SCRIPTS
+
+# Hard limits of a study.
+LIMITS = "[limits]\nposition = { slide = [-1.0, 1.0] }\ncontrol = { force = [-5.0, 5.0] }\n"
 
 # Folder into which every call writes.
 OUTPUT = "out"
@@ -112,6 +115,20 @@ def results_of(folder: Path) -> dict[str, Any]:
     return {name: value for name, value in found.items() if Path(name).name not in BOOKKEEPING}
 
 
+def completed(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """A call in a folder that has ended by itself."""
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env=environment(),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_CALL,
+        check=False,
+    )
+
+
 @functools.cache
 def reference(name: str) -> Reference:
     """Carry out a call without a kill."""
@@ -119,16 +136,7 @@ def reference(name: str) -> Reference:
         folder = Path(place)
         prepare(folder)
         begin = time.monotonic()
-        done = subprocess.run(
-            CALLS[name].command(),
-            cwd=folder,
-            env=environment(),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=LONGEST_CALL,
-            check=False,
-        )
+        done = completed(CALLS[name].command(), folder)
         seconds = time.monotonic() - begin
         if done.returncode not in (0, 1) or "Traceback" in done.stderr:
             raise RuntimeError(f"{name} fails without a kill: {done.stderr[-2000:]}")
@@ -139,37 +147,17 @@ def reference(name: str) -> Reference:
 def valid_study() -> Path:
     """Folder with studies, a design and a recording."""
     folder = Path(tempfile.mkdtemp(dir=Path.cwd()))
-    _write_limited(folder)
-    _write_wanted(folder)
-    _write_guess(folder)
+    for name, lines, old, new in (
+        # Under hard limits; its initial controls run in worker processes.
+        ("limited", "8\nstarts = 3", "[parameters.m]", f"{LIMITS}[parameters.m]"),
+        # With a target accuracy, which is reached at about its horizon.
+        ("wanted", "3", "scale = ", "wanted = 0.04\nscale = "),
+    ):
+        study = write_experiment(folder, tolerance="1e-12", max_iterations=lines)
+        text = study.read_text(encoding="utf-8").replace(old, new, 1)
+        (folder / f"{name}.toml").write_text(text, encoding="utf-8")
 
-    study = write_experiment(folder)
-    made = folder / "made"
-    designed = run_here("design", study, "-o", made, "--threads", 1)
-    simulated = run_here("simulate", study, made / "design.npz", "-o", folder / "run.csv")
-    if designed.exit_code not in (0, 1) or simulated.exit_code:
-        raise RuntimeError(f"the valid study fails: {designed.stderr} {simulated.stderr}")
-    shutil.copy(made / "design.npz", folder)
-    return folder
-
-
-def _write_limited(folder: Path) -> None:
-    """A study under hard limits; its initial controls run in worker processes."""
-    study = write_experiment(folder, tolerance="1e-12", max_iterations="8\nstarts = 3")
-    limits = "\n[limits]\nposition = { slide = [-1.0, 1.0] }\ncontrol = { force = [-5.0, 5.0] }\n"
-    text = study.read_text(encoding="utf-8") + limits
-    (folder / "limited.toml").write_text(text, encoding="utf-8")
-
-
-def _write_wanted(folder: Path) -> None:
-    """A study with a target accuracy, which is reached at about its horizon."""
-    study = write_experiment(folder, tolerance="1e-12", max_iterations="3")
-    text = study.read_text(encoding="utf-8").replace("scale = ", "wanted = 0.04\nscale = ", 1)
-    (folder / "wanted.toml").write_text(text, encoding="utf-8")
-
-
-def _write_guess(folder: Path) -> None:
-    """A study whose guess is wrong, for campaigns."""
+    # With a wrong guess, for campaigns.
     text = (MODELS / "cart_pendulum_guess.toml").read_text(encoding="utf-8")
     for old, new in (
         ("horizon = 4.0", "horizon = 1.0"),
@@ -180,3 +168,7 @@ def _write_guess(folder: Path) -> None:
     ):
         text = text.replace(old, new, 1)
     (folder / "guess.toml").write_text(text, encoding="utf-8")
+
+    make_study(folder, folder / "made")
+    shutil.copy(folder / "made" / "design.npz", folder)
+    return folder

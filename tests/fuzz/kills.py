@@ -24,6 +24,7 @@ from tests.fuzz.kill_calls import (
     START_OF_PYTHON,
     Call,
     Reference,
+    completed,
     environment,
     prepare,
     reference,
@@ -285,16 +286,7 @@ def _files(folder: Path, *, has_ended_itself: bool) -> list[str]:
 def _again(call: Call, folder: Path, undisturbed: Reference) -> list[str]:
     """Repeat a call, and describe in what it differs from one that nobody disturbed."""
     try:
-        done = subprocess.run(
-            call.command(again=True),
-            cwd=folder,
-            env=environment(),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=LONGEST_CALL,
-            check=False,
-        )
+        done = completed(call.command(again=True), folder)
     except subprocess.TimeoutExpired:
         return [f"no end after {LONGEST_CALL:g} s"]
 
