@@ -12,10 +12,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from mjfim.errors import MjfimError
-from mjfim.files import replacing
 from mjfim.output import plots, words
 from mjfim.output.archive import rotation_vectors
 from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals
@@ -532,22 +530,6 @@ def test_settings_of_the_user_change_no_figure_and_stay(tmp_path: Path) -> None:
         save(figure_of(picture), tmp_path / "other.png")
         assert mpl.rcParams["font.size"] == 20.0
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "other.png").read_bytes()
-
-
-def test_a_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "figure.png"
-    with replacing(path) as temporary:
-        temporary.write_bytes(b"old")
-
-    def fail(*_: object) -> None:
-        """Run out of space."""
-        raise OSError("disk full")
-
-    monkeypatch.setattr(Path, "write_bytes", fail)
-    with pytest.raises(OSError, match="disk full"):
-        save(Figure(), path)
-    assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
 
 
 @pytest.mark.slow

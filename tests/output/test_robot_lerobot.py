@@ -82,50 +82,42 @@ def test_the_files_follow_the_format(arm: Designed, tmp_path: Path) -> None:
     assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 100, 51)
     assert info["splits"] == {"train": "0:1"} and info["video_path"] is None
     joints = ["yaw", "shoulder", "elbow", "wrist"]
-    assert info["features"]["action"] == {
-        "dtype": "float32",
-        "shape": [4],
-        "names": [f"{joint}.pos" for joint in joints],
-    }
-    assert info["features"]["observation.state"]["names"] == [
-        f"{joint}.{ending}" for ending in ("pos", "vel") for joint in joints
-    ]
+    features = info["features"]
+    assert (features["action"]["dtype"], features["action"]["shape"]) == ("float32", [4])
+    assert features["action"]["names"] == [f"{joint}.pos" for joint in joints]
+    states = [f"{joint}.{ending}" for ending in ("pos", "vel") for joint in joints]
+    assert features["observation.state"]["names"] == states
 
     data = table(tmp_path, "data/chunk-000/file-000.parquet")
     types = {name: str(data.schema.field(name).type) for name in data.column_names}
     assert {name: types[name] for name in DEFAULTS} == DEFAULTS
     assert data.schema.field("action").type == pa.list_(pa.float32(), 4)
     assert data.schema.field("observation.state").type == pa.list_(pa.float32(), 8)
-    assert set(info["features"]) == set(data.column_names)
+    assert set(features) == set(data.column_names)
     assert data.column("timestamp").to_pylist()[-1] == 0.5
 
     stats = json.loads((tmp_path / "meta" / "stats.json").read_text(encoding="utf-8"))
-    assert set(stats) == set(info["features"])
+    assert set(stats) == set(features)
     for feature, numbers in stats.items():
-        width = info["features"][feature]["shape"][0]
+        width = features[feature]["shape"][0]
         assert set(numbers) == STATISTICS
         assert {len(value) for key, value in numbers.items() if key != "count"} == {width}
         assert numbers["count"] == [51]
 
-    episodes = table(tmp_path, "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert len(episodes) == 1 and episodes[0]["tasks"] == ["mjfim design servo_arm"]
-    assert (episodes[0]["dataset_from_index"], episodes[0]["dataset_to_index"]) == (0, 51)
-    assert episodes[0]["stats/action/max"] == stats["action"]["max"]
-    assert {key for key in episodes[0] if key.startswith(("data/", "meta/"))} == {
-        "data/chunk_index",
-        "data/file_index",
-        "meta/episodes/chunk_index",
-        "meta/episodes/file_index",
+    (episode,) = table(tmp_path, "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert episode["tasks"] == ["mjfim design servo_arm"]
+    assert (episode["dataset_from_index"], episode["dataset_to_index"]) == (0, 51)
+    assert episode["stats/action/max"] == stats["action"]["max"]
+    places = {
+        f"{place}/{kind}_index" for place in ("data", "meta/episodes") for kind in ("chunk", "file")
     }
+    assert {key for key in episode if key.startswith(("data/", "meta/"))} == places
 
     # pandas makes the texts the index of the table of tasks.
     tasks = table(tmp_path, "meta/tasks.parquet")
     metadata = json.loads(tasks.schema.metadata[b"pandas"])
-    assert metadata["index_columns"] == ["__index_level_0__"]
-    assert tasks.to_pydict() == {
-        "task_index": [0],
-        "__index_level_0__": ["mjfim design servo_arm"],
-    }
+    (index,) = metadata["index_columns"]
+    assert tasks.to_pydict() == {"task_index": [0], index: ["mjfim design servo_arm"]}
 
 
 @pytest.mark.parametrize("unit", ["rad", "deg"])

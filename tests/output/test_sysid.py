@@ -20,7 +20,7 @@ from mjfim.model.comparison import same_dynamics
 from mjfim.output.export.sysid import SysidProblem, silenced, sysid_problem
 from mjfim.records.trajectory import Recording
 from tests.support.dense_residuals import dense_residuals
-from tests.support.numerics import Array, body_task, filtered_task
+from tests.support.numerics import Array, body_task
 from tests.support.paths import ROOT
 
 CART = ROOT / "models" / "cart_pendulum.toml"
@@ -79,18 +79,9 @@ def test_it_finds_the_estimate_of_mjfim() -> None:
 def coarse(folder: Path) -> tuple[DesignTask, Recording]:
     """Two engine steps per sample; velocities are measured at every second sample."""
     noise = {**UNEQUAL, "qvel:slide": {"sigma": 0.005, "rate": 25.0}}
-    values = Experiment.from_file(CART).model_dump(exclude_unset=True) | {
-        "rate": 50.0,
-        "measure_rate": 50.0,
-        "noise": noise,
-    }
-    values["initial"]["control"] = {
-        "kind": "chirp",
-        "amplitude": 2.0,
-        "frequency": 0.3,
-        "frequency_end": 1.0,
-    }
-    task = DesignTask.resolve(Experiment(**values, directory=CART.parent))
+    chirp = {"kind": "chirp", "amplitude": 2.0, "frequency": 0.3, "frequency_end": 1.0}
+    tables = {"rate": 50.0, "measure_rate": 50.0, "initial": {"control": chirp}}
+    task = DesignTask.resolve(Experiment.from_file(CART).replace(noise=noise, **tables))
     return task, simulate_system(task.system, task.initial, 1)
 
 
@@ -101,14 +92,8 @@ def whole(folder: Path) -> tuple[DesignTask, Recording]:
     return task, simulate_system(task.system, task.initial, 1)
 
 
-def activated(folder: Path) -> tuple[DesignTask, Recording]:
-    """An actuator with a state."""
-    task = filtered_task(folder)
-    return task, simulate_system(task.system, task.initial, 1)
-
-
 def model(name: str) -> Callable[[Path], tuple[DesignTask, Recording]]:
-    """One of the models: inertias in charts, servo gains, a tendon, a loop."""
+    """One of the models: inertias in charts, servo gains, a tendon, a loop, an actuator's state."""
 
     def build(folder: Path) -> tuple[DesignTask, Recording]:
         task = DesignTask.resolve(Experiment.from_file(ROOT / "models" / f"{name}.toml"))
@@ -121,7 +106,6 @@ MODELS = ("ball_pendulum", "servo_arm", "four_bar", "muscle_arm")
 CASES = {
     "coarse": coarse,
     "whole": whole,
-    "activated": activated,
     **{name: model(name) for name in MODELS},
 }
 

@@ -7,7 +7,6 @@ import json
 import pickle
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -93,7 +92,3 @@ def test_shown_sentences_use_the_words_of_the_page() -> None:
 def test_a_copied_word_keeps_its_colours(term: Term) -> None:
     copied = pickle.loads(pickle.dumps(term))
     assert (copied, copied.rgb, copied.colour_name) == (term, term.rgb, term.colour_name)
-
-
-def test_the_page_is_part_of_the_documentation() -> None:
-    assert f"how-to/{PAGE.name}" in Path(ROOT / "mkdocs.yml").read_text(encoding="utf-8")
