@@ -16,7 +16,7 @@ from typer.testing import Result
 
 from mjfim.output.manifest import MANIFEST
 from mjfim.parallel import pool
-from tests.support.cli import loads, misused, names, read, run, write_experiment
+from tests.support.cli import done, loads, misused, names, read, run, write_experiment
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +98,7 @@ def test_combinations_of_parameters_are_named_and_the_exit_code_is_1(
     path = tmp_path / "study.toml"
     path.write_text(text, encoding="utf-8")
 
-    result = run("check", path, "--verbose")
-    assert result.exit_code == 1
+    result = done("check", path, "--verbose", code=1)
     for word in ("M + a", "time", "σ without it", "derivative self-test passed"):
         assert word in result.stdout
 

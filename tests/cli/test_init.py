@@ -14,7 +14,7 @@ from typer.testing import Result
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
-from tests.support.cli import MODELS, loads, misused, names, run
+from tests.support.cli import MODELS, done, loads, misused, names, run
 
 
 def test_init_does_not_overwrite_files_of_the_user(tmp_path: Path) -> None:
@@ -26,7 +26,7 @@ def test_init_does_not_overwrite_files_of_the_user(tmp_path: Path) -> None:
     # The model itself is never replaced, not even by force.
     model = tmp_path / "model.xml"
     model.write_bytes((MODELS / "cart_pendulum.xml").read_bytes())
-    assert run("init", model, "-o", model, "--force").exit_code == 2
+    done("init", model, "-o", model, "--force", code=2)
     assert model.read_bytes() == (MODELS / "cart_pendulum.xml").read_bytes()
 
 
@@ -47,13 +47,6 @@ def test_a_model_and_an_experiment_in_the_place_of_the_other(tmp_path: Path) -> 
         misused(run(verb, experiment), f"{experiment}: an experiment file, but a model")
 
 
-def test_a_model_without_joints_is_refused(tmp_path: Path) -> None:
-    model = tmp_path / "rigid.xml"
-    model.write_text("<mujoco/>", encoding="utf-8")
-    result = run("init", model, "-o", tmp_path / "a.toml")
-    misused(result, "rigid.xml: the model has no joint")
-
-
 @pytest.mark.slow
 def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
     """The experiment file reads the log as it is, and the next command fits it."""
@@ -71,8 +64,7 @@ def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
     log.write_text("\n".join(("time [ms]; force_cmd; x_slide; hinge [deg]", *lines)), "utf-8")
 
     file = tmp_path / "robot.toml"
-    result = run("init", MODELS / "cart_pendulum.xml", "--log", log, "-o", file)
-    assert result.exit_code == 0
+    result = done("init", MODELS / "cart_pendulum.xml", "--log", log, "-o", file)
     assert result.stdout.strip() == f"next: mjfim identify {file} {log}"
     stated = tomllib.loads(file.read_text(encoding="utf-8"))["recording"]
     assert stated == {
@@ -84,10 +76,8 @@ def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
         },
     }
     read = read_recording(log, System.resolve(Experiment.from_file(file)).channels)
-    expected = np.array(rows)
-    assert np.allclose(read.t, expected[:, 0] / 1e3, rtol=0, atol=1e-9)
-    assert np.allclose(read.y[:, 0], expected[:, 2], rtol=0, atol=1e-9)
-    assert np.allclose(read.y[:, 1], np.radians(expected[:, 3]), rtol=0, atol=1e-9)
+    shown = np.column_stack([1e3 * read.t, read.y[:, 0], np.degrees(read.y[:, 1])])
+    assert np.allclose(shown, np.array(rows)[:, [0, 2, 3]], rtol=0, atol=1e-6)
     assert run("identify", file, log, "-o", tmp_path / "fit").exit_code in (0, 1)
 
 
@@ -103,16 +93,14 @@ def test_init_writes_a_file_that_validate_accepts(
 ) -> None:
     """Enter takes what it proposes without questions."""
     monkeypatch.chdir(tmp_path)
-    result = run("init", MODELS / "cart_pendulum.xml")
-    assert result.exit_code == 0
+    result = done("init", MODELS / "cart_pendulum.xml")
     assert "next: mjfim check cart_pendulum.toml" in result.stdout
     text = (tmp_path / "cart_pendulum.toml").read_text(encoding="utf-8")
     assert "# A first experiment for" in text
     assert asked(tmp_path / "asked.toml", *[""] * 5).exit_code == 0
     assert (tmp_path / "asked.toml").read_text(encoding="utf-8") == text
 
-    valid = run("validate", "cart_pendulum.toml")
-    assert valid.exit_code == 0
+    valid = done("validate", "cart_pendulum.toml")
     assert "is correct" in valid.stdout
 
 
@@ -149,12 +137,10 @@ def test_a_urdf_of_a_ros_package_becomes_a_file_that_validate_accepts(
     words = ["--package", f"arm_description={package}"] if place == "stated" else []
     file = tmp_path / "first" / "arm.toml"
     file.parent.mkdir()
-    result = run("init", urdf, "-o", file, *words)
-    assert result.exit_code == 0, result.stderr
+    done("init", urdf, "-o", file, *words)
     values = tomllib.loads(file.read_text("utf-8"))
     assert values["limits"]["velocity"] in (3.0, {"shoulder": 3.0})
-    valid = run("validate", file)
-    assert valid.exit_code == 0, valid.stderr
+    done("validate", file)
     model = System.resolve(Experiment.from_file(file)).model
     assert (model.nu, model.nmesh, model.actuator("shoulder").ctrlrange[1]) == (1, 1, 9.0)
 
@@ -185,14 +171,13 @@ def test_the_load_that_is_asked_for_is_an_unknown_of_a_size_that_the_motors_lift
 ) -> None:
     model, file = tmp_path / "arm.xml", tmp_path / "arm.toml"
     model.write_text(WRIST, encoding="utf-8")
-    result = run("init", model, "-o", file, "--payload", "wrist_3")
-    assert result.exit_code == 0, result.stderr
+    done("init", model, "-o", file, "--payload", "wrist_3")
     payload = tomllib.loads(file.read_text("utf-8"))["parameters"]["payload"]
     [target] = payload["targets"]
     assert target == {"path": "body/wrist_3:mass", "offset": 0.05}
     # 5 % of what the shoulder holds at the length of the arm, which may be bent.
     assert payload["scale"] == pytest.approx(0.05 * 60.0 / (9.81 * 0.6), rel=0.2)
-    assert run("validate", file).exit_code == 0
+    done("validate", file)
 
     # Not any body can carry a load.
     misused(run("init", model, "-o", tmp_path / "b.toml", "--payload", "hand"), "unknown body")
@@ -242,14 +227,6 @@ def test_list_finds_paths_by_a_part_of_their_name() -> None:
     misused(run("list", model, "xyzzy"), "no path or name contains 'xyzzy'")
 
 
-def test_validate_names_the_fault(tmp_path: Path) -> None:
-    file = tmp_path / "bad.toml"
-    text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
-    text = text.replace("cart_pendulum.xml", str(MODELS / "cart_pendulum.xml"))
-    file.write_text(text.replace("joint/hinge:damping", "joint/hinges:damping"), encoding="utf-8")
-    misused(run("validate", file), "unknown joint 'hinges'")
-
-
 def test_validate_says_what_design_lacks(tmp_path: Path) -> None:
     file = tmp_path / "log.toml"
     model = MODELS / "cart_pendulum.xml"
@@ -258,12 +235,11 @@ def test_validate_says_what_design_lacks(tmp_path: Path) -> None:
         '[parameters.c]\ntarget = "joint/hinge:damping"\n',
         encoding="utf-8",
     )
-    result = run("validate", file, "--json")
-    assert result.exit_code == 0
+    result = done("validate", file, "--json")
     assert loads(result.stdout)["missing"] == ["horizon", "initial.control"]
 
 
 def test_validate_prints_the_schema() -> None:
     schema = json.loads(run("validate", "--schema").stdout)
     assert "model" in schema["properties"]
-    assert run("validate").exit_code == 2
+    done("validate", code=2)

@@ -17,7 +17,7 @@ from typer.main import get_command
 
 from mjfim.cli.main import ORDER, app
 from mjfim.parallel import cores
-from tests.support.cli import MODELS, run, write_experiment
+from tests.support.cli import MODELS, done, run, write_experiment
 from tests.support.paths import ROOT
 
 # Packages that take long to import, and that no help and no message about misuse needs.
@@ -138,7 +138,7 @@ def test_a_design_imports_only_the_parts_of_scipy_that_it_needs(tmp_path: Path) 
 @pytest.mark.slow
 def test_a_fit_imports_nothing_of_a_design(tmp_path: Path) -> None:
     experiment, log = str(short_experiment(tmp_path)), str(tmp_path / "log.csv")
-    assert run("simulate", experiment, "-o", log).exit_code == 0
+    done("simulate", experiment, "-o", log)
     words = ["identify", experiment, log, "-o", str(tmp_path / "out")]
     report = imported([words], ("mjfim.excitation", "mjfim.identification"))
     assert report[1][1:] == (0, ["mjfim.identification"])

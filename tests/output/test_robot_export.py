@@ -25,7 +25,7 @@ from mjfim.output.export.trajectories import (
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats import read_table
 from tests.output.conftest import Designed, designed
-from tests.support.cli import misused, names, run
+from tests.support.cli import done, misused, names, run
 from tests.support.paths import MODELS
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
@@ -157,15 +157,14 @@ def test_the_verb_writes_and_replaces_its_own_files_only(folder: Path, tmp_path:
     experiment = MODELS / "cart_pendulum.toml"
     words = ("export", folder, "--experiment", experiment, "-o")
     for storage, ending in (("sqlite3", "db3"), ("mcap", "mcap")):
-        done = run(*words, bag, "--to", "ros2-bag", "--storage", storage)
-        assert done.exit_code == 0, done.stderr
+        done(*words, bag, "--to", "ros2-bag", "--storage", storage)
         assert names(bag) == {".mjfim.json", "metadata.yaml", f"bag.{ending}"}
 
     mine = tmp_path / "mine.yaml"
     mine.write_text("mine", encoding="utf-8")
     misused(run(*words, mine, "--to", "ros2"), "--force")
     assert mine.read_text(encoding="utf-8") == "mine"
-    assert run(*words, mine, "--to", "ros2", "--force").exit_code == 0
+    done(*words, mine, "--to", "ros2", "--force")
     assert load(mine.read_text(encoding="utf-8"))["joint_names"] == ["slide"]
     misused(run(*words, folder / "design.csv", "--to", "ros2", "--force"), "is an input")
 

@@ -16,7 +16,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment import System
 from mjfim.recordings import read_recording
 from tests.output.conftest import Designed
-from tests.support.cli import misused, run
+from tests.support.cli import done, misused, run
 from tests.support.paths import MODELS
 
 CART = MODELS / "cart_pendulum.toml"
@@ -149,8 +149,7 @@ def test_the_verb_replaces_its_own_dataset(cart: Designed, tmp_path: Path) -> No
     cart[1].save(tmp_path / "design")
     words = ("export", tmp_path / "design", "--experiment", CART, "--to", "lerobot")
     for _ in range(2):
-        done = run(*words, "-o", tmp_path / "set")
-        assert done.exit_code == 0, done.stderr
+        done(*words, "-o", tmp_path / "set")
     assert described(tmp_path / "set")["total_frames"] == 401
 
     info = tmp_path / "set" / "meta" / "info.json"

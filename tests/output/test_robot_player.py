@@ -23,7 +23,7 @@ from mjfim.output.export.trajectories import RobotPlan
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats import read_table
 from tests.output.conftest import Designed
-from tests.support.cli import run
+from tests.support.cli import done
 from tests.support.numerics import body_task
 from tests.support.paths import MODELS
 
@@ -67,8 +67,7 @@ def script(cart: Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("player")
     cart[1].save(folder / "design")
     words = ("export", folder / "design", "--experiment", MODELS / "cart_pendulum.toml")
-    done = run(*words, "--to", "player", "-o", folder / "play.py")
-    assert done.exit_code == 0, done.stderr
+    done(*words, "--to", "player", "-o", folder / "play.py")
     return folder / "play.py"
 
 

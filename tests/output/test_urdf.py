@@ -17,7 +17,7 @@ from mjfim.model.model_files import urdf_sources
 from mjfim.output.export.mjcf import identified_files, write_identified
 from mjfim.output.manifest import MANIFEST
 from tests.output.test_mjcf import changes
-from tests.support.cli import names, run
+from tests.support.cli import done, names
 from tests.support.numerics import Array
 
 # Two links with inertial frames that are turned, and a tool that is fixed to the second one.
@@ -348,10 +348,9 @@ true = 1.6
 """
     (tmp_path / "two.toml").write_text(experiment, encoding="utf-8")
     out = tmp_path / "fit"
-    assert run("simulate", tmp_path / "two.toml", "-o", tmp_path / "log.csv").exit_code == 0
+    done("simulate", tmp_path / "two.toml", "-o", tmp_path / "log.csv")
     words = ("identify", tmp_path / "two.toml", tmp_path / "log.csv", "-o", out)
-    result = run(*words)
-    assert result.exit_code == 0, result.stderr
+    result = done(*words)
     assert {"identified.xml", "identified.urdf", MANIFEST} <= names(out)
     assert "printed by MuJoCo" not in result.stderr
     estimate = mjfim.Estimate.load(out)
@@ -359,6 +358,5 @@ true = 1.6
     assert model.body("upper").mass[0] == estimate.theta[0]
 
     (out / "identified.urdf").write_text("edited", encoding="utf-8")
-    refused = run(*words)
-    assert refused.exit_code == 2
+    refused = done(*words, code=2)
     assert "identified.urdf: changed after mjfim wrote it" in refused.stderr
