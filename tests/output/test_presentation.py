@@ -55,20 +55,6 @@ def test_a_figure_is_drawn_and_shown_as_png(verb: str) -> None:
     assert 300.0 < options["width"] < 1800.0
 
 
-@verbs
-def test_a_result_is_a_few_short_lines_and_can_be_saved_and_loaded(
-    verb: str, tmp_path: Path
-) -> None:
-    """In a terminal, the text of a design had 122,394 characters."""
-    record = results.MAKERS[verb]()
-    lines = repr(record).splitlines()
-    assert lines[0] == f"{type(record).__name__}("
-    assert max(map(len, lines)) < 100 and len(lines) <= 60
-
-    record.save(tmp_path)
-    assert repr(type(record).load(tmp_path)) == repr(record)
-
-
 def test_a_campaign_before_its_first_round_is_shown_in_words() -> None:
     begun = results.campaign(rounds=())
     assert "Campaign of designs and recordings" in texts(begun._repr_html_())

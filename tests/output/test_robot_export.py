@@ -20,7 +20,6 @@ from mjfim.output.export.trajectories import (
     JointTrajectory,
     RobotPlan,
     write_trajectory_yaml,
-    yaml_number,
 )
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats import read_table
@@ -77,6 +76,10 @@ def test_a_trajectory_holds_the_rows_of_the_reference(
     assert all(isinstance(n, int) and 0 <= n < 10**9 for t in times for n in t.values())
     assert any("does not end at rest" in sentence for sentence in remarks)
 
+    # In YAML 1.1 a float needs a decimal point, and its exponent a sign.
+    numbers = re.findall(r"(?<=[\[ ])-?[0-9][^,\]\s]*e[^,\]\s]*", text)
+    assert all(re.fullmatch(r"-?[0-9]+\.[0-9]*e[-+][0-9]+", number) for number in numbers)
+
     # The shell puts the file into a goal of an action.
     assert load(f"{{trajectory: {text.rstrip()}}}") == {"trajectory": found}
 
@@ -94,14 +97,6 @@ def test_rare_characters_in_names_come_back(cart: Designed, tmp_path: Path) -> N
 
     write_player(tmp_path / "play.py", plan)
     assert runpy.run_path(str(tmp_path / "play.py"))["DESIGN"]["name"] == RARE
-
-
-def test_numbers_are_floats_in_old_and_new_yaml() -> None:
-    """In YAML 1.1 a float needs a decimal point, and its exponent a sign."""
-    old = re.compile(r"[-+]?[0-9]+\.[0-9]*(e[-+][0-9]+)?")
-    for value in (0.0, -1.0, 1e-05, -2.5e-300, 1e22, 123456789.0, 0.1):
-        assert old.fullmatch(yaml_number(value))
-        assert float(yaml_number(value)) == value
 
 
 def test_servos_get_their_commands(arm: Designed, tmp_path: Path) -> None:
