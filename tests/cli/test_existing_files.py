@@ -44,26 +44,6 @@ def test_identify_does_not_replace_the_model_of_the_experiment(
     assert contents(tmp_path / "fit") == before
 
 
-@pytest.mark.usefixtures("empty_figures")
-@pytest.mark.slow
-def test_compare_keeps_controls_that_it_did_not_write(tmp_path: Path) -> None:
-    """In the folder of the experiment, whose own control has a name like a result."""
-    study = write_experiment(tmp_path, start='"control_mine.csv"')
-    (tmp_path / "cart_pendulum.csv").rename(tmp_path / "control_mine.csv")
-    (tmp_path / "control_other.csv").write_text("mine", encoding="utf-8")
-    before = contents(tmp_path)
-
-    words = ("compare", study, "-o", tmp_path, "--seconds", 1)
-    for methods in ("chirp", "steps"):
-        result = run(*words, "--methods", methods)
-        assert "wrote" in result.stderr, result.stderr
-
-    after = contents(tmp_path)
-    assert {name: after[name] for name in before} == before
-    assert "control_steps.csv" in after
-    assert "control_chirp.csv" not in after
-
-
 def test_compare_keeps_an_earlier_result_that_it_reads(study: Path, tmp_path: Path) -> None:
     """A control of an earlier comparison is the initial control now."""
     write_experiment(tmp_path, start='"control_chirp.csv"')

@@ -10,7 +10,6 @@ import pytest
 from typer.testing import Result
 
 import mjfim
-from mjfim.cli.progress import ProgressDisplay
 from mjfim.output.manifest import MANIFEST
 from tests.support.cli import (
     ESTIMATE,
@@ -22,26 +21,6 @@ from tests.support.cli import (
     run,
     write_experiment,
 )
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("empty_figures")
-def test_a_model_that_is_edited_during_the_fit_is_written_as_it_was_loaded(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    study, model = write_experiment(tmp_path), tmp_path / "cart_pendulum.xml"
-    loaded = model.read_text(encoding="utf-8")
-
-    def edit(*_: object) -> None:
-        """Save another integrator and another timestep."""
-        other = loaded.replace('timestep="0.01" integrator="RK4"', 'timestep="0.005"')
-        model.write_text(other, encoding="utf-8")
-
-    monkeypatch.setattr(ProgressDisplay, "__call__", edit)
-    done("identify", study, recorded, "-o", tmp_path / "fit")
-    assert model.read_text(encoding="utf-8") != loaded
-    option = mujoco.MjModel.from_xml_path(str(tmp_path / "fit" / "identified.xml")).opt
-    assert (option.timestep, option.integrator) == (0.01, int(mujoco.mjtIntegrator.mjINT_RK4))
 
 
 def test_identify_leaves_its_files(home: Path, identified: Result) -> None:

@@ -1,4 +1,4 @@
-"""Bad inputs: a valid study of which one thing is spoiled at random."""
+"""Bad inputs: a valid study of which one thing, or two, are spoiled at random."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow
+import pyarrow.csv
 import pyarrow.parquet
 import scipy.io
 
@@ -270,21 +271,35 @@ MODEL_VALUES = (
 MOVING = ("mass", "timestep", "damping", "gravity", "qpos", "diaginertia")
 
 
+URDF = """<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0.1 0 0"/>
+<mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>
+</link><joint name="slide" type="revolute"><parent link="base"/><child link="arm"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="5" velocity="5"/></joint></robot>"""
+
+
 def spoiled_model(rng: Rng, folder: Path) -> Call:
-    """Spoil the MJCF."""
+    """Spoil the MJCF, or give a URDF, which lacks what the experiment names."""
     file = folder / "cart_pendulum.xml"
-    refused = False
+    text, refused = file.read_text(encoding="utf-8"), False
+    is_urdf = rng.random() < 0.1
+    if is_urdf:
+        text, file = URDF, folder / "robot.urdf"
+        experiment = folder / "study.toml"
+        stated = experiment.read_text(encoding="utf-8").replace("cart_pendulum.xml", file.name)
+        experiment.write_text(stated, encoding="utf-8")
     if rng.random() < 0.2:
-        content, spoiled = spoil_bytes(rng, file.read_bytes())
-        file.write_bytes(content)
+        content, spoiled = spoil_bytes(rng, text.encode())
     else:
-        tree = ElementTree.fromstring(file.read_text(encoding="utf-8"))
+        tree = ElementTree.fromstring(text)
         spoil = pick(rng, (_set_attribute, _set_attribute, _set_attribute, _change_element))
         spoiled, refused = spoil(rng, tree)
-        file.write_bytes(ElementTree.tostring(tree))
-
+        content = ElementTree.tostring(tree)
+    if not is_urdf and rng.random() < 0.2:
+        (folder / "inner.xml").write_bytes(content)
+        content, spoiled = b'<mujoco><include file="inner.xml"/></mujoco>', f"included, {spoiled}"
+    file.write_bytes(content)
     words = pick(rng, EXPERIMENT_VERBS)
-    return Call(words=words, spoiled=f"model: {spoiled}", refused=refused)
+    return Call(words=words, spoiled=f"{file.name}: {spoiled}", refused=refused or is_urdf)
 
 
 def _set_attribute(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
@@ -333,8 +348,8 @@ def spoiled_recording(rng: Rng, folder: Path) -> Call:
     spoil = pick(
         rng,
         (
-            *(_ragged, _bad_cell, _bad_cell, _columns, _columns, _times, _rows, _booleans),
-            *(_odd_numbers, _odd_numbers, None, None),
+            *(_ragged, _bad_cell, _bad_cell, _columns, _columns, odd_times, few_rows, _booleans),
+            *(odd_numbers, odd_numbers, None, None),
         ),
     )
     spoiled, refused = ("intact", False) if spoil is None else spoil(rng, rows)
@@ -444,7 +459,7 @@ def _columns(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"column {title} {name}", refused
 
 
-def _times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def odd_times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     """Spoil the times."""
     name = pick(rng, ("shuffled", "equal", "reversed", "negative", "huge", "a gap", "text", "tiny"))
     times = [float(row[0]) for row in rows[1:]]
@@ -463,7 +478,7 @@ def _times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"times {name}", name in ("equal", "text")
 
 
-def _rows(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def few_rows(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     """Keep few rows."""
     count = int(rng.integers(4))
     del rows[1 + count :]
@@ -479,7 +494,7 @@ def _booleans(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"column {rows[0][j]} of truth values", not rows[0][j].startswith("ctrl:")
 
 
-def _odd_numbers(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def odd_numbers(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     """Write an odd number into some rows of a column or of all columns."""
     count = len(rows[0])
     columns = [int(rng.integers(count))] if rng.random() < 0.7 else list(range(count))
@@ -555,133 +570,3 @@ def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
     always = ("removed", "shorter", "flat", "NaN", "infinite", "text", "pickle")
     refused = necessary and (how in always or (name == "t" and how in ("equal", "reversed")))
     return f"array {name} {how}", refused
-
-
-# Output folders and options.
-
-
-def spoiled_output(rng: Rng, folder: Path) -> Call:
-    """Give a bad or an unusual output folder or file."""
-    (folder / "file").write_text("a file of the user\n", encoding="utf-8")
-    (folder / "locked").mkdir()
-    (folder / "locked").chmod(0o500)
-    place = pick(
-        rng,
-        (
-            "file",
-            "file/below",
-            "study.toml",
-            "design.npz",
-            "cart_pendulum.xml",
-            "run.csv",
-            ".",
-            "",
-            " ",
-            "[bold]x[/bold]",
-            "[/]",
-            "ünïcode/ö",
-            "x" * 300,
-            "a/b/c/d",
-            "/dev/null/x",
-            "/dev/full",
-            "locked/x",
-            "-",
-            "--",
-            "~",
-            "a\nb",
-            "%s{0}",
-        ),
-    )
-    words = pick(rng, WRITING_VERBS)
-    return Call(words=[*words[:-1], place], spoiled=f"output: {place[:30]!r}")
-
-
-OPTION_VALUES = ("-1", "0", "1", "nan", "inf", "1e300", "abc", "", "1.5", "99999999999999999999")
-
-OPTIONS: tuple[tuple[Sequence[str], tuple[str, ...]], ...] = (
-    (CHECK[:2], ("--threads", "--design", "--nonsense")),
-    (DESIGN[:4], ("--threads", "--starts", "--shortest", "-x")),
-    (SIMULATE, ("--seed", "--rate")),
-    (IDENTIFY, ("--method", "--held-out", "--starts")),
-    (MONTECARLO, ("--measure-rate", "--seed", "--trials")),
-    (("compare", "study.toml", "-o", "out", "--seconds", "0.1"), ("--methods", "--seconds")),
-)
-
-# Texts of `--executor` that name no executor.
-EXECUTORS = (
-    "",
-    "local:",
-    "local:0",
-    "local:-1",
-    "local:1.5",
-    "local:" + "9" * 5000,
-    "python:",
-    "python:.a:make",
-    "python:..:make",
-    "python:json:loads",
-    "python:os:nothing",
-    "dask:",
-    "dask:missing.json",
-    "dask:study.toml",
-    "dask://[::1",
-    "dask:tcp://",
-    "http://x",
-    "\u2028",
-)
-
-# Calls with options whose values name nothing, and these values.
-NOTHING: tuple[tuple[Sequence[str], tuple[str, ...]], ...] = (
-    ((*MONTECARLO, "--executor"), EXECUTORS),
-    ((*IDENTIFY, "--executor"), EXECUTORS),
-    ((*OPTIONS[-1][0], "--methods"), ("", ",", " ", " , ,")),
-)
-
-# Files that no verb can read.
-PLACES = ("missing.toml", ".", "", "design.npz", "run.csv", "/dev/null", "study.toml/x", "x" * 5000)
-
-
-def spoiled_options(rng: Rng, folder: Path) -> Call:
-    """Give a bad value of an option, a bad file, or too few or too many words."""
-    verb, options = pick(rng, OPTIONS)
-    words = list(verb)
-    how = pick(rng, ("option", "option", "file", "dropped", "further", "nothing", "nothing"))
-    if how == "nothing":
-        call, values = pick(rng, NOTHING)
-        words = [*call, pick(rng, values)]
-    elif how == "option":
-        words += [pick(rng, options), pick(rng, OPTION_VALUES)]
-    elif how == "file":
-        files = [i for i in range(1, len(words)) if "." in words[i]]
-        words[pick(rng, files)] = pick(rng, PLACES)
-    elif how == "dropped":
-        del words[int(rng.integers(len(words)))]
-    else:
-        words.append(pick(rng, ("study.toml", "", "-", "--", "--json=1")))
-    listed = " ".join(repr(word[:30]) for word in words)
-    return Call(words=words, spoiled=f"options: {listed}", refused=how in ("dropped", "nothing"))
-
-
-# What is spoiled, with the share of the cases.
-SPOILERS: tuple[tuple[Callable[[Rng, Path], Call], float], ...] = (
-    (spoiled_experiment, 0.33),
-    (spoiled_model, 0.17),
-    (spoiled_recording, 0.24),
-    (spoiled_design, 0.11),
-    (spoiled_output, 0.06),
-    (spoiled_options, 0.09),
-)
-
-
-def bad_input(rng: Rng, folder: Path) -> Call:
-    """Spoil one thing of the valid study in a folder.
-
-    Args:
-        rng: Random numbers.
-        folder: Folder with the files of the study; one of them is changed.
-
-    Returns:
-        The call that has to cope with it.
-    """
-    shares = [share for _, share in SPOILERS]
-    spoiler = SPOILERS[int(rng.choice(len(SPOILERS), p=shares))][0]
-    return spoiler(rng, folder)

@@ -21,8 +21,8 @@ from pathlib import Path
 from mjfim.files import replacing
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import LAST_SECONDS
-from tests.fuzz.bad_inputs import Call, bad_input
-from tests.fuzz.faults import fault, long_log, no_permission
+from tests.fuzz.bad_inputs import Call
+from tests.fuzz.odd_inputs import bad_input, long_log, no_permission
 from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import announce
@@ -63,7 +63,7 @@ class Ending:
 def run(case: Case, folder: Path) -> Outcome:
     """Spoil something, call the command line, and judge how it ends."""
     rng = case.rng
-    spoils = {"fault": fault, "permission": no_permission, "log": long_log}
+    spoils = {"permission": no_permission, "log": long_log}
     spoil = spoils.get(case.kind, bad_input)
     if case.kind == "permission" and not may_be_refused():
         reason = "skipped: this user may do everything"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 # Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
-KINDS = ("problem", "input", "kill", "mechanism", "fault", "permission", "log")
+KINDS = ("problem", "input", "kill", "mechanism", "permission", "log")
 
 # Time after which a case has failed [s]. It includes the time that a busy machine takes from it.
 TIME_LIMITS = {
@@ -15,7 +15,6 @@ TIME_LIMITS = {
     "input": 60.0,
     "kill": 300.0,
     "mechanism": 180.0,
-    "fault": 60.0,
     "permission": 180.0,
     "log": 600.0,
 }

@@ -14,9 +14,9 @@ import pytest
 
 from mjfim.parallel.budget import measured_by
 from tests.fuzz import bad_inputs, inputs, problems
-from tests.fuzz.faults import FAULTS, packed_bomb
 from tests.fuzz.inputs import Ending
 from tests.fuzz.mechanisms import random_mechanism
+from tests.fuzz.odd_inputs import SPOILERS, no_permission
 from tests.fuzz.outcome import Case
 from tests.fuzz.plants import Plant, Ranges, random_plant
 from tests.fuzz.player import (
@@ -39,7 +39,6 @@ SECONDS = {
     "input": 8.0,
     "kill": 12.0,
     "mechanism": 8.0,
-    "fault": 8.0,
     "permission": 8.0,
 }
 
@@ -117,8 +116,8 @@ def test_ranges_that_a_design_does_not_mention_are_noticed() -> None:
     assert omissions(mechanism, (f"ranges of {' '.join(unheld)}",)) == []
 
 
-@pytest.mark.parametrize("make", [make for make, _ in FAULTS if make is not packed_bomb])
-def test_every_fault_can_be_made(
+@pytest.mark.parametrize("make", [*SPOILERS, no_permission])
+def test_everything_can_be_spoiled(
     make: Callable[[Any, Path], bad_inputs.Call], tmp_path: Path
 ) -> None:
     """Nothing but the generator is called; it has to cope with every choice that it makes."""

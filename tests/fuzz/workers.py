@@ -43,7 +43,6 @@ def run_case(case: Case, folder: Path) -> Outcome:
         "input": inputs.run,
         "kill": kills.run,
         "mechanism": problems.run,
-        "fault": inputs.run,
         "permission": inputs.run,
         "log": inputs.run,
     }

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import mjfim
@@ -228,10 +229,10 @@ def assert_is_identified_model(path: Path, system: System, theta: Any) -> None:
         a, b = np.asarray(getattr(found, name)), np.asarray(getattr(wanted, name))
         assert a.shape == b.shape, name
         size = PRECISE * np.abs(b).max(initial=0.0)
-        np.testing.assert_allclose(a, b, rtol=PRECISE, atol=size, err_msg=name)
+        assert_allclose(a, b, rtol=PRECISE, atol=size, err_msg=name)
     for name in ("gravity", "wind", "density", "viscosity", "timestep"):
         a, b = getattr(found.opt, name), getattr(wanted.opt, name)
-        np.testing.assert_allclose(a, b, rtol=1e-15, err_msg=name)
+        assert_allclose(a, b, rtol=1e-15, err_msg=name)
     mine, theirs = inertias(found), inertias(wanted)
     sizes = PRECISE * np.trace(theirs, axis1=1, axis2=2)[:, None, None]
     assert (np.abs(mine - theirs) <= sizes).all()
@@ -315,7 +316,7 @@ def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
     second = system_of(new, tmp_path / "again", *paths)
     straight = np.array([":rot" not in p for p in paths])
     found = second.parameters.guess
-    np.testing.assert_allclose(found[straight], theta[straight], rtol=1e-12, atol=1e-13)
+    assert_allclose(found[straight], theta[straight], rtol=1e-12, atol=1e-13)
     assert write_identified(tmp_path / "again.xml", second, found) == []
     assert (tmp_path / "again.xml").read_bytes() == new.read_bytes()
 
@@ -379,29 +380,19 @@ def test_mujoco_prints_values_that_the_text_cannot_express(
     new = written(system, value, said="it is printed by MuJoCo, without comments")
     found = mujoco.MjModel.from_xml_path(str(new))
     wanted = system.model_at(np.array([value]))
-    for name in ("dof_damping", "body_pos", "body_mass", "body_inertia", "actuator_gainprm"):
-        np.testing.assert_allclose(
-            getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12
-        )
+    for name in ("dof_damping", "body_pos", "body_mass", "actuator_gainprm"):
+        assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12)
 
 
-def stiffen(spec: Any, value: float) -> None:
-    """Function of the MjSpec that is a parameter, and changes a number."""
-    spec.joint("j").armature = value
-
-
-def soften(spec: Any, value: float) -> None:
-    """Another one, which changes what no parameter path names."""
-    spec.joint("j").margin = value
-
-
-@pytest.mark.parametrize("function", [stiffen, soften])
-def test_functions_of_the_spec(function: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("attribute", "said"), [("armature", ""), ("margin", "jnt_margin")])
+def test_functions_of_the_spec(attribute: str, said: str, tmp_path: Path) -> None:
     """A text states the numbers that a function changes; MuJoCo prints other changes."""
+
+    def function(spec: Any, value: float) -> None:
+        setattr(spec.joint("j"), attribute, value)
+
     system = system_of(RICH, tmp_path, {"function": function, "guess": 0.1, "scale": 1.0})
-    said = "jnt_margin" if function is soften else ""
-    new = written(system, 0.25, said=said)
-    found = mujoco.MjModel.from_xml_path(str(new))
+    found = mujoco.MjModel.from_xml_path(str(written(system, 0.25, said=said)))
     assert same_dynamics(found, system.model_at(np.array([0.25])))
 
 
@@ -533,8 +524,8 @@ def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: 
     system = system_of(xml, tmp_path, "body/a:fullinertia[3]")
     found = mujoco.MjModel.from_xml_path(str(written(system, 0.004)))
     wanted = system.model_at(np.array([0.004]))
-    np.testing.assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
+    assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
+    assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
 
 
 def test_a_negative_mass_is_named_and_a_floor_of_the_experiment_is_left_out(tmp_path: Path) -> None:

@@ -30,8 +30,6 @@ from mjfim.records.terms import (
     Selection,
     SelectionStep,
     Term,
-    TermNumber,
-    TermTestData,
 )
 from mjfim.records.verdict import Level, Verdict
 from mjfim.studies.selected_models import possible_pools, selected_experiment
@@ -88,16 +86,6 @@ STOPPED: dict[str, Any] = {"status": Status.MAX_ITERATIONS, "improvement": 0.048
 )
 def test_the_first_next_step(verb: str, changes: dict[str, Any], words: str) -> None:
     assert words in page_of(results.MAKERS[verb](**changes)).next_steps[0]
-
-
-def test_missing_terms_say_on_how_much_of_the_data_they_were_tested() -> None:
-    tested = TermTestData(share=0.17, recordings=4, count=4)
-    estimate = results.estimate(
-        misfit=True, missing_terms=(results.missing_term(),), tested_data=tested
-    )
-    text = printed(page_of(estimate), verbose=True)
-    assert "were tested on 17 % of the data, from all 4 recordings." in text
-    assert estimate.summary()["suspects_tested"]["share"] == 0.17
 
 
 # ---- numbers and tables
@@ -215,23 +203,13 @@ def test_the_tables_to_keep_state_the_selected_experiment() -> None:
         fit={"hold": ["m2"], "bootstrap": 0},
     )
     # A number of the model, a term of the library with two parameters, a pool and held parameters.
-    places = [("friction", "N", 0.1 + 0.2), ("velocity", "rad/s", 1 / 3)]
-    stribeck = Term(
-        description="Stribeck friction of elbow",
-        numbers=tuple(
-            TermNumber(
-                name=f"stribeck_{name}",
-                path=f"term/elbow_stribeck:{name}",
-                value=0.1,
-                unit=unit,
-                scale=scale,
-            )
-            for name, unit, scale in places
-        ),
-        tables={
-            "elbow_stribeck": {"kind": "stribeck", "joint": "elbow", "values": {"velocity": 1e-5}}
-        },
+    (number,) = SLIDE_FRICTION.numbers
+    numbers = tuple(
+        replace(number, name=name, path=f"term/elbow_stribeck:{name}", unit=unit, scale=scale)
+        for name, unit, scale in (("friction", "N", 0.1 + 0.2), ("velocity", "rad/s", 1 / 3))
     )
+    table = {"kind": "stribeck", "joint": "elbow", "values": {"velocity": 1e-5}}
+    stribeck = Term(description="", numbers=numbers, tables={"elbow_stribeck": table})
     (pool,) = possible_pools(System.resolve(experiment).parameters, ("d1", "d2"))
     found = selection(
         terms=(SLIDE_FRICTION, stribeck),

@@ -76,7 +76,7 @@ def included_system(folder: Path) -> System:
 def test_every_model_is_the_one_in_memory(
     is_included: bool, system: System, tmp_path: Path
 ) -> None:
-    """Also where links stand in an included file and in a URDF, which are written for each robot."""
+    """Also where links stand in an included file and in a URDF."""
     if is_included:
         system = included_system(tmp_path)
     count = len(system.parameters)

@@ -81,7 +81,8 @@ def coarse(folder: Path) -> tuple[DesignTask, Recording]:
     noise = {**UNEQUAL, "qvel:slide": {"sigma": 0.005, "rate": 25.0}}
     chirp = {"kind": "chirp", "amplitude": 2.0, "frequency": 0.3, "frequency_end": 1.0}
     tables = {"rate": 50.0, "measure_rate": 50.0, "initial": {"control": chirp}}
-    task = DesignTask.resolve(Experiment.from_file(CART).replace(noise=noise, **tables))
+    experiment = Experiment.from_file(CART).replace(**tables).model_copy(update={"noise": noise})
+    task = DesignTask.resolve(experiment)
     return task, simulate_system(task.system, task.initial, 1)
 
 

@@ -18,7 +18,7 @@ from mjfim.arrays import Array
 from mjfim.errors import NoVideoError, RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
-from mjfim.output.film import Film, Painter, film_of, film_of_motions, film_speed, positions_at
+from mjfim.output.film import Film, film_of, film_of_motions, film_speed, positions_at
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED
 from mjfim.output.video import Video, render, report_video, require_format
 from mjfim.records.rehearsal import RobotMotions
@@ -31,16 +31,6 @@ SWING = """
 <mujoco>
   <worldbody>
     <body><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/></body>
-  </worldbody>
-</mujoco>
-"""
-
-BARE = """
-<mujoco>
-  <worldbody>
-    <body>
-      <joint type="slide"/><inertial pos="0 0 0" mass="1" diaginertia=".01 .01 .01"/>
-    </body>
   </worldbody>
 </mujoco>
 """
@@ -258,20 +248,6 @@ class TestVideo:
         change = np.abs(first - later)[40:380].max(axis=(0, 2))
         half = video.width // 2
         assert change[: half - 20].max() < 40 < change[half + 20 :].max()
-
-    @pytest.mark.slow
-    @pytest.mark.usefixtures("drawing")
-    def test_ghosts_of_bodies_without_geoms_have_their_colour(self) -> None:
-        model = mujoco.MjModel.from_xml_string(BARE)
-        away = [motion(np.linspace(0.0, 4.0, 401), np.full((401, 1), x)) for x in (0.0, 1.0)]
-        try:
-            painter = Painter(identified(model, *away), shadows=False, samples=0)
-        except NoVideoError as reason:
-            pytest.skip(f"no video here: {reason}")
-        frame = painter.frame(0)[40:-40].astype(float)
-        painter.close()
-        # Between title and foot, a measured robot is teal: more green and blue than red.
-        assert (frame[..., 1:].min(axis=2) - frame[..., 0]).max() > 25.0
 
     @pytest.mark.slow
     @pytest.mark.usefixtures("drawing")
