@@ -11,6 +11,7 @@ from unittest.mock import Mock
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
@@ -31,7 +32,7 @@ from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses,
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
 from mjfim.records.estimate_parts import InformationInTime, ResidualForce
-from mjfim.records.rehearsal import FiniteSteps, RobotMotions
+from mjfim.records.rehearsal import RobotMotions
 from mjfim.records.trajectory import Trajectory
 from tests.support import results
 from tests.support.made_motions import designed, estimated, load, simulated
@@ -104,15 +105,24 @@ def opened_rows(path: Path) -> list[list[str]]:
 
 def empty_views(path: Path) -> list[str]:
     """Origins of views below which there is nothing."""
-    found = entities(path)
-    origins = [
-        origin[0] for origin in blueprint_column(path, "ViewBlueprint:space_origin").values()
-    ]
-    return [
-        origin
-        for origin in origins
-        if not any(name == origin or name.startswith(f"{origin}/") for name in found)
-    ]
+    found = [f"{name}/" for name in entities(path)]
+    origins = blueprint_column(path, "ViewBlueprint:space_origin").values()
+    return [at for (at,) in origins if not any(name.startswith(f"{at}/") for name in found)]
+
+
+def text_of(path: Path) -> str:
+    """The summary."""
+    return str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])
+
+
+def plain_poses(model: mujoco.MjModel, qpos: Array) -> tuple[Array, Array, Array]:
+    """Positions and orientations of the bodies, and positions of the geoms, by plain MuJoCo."""
+    data, rows = mujoco.MjData(model), []
+    for data.qpos[:] in qpos:
+        mujoco.mj_kinematics(model, data)
+        rows.append((data.xpos.copy(), data.xquat.copy(), data.geom_xpos.copy()))
+    xpos, xquat, geom_xpos = (np.array(each) for each in zip(*rows, strict=True))
+    return xpos, xquat, geom_xpos
 
 
 @pytest.fixture(scope="module")
@@ -170,23 +180,21 @@ def test_accuracy_over_time_is_that_of_the_picture(file: Path, design: Design) -
         times, values = scalars(file, path)
         percent = 100.0 * design.std_over_time[:, j] / design.sizes[j]
         shown = np.isfinite(mark.y)
-        np.testing.assert_allclose(values, percent[shown])
-        np.testing.assert_allclose(times, design.trajectory.t[shown], atol=1e-9)
+        assert_allclose(values, percent[shown])
+        assert_allclose(times, design.trajectory.t[shown], atol=1e-9)
 
 
 def test_series_are_exact(file: Path, design: Design) -> None:
-    for k, (name, evaluation) in enumerate(
-        (("initial", design.initial), ("designed", design.final))
-    ):
+    for name, evaluation in (("0 initial", design.initial), ("1 designed", design.final)):
         trajectory = evaluation.trajectory
         for at, expected in (
-            (("positions", "hinge [rad]", f"{k} {name}"), trajectory.qpos[:, 1]),
-            (("velocities", "slide [m/s]", f"{k} {name}"), trajectory.qvel[:, 0]),
-            (("controls", "force [N]", f"{k} {name}"), trajectory.ctrl[:, 0]),
+            (("positions", "hinge [rad]", name), trajectory.qpos[:, 1]),
+            (("velocities", "slide [m/s]", name), trajectory.qvel[:, 0]),
+            (("controls", "force [N]", name), trajectory.ctrl[:, 0]),
         ):
             times, values = scalars(file, at)
-            np.testing.assert_allclose(values, expected)
-            np.testing.assert_allclose(times, trajectory.t[: len(expected)], atol=1e-9)
+            assert_allclose(values, expected)
+            assert_allclose(times, trajectory.t[: len(expected)], atol=1e-9)
 
 
 def test_limits_that_are_near_are_lines(file: Path) -> None:
@@ -196,16 +204,12 @@ def test_limits_that_are_near_are_lines(file: Path) -> None:
 
 
 def test_poses_are_those_of_mujoco(file: Path, cart: mujoco.MjModel, design: Design) -> None:
-    data = mujoco.MjData(cart)
-    path = ("robots", "designed", "bodies", "bob")
-    times, translation = column(file, path, "sim_time", "Transform3D:translation")
+    bob, path = cart.body("bob").id, ("robots", "designed", "bodies", "bob")
+    positions, orientations, _ = plain_poses(cart, design.trajectory.qpos)
+    _, translation = column(file, path, "sim_time", "Transform3D:translation")
     _, quaternion = column(file, path, "sim_time", "Transform3D:quaternion")
-    assert len(times) == len(design.trajectory.t)
-    for k, q in enumerate(design.trajectory.qpos):
-        data.qpos[:] = q
-        mujoco.mj_forward(cart, data)
-        np.testing.assert_allclose(translation[k, 0], data.body("bob").xpos, atol=1e-6)
-        np.testing.assert_allclose(np.roll(quaternion[k, 0], 1), data.body("bob").xquat, atol=1e-6)
+    assert_allclose(translation[:, 0], positions[:, bob], atol=1e-6)
+    assert_allclose(np.roll(quaternion[:, 0], 1, axis=1), orientations[:, bob], atol=1e-6)
 
 
 def test_the_search_is_on_the_timeline_of_iterations(file: Path) -> None:
@@ -237,20 +241,16 @@ def test_robots_beside_both_motions_are_outlines_without_static_shapes(
     for name, pair in zip(("initial", "designed"), beside, strict=True):
         for number, motion in enumerate(pair, start=1):
             root = ("robots", name, f"robot {number}", "bodies")
-            times, places = column(path, (*root, "bob"), "sim_time", "Transform3D:translation")
-            expected = body_poses(cart, motion.t, motion.qpos)
-            assert len(times) == len(motion.t)
-            bob = cart.body("bob").id
-            np.testing.assert_allclose(places[:, 0], expected.positions[:, bob], atol=1e-6)
+            _, places = column(path, (*root, "bob"), "sim_time", "Transform3D:translation")
+            expected = plain_poses(cart, motion.qpos)[0]
+            assert_allclose(places[:, 0], expected[:, cart.body("bob").id], atol=1e-6)
             # On the timeline of the iterations they would stand still in a wrong place.
             shape = (*root, "bob", "bob")
             assert not len(column(path, shape, None, "Ellipsoids3D:half_sizes")[1])
             _, fill = column(path, shape, "sim_time", "Ellipsoids3D:fill_mode")
             assert fill[0, 0] == OUTLINE.value
     assert not any("robot 1/bodies/world" in name for name in entities(path))
-    assert "Pale: two robots." in str(
-        column(path, ("summary",), None, "TextDocument:text")[1][0, 0]
-    )
+    assert "Pale: two robots." in text_of(path)
 
 
 def test_ends_of_rehearsed_robots_are_those_of_mujoco(
@@ -258,37 +258,27 @@ def test_ends_of_rehearsed_robots_are_those_of_mujoco(
 ) -> None:
     """Two robots, of which one leaves a limit; the bands are series."""
     t = np.linspace(0.0, 2.0, 30)
-    qpos = np.stack([a * np.stack([np.sin(t), np.cos(t)], axis=1) for a in (0.3, 0.6)])
+    swing = np.column_stack([np.sin(t), np.cos(t)])
+    motions = RobotMotions(robots=(7, 2), t=t, qpos=np.stack([0.3 * swing, 0.6 * swing]))
     std = np.array([0.1, 0.2])
-    steps = FiniteSteps(
-        names=design.parameters, predicted=std, std=std, length=np.ones(2), ratio=np.ones(2)
-    )
+    steps = replace(results.finite_steps(predicted=std), names=design.parameters)
     kept = results.rehearsal(steps=steps)
     margins = kept.margins.copy()
     margins[7] = -0.1
-    rehearsal = replace(kept, margins=margins, motions=RobotMotions(robots=(7, 2), t=t, qpos=qpos))
+    rehearsal = replace(kept, margins=margins, motions=motions)
     path = logged(tmp_path, cart, replace(design, rehearsal=rehearsal))
-    data = mujoco.MjData(cart)
-    for positions, name in zip(qpos, ("a limit", "no limit"), strict=True):
-        expected = []
-        for row in positions:
-            data.qpos[:] = row
-            mujoco.mj_kinematics(cart, data)
-            expected.append(data.geom_xpos[-1].copy())
+    for positions, name in zip(motions.qpos, ("a limit", "no limit"), strict=True):
+        expected = plain_poses(cart, positions)[2][:, -1]
         at = ("robots", "designed", f"robots that leave {name}")
         _, (strips,) = column(path, (*at, "paths"), None, "LineStrips3D:strips")
-        np.testing.assert_allclose(strips[0], expected, atol=1e-6)
+        assert_allclose(strips[0], expected, atol=1e-6)
         times, ends = column(path, (*at, "ends"), "sim_time", "Points3D:positions")
-        np.testing.assert_allclose(ends[:, 0], expected, atol=1e-6)
-        np.testing.assert_allclose(times * 1e-9, t, atol=1e-9)
+        assert_allclose(ends[:, 0], expected, atol=1e-6)
+        assert_allclose(1e-9 * times, t, atol=1e-9)
     fan = rehearsal.fans[0]
-    edges = [
-        scalars(path, entity)[1]
-        for entity in entities(path)
-        if entity.startswith("/robots/position") and "of" in entity.rpartition("/")[2]
-    ]
-    edges.sort(key=lambda edge: float(edge.sum()))
-    np.testing.assert_allclose(edges, fan.before)
+    below = [name for name in entities(path) if name.startswith("/robots/position")]
+    edges = [scalars(path, name)[1] for name in below if "of" in name.rpartition("/")[2]]
+    assert_allclose(sorted(edges, key=np.sum), fan.before)
 
 
 def test_in_the_view_of_both_robots_the_initial_one_is_translucent(file: Path) -> None:
@@ -301,7 +291,7 @@ def test_in_the_view_of_both_robots_the_initial_one_is_translucent(file: Path) -
 
 
 def test_the_summary_holds_outcome_warnings_and_colours(file: Path) -> None:
-    text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
+    text = text_of(file)
     assert "it violates limits (position)" in text
     assert "the two parameters are nearly confounded" in text
     assert text.rstrip().endswith("in place of the designed trajectory.")
@@ -382,12 +372,8 @@ def test_the_camera_follows_a_body_that_flies_away_except_in_the_common_view(
 def test_the_camera_follows_a_base_on_slides_that_drives_far() -> None:
     """A cart that stays near its rail is seen from where it is."""
     model = load("cart")
-    poses = [
-        body_poses(
-            model, np.arange(50.0), np.column_stack([np.linspace(0.0, way, 50), np.ones(50)])
-        )
-        for way in (1.0, 40.0)
-    ]
+    ways = (np.column_stack([np.linspace(0.0, way, 50), np.ones(50)]) for way in (1.0, 40.0))
+    poses = [body_poses(model, np.arange(50.0), qpos) for qpos in ways]
     near, far = (place_camera(model, [each], views=1, aspect=1.3) for each in poses)
     assert (near.followed, far.followed) == (None, model.body("cart").id)
 
@@ -436,18 +422,18 @@ def test_a_mesh_keeps_the_compiled_vertices_and_flat_normals(zoo_file: Path) -> 
     triangles = static(zoo_file, "Mesh3D:triangle_indices", "rock", "rock").reshape(-1, 3)
     assert triangles.shape == (4, 3)
     assert len(vertices) == len(np.unique(triangles))
-    corners = {tuple(np.round(v, 6)) for v in vertices}
-    assert corners == {tuple(np.round(v, 6)) for v in model.mesh_vert.astype(float)}
+    expected = model.mesh_vert[np.lexsort(model.mesh_vert.T)]
+    assert_allclose(vertices[np.lexsort(vertices.T)], expected, atol=1e-6)
 
 
 def test_a_height_field_has_heights_where_mujoco_has_them(zoo_file: Path) -> None:
     vertices = static(zoo_file, "Mesh3D:vertex_positions", "world", "hills")
-    model, data = load("zoo"), mujoco.MjData(load("zoo"))
+    model = load("zoo")
+    data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for x, y, z in vertices:
-        start = np.array([0.99 * x, 1.0 + 0.99 * y, 2.0])
-        down, geom = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
-        hit = mujoco.mj_ray(model, data, start, down, None, 1, -1, geom)
+        start, down = np.array([0.99 * x, 1.0 + 0.99 * y, 2.0]), np.array([0.0, 0.0, -1.0])
+        hit = mujoco.mj_ray(model, data, start, down, None, 1, -1, np.zeros(1, np.int32))
         assert 2.0 - hit == pytest.approx(z, abs=0.02)
 
 
@@ -460,12 +446,12 @@ def test_capsules_sticks_fixed_bodies_and_planes(zoo_file: Path) -> None:
     to_middle = np.empty(3)
     mujoco.mju_rotVecQuat(to_middle, np.array([0.0, 0.0, 0.25]), model.geom_quat[limb])
     begin = static(zoo_file, "Transform3D:translation", "a/b c", "limb")[0]
-    np.testing.assert_allclose(begin + to_middle, model.geom_pos[limb], atol=1e-7)
+    assert_allclose(begin + to_middle, model.geom_pos[limb], atol=1e-7)
 
     stick = static(zoo_file, "Capsules3D:lengths", "bare", "stick 6")[0]
     assert stick == pytest.approx(np.hypot(0.3, 0.5))
     fixed = static(zoo_file, "Transform3D:translation", "fixed")[0]
-    np.testing.assert_allclose(fixed, [0, -1, 0])
+    assert_allclose(fixed, [0, -1, 0])
     board = static(zoo_file, "Mesh3D:vertex_positions", "world", "floor")
     assert np.abs(board).max() == pytest.approx(INFINITE_REACH * model.stat.extent, rel=1e-6)
 
@@ -475,10 +461,8 @@ def test_capsules_sticks_fixed_bodies_and_planes(zoo_file: Path) -> None:
 
 def estimate_of(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
     """A hand-made estimate with a held-out recording."""
-    made = replace(estimated(model, trajectory), sigma={"qpos:slide": 0.01, "hinge_angle": 0.01})
-    errors = PredictionErrors(
-        name="held.csv", outputs=("qpos:slide", "hinge_angle"), rms=np.ones(2), mae=np.ones(2)
-    )
+    made, outputs = estimated(model, trajectory), ("qpos:slide", "hinge_angle")
+    errors = PredictionErrors(name="held.csv", outputs=outputs, rms=np.ones(2), mae=np.ones(2))
     held = Prediction(
         name="held.csv",
         identified=errors,
@@ -488,7 +472,7 @@ def estimate_of(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
         identified_outputs=made.predicted[0],
         nominal_outputs=1.1 * made.predicted[0],
     )
-    return replace(made, predictions=(held,))
+    return replace(made, sigma=dict.fromkeys(outputs, 0.01), predictions=(held,))
 
 
 def logged_estimate(
@@ -513,7 +497,7 @@ def test_outputs_and_residuals_of_every_recording(cart: mujoco.MjModel, tmp_path
         )
         values = scalars(path, measured)[1]
         y = estimate.recordings[0].y[:, 0]
-        np.testing.assert_allclose(values, y[np.isfinite(y)])
+        assert_allclose(values, y[np.isfinite(y)])
 
     fills = [
         column(path, ("robots", name, "bodies", "bob", "bob"), None, "Ellipsoids3D:fill_mode")[1][
@@ -555,8 +539,8 @@ def test_ribbons_are_curves_over_time_and_residual_torques_are_planes(
     first = entity_path(("information [% per s]", "run 0")) + "/0"
     (curve,) = (name for name in entities(path) if name.startswith(first))
     times, values = scalars(path, curve)
-    np.testing.assert_allclose(values, np.array([25.0, 75.0]) * 2.0 / end)
-    np.testing.assert_allclose(times, [0.0, 0.5 * end], atol=1e-6)
+    assert_allclose(values, np.array([25.0, 75.0]) * 2.0 / end)
+    assert_allclose(times, [0.0, 0.5 * end], atol=1e-6)
     plane = entity_path(("residual torque", "slide [N] over speed [m/s]"))
     assert any(name.startswith(plane) for name in entities(path))
 

@@ -152,8 +152,7 @@ def test_the_verb_replaces_its_own_dataset(cart: Designed, tmp_path: Path) -> No
         done(*words, "-o", tmp_path / "set")
     assert described(tmp_path / "set")["total_frames"] == 401
 
-    info = tmp_path / "set" / "meta" / "info.json"
-    info.write_text("{}", encoding="utf-8")
+    (tmp_path / "set" / "meta" / "info.json").write_text("{}", encoding="utf-8")
     misused(run(*words, "-o", tmp_path / "set"), "info.json", "--force")
     misused(run(*words, "-o", tmp_path / "set2", "--unit", "turn"), "--unit: unknown unit 'turn'")
 

@@ -56,25 +56,23 @@ def saved_fields(record: Any) -> list[str]:
     return [each.name for each in dataclasses.fields(record) if each.metadata.get("saved", True)]
 
 
-def assert_same(left: Any, right: Any, path: str = "record") -> None:
-    """Compare two records field by field; arrays bit by bit."""
-    assert type(left) is type(right), path
-    if isinstance(left, np.ndarray):
-        assert left.dtype == right.dtype and left.shape == right.shape, path
-        assert left.tobytes() == right.tobytes(), path
-    elif dataclasses.is_dataclass(left):
-        for name in saved_fields(left):
-            assert_same(getattr(left, name), getattr(right, name), f"{path}.{name}")
-    elif isinstance(left, tuple):
-        assert len(left) == len(right), path
-        for i, (a, b) in enumerate(zip(left, right, strict=True)):
-            assert_same(a, b, f"{path}[{i}]")
-    elif isinstance(left, dict):
-        assert list(left) == list(right), path
-        for key in left:
-            assert_same(left[key], right[key], f"{path}[{key!r}]")
-    else:
-        assert left == right or (left != left and right != right), path
+def canonical(value: Any) -> Any:
+    """Types and values of a record, field by field; arrays and numbers bit by bit."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if dataclasses.is_dataclass(value):
+        fields = {name: canonical(getattr(value, name)) for name in saved_fields(value)}
+        return type(value), fields
+    if isinstance(value, tuple):
+        return tuple(map(canonical, value))
+    if isinstance(value, dict):
+        return [(key, canonical(entry)) for key, entry in value.items()]
+    return type(value), repr(value)
+
+
+def assert_same(left: Any, right: Any) -> None:
+    """Compare two records."""
+    assert canonical(left) == canonical(right)
 
 
 # ---- values that files spoil easily
