@@ -123,18 +123,13 @@ TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", ["above", "stated"])
-def test_a_urdf_of_a_ros_package_becomes_a_file_that_validate_accepts(
-    place: str, tmp_path: Path
-) -> None:
+def test_a_urdf_of_a_ros_package_becomes_a_file_that_validate_accepts(tmp_path: Path) -> None:
     """The written MJCF finds the meshes, and has the motors and the mesh of the URDF."""
-    package = tmp_path / ("arm_description" if place == "above" else "elsewhere")
+    package, urdf = tmp_path / "elsewhere", tmp_path / "arm.urdf"
     (package / "meshes").mkdir(parents=True)
     (package / "meshes" / "a.obj").write_text(TETRAHEDRON, encoding="utf-8")
-    urdf = tmp_path / "arm_description" / "urdf" / "arm.urdf"
-    urdf.parent.mkdir(parents=True)
     urdf.write_text(PACKAGED, encoding="utf-8")
-    words = ["--package", f"arm_description={package}"] if place == "stated" else []
+    words = ("--package", f"arm_description={package}")
     file = tmp_path / "first" / "arm.toml"
     file.parent.mkdir()
     done("init", urdf, "-o", file, *words)
@@ -145,41 +140,11 @@ def test_a_urdf_of_a_ros_package_becomes_a_file_that_validate_accepts(
     assert (model.nu, model.nmesh, model.actuator("shoulder").ctrlrange[1]) == (1, 1, 9.0)
 
 
-# Three joints and a light wrist, with the motors of a small arm.
-WRIST = """
-<mujoco>
-  <compiler autolimits="true"/>
-  <default><joint axis="0 1 0" range="-120 120" damping="0.5"/></default>
-  <worldbody><geom type="plane" size="2 2 1"/>
-    <body name="upper" pos="0 0 1"><joint name="shoulder"/>
-      <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.03" mass="2"/>
-      <body name="fore" pos="0 0 0.3"><joint name="elbow"/>
-        <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="1"/>
-        <body name="wrist_3" pos="0 0 0.3"><joint name="roll" axis="0 0 1"/>
-          <geom type="capsule" fromto="0 0 0 0.02 0 0.05" size="0.01" mass="0.05"/>
-        </body></body></body></worldbody>
-  <actuator><motor name="shoulder" joint="shoulder" ctrlrange="-60 60"/>
-    <motor name="elbow" joint="elbow" ctrlrange="-30 30"/>
-    <motor name="roll" joint="roll" ctrlrange="-5 5"/></actuator>
-</mujoco>
-"""
-
-
-@pytest.mark.slow
-def test_the_load_that_is_asked_for_is_an_unknown_of_a_size_that_the_motors_lift(
-    tmp_path: Path,
-) -> None:
-    model, file = tmp_path / "arm.xml", tmp_path / "arm.toml"
-    model.write_text(WRIST, encoding="utf-8")
-    done("init", model, "-o", file, "--payload", "wrist_3")
+def test_the_load_that_is_asked_for_is_an_unknown(tmp_path: Path) -> None:
+    model, file = MODELS / "two_joint_arm.xml", tmp_path / "arm.toml"
+    done("init", model, "-o", file, "--payload", "fore")
     payload = tomllib.loads(file.read_text("utf-8"))["parameters"]["payload"]
-    [target] = payload["targets"]
-    assert target == {"path": "body/wrist_3:mass", "offset": 0.05}
-    # 5 % of what the shoulder holds at the length of the arm, which may be bent.
-    assert payload["scale"] == pytest.approx(0.05 * 60.0 / (9.81 * 0.6), rel=0.2)
-    done("validate", file)
-
-    # Not any body can carry a load.
+    assert payload["targets"][0]["path"] == "body/fore:mass"
     misused(run("init", model, "-o", tmp_path / "b.toml", "--payload", "hand"), "unknown body")
     assert not (tmp_path / "b.toml").exists()
 

@@ -23,9 +23,8 @@ from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import NOTHING_SENTENCE
-from mjfim.records.events import FitEvent, StudyEvent
+from mjfim.records.events import FitEvent
 from mjfim.studies import check as study_check
-from mjfim.studies import monte_carlo as trials
 from tests.support.cli import (
     DESIGN,
     ESTIMATE_DATA,
@@ -104,35 +103,6 @@ def test_presses_while_robots_are_drawn_keep_the_fit(
     assert (result.exit_code, type(result.exception)) == (1, SystemExit)
     assert names(tmp_path / "fit") == {*ESTIMATE_DATA, MANIFEST}
     assert "no robots were drawn, because the run was interrupted" in result.stderr
-
-
-@pytest.mark.usefixtures("empty_figures")
-def test_a_press_during_trials_keeps_those_that_are_done(
-    study: Path, archived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """12 trials are stepped in chunks of 4; the press comes in the second or third one."""
-    monkeypatch.setattr(trials, "MIN_CHUNK", 4)
-    show = ProgressDisplay.__call__
-
-    def press_once(display: ProgressDisplay, event: StudyEvent) -> None:
-        show(display, event)
-        if event.share > 0.5 and not pressed:
-            pressed.append(event.part)
-            interrupt()
-
-    pressed: list[str] = []
-    monkeypatch.setattr(ProgressDisplay, "__call__", press_once)
-    out = tmp_path / "mc"
-    result = run("montecarlo", study, archived, "-o", out, "--trials", 12)
-    assert (result.exit_code, type(result.exception)) == (1, SystemExit)
-    assert pressed == ["initial"]
-
-    data = read(out / "montecarlo.json")
-    done = data["initial"]["trials"]
-    assert done in (4, 8)
-    assert "final" not in data
-    assert f"interrupted; only {done} of 12 trials of initial are finished" in result.stderr
-    assert mjfim.MonteCarloStudy.load(out).sets["initial"].trials == done
 
 
 @pytest.mark.usefixtures("empty_figures")

@@ -417,13 +417,14 @@ def odd_name(rng: Rng, folder: Path) -> Call:
     """Inputs and outputs with odd names; nothing else is wrong, so that they must work."""
     name = str(pick(rng, ODD_NAMES))
     if rng.random() < 0.5:
+        name = name.replace("/", "_")
         shutil.move(folder / "study.toml", folder / f"{name}.toml")
         shutil.move(folder / "run.csv", folder / f"{name}.csv")
         words = ["identify", f"./{name}.toml", f"./{name}.csv", "-o", f"./{name} out"]
         return Call(words=words, spoiled=f"files {name[:20]!r}", accepted=True)
 
     files = list(folder.iterdir())
-    (folder / name).mkdir()
+    (folder / name).mkdir(parents=True)
     for file in files:
         shutil.move(file, folder / name)
     words = ["identify", f"./{name}/study.toml", f"./{name}/run.csv", "-o", f"./{name}/out"]
