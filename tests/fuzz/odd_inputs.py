@@ -307,13 +307,11 @@ def long_log(rng: Rng, folder: Path) -> Call:
     cells = np.array([[float(cell or "nan") for cell in row] for row in rows]).round(3)
     columns = {name: np.resize(cells[:, i], LONG_ROWS) for i, name in enumerate(header)}
     columns["t"] = 0.01 * np.arange(LONG_ROWS)
-    name = str(pick(rng, ("log.csv", "log.npz", "log.parquet")))
+    name = str(pick(rng, ("log.csv", "log.npz")))
     if name == "log.npz":
         np.savez(folder / name, **columns)
-    elif name == "log.csv":
-        pyarrow.csv.write_csv(pyarrow.table(columns), folder / name)
     else:
-        pyarrow.parquet.write_table(pyarrow.table(columns), folder / name)
+        pyarrow.csv.write_csv(pyarrow.table(columns), folder / name)
     spoiled = f"{name}: {LONG_ROWS} rows"
     if rng.random() < 0.5:
         spoiled += ", a window of 1 s"

@@ -554,9 +554,12 @@ def test_the_viewer_is_opened_or_says_why_not(
     with pytest.raises(RecordingError, match="there is no Rerun recording"):
         show(tmp_path / "none.rrd")
     expired = Mock(side_effect=subprocess.TimeoutExpired("rerun", 1.0))
-    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: Mock(wait=expired))
+    viewer = Mock(return_value=Mock(wait=expired))
+    monkeypatch.setattr(subprocess, "Popen", viewer)
     show(file)
-    ended = Mock(wait=Mock(return_value=1))
-    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: ended)
+    # Python does not search for the viewer in the current folder.
+    command = viewer.call_args.args[0]
+    assert "-P" in command[: command.index("-m")]
+    viewer.return_value.wait = Mock(return_value=1)
     with pytest.raises(MjfimError, match="ended with code 1"):
         show(file)

@@ -125,8 +125,3 @@ def test_tables_of_large_models_are_printed_in_seconds() -> None:
     begin = time.process_time()
     assert "p59999" in printed(page_with(rows_table(60_000)), 80, verbose=True)
     assert time.process_time() - begin < 10.0
-
-
-def test_lines_to_be_copied_are_printed_as_they_are() -> None:
-    listing = Listing("Copy", ("[fit]\nhold = ['m']",), code=True)
-    assert "  [fit]\n  hold = ['m']" in printed(page_with(listing), 80)
