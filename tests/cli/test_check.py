@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from numpy.testing import assert_allclose
 from typer.testing import Result
 
 from mjfim.output.manifest import MANIFEST
@@ -108,11 +109,11 @@ def test_designs_and_recordings_are_checked(study: Path, archived: Path, recorde
 
     design = loads(run("check", study, "--design", archived, "--json").stdout)
     assert design["source"] == "the given trajectory"
-    np.testing.assert_allclose([row["std"] for row in design["parameters"]], sigma, rtol=1e-4)
+    assert_allclose([row["std"] for row in design["parameters"]], sigma, rtol=1e-4)
 
     recording = loads(run("check", study, recorded, "--json").stdout)
     assert recording["source"] == "1 recording"
-    np.testing.assert_allclose([row["std"] for row in recording["parameters"]], sigma, rtol=1e-4)
+    assert_allclose([row["std"] for row in recording["parameters"]], sigma, rtol=1e-4)
 
 
 def test_without_locks_between_processes_one_process_does_the_work(

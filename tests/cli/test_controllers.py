@@ -69,9 +69,7 @@ def test_an_estimate_says_which_laws_were_in_the_loop(stated: Path, tmp_path: Pa
     assert [law["actuator"] for law in found["controllers"]] == ["shoulder", "elbow"]
     assert found["controllers"][0]["numbers"]["kp"] == pytest.approx(60.0, abs=1.0)
     loaded = mjfim.Estimate.load(folder)
-    assert loaded.controllers[0].clipped >= 0.0
-    assert loaded.motion is not None
-    assert loaded.motion.ctrl.shape[1] == 2
+    assert loaded.motion is not None and loaded.motion.ctrl.shape[1] == 2
     assert "law in the loop" in (folder / "report.html").read_text()
 
 

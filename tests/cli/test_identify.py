@@ -100,7 +100,8 @@ def test_drawn_robots(study: Path, recorded: Path, tmp_path: Path) -> None:
     misused(run(*words, "--samples", 2), "robot_0002.xml: changed after mjfim wrote it")
     done(*words, "--samples", 2, "--seed", 7, "--force")
     assert names(out / "samples") - {MANIFEST} == {"robot_0001.xml", "robot_0002.xml"}
-    assert (out / "samples.csv").read_text(encoding="utf-8").splitlines() == first.splitlines()[:3]
+    second = (out / "samples.csv").read_text(encoding="utf-8")
+    assert first.startswith(second)
 
     # Without the option, nothing of them remains.
     done(*words)

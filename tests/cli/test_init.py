@@ -6,7 +6,6 @@ import json
 import tomllib
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 from typer.testing import Result
@@ -14,6 +13,7 @@ from typer.testing import Result
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
+from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.cli import MODELS, done, loads, misused, names, run
 
 
@@ -50,15 +50,9 @@ def test_a_model_and_an_experiment_in_the_place_of_the_other(tmp_path: Path) -> 
 @pytest.mark.slow
 def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
     """The experiment file reads the log as it is, and the next command fits it."""
-    model = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(0)
-    rows = []
-    for _ in range(round(4.0 / model.opt.timestep)):
-        data.ctrl[:] = 2.0 * np.sin(4.0 * data.time)
-        slide, hinge = data.qpos + 1e-3 * rng.standard_normal(2)
-        rows.append((1e3 * data.time, data.ctrl[0], slide, np.degrees(hinge)))
-        mujoco.mj_step(model, data)
+    (recorded,) = logs_of(cart_pendulum(), 0)
+    slide, hinge = recorded.y[:-1, :2].T
+    rows = np.column_stack([1e3 * recorded.t[:-1], recorded.ctrl, slide, np.degrees(hinge)])
     lines = ("; ".join(f"{x:.9f}".replace(".", ",") for x in row) for row in rows)
     log = tmp_path / "robot.csv"
     log.write_text("\n".join(("time [ms]; force_cmd; x_slide; hinge [deg]", *lines)), "utf-8")
@@ -67,17 +61,11 @@ def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
     result = done("init", MODELS / "cart_pendulum.xml", "--log", log, "-o", file)
     assert result.stdout.strip() == f"next: mjfim identify {file} {log}"
     stated = tomllib.loads(file.read_text(encoding="utf-8"))["recording"]
-    assert stated == {
-        "time": "time",
-        "columns": {
-            "ctrl:force": "force_cmd",
-            "slide_position": "x_slide",
-            "hinge_angle": "hinge",
-        },
-    }
+    columns = {"ctrl:force": "force_cmd", "slide_position": "x_slide", "hinge_angle": "hinge"}
+    assert stated == {"time": "time", "columns": columns}
     read = read_recording(log, System.resolve(Experiment.from_file(file)).channels)
     shown = np.column_stack([1e3 * read.t, read.y[:, 0], np.degrees(read.y[:, 1])])
-    assert np.allclose(shown, np.array(rows)[:, [0, 2, 3]], rtol=0, atol=1e-6)
+    assert np.allclose(shown, rows[:, [0, 2, 3]], rtol=0, atol=1e-6)
     assert run("identify", file, log, "-o", tmp_path / "fit").exit_code in (0, 1)
 
 

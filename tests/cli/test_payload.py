@@ -47,11 +47,7 @@ def test_a_payload_is_said_and_written(tmp_path: Path) -> None:
     assert payload["edge"] in (None, 0.1)
     assert '<body name="payload"' in (out / "identified.xml").read_text(encoding="utf-8")
 
-    # The report is made again from the files alone.
-    before = (out / "report.html").read_bytes()
-    assert "The payload at bob" in before.decode()
-    done("report", out)
-    assert (out / "report.html").read_bytes() == before
+    assert "The payload at bob" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_misuse_is_one_message(tmp_path: Path) -> None:

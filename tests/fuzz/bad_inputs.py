@@ -163,7 +163,6 @@ def leaves(value: Any, path: Key = ()) -> list[Key]:
 
 
 def at(value: Any, path: Key) -> Any:
-    """The part of a value at a path."""
     for key in path:
         value = value[key]
     return value
@@ -479,7 +478,6 @@ def odd_times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
 
 
 def few_rows(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
-    """Keep few rows."""
     count = int(rng.integers(4))
     del rows[1 + count :]
     return f"{count} rows", count < 2
@@ -526,7 +524,6 @@ def spoiled_design(rng: Rng, folder: Path) -> Call:
 
 
 def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
-    """Spoil one array of an npz file."""
     with np.load(file, allow_pickle=False) as loaded:
         arrays = {name: loaded[name] for name in loaded.files}
     name = pick(rng, ["t", "qpos", "qvel", "ctrl", *sorted(arrays)])

@@ -158,7 +158,6 @@ class _Builder:
         )
 
     def _attributes(self, joint: Joint) -> dict[str, str]:
-        """Attributes of a joint."""
         rng = self.rng
         if joint.is_scalar:
             attributes = joint_attributes(rng, joint, self.ranges)

@@ -139,7 +139,6 @@ def by_coordinate(stated: dict[str, Any]) -> dict[str, Any]:
 
 
 def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
-    """Tables of a random experiment file for a plant."""
     substeps = int(rng.choice([1, 2, 4, 5]))
     sample = substeps * plant.timestep
     horizon = int(rng.integers(20, 60)) * sample
@@ -200,7 +199,6 @@ def _state_some(
     wanted: dict[str, Any],
     chances: tuple[float, ...],
 ) -> None:
-    """State each limit of a joint or an actuator with a chance."""
     for (kind, value), chance in zip(wanted.items(), chances, strict=True):
         if rng.random() < chance:
             stated = value if isinstance(value, tuple) else float(value)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import errno
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -145,27 +145,12 @@ def test_json_holds_the_documented_keys(folder: Path, design: Design) -> None:
     assert (folder / data["experiment"]).resolve() == MODELS / "cart_pendulum.toml"
 
 
-@pytest.mark.slow
-def test_json_names_nuisance_parameters_and_priors(tmp_path: Path) -> None:
-    """The information contains the prior, which is also written so that it can be subtracted."""
-    known = DesignTask.resolve(
-        cart_pendulum(
-            horizon=0.4,
-            parameters={"m": {"prior": 0.5}, "c": {"nuisance": True}},
-            nuisance={"delay": 0.1, "initial": 0.2},
-            descent={"max_iterations": 0},
-            rehearsal={"robots": 0},
-        )
-    )
-    archive.write_design(tmp_path, design_task(known), known.system)
-    data = strict_json((tmp_path / "design.json").read_text(encoding="utf-8"))
-    starts = [f"initial {kind}:{name}" for kind in ("qpos", "qvel") for name in ("slide", "hinge")]
-    assert data["parameters"] == ["m", "l", "c", *starts, "delay"]
-    assert data["nuisance"] == ["c", *starts, "delay"]
-    prior = np.diag([4.0, 0.0, 0.0, *[25.0] * 4, 100.0])
-    np.testing.assert_allclose(data["prior"], prior, rtol=1e-12)
-    left = np.array(data["final"]["information"]) - np.array(data["prior"])
-    assert np.linalg.eigvalsh(left)[0] > -1e-8 * np.linalg.eigvalsh(left)[-1]
+def test_json_names_nuisance_parameters_and_priors() -> None:
+    """The prior, which the information contains, is written so that it can be subtracted."""
+    prior = np.diag([4.0, 0.0, 0.0])
+    summary = results.design(nuisance=("damping",), prior=prior).summary()
+    data = strict_json(as_json(summary))
+    assert (data["nuisance"], data["prior"]) == (["damping"], prior.tolist())
 
 
 def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
@@ -187,8 +172,8 @@ def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
 
 def test_json_has_no_nan(design: Design) -> None:
     """Infinite and undefined numbers become null."""
-    blank = dataclasses.replace(design.final, std=np.array([np.inf, np.nan, 1.0]), cost=np.inf)
-    text = as_json(dataclasses.replace(design, final=blank, slope=float("nan")).summary())
+    blank = replace(design.final, std=np.array([np.inf, np.nan, 1.0]), cost=np.inf)
+    text = as_json(replace(design, final=blank, slope=float("nan")).summary())
     data = strict_json(text)
     assert data["final"]["std"] == [None, None, 1.0]
     assert (data["final"]["cost"], data["slope"]) == (None, None)
@@ -255,7 +240,7 @@ def test_wrong_arrays_are_refused(
 def test_designs_at_another_rate_are_refused(folder: Path, task: DesignTask) -> None:
     path, curve = folder / "design.npz", archive.read_design(folder / "design.npz")["final"]
     check_fits(path, curve, task.system)
-    slow = dataclasses.replace(curve, t=2 * curve.t)
+    slow = replace(curve, t=2 * curve.t)
     with pytest.raises(RecordingError, match=r"sampled at 50 Hz, the experiment at 100 Hz"):
         check_fits(path, slow, task.system)
 
@@ -347,7 +332,7 @@ def half_written(*args: Any, **kwargs: Any) -> None:
 
 def write_all(folder: Path, design: Design, task: DesignTask) -> None:
     """Write a design, a picture and a view of it."""
-    archive.write_design(folder, dataclasses.replace(design, seconds=1.0), task.system)
+    archive.write_design(folder, replace(design, seconds=1.0), task.system)
     draw.save(Figure(), folder / "accuracy.png")
     log_design(folder / "design.rrd", task.system.model, design, design.labels)
 
@@ -386,7 +371,7 @@ def test_recording_round_trip(recording: Recording, task: DesignTask, tmp_path: 
     extreme = np.array([5e-324, 1e-300, 0.1 + 0.2, -1.2345678901234567e150])
     y = np.array(recording.y)
     y[0] = extreme
-    recording = dataclasses.replace(recording, y=y)
+    recording = replace(recording, y=y)
     archive.write_recording(path, recording, task.system)
     text = path.read_text(encoding="utf-8")
     assert next(csv.reader(text.splitlines())) == ["t", "ctrl:force", *task.system.outputs.names]

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
@@ -88,11 +89,11 @@ def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: P
     path, _ = written(task, tmp_path)
     nx, rows = task.space.nx, table(path)
     states, used, plan = closed_loop(path, tmp_path, np.zeros(nx))
-    np.testing.assert_allclose(states, plan, rtol=0, atol=1e-9)
+    assert_allclose(states, plan, rtol=0, atol=1e-9)
     assert len(plan) == round(task.experiment.horizon * FINE[kind]) + 1
     times = len(used) // len(task.initial.ctrl)
-    np.testing.assert_allclose(used, np.repeat(task.initial.ctrl, times, axis=0), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(rows["t"], np.arange(len(plan)) / FINE[kind], rtol=0, atol=1e-12)
+    assert_allclose(used, np.repeat(task.initial.ctrl, times, axis=0), rtol=0, atol=1e-9)
+    assert_allclose(rows["t"], np.arange(len(plan)) / FINE[kind], rtol=0, atol=1e-12)
     assert np.isnan(starting(rows, "ctrl:")[-1]).all()
     assert np.isnan(starting(rows, "gain:")[-1]).all()
 
@@ -103,7 +104,7 @@ def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: P
     model = task.plant.model(task.theta)
     reference = np.array(task.initial.state)
     expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, gains(task))
-    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
+    assert_allclose(states, expected, rtol=0, atol=1e-9)
     assert np.abs(used - task.initial.ctrl).max() > 1e-3
 
 
@@ -137,7 +138,7 @@ def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
         data.qpos[:], data.qvel[:], data.act[:] = task.space.split(played.state[k])
         data.ctrl[:] = played.ctrl[min(k, len(played.ctrl) - 1)]
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(force[k], data.qfrc_actuator, rtol=1e-9, atol=1e-12)
+        assert_allclose(force[k], data.qfrc_actuator, rtol=1e-9, atol=1e-12)
         before = played.state[k, nq : nq + nv]
         if k == len(played.ctrl):
             # The last row has the acceleration of the last engine step.
@@ -146,7 +147,7 @@ def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
             before = data.qvel.copy()
         mujoco.mj_step(model, data)
         change = (data.qvel - before) / model.opt.timestep
-        np.testing.assert_allclose(qacc[k], change, rtol=1e-6, atol=1e-6)
+        assert_allclose(qacc[k], change, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : task.space.nq])
 
 

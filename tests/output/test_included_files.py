@@ -6,13 +6,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
 from mjfim.errors import ModelError
 from mjfim.output.export.mjcf import identified_files, write_identified
-from tests.output.test_mjcf import assert_is_identified_model, changes, system_of
+from tests.output.test_mjcf import assert_is_identified_model, changes, compiled, system_of
 from tests.support.contents import contents
 
 # A robot of five files: settings with defaults, an arm in the tree, and inside it a hand, all in
@@ -164,20 +163,26 @@ def test_a_copy_can_be_identified_again(robot: Path, tmp_path: Path) -> None:
     beside = first.with_name("other.xml")
     assert write_identified(beside, again, np.array([0.06])) == []
     assert (first.parent / "other_identified_hand.xml").is_file()
-    assert mujoco.MjModel.from_xml_path(str(first)).joint("finger").damping[0] == 0.05
+    assert compiled(first).joint("finger").damping[0] == 0.05
+
+
+PART = """<mujocoinclude>
+  <body name="b#"><joint name="j#" damping="1"/><geom size="0.1"/></body>
+</mujocoinclude>"""
+ROBOT_OF_PARTS = """<mujoco>
+  <worldbody><include file="%s"/><include file="%s"/><include file="%s"/></worldbody>
+  <actuator><motor joint="j0"/></actuator>
+</mujoco>"""
 
 
 def test_names_do_not_collide(tmp_path: Path) -> None:
     """Two included files have one name, and a third has the name of a copy."""
     names = ("a/part.xml", "b/part.xml", "identified_part_2.xml")
-    body = '<mujocoinclude><body name="b{0}"><joint name="j{0}" damping="1"/><geom size="0.1"/>'
     for i, name in enumerate(names):
         (tmp_path / name).parent.mkdir(exist_ok=True)
-        text = f"{body.format(i)}</body></mujocoinclude>"
+        text = PART.replace("#", str(i))
         (tmp_path / name).write_text(text, encoding="utf-8")
-    parts = "".join(f'<include file="{name}"/>' for name in names)
-    motor = '<actuator><motor joint="j0"/></actuator>'
-    xml = f"<mujoco><worldbody>{parts}</worldbody>{motor}</mujoco>"
+    xml = ROBOT_OF_PARTS % names
     (tmp_path / "model.xml").write_text(xml, encoding="utf-8")
     paths = (f"joint/j{i}:damping" for i in range(3))
     system = system_of(tmp_path / "model.xml", tmp_path, *paths)
@@ -204,7 +209,7 @@ def test_nothing_is_left_where_the_text_cannot_express_the_value(
     (said,) = write_identified(new, system, np.array([0.25, 0.02]))
     assert "printed by MuJoCo" in said
     assert os.listdir(new.parent) == ["identified.xml"]
-    model = mujoco.MjModel.from_xml_path(str(new))
+    model = compiled(new)
     assert model.body("hand").pos[0] == 0.25
 
 

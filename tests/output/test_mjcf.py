@@ -198,6 +198,11 @@ def system_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> Sy
     return System.resolve(mjfim.Experiment(model=str(path), rate=500.0, parameters=given, **tables))
 
 
+def compiled(path: Path) -> Any:
+    """The compiled model of a file."""
+    return mujoco.MjModel.from_xml_path(str(path))
+
+
 def elements(path: Path) -> list[str]:
     """Start tags and comments of a text, with one blank between words and one kind of quotes."""
     text = path.read_text(encoding="utf-8").replace("'", '"')
@@ -221,7 +226,7 @@ def written(system: System, *theta: float, said: str = "") -> Path:
 
 def assert_is_identified_model(path: Path, system: System, theta: Any) -> None:
     """Assert that the file is the identified model, to 1e-12 of each array's largest number."""
-    found = mujoco.MjModel.from_xml_path(str(path))
+    found = compiled(path)
     wanted = system.model_at(np.asarray(theta, float), at_keyframe=False)
     for name in dir(found):
         if not name.startswith(DYNAMICS) or name.startswith(NO_DYNAMICS):
@@ -378,7 +383,7 @@ def test_mujoco_prints_values_that_the_text_cannot_express(
     system = system_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
     value = 0.6 + 1e-9
     new = written(system, value, said="it is printed by MuJoCo, without comments")
-    found = mujoco.MjModel.from_xml_path(str(new))
+    found = compiled(new)
     wanted = system.model_at(np.array([value]))
     for name in ("dof_damping", "body_pos", "body_mass", "actuator_gainprm"):
         assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12)
@@ -392,7 +397,7 @@ def test_functions_of_the_spec(attribute: str, said: str, tmp_path: Path) -> Non
         setattr(spec.joint("j"), attribute, value)
 
     system = system_of(RICH, tmp_path, {"function": function, "guess": 0.1, "scale": 1.0})
-    found = mujoco.MjModel.from_xml_path(str(written(system, 0.25, said=said)))
+    found = compiled(written(system, 0.25, said=said))
     assert same_dynamics(found, system.model_at(np.array([0.25])))
 
 
@@ -522,7 +527,7 @@ def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: 
     """`objtype="body"` reads the principal axes, whose order the matrix does not determine."""
     xml = RICH.replace('mass="1.50"', f'mass="1.50"{turned}')
     system = system_of(xml, tmp_path, "body/a:fullinertia[3]")
-    found = mujoco.MjModel.from_xml_path(str(written(system, 0.004)))
+    found = compiled(written(system, 0.004))
     wanted = system.model_at(np.array([0.004]))
     assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
     assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
@@ -606,7 +611,7 @@ def test_a_model_in_memory_is_written_with_the_files_that_it_needs(tmp_path: Pat
 
     assert write_identified(file, system, np.array([1.5])) == []
 
-    found = mujoco.MjModel.from_xml_path(str(file))
+    found = compiled(file)
     assert same_dynamics(found, system.model_at(np.array([1.5])))
     assert [each.name for each in file.parent.iterdir()] == [file.name]
 
@@ -644,7 +649,7 @@ def test_an_estimate_gives_its_model(identified: Estimate, tmp_path: Path) -> No
 
     file = tmp_path / "arm.xml"
     assert identified.save_model(file) == []
-    written = mujoco.MjModel.from_xml_path(str(file))
+    written = compiled(file)
     assert same_dynamics(written, identified.model)
     head = file.read_text(encoding="utf-8").partition("-->")[0]
     assert f"mjfim {mjfim.__version__} and MuJoCo {mujoco.__version__}" in head
@@ -676,7 +681,7 @@ def test_meshes_of_the_memory_are_written_beside_the_model(tmp_path: Path) -> No
     assert estimate.save_model(new / "first.xml") == estimate.save_model(new / "second.xml") == []
     names = {file.name for file in new.glob("[!.]*")}
     assert names == {"first.xml", "first_tetra.obj", "second.xml", "second_tetra.obj"}
-    assert mujoco.MjModel.from_xml_path(str(new / "second.xml")).dof_damping[0] == 0.3
+    assert compiled(new / "second.xml").dof_damping[0] == 0.3
     (new / "third_tetra.obj").write_text("mine")
     with pytest.raises(OutputError, match="third_tetra"):
         estimate.save_model(new / "third.xml")

@@ -30,6 +30,7 @@ from mjfim.records.terms import (
     Selection,
     SelectionStep,
     Term,
+    TermTestData,
 )
 from mjfim.records.verdict import Level, Verdict
 from mjfim.studies.selected_models import possible_pools, selected_experiment
@@ -86,6 +87,15 @@ STOPPED: dict[str, Any] = {"status": Status.MAX_ITERATIONS, "improvement": 0.048
 )
 def test_the_first_next_step(verb: str, changes: dict[str, Any], words: str) -> None:
     assert words in page_of(results.MAKERS[verb](**changes)).next_steps[0]
+
+
+def test_pages_say_what_was_tested_and_which_parameters_are_nuisance() -> None:
+    tested = TermTestData(share=0.17, recordings=4, count=4)
+    text = printed(page_of(results.estimate(tested_data=tested)), verbose=True)
+    assert "were tested on 17 % of the data, from all 4 recordings." in text
+    first, *others = results.check().rows
+    check = results.check(rows=(*others, replace(first, nuisance=True)))
+    assert "nuisance" in printed(page_of(check))
 
 
 # ---- numbers and tables

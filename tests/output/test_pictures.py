@@ -26,7 +26,7 @@ from mjfim.output.plots.design import (
     limits,
     trajectories,
 )
-from mjfim.output.plots.draw import figure_of, save
+from mjfim.output.plots.draw import figure_of, log_ticks, save
 from mjfim.output.plots.estimate import accuracy as accuracy_of_estimate
 from mjfim.output.plots.estimate import fit, parameter_intervals
 from mjfim.output.plots.estimate_studies import Spread, estimate_pairs, pairs, selection
@@ -52,7 +52,6 @@ LABELS = make_labels(2, 3)
 
 
 def marks_of(panel: Panel, role: str, kind: str = "line") -> list[Mark]:
-    """Marks of a role and a kind in a panel."""
     return [mark for mark in panel.marks if mark.role == role and mark.kind == kind]
 
 
@@ -138,7 +137,6 @@ def test_curves_over_time_meet_the_wanted_accuracy_at_their_dots() -> None:
 
 
 def limits_panel(kind: str, margin: float, speed: float, **amplitudes: float) -> Panel:
-    """The panel of limits of one kind on several joints."""
     t = np.linspace(0.0, 1.0, 1000)
     usage = tuple(
         LimitUsage(kind=kind, name=name, t=t, share=size * np.sin(speed * t))
@@ -451,6 +449,8 @@ def test_the_largest_pictures_of_a_large_result_are_files_only_on_request() -> N
 def test_wrong_names_and_endings_are_refused(tmp_path: Path) -> None:
     design = replace(make_design(), labels=LABELS)
     assert picture_names(design)[0] == "trajectories"
+    with pytest.raises(MjfimError, match="a object has no figures"):
+        picture_names(object())  # type: ignore[arg-type]
     with pytest.raises(MjfimError, match=r"picture of a Design .*valid: accuracy, "):
         draw(design, "portrait")
     with pytest.raises(MjfimError, match=r"trajectorys.*did you mean 'trajectories'"):
@@ -479,6 +479,14 @@ def test_wrong_names_and_endings_are_refused(tmp_path: Path) -> None:
 )
 def test_numbers_have_three_digits_and_raised_powers(shown: str, text: str) -> None:
     assert shown == text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(0.9, 1.5, [0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5]), (0.8, 1500.0, [1.0, 10.0, 100.0, 1000.0])],
+)
+def test_logarithmic_axes_have_round_ticks(low: float, high: float, expected: list[float]) -> None:
+    assert log_ticks(low, high) == pytest.approx(expected)
 
 
 # ---- style and files

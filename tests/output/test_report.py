@@ -74,7 +74,6 @@ def data_of(html: str) -> dict[str, Any]:
 
 
 def numbers(array: dict[str, str]) -> np.ndarray:
-    """The numbers of an array of a plot."""
     return np.frombuffer(base64.b64decode(array["bdata"]), dtype=f"<{array['dtype']}")
 
 

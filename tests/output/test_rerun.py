@@ -76,7 +76,6 @@ def logged(folder: Path, model: mujoco.MjModel, design: Design, *beside: tuple[A
 
 
 def blueprint_column(path: Path, component: str) -> dict[str, Any]:
-    """One component of the blueprint by entity."""
     reader = RrdReader(path)
     found = {}
     for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -127,10 +128,10 @@ def test_actions_are_the_controls_in_the_unit(unit: str, arm: Designed, tmp_path
     curve, factor = arm[1].trajectory, 180.0 / np.pi if unit == "deg" else 1.0
     actions = np.array(data.column("action").to_pylist())
     states = np.array(data.column("observation.state").to_pylist())
-    np.testing.assert_allclose(actions[:-1], factor * curve.ctrl, rtol=1e-6, atol=1e-6)
+    assert_allclose(actions[:-1], factor * curve.ctrl, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(actions[-1], actions[-2])
     wanted = factor * np.concatenate([curve.qpos, curve.qvel], axis=1)
-    np.testing.assert_allclose(states, wanted, rtol=1e-6, atol=1e-5)
+    assert_allclose(states, wanted, rtol=1e-6, atol=1e-5)
 
 
 def test_the_dataset_is_read_as_a_recording(cart: Designed, tmp_path: Path) -> None:
@@ -138,10 +139,10 @@ def test_the_dataset_is_read_as_a_recording(cart: Designed, tmp_path: Path) -> N
     mjfim.export_design(*cart, tmp_path, to="lerobot")
     recording = read_recording(tmp_path, System.resolve(cart[0]).channels)
     curve = cart[1].trajectory
-    np.testing.assert_allclose(recording.ctrl, curve.ctrl, rtol=1e-6)
+    assert_allclose(recording.ctrl, curve.ctrl, rtol=1e-6)
     assert recording.outputs == ("qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge")
     planned = np.concatenate([curve.qpos, curve.qvel], axis=1)
-    np.testing.assert_allclose(recording.y, planned, rtol=1e-6, atol=1e-12)
+    assert_allclose(recording.y, planned, rtol=1e-6, atol=1e-12)
 
 
 def test_the_verb_replaces_its_own_dataset(cart: Designed, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from unittest.mock import Mock
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.experiment import System
@@ -107,7 +108,7 @@ def test_parameters_are_identified_from_what_the_player_records(
 
     system = System.resolve(cart[0])
     recording = read_recording(log, system.channels)
-    np.testing.assert_array_equal(recording.ctrl, np.array(robot.sent[:400]))
+    assert_array_equal(recording.ctrl, np.array(robot.sent[:400]))
     assert np.array_equal(recording.ctrl, cart[1].trajectory.ctrl) is not feedback
     estimate = mjfim.identify(cart[0], [recording])
     off = np.abs(np.array(estimate.theta) - [2.0, 1.0, 1.0])
@@ -132,7 +133,7 @@ def test_feedback_is_the_gain_times_the_deviation_within_limits(
     feedback = np.einsum("ki,ki->k", gains, planned[:-1] - measured[:-1])
     wanted = cart[1].trajectory.ctrl[:, 0] + feedback
     sent = found["ctrl:force"]
-    np.testing.assert_allclose(sent[:-1], np.clip(wanted, -20.0, 20.0), atol=1e-9)
+    assert_allclose(sent[:-1], np.clip(wanted, -20.0, 20.0), atol=1e-9)
     assert f"{int((np.abs(wanted) > 20.0).sum())} clipped" in said
     assert np.isnan(sent[-1]) and len(found["t"]) == 401
 
@@ -140,7 +141,7 @@ def test_feedback_is_the_gain_times_the_deviation_within_limits(
 def test_what_is_not_measured_has_no_feedback(player: ModuleType, tmp_path: Path) -> None:
     planned = player.X[5]
     some = player.deviation(planned, {"qpos:hinge": planned[1] - 0.1, "qvel:slide": float("nan")})
-    np.testing.assert_allclose(some, [0.0, 0.1, 0.0, 0.0], atol=1e-15)
+    assert_allclose(some, [0.0, 0.1, 0.0, 0.0], atol=1e-15)
     with pytest.raises(ValueError, match="'qpos:hing' is not in the model"):
         player.measured(SimpleNamespace(read_state=lambda: {"qpos:hing": 0.0}))
 
@@ -160,8 +161,8 @@ def test_rotations_are_subtracted_as_mujoco_does(tmp_path: Path) -> None:
         wanted = np.zeros(model.nv)
         mujoco.mj_differentiatePos(model, wanted, 1.0, state[: model.nq], planned[: model.nq])
         found = player.deviation(planned, dict(zip(player.STATE, state.tolist(), strict=True)))
-        np.testing.assert_allclose(found[: model.nv], wanted, atol=1e-12)
-        np.testing.assert_allclose(found[model.nv :], (planned - state)[model.nq :], atol=1e-15)
+        assert_allclose(found[: model.nv], wanted, atol=1e-12)
+        assert_allclose(found[model.nv :], (planned - state)[model.nq :], atol=1e-15)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
@@ -191,8 +192,8 @@ def test_a_late_computer_leaves_rows_out_and_keeps_the_time(
     said = played(player, robot, tmp_path / "recording.csv")
     found = read_table(tmp_path / "recording.csv")
     assert said.startswith("sent 398 rows, 2 left out")
-    np.testing.assert_allclose(found["t"][98:103], [0.98, 0.99, 1.0, 1.03, 1.04], atol=1e-9)
-    np.testing.assert_array_equal(found["ctrl:force"][101], cart[1].trajectory.ctrl[103, 0])
+    assert_allclose(found["t"][98:103], [0.98, 0.99, 1.0, 1.03, 1.04], atol=1e-9)
+    assert_array_equal(found["ctrl:force"][101], cart[1].trajectory.ctrl[103, 0])
     assert found["t"][-1] == pytest.approx(4.0, abs=1e-9)
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -23,6 +22,7 @@ from mjfim.output.page import Text
 from mjfim.output.pages.estimate import sample_parts
 from mjfim.records.estimate import Estimate, PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
+from tests.output.test_mjcf import compiled
 from tests.support.cart_pendulum import cart_pendulum
 
 # A robot of which one link stands in an included file, and one in a URDF.
@@ -89,7 +89,7 @@ def test_every_model_is_the_one_in_memory(
     assert sample_files(out, 0, system.model_path) == ()
 
     for i in range(5):
-        written = mujoco.MjModel.from_xml_path(str(out / "samples" / f"robot_{i + 1:04d}.xml"))
+        written = compiled(out / "samples" / f"robot_{i + 1:04d}.xml")
         theta = np.array(estimate.theta)
         theta[~system.parameters.initial_deviations] = values[i]
         assert same_dynamics(written, system.model_at(theta, at_keyframe=False))

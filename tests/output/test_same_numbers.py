@@ -44,13 +44,11 @@ def design(task: DesignTask) -> Design:
 
 @pytest.fixture(scope="module")
 def check(task: DesignTask, design: Design) -> Check:
-    """A check of this design."""
     return mjfim.check(task.experiment, trajectory=design.trajectory)
 
 
 @pytest.fixture(scope="module")
 def estimate(task: DesignTask, design: Design) -> Estimate:
-    """An estimate from one recording of this design."""
     recording = mjfim.simulate(task.experiment, design.trajectory, seed=0)
     found = mjfim.identify(task.experiment, [recording])
     return replace(found, converged=True, misfit=False)
@@ -62,7 +60,6 @@ def in_terminal(record: ShownRecord) -> str:
 
 
 def texts_of(figure: Figure) -> str:
-    """All texts of a figure."""
     return "\n".join(text.get_text() for text in figure.findobj(Text))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mujoco import sysid
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError, MjfimError
@@ -25,7 +26,6 @@ from tests.support.paths import ROOT
 
 CART = ROOT / "models" / "cart_pendulum.toml"
 UNEQUAL = {"qpos:slide": 0.05, "qpos:hinge": 0.05, "qvel:slide": 0.005, "qvel:hinge": 0.005}
-SENSED = {"slide_position": 0.05, "hinge_velocity": 0.005}
 installed = pytest.mark.skipif(
     not hasattr(sysid, "ModelSequences"), reason="needs mujoco.sysid: pip install 'mjfim[sysid]'"
 )
@@ -52,16 +52,6 @@ def residual(problem: SysidProblem, theta: Array) -> Array:
     """All residuals in one row."""
     with silenced():
         return np.concatenate(problem.residual(theta, problem.parameters.copy())[0])
-
-
-@installed
-@pytest.mark.parametrize("noise", [{"state": 0.05}, UNEQUAL, SENSED])
-def test_sysid_recovers_the_truth_without_lag(noise: dict[str, float]) -> None:
-    task = cart(noise=noise)
-    problem = sysid_problem(task.system, [noiseless(task)])
-    with silenced():
-        fit, _ = sysid.optimize(problem.parameters, problem.residual, verbose=False)
-    np.testing.assert_allclose(fit.as_vector(), task.parameters.true, rtol=1e-6)
 
 
 @installed
@@ -126,23 +116,7 @@ def test_sysid_gets_the_same_model_data_and_weights(case: str, tmp_path: Path) -
     wanted = dense_residuals(fit, fit.begin(theta))
     mine = np.sort(np.abs(residual(problem, theta)))
     theirs = np.sort(np.abs(wanted.r[: fit.value_count]))  # priors follow the data
-    np.testing.assert_allclose(mine, theirs, rtol=1e-6, atol=1e-6)
-
-
-@installed
-def test_times_off_the_grid_are_read_between_the_steps() -> None:
-    task = cart()
-    fine, rng = noiseless(task), np.random.default_rng(4)
-    rows = np.sort(rng.choice(np.arange(1, 400), 300, replace=False))
-    t = fine.t[rows] + rng.uniform(-2e-3, 2e-3, 300)
-    t[0] = 0.0
-    y = np.column_stack([np.interp(t, fine.t, column) for column in fine.y.T])
-    recording = Recording(t=t, ctrl=fine.ctrl[rows[:-1]], y=y, outputs=fine.outputs)
-    problem = sysid_problem(task.system, [recording])
-    fit = FitProblem.of(task.system, [recording])
-    wanted = dense_residuals(fit, fit.begin(task.parameters.true))
-    mine = residual(problem, task.parameters.true)
-    np.testing.assert_allclose(mine, -wanted.r, atol=1e-3)
+    assert_allclose(mine, theirs, rtol=1e-6, atol=1e-6)
 
 
 @installed

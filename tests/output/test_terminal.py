@@ -56,7 +56,6 @@ def test_the_short_form_fits_on_a_screen(verb: str, width: int) -> None:
 
 
 def rows_table(count: int, **changes: object) -> Table:
-    """A table with many rows."""
     rows = tuple(Row((f"p{k}", str(k))) for k in range(count))
     return replace(Table(title="Values", columns=("parameter", "value"), rows=rows), **changes)
 

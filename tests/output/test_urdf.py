@@ -17,8 +17,8 @@ from mjfim.model.comparison import same_dynamics
 from mjfim.model.model_files import urdf_sources
 from mjfim.output.export.mjcf import identified_files, write_identified
 from mjfim.output.manifest import MANIFEST
-from tests.output.test_mjcf import changes
-from tests.support.cli import done, names
+from tests.output.test_mjcf import changes, compiled
+from tests.support.cli import done, misused, names, run
 from tests.support.numerics import Array
 
 # Two links with inertial frames that are turned, and a tool that is fixed to the second one.
@@ -98,14 +98,12 @@ def parameters(prefix: str = "") -> dict[str, dict[str, Any]]:
 def system_of(
     folder: Path, model: str = "two.urdf", prefix: str = "", **further: dict[str, Any]
 ) -> System:
-    """The system of a model in a folder, with further parameters."""
     (folder / "two.urdf").write_text(URDF, encoding="utf-8")
     (folder / "driven.xml").write_text(MOTORS.format(prefix=prefix), encoding="utf-8")
     return resolved(folder, model, {**parameters(prefix), **further})
 
 
 def resolved(folder: Path, model: str, parameters: dict[str, dict[str, Any]]) -> System:
-    """The system of a model in a folder."""
     tables: dict[str, Any] = {"rate": 100.0, "noise": {"state": 0.01}, "parameters": parameters}
     return System.resolve(mjfim.Experiment(model=model, directory=folder, **tables))
 
@@ -143,9 +141,9 @@ def test_mujoco_reads_the_identified_robot(tmp_path: Path) -> None:
     assert written(tmp_path / "out", system, theta) == []
     wanted = system.model_at(theta)
     for name in ("identified.urdf", "identified.xml"):
-        found = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / name))
+        found = compiled(tmp_path / "out" / name)
         assert_allclose(motion(found), motion(wanted), rtol=1e-5, atol=1e-5)
-    found = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "identified.urdf"))
+    found = compiled(tmp_path / "out" / "identified.urdf")
     assert same_dynamics(found, wanted)
     assert_allclose(motion(found), motion(wanted), rtol=1e-9, atol=1e-11)
 
@@ -199,10 +197,10 @@ def test_an_mjcf_attaches_the_identified_urdf(tmp_path: Path, prefix: str) -> No
     assert f'gear="{float(theta[-1])!r}"' in text
 
     wanted = system.model_at(theta)
-    assert same_dynamics(mujoco.MjModel.from_xml_path(str(out / "identified.xml")), wanted)
+    assert same_dynamics(compiled(out / "identified.xml"), wanted)
 
     # The URDF alone moves as the robot with its motors at rest.
-    alone = mujoco.MjModel.from_xml_path(str(out / "identified.urdf"))
+    alone = compiled(out / "identified.urdf")
     assert_allclose(motion(alone), motion(wanted), rtol=1e-8, atol=1e-10)
 
 
@@ -232,7 +230,7 @@ def test_a_urdf_that_is_attached_twice_is_not_written(tmp_path: Path) -> None:
     (remark,) = written(tmp_path / "out", both, np.array([1.6]))
     assert "is attached 2 times, and one URDF has one set of values" in remark
     assert names(tmp_path / "out") == {"identified.xml"}
-    found = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "identified.xml"))
+    found = compiled(tmp_path / "out" / "identified.xml")
     assert [found.body(f"{side}_upper").mass[0] for side in "ab"] == [1.6, 1.5]
 
 
@@ -262,7 +260,7 @@ def test_links_whose_inertia_comes_from_their_geometry(tmp_path: Path) -> None:
     theta = np.array([5.0, -0.05])
     assert written(tmp_path / "out", system, theta) == []
     file = tmp_path / "out" / "identified.urdf"
-    assert same_dynamics(mujoco.MjModel.from_xml_path(str(file)), system.model_at(theta))
+    assert same_dynamics(compiled(file), system.model_at(theta))
     changed = file.read_text(encoding="utf-8")
     assert '<origin xyz="0 0 -0.0' in changed
     assert '<mass value="5"/>' in changed
@@ -293,7 +291,7 @@ def test_meshes_are_found_from_another_folder(
     out = tmp_path / "far" / "away"
     assert written(out, system, np.array([2.0])) == []
     assert said in (out / "identified.urdf").read_text(encoding="utf-8")
-    assert mujoco.MjModel.from_xml_path(str(out / "identified.urdf")).nmesh == 1
+    assert compiled(out / "identified.urdf").nmesh == 1
 
 
 @pytest.mark.parametrize(
@@ -336,9 +334,8 @@ true = 1.6
     assert {"identified.xml", "identified.urdf", MANIFEST} <= names(out)
     assert "printed by MuJoCo" not in result.stderr
     estimate = mjfim.Estimate.load(out)
-    model = mujoco.MjModel.from_xml_path(str(out / "identified.xml"))
+    model = compiled(out / "identified.xml")
     assert model.body("upper").mass[0] == estimate.theta[0]
 
     (out / "identified.urdf").write_text("edited", encoding="utf-8")
-    refused = done(*words, code=2)
-    assert "identified.urdf: changed after mjfim wrote it" in refused.stderr
+    misused(run(*words), "identified.urdf: changed after mjfim wrote it")

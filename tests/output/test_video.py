@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 
 import mjfim
@@ -127,7 +128,7 @@ class TestFilm:
         assert [track.term for track in right.tracks] == ["designed", "unsafe", "rehearsed"]
         assert [track.is_ghost for track in right.tracks] == [False, True, True]
         for track, qpos in zip(right.tracks, moves[[0, 1, 3]], strict=True):
-            np.testing.assert_allclose(track.qpos, qpos, atol=1e-12)
+            assert_allclose(track.qpos, qpos, atol=1e-12)
 
         # Two safe robots are named once.
         safe = film_of(system, replace(design, rehearsal=replace(kept, motions=motions)))
@@ -141,8 +142,8 @@ class TestFilm:
         # The other sign of the quaternion is the same rotation.
         rows = np.stack([begin, [1.0, 1.0, 1.0, -1.0, 1.0, 1.0, -1.0] * end])
         found = positions_at(flying, np.array([0.0, 2.0]), rows, np.array([-1.0, 1.0, 9.0]))
-        np.testing.assert_allclose(found[:2], [begin, middle], atol=1e-12)
-        np.testing.assert_allclose(found[2, :3], end[:3])
+        assert_allclose(found[:2], [begin, middle], atol=1e-12)
+        assert_allclose(found[2, :3], end[:3])
 
     @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
     @pytest.mark.parametrize(("distance", "follows"), [(0.1, False), (5.0, True)])

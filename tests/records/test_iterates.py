@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.testing import assert_array_equal
 
 from mjfim.records.design import (
     MAX_MOTIONS,
@@ -31,8 +32,8 @@ def test_a_motion_has_both_ends_and_evenly_spread_samples() -> None:
     assert motion.t.shape == (MOTION_SAMPLES,) and motion.qpos.shape == (MOTION_SAMPLES, 1)
     assert motion.t[0] == 0.0 and motion.t[-1] == 10.0
     assert np.ptp(np.diff(motion.t)) < 0.011
-    np.testing.assert_array_equal(motion.qpos[:, 0], motion.t)
-    np.testing.assert_array_equal(motion.ctrl[:-1, 0], motion.t[:-1])
+    assert_array_equal(motion.qpos[:, 0], motion.t)
+    assert_array_equal(motion.ctrl[:-1, 0], motion.t[:-1])
 
 
 def test_short_and_diverged_iterates_are_taken() -> None:
