@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
+import runpy
 import shutil
 from pathlib import Path
 
@@ -80,19 +80,15 @@ def test_the_script_for_logs_does_not_replace_a_model_of_the_user(
     study: Path, recorded: Path, tmp_path: Path
 ) -> None:
     """Its own earlier result is replaced; the user's with --force, which the message names."""
-    spec = importlib.util.spec_from_file_location("script", SCRIPTS / "identify_offline.py")
-    assert spec is not None and spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-
+    identify = runpy.run_path(str(SCRIPTS / "identify_offline.py"))["identify"]
     log = tmp_path / "log.csv"
     shutil.copy(recorded, log)
     mine = tmp_path / "identified.xml"
     mine.write_text("mine", encoding="utf-8")
     with pytest.raises(OutputError, match=r"identified\.xml: not listed.*--force"):
-        script.identify(study, [log], force=False)
+        identify(study, [log], force=False)
     assert mine.read_text(encoding="utf-8") == "mine"
 
-    assert script.identify(study, [log], force=True) == 0
+    assert identify(study, [log], force=True) == 0
     OutputGuard([], force=False).check([mine])
     assert mine.read_text(encoding="utf-8").startswith("<mujoco")

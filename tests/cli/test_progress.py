@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from mjfim.cli import progress as module
 from mjfim.cli.common import say_written
-from mjfim.cli.progress import ProgressDisplay, progress, say
+from mjfim.cli.progress import ProgressDisplay, clock, progress, say
 from mjfim.excitation.task import DesignTask
 from mjfim.output.progress_text import design_stage, design_text
 from mjfim.records.design import HistoryRow
@@ -36,6 +36,13 @@ def a_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> io.StringIO:
         module, "errors", Console(file=stream, force_terminal=True, width=width, highlight=False)
     )
     return stream
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(0.2, "0:00"), (59.6, "1:00"), (135.0, "2:15"), (3725.0, "1:02:05")]
+)
+def test_times_in_words(seconds: float, shown: str) -> None:
+    assert clock(seconds) == shown
 
 
 def test_the_stage_of_a_design_is_named() -> None:

@@ -73,10 +73,8 @@ def table(folder: Path, file: str) -> Any:
 def test_the_files_follow_the_format(arm: Designed, tmp_path: Path) -> None:
     """Files, keys, columns and types are those of LeRobot 0.4; each feature has statistics."""
     mjfim.export_design(*arm, tmp_path, to="lerobot")
-    found = {
-        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
-    }
-    assert found == FILES
+    files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")}
+    assert files == FILES
 
     info = described(tmp_path)
     assert set(info) == INFO_KEYS

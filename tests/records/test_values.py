@@ -91,6 +91,9 @@ def test_designs_are_compared_by_the_names_of_their_parameters() -> None:
     assert "determines 1 of 3 parameters better" in found.verdict.sentence
     back = turned.compare(design).verdict
     assert not back.ok and "determines length better" in back.sentence
+    std = turned.final.std * [1.0, 1.0, 0.5]
+    mixed = design.compare(replace(turned, final=replace(turned.final, std=std))).verdict.sentence
+    assert "better, and this one 1 of 3 parameters" in mixed
     assert "equally well" in design.compare(design).verdict.sentence
 
 
