@@ -130,9 +130,12 @@ def test_no_robots_are_drawn_from_undetermined_parameters(
 def test_the_accuracy_that_a_design_predicted_stands_beside_the_estimates(
     home: Path, study: Path, recorded: Path, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "fit"
-    words = ("identify", study, recorded, "-o", folder, "--predicted")
+    folder, held = tmp_path / "fit", tmp_path / "held.csv"
+    done("simulate", study, home / "out" / "design.npz", "-o", held, "--seed", 5)
+    words = ("identify", study, recorded, "-o", folder, "--held-out", held, "--predicted")
     done(*words, home / "out")
     stated = mjfim.Design.load(home / "out").stated_std
     np.testing.assert_allclose(read(folder / "estimate.json")["predicted_std"], stated, rtol=1e-9)
+    (prediction,) = mjfim.Estimate.load(folder).predictions
+    assert prediction.held_out and prediction.recording is not None
     misused(run(*words, tmp_path, "--force"), "design.npz: this file is missing")

@@ -47,6 +47,13 @@ def test_a_model_and_an_experiment_in_the_place_of_the_other(tmp_path: Path) -> 
         misused(run(verb, experiment), f"{experiment}: an experiment file, but a model")
 
 
+def test_a_model_without_joints_is_refused(tmp_path: Path) -> None:
+    model = tmp_path / "rigid.xml"
+    model.write_text("<mujoco/>", encoding="utf-8")
+    result = run("init", model, "-o", tmp_path / "a.toml")
+    misused(result, "rigid.xml: the model has no joint")
+
+
 @pytest.mark.slow
 def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
     """The experiment file reads the log as it is, and the next command fits it."""

@@ -85,6 +85,9 @@ def test_streams_that_cannot_be_used(
 
 def test_no_stream(study: Path, tmp_path: Path) -> None:
     misused(run("watch", study, "--stream", tmp_path / "none.csv"), "none.csv: no such file")
+    empty = tmp_path / "empty.csv"
+    empty.touch()
+    misused(run("watch", study, "--stream", empty), "no line; the first one names the columns")
 
 
 @pytest.mark.slow

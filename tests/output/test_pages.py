@@ -91,8 +91,12 @@ def test_the_first_next_step(verb: str, changes: dict[str, Any], words: str) -> 
 
 def test_pages_say_what_was_tested_and_which_parameters_are_nuisance() -> None:
     tested = TermTestData(share=0.17, recordings=4, count=4)
-    text = printed(page_of(results.estimate(tested_data=tested)), verbose=True)
+    estimate = results.estimate(tested_data=tested, missing_terms=(results.missing_term(),))
+    text = printed(page_of(estimate), verbose=True)
     assert "were tested on 17 % of the data, from all 4 recordings." in text
+    summary = estimate.summary()
+    assert summary["suspects_tested"]["share"] == 0.17
+    assert summary["suspects"][0]["path"] == "joint/hinge:frictionloss"
     first, *others = results.check().rows
     check = results.check(rows=(*others, replace(first, nuisance=True)))
     assert "nuisance" in printed(page_of(check))
