@@ -6,6 +6,7 @@ The records are made by hand: few and many parameters and joints, with short and
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -190,9 +191,7 @@ def named(verb: str) -> ShownRecord:
 
 RECORDS = {
     # The title of `watch` is one line, which leaves the figure with such names.
-    **{
-        f"named {verb}": lambda verb=verb: named(verb) for verb in results.MAKERS if verb != "watch"
-    },
+    **{f"named {verb}": partial(named, verb) for verb in results.MAKERS if verb != "watch"},
     "small design": lambda: design(1, 1, 0),
     "large design": lambda: design(12, 30, LONG),
     "small estimate": lambda: estimate(1, 1, 0),

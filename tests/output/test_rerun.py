@@ -117,7 +117,8 @@ def text_of(path: Path) -> str:
 def plain_poses(model: mujoco.MjModel, qpos: Array) -> tuple[Array, Array, Array]:
     """Positions and orientations of the bodies, and positions of the geoms, by plain MuJoCo."""
     data, rows = mujoco.MjData(model), []
-    for data.qpos[:] in qpos:
+    for row in qpos:
+        data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         rows.append((data.xpos.copy(), data.xquat.copy(), data.geom_xpos.copy()))
     xpos, xquat, geom_xpos = (np.array(each) for each in zip(*rows, strict=True))
