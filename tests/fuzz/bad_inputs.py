@@ -7,7 +7,7 @@ import gzip
 import io
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -175,7 +175,6 @@ def pick(rng: Rng, choices: Any) -> Any:
 
 def spoil_bytes(rng: Rng, content: bytes) -> tuple[bytes, str]:
     """Spoil the content of a file without a look at what it says."""
-    name = pick(rng, ("cut", "flipped", "empty", "not UTF-8", "NUL", "repeated", "random"))
     place = int(rng.integers(max(len(content), 1)))
     flipped = bytearray(content)
     for i in rng.integers(len(content), size=5).tolist():
@@ -189,6 +188,7 @@ def spoil_bytes(rng: Rng, content: bytes) -> tuple[bytes, str]:
         "repeated": content + content,
         "random": rng.bytes(2000),
     }
+    name = pick(rng, tuple(results))
     return results[name], f"bytes {name}"
 
 
@@ -460,19 +460,19 @@ def _columns(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
 
 def odd_times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     """Spoil the times."""
-    name = pick(rng, ("shuffled", "equal", "reversed", "negative", "huge", "a gap", "text", "tiny"))
     times = [float(row[0]) for row in rows[1:]]
-    changed: dict[str, Callable[[], list[Any]]] = {
-        "shuffled": lambda: rng.permutation(times).tolist(),
-        "equal": lambda: [1.0] * len(times),
-        "reversed": lambda: times[::-1],
-        "negative": lambda: [-t for t in times],
-        "huge": lambda: [1e300 * t for t in times],
-        "a gap": lambda: [t + 100.0 * (t > 0.5) for t in times],
-        "text": lambda: [f"12:00:{t}" for t in times],
-        "tiny": lambda: [5e-324 * k for k in range(len(times))],
+    changed = {
+        "shuffled": rng.permutation(times).tolist(),
+        "equal": [1.0] * len(times),
+        "reversed": times[::-1],
+        "negative": [-t for t in times],
+        "huge": [1e300 * t for t in times],
+        "a gap": [t + 100.0 * (t > 0.5) for t in times],
+        "text": [f"12:00:{t}" for t in times],
+        "tiny": [5e-324 * k for k in range(len(times))],
     }
-    for row, value in zip(rows[1:], changed[name](), strict=True):
+    name = pick(rng, tuple(changed))
+    for row, value in zip(rows[1:], changed[name], strict=True):
         row[0] = str(value)
     return f"times {name}", name in ("equal", "text")
 
@@ -528,31 +528,17 @@ def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
         arrays = {name: loaded[name] for name in loaded.files}
     name = pick(rng, ["t", "qpos", "qvel", "ctrl", *sorted(arrays)])
     array = arrays[name]
-    how = pick(
-        rng,
-        (
-            "removed",
-            "shorter",
-            "flat",
-            "NaN",
-            "infinite",
-            "text",
-            "pickle",
-            "equal",
-            "reversed",
-            "npy",
-        ),
-    )
-    changes: dict[str, Callable[[], Any]] = {
-        "shorter": lambda: array[:-1] if array.ndim else array,
-        "flat": lambda: array.ravel()[:1],
-        "NaN": lambda: np.full(array.shape, np.nan),
-        "infinite": lambda: np.full(array.shape, np.inf),
-        "text": lambda: np.full(array.shape, "text"),
-        "pickle": lambda: np.array([{"a": 1}], dtype=object),
-        "equal": lambda: np.zeros(array.shape),
-        "reversed": lambda: array[::-1] if array.ndim else array,
+    changes: dict[str, Any] = {
+        "shorter": array[:-1] if array.ndim else array,
+        "flat": array.ravel()[:1],
+        "NaN": np.full(array.shape, np.nan),
+        "infinite": np.full(array.shape, np.inf),
+        "text": np.full(array.shape, "text"),
+        "pickle": np.array([{"a": 1}], dtype=object),
+        "equal": np.zeros(array.shape),
+        "reversed": array[::-1] if array.ndim else array,
     }
+    how = pick(rng, ("removed", "npy", *changes))
     if how == "npy":
         with file.open("wb") as stream:
             np.save(stream, np.zeros(3))
@@ -560,7 +546,7 @@ def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
     if how == "removed":
         del arrays[name]
     else:
-        arrays[name] = changes[how]()
+        arrays[name] = changes[how]
     np.savez(file, **arrays)
 
     necessary = name in ("t", "qpos", "ctrl")
