@@ -64,12 +64,10 @@ class SimulatedRobot:
 
 @pytest.fixture(scope="module")
 def script(cart: Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The player of this design, by the verb."""
-    folder = tmp_path_factory.mktemp("player")
-    cart[1].save(folder / "design")
-    words = ("export", folder / "design", "--experiment", MODELS / "cart_pendulum.toml")
-    done(*words, "--to", "player", "-o", folder / "play.py")
-    return folder / "play.py"
+    """The player of this design."""
+    path = tmp_path_factory.mktemp("player") / "play.py"
+    mjfim.export_design(*cart, path, to="player")
+    return path
 
 
 def imported(path: Path) -> ModuleType:
@@ -237,3 +235,10 @@ def test_servos_hold_their_last_command(arm: Designed, tmp_path: Path) -> None:
     mjfim.export_design(*arm, tmp_path / "play.py", to="player")
     player = imported(tmp_path / "play.py")
     assert np.isnan(player.SAFE).all() and player.LOWER[0] == -2.6
+
+
+def test_the_verb_writes_the_player(cart: Designed, tmp_path: Path) -> None:
+    cart[1].save(tmp_path / "design")
+    words = ("export", tmp_path / "design", "--experiment", MODELS / "cart_pendulum.toml")
+    done(*words, "--to", "player", "-o", tmp_path / "play.py")
+    assert imported(tmp_path / "play.py").COUNT == 400
