@@ -11,7 +11,7 @@ import pytest
 from typer.testing import Result
 
 from mjfim.output import folders
-from tests.support.cli import run, write_empty_figures, write_experiment
+from tests.support.cli import done, run, write_empty_figures, write_experiment
 
 
 @pytest.fixture(scope="session")
@@ -44,7 +44,7 @@ def archived(home: Path, designed: Result) -> Path:
 @pytest.fixture(scope="session")
 def recorded(home: Path, study: Path, archived: Path) -> Path:
     """Recording that `mjfim simulate` writes to home/run.csv."""
-    assert run("simulate", study, archived, "-o", home / "run.csv", "--seed", 1).exit_code == 0
+    done("simulate", study, archived, "-o", home / "run.csv", "--seed", 1)
     return home / "run.csv"
 
 

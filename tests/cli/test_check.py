@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from numpy.testing import assert_allclose
 from typer.testing import Result
 
 from mjfim.output.manifest import MANIFEST
 from mjfim.parallel import pool
-from tests.support.cli import loads, misused, names, read, run, write_experiment
+from tests.support.cli import done, loads, misused, names, read, run, write_experiment
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +99,7 @@ def test_combinations_of_parameters_are_named_and_the_exit_code_is_1(
     path = tmp_path / "study.toml"
     path.write_text(text, encoding="utf-8")
 
-    result = run("check", path, "--verbose")
-    assert result.exit_code == 1
+    result = done("check", path, "--verbose", code=1)
     for word in ("M + a", "time", "σ without it", "derivative self-test passed"):
         assert word in result.stdout
 
@@ -109,11 +109,11 @@ def test_designs_and_recordings_are_checked(study: Path, archived: Path, recorde
 
     design = loads(run("check", study, "--design", archived, "--json").stdout)
     assert design["source"] == "the given trajectory"
-    np.testing.assert_allclose([row["std"] for row in design["parameters"]], sigma, rtol=1e-4)
+    assert_allclose([row["std"] for row in design["parameters"]], sigma, rtol=1e-4)
 
     recording = loads(run("check", study, recorded, "--json").stdout)
     assert recording["source"] == "1 recording"
-    np.testing.assert_allclose([row["std"] for row in recording["parameters"]], sigma, rtol=1e-4)
+    assert_allclose([row["std"] for row in recording["parameters"]], sigma, rtol=1e-4)
 
 
 def test_without_locks_between_processes_one_process_does_the_work(

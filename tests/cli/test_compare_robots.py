@@ -10,7 +10,7 @@ import pytest
 
 from mjfim.output.manifest import MANIFEST
 from tests.support import results
-from tests.support.cli import loads, misused, names, read, run
+from tests.support.cli import done, misused, names, read, run
 
 FILES = {
     "robots.json",
@@ -37,8 +37,7 @@ def saved(folder: Path, shift: float, **changes: object) -> Path:
 def test_a_difference_is_said_and_written(tmp_path: Path) -> None:
     monday, friday = saved(tmp_path / "monday", 0.0), saved(tmp_path / "friday", 0.2)
     out = tmp_path / "out"
-    result = run("compare-robots", monday, friday, "-o", out)
-    assert result.exit_code == 1
+    result = done("compare-robots", monday, friday, "-o", out, code=1)
     assert names(out) == FILES
     said = " ".join(result.stdout.split())
     assert "There is a difference between monday and friday in damping." in said
@@ -50,19 +49,15 @@ def test_a_difference_is_said_and_written(tmp_path: Path) -> None:
 
     # The report is made again from the files alone.
     before = (out / "report.html").read_bytes()
-    assert run("report", out).exit_code == 0
+    done("report", out)
     assert (out / "report.html").read_bytes() == before
-
-    as_json = run("compare-robots", monday, friday, "-o", out, "--json")
-    assert loads(as_json.stdout)["changes"] == data["changes"]
 
 
 @pytest.mark.usefixtures("empty_figures")
 def test_equal_robots(tmp_path: Path) -> None:
     """The exit code is 0, and what would have been found is said; the folders have one name."""
     first, second = saved(tmp_path / "old" / "fit", 0.0), saved(tmp_path / "new" / "fit", 1e-4)
-    result = run("compare-robots", first, second / "estimate.npz", "-o", tmp_path / "out")
-    assert result.exit_code == 0
+    result = done("compare-robots", first, second / "estimate.npz", "-o", tmp_path / "out")
     said = " ".join(result.stdout.split())
     assert "The data show no difference between old/fit and new/fit. A change of" in said
     assert "the experiment files of the estimates are not where they were" in said
@@ -78,8 +73,7 @@ def test_models_that_differ_are_named(tmp_path: Path) -> None:
         text = path.read_text(encoding="utf-8")
         origin = '{"experiment": "robot.toml", "model": "robot.xml", '
         path.write_text(origin + text[1:], encoding="utf-8")
-    result = run("compare-robots", *folders, "-o", tmp_path / "out", "-v")
-    assert result.exit_code == 0
+    result = done("compare-robots", *folders, "-o", tmp_path / "out", "-v")
     said = " ".join(result.stdout.split())
     assert "the models of the estimates differ" in said
     assert "experiment files" not in said
@@ -89,8 +83,5 @@ def test_misuse(tmp_path: Path) -> None:
     first = saved(tmp_path / "a", 0.0)
     missing = run("compare-robots", first, tmp_path / "b", "-o", tmp_path / "out")
     misused(missing, "b: no such file or folder")
-    same = run("compare-robots", first, saved(tmp_path / "c", 0.0), "-o", tmp_path / "out")
-    misused(same, "estimates from the same recordings")
-    onto = run("compare-robots", first, saved(tmp_path / "d", 0.1), "-o", first)
-    assert onto.exit_code == 1
+    done("compare-robots", first, saved(tmp_path / "d", 0.1), "-o", first, code=1)
     assert {"estimate.npz", "robots.npz"} <= names(first)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import mjfim
-from tests.support.cli import misused, run
+from tests.support.cli import done, misused, run
 from tests.support.closed_loop import ARM
 
 EXPERIMENT = """
@@ -49,7 +49,7 @@ def stated(tmp_path: Path) -> Path:
 
 
 def test_a_closed_loop_is_simulated(stated: Path, tmp_path: Path) -> None:
-    assert run("simulate", stated).exit_code == 0
+    done("simulate", stated)
     header = (tmp_path / "recording.csv").read_text().splitlines()[0].replace('"', "")
     assert header == "t,reference:shoulder,reference:elbow,qpos:shoulder,qpos:elbow"
 
@@ -58,10 +58,9 @@ def test_a_closed_loop_is_simulated(stated: Path, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("empty_figures")
 def test_an_estimate_says_which_laws_were_in_the_loop(stated: Path, tmp_path: Path) -> None:
     log, folder = tmp_path / "recording.csv", tmp_path / "out"
-    assert run("simulate", stated).exit_code == 0
+    done("simulate", stated)
 
-    result = run("identify", stated, log, "-o", folder)
-    assert result.exit_code == 0
+    result = done("identify", stated, log, "-o", folder)
     plain = " ".join(result.output.split())
     assert "The control of shoulder is that of its law in the loop, evaluated at 250 Hz" in plain
     assert "without the control laws of shoulder, elbow" in plain
@@ -70,20 +69,13 @@ def test_an_estimate_says_which_laws_were_in_the_loop(stated: Path, tmp_path: Pa
     assert [law["actuator"] for law in found["controllers"]] == ["shoulder", "elbow"]
     assert found["controllers"][0]["numbers"]["kp"] == pytest.approx(60.0, abs=1.0)
     loaded = mjfim.Estimate.load(folder)
-    assert loaded.controllers[0].clipped >= 0.0
-    assert loaded.motion is not None
-    assert loaded.motion.ctrl.shape[1] == 2
+    assert loaded.motion is not None and loaded.motion.ctrl.shape[1] == 2
     assert "law in the loop" in (folder / "report.html").read_text()
 
 
 def test_verbs_say_what_a_file_with_laws_serves(stated: Path, tmp_path: Path) -> None:
-    shown = run("validate", stated, "--verbose")
-    assert shown.exit_code == 0
+    shown = done("validate", stated, "--verbose")
     assert "It serves `identify` and `simulate`, not `design`" in " ".join(shown.output.split())
     assert "Control laws in the loop" in shown.output
 
     misused(run("design", stated, "-o", tmp_path / "d"), "controllers: design needs a control")
-    misused(run("check", stated), "check without recordings needs a control without a law")
-    text = stated.read_text().replace("kp = 50.0", "kp = 50.0\nrate = 300.0")
-    stated.write_text(text)
-    misused(run("validate", stated), "controllers.shoulder.rate: 300 Hz does not divide")

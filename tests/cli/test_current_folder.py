@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import mjfim
-from mjfim.output.rerun import documents
 from tests.support.cli import PROCESS, write_experiment
 from tests.support.paths import ROOT
 
@@ -50,23 +49,3 @@ def test_a_verb_takes_nothing_from_the_current_folder(trap: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert (trap / "out" / "check.png").is_file()
     assert not (trap / "imported").exists()
-
-
-def test_the_viewer_is_not_searched_in_the_current_folder(
-    trap: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    commands: list[list[str]] = []
-
-    class Started:
-        """A viewer that ends well."""
-
-        def __init__(self, command: list[str], **options: object) -> None:
-            commands.append(command)
-
-        def wait(self, timeout: float) -> int:
-            return 0
-
-    monkeypatch.setattr(documents.subprocess, "Popen", Started)
-    (trap / "design.rrd").touch()
-    documents.show(trap / "design.rrd")
-    assert "-P" in commands[0][: commands[0].index("-m")]

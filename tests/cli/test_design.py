@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from unittest.mock import patch
 
-import numpy as np
 import pytest
 from typer.testing import Result
 
@@ -16,6 +16,7 @@ from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots import draw
 from tests.support.cli import (
     DESIGN,
+    done,
     loads,
     misused,
     names,
@@ -44,41 +45,35 @@ def test_design_json_is_the_file(home: Path, designed: Result) -> None:
     assert "wrote" in designed.stderr
 
 
+LIMITED = "\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"
+
+
 @pytest.mark.usefixtures("no_files")
 @pytest.mark.parametrize(
     ("lines", "status", "satisfied"),
     [
-        (
-            {"max_iterations": "1\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"},
-            "max_iterations",
-            False,
-        ),
-        ({"max_iterations": "0"}, "max_iterations", True),
-        (
-            {"max_iterations": "40\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"},
-            "converged",
-            False,
-        ),
+        (f"1{LIMITED}", "max_iterations", False),
+        ("0", "max_iterations", True),
+        (f"40{LIMITED}", "converged", False),
     ],
     ids=["budget-and-limits-violated", "no-improvement", "limits-violated"],
 )
 def test_design_that_misses_its_goal(
-    tmp_path: Path, lines: dict[str, str], status: str, satisfied: bool
+    tmp_path: Path, lines: str, status: str, satisfied: bool
 ) -> None:
     """The exit code is 1, and the summary says why."""
-    result = run("design", write_experiment(tmp_path, **lines), "-o", tmp_path / "out", "--json")
-    data = loads(result.stdout)
-    assert (result.exit_code, data["status"], data["limits"]["satisfied"]) == (1, status, satisfied)
+    path = write_experiment(tmp_path, max_iterations=lines)
+    data = loads(done("design", path, "-o", tmp_path / "out", "--json", code=1).stdout)
+    assert (data["status"], data["limits"]["satisfied"]) == (status, satisfied)
     assert bool(data["warnings"]) is not satisfied
 
 
 @pytest.mark.usefixtures("no_files")
-@pytest.mark.parametrize("lines", [{"max_iterations": "1"}, {"max_iterations": "3"}])
-def test_design_that_stops_at_its_budget(tmp_path: Path, lines: dict[str, str]) -> None:
+@pytest.mark.parametrize("most", ["1", "3"])
+def test_design_that_stops_at_its_budget(tmp_path: Path, most: str) -> None:
     """The exit code is 0 and the outcome names the budget: the trajectory is better than before."""
-    path = write_experiment(tmp_path, tolerance="1e-12", **lines)
-    result = run("design", path, "-o", tmp_path / "out", "--verbose")
-    assert result.exit_code == 0
+    path = write_experiment(tmp_path, tolerance="1e-12", max_iterations=most)
+    result = done("design", path, "-o", tmp_path / "out", "--verbose")
     said = " ".join(result.stdout.split())
     assert "This motion can be played" in said and "Stopped at its budget" in said
 
@@ -138,26 +133,19 @@ def test_parameters_that_do_the_same_give_the_code_of_check(
     assert ("no control separates these parameters: cart" in designed.stderr) is bool(code)
 
 
-BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {
-    "unknown key": (
-        {"horizon": "1.0\nhorizn = 2"},
-        ["study.toml", "horizn", "unknown key", "horizon"],
-    ),
-    "bad value": ({"rate": "-1"}, ["study.toml", "rate", "greater than 0"]),
-    "bad rate": ({"rate": "33.0"}, ["study.toml", "rate: at 33 Hz", "write one of"]),
-    "bad syntax": ({"rate": ""}, ["study.toml", "not valid TOML"]),
-    "no model": ({"model": '"gone.xml"'}, ["gone.xml", "no such model file"]),
-    "no table": ({"start": '"gone.csv"'}, ["gone.csv", "no such file"]),
-    "bad joint": ({"tracking": "{ slid = 1 }"}, ["study.toml", "cost.tracking", "hinge, slide"]),
-}
-
-
-@pytest.mark.parametrize("name", BAD_LINES)
-def test_bad_experiment(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("lines", "fragments"),
+    [
+        ({"horizon": "1.0\nhorizn = 2"}, ["study.toml", "horizn", "unknown key", "horizon"]),
+        ({"rate": ""}, ["study.toml", "not valid TOML"]),
+        ({"start": '"gone.csv"'}, ["gone.csv", "no such file"]),
+        ({"tracking": "{ slid = 1 }"}, ["study.toml", "cost.tracking", "hinge, slide"]),
+    ],
+)
+def test_bad_experiment(lines: dict[str, str], fragments: list[str], tmp_path: Path) -> None:
     """Exit code 2, one message, and nothing is written."""
-    lines, fragments = BAD_LINES[name]
-    write_experiment(tmp_path, **lines)
-    misused(run("design", tmp_path / "study.toml", "-o", tmp_path / "a" / "b"), *fragments)
+    path = write_experiment(tmp_path, **lines)
+    misused(run("design", path, "-o", tmp_path / "a" / "b"), *fragments)
     assert names(tmp_path) == {"study.toml", "cart_pendulum.xml", "cart_pendulum.csv"}
 
 
@@ -179,14 +167,11 @@ def test_unwritable_folder(study: Path, tmp_path: Path, monkeypatch: pytest.Monk
     assert names(tmp_path) == set()
 
 
-def test_disk_full(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_full(study: Path, tmp_path: Path) -> None:
     """One message with the words of the operating system."""
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device", str(tmp_path / "out" / "design.npz"))
-
-    monkeypatch.setattr(np, "savez_compressed", full)
-    result = run("design", study, "-o", tmp_path / "out")
+    full = OSError(28, "No space left on device", "design.npz")
+    with patch("numpy.savez_compressed", side_effect=full):
+        result = run("design", study, "-o", tmp_path / "out")
     assert isinstance(result.exception, SystemExit), repr(result.exception)
     assert result.exit_code in (1, 2)
     assert re.search(r"^mjfim: .*design\.npz.*No space left on device", result.stderr, re.MULTILINE)
@@ -215,40 +200,28 @@ def test_start_that_diverges(
 
 
 @pytest.mark.parametrize(
-    ("place", "message"),
+    ("verb", "place", "said"),
     [
-        ("cluster", "state local, local:N"),
-        ("local:0", "not a number"),
-        ("dask:no.json", "no such file"),
+        ("design", "local:0", "not a number"),
+        ("design", "dask:no.json", "no such file"),
+        *((verb, "cluster", "state local, local:N") for verb in ("design", "check", "compare")),
+        *(
+            (verb, "cluster", "state local, local:N")
+            for verb in ("campaign", "montecarlo", "identify")
+        ),
     ],
 )
 def test_an_executor_that_cannot_be_had_is_misuse(
-    place: str, message: str, study: Path, tmp_path: Path
+    verb: str, place: str, said: str, study: Path, tmp_path: Path
 ) -> None:
-    result = run("design", study, "-o", tmp_path / "out", "--executor", place)
-    misused(result, message)
+    """All verbs with much work state where it is done."""
+    # A file whose existence is checked before the options.
+    names_of_files = {"montecarlo": ["design.npz"], "identify": ["log.csv"]}.get(verb, [])
+    files = [tmp_path / name for name in names_of_files]
+    for file in files:
+        file.touch()
+    misused(run(verb, study, *files, "-o", tmp_path / "out", "--executor", place), said)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("verb", "files"),
-    [
-        ("montecarlo", ("design.npz",)),
-        ("identify", ("log.csv",)),
-        ("check", ()),
-        ("compare", ()),
-        ("campaign", ()),
-    ],
-)
-def test_all_verbs_with_much_work_state_where_it_is_done(
-    verb: str, files: tuple[str, ...], study: Path, tmp_path: Path
-) -> None:
-    # Files whose existence is checked before the options.
-    for name in files:
-        (tmp_path / name).touch()
-
-    words = (verb, study, *(tmp_path / name for name in files), "-o", tmp_path / "out")
-    misused(run(*words, "--executor", "cluster"), "state local, local:N")
 
 
 def test_the_answer_is_printed_before_pictures_are_drawn(

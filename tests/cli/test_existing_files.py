@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
+import runpy
 import shutil
 from pathlib import Path
 
@@ -44,26 +44,6 @@ def test_identify_does_not_replace_the_model_of_the_experiment(
     assert contents(tmp_path / "fit") == before
 
 
-@pytest.mark.usefixtures("empty_figures")
-@pytest.mark.slow
-def test_compare_keeps_controls_that_it_did_not_write(tmp_path: Path) -> None:
-    """In the folder of the experiment, whose own control has a name like a result."""
-    study = write_experiment(tmp_path, start='"control_mine.csv"')
-    (tmp_path / "cart_pendulum.csv").rename(tmp_path / "control_mine.csv")
-    (tmp_path / "control_other.csv").write_text("mine", encoding="utf-8")
-    before = contents(tmp_path)
-
-    words = ("compare", study, "-o", tmp_path, "--seconds", 1)
-    for methods in ("chirp", "steps"):
-        result = run(*words, "--methods", methods)
-        assert "wrote" in result.stderr, result.stderr
-
-    after = contents(tmp_path)
-    assert {name: after[name] for name in before} == before
-    assert "control_steps.csv" in after
-    assert "control_chirp.csv" not in after
-
-
 def test_compare_keeps_an_earlier_result_that_it_reads(study: Path, tmp_path: Path) -> None:
     """A control of an earlier comparison is the initial control now."""
     write_experiment(tmp_path, start='"control_chirp.csv"')
@@ -100,19 +80,15 @@ def test_the_script_for_logs_does_not_replace_a_model_of_the_user(
     study: Path, recorded: Path, tmp_path: Path
 ) -> None:
     """Its own earlier result is replaced; the user's with --force, which the message names."""
-    spec = importlib.util.spec_from_file_location("script", SCRIPTS / "identify_offline.py")
-    assert spec is not None and spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-
+    identify = runpy.run_path(str(SCRIPTS / "identify_offline.py"))["identify"]
     log = tmp_path / "log.csv"
     shutil.copy(recorded, log)
     mine = tmp_path / "identified.xml"
     mine.write_text("mine", encoding="utf-8")
     with pytest.raises(OutputError, match=r"identified\.xml: not listed.*--force"):
-        script.identify(study, [log], force=False)
+        identify(study, [log], force=False)
     assert mine.read_text(encoding="utf-8") == "mine"
 
-    assert script.identify(study, [log], force=True) == 0
+    assert identify(study, [log], force=True) == 0
     OutputGuard([], force=False).check([mine])
     assert mine.read_text(encoding="utf-8").startswith("<mujoco")

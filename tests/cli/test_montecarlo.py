@@ -10,6 +10,7 @@ import pytest
 from mjfim.output.manifest import MANIFEST
 from tests.support.cli import (
     STUDY,
+    done,
     loads,
     misused,
     names,
@@ -23,9 +24,7 @@ def test_montecarlo_leaves_its_files(study: Path, archived: Path, tmp_path: Path
     """Trials of the initial and the designed trajectory, at a lower measurement rate."""
     out = tmp_path / "mc"
     options = ("--trials", 20, "--seed", 3, "--measure-rate", 25, "--json")
-    result = run("montecarlo", study, archived, "-o", out, *options)
-
-    assert result.exit_code == 0
+    result = done("montecarlo", study, archived, "-o", out, *options)
     assert names(out) == STUDY | {MANIFEST}
     data = read(out / "montecarlo.json")
     assert loads(result.stdout) == data

@@ -14,17 +14,12 @@ from mjfim.cli import main as cli
 from mjfim.cli.progress import errors, lose_what_cannot_be_written, out
 from mjfim.output.page import Row, Table
 from mjfim.output.terminal import TerminalPage
-from tests.support.cli import MODELS, PROCESS, loads, misused, run, write_experiment
+from tests.support.cli import MODELS, PROCESS, loads, run, write_experiment
 from tests.support.pages import page_with
 from tests.support.paths import ROOT
 
 # Name that a terminal library would take for markup, a closing tag without a begin, and an emoji.
 NAME = "run [bold]1[/] [/red] :smile:"
-
-
-def test_brackets_in_messages(tmp_path: Path) -> None:
-    """A message shows the path of a missing file as it is."""
-    misused(run("check", tmp_path / f"{NAME}.toml"), f"{NAME}.toml: no such file")
 
 
 def test_brackets_in_the_path_of_results(study: Path, archived: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mjfim.output.manifest import MANIFEST
-from tests.support.cli import ESTIMATE, misused, names, read, run, write_experiment
+from tests.support.cli import ESTIMATE, done, misused, names, read, run, write_experiment
 
 # A load on the pendulum of the cart, which the experiment states for a design.
 LOAD = """
@@ -29,8 +29,8 @@ def test_a_payload_is_said_and_written(tmp_path: Path) -> None:
     loaded = tmp_path / "loaded.toml"
     loaded.write_text(robot.read_text(encoding="utf-8") + LOAD, encoding="utf-8")
     unloaded_log, log = tmp_path / "unloaded.csv", tmp_path / "loaded.csv"
-    assert run("simulate", robot, "-o", unloaded_log).exit_code == 0
-    assert run("simulate", loaded, "-o", log, "--seed", 1).exit_code == 0
+    done("simulate", robot, "-o", unloaded_log)
+    done("simulate", loaded, "-o", log, "--seed", 1)
 
     # The experiment with the load says where it is; the log without it says what the robot is.
     out = tmp_path / "out"
@@ -47,11 +47,7 @@ def test_a_payload_is_said_and_written(tmp_path: Path) -> None:
     assert payload["edge"] in (None, 0.1)
     assert '<body name="payload"' in (out / "identified.xml").read_text(encoding="utf-8")
 
-    # The report is made again from the files alone.
-    before = (out / "report.html").read_bytes()
-    assert "The payload at bob" in before.decode()
-    assert run("report", out).exit_code == 0
-    assert (out / "report.html").read_bytes() == before
+    assert "The payload at bob" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_misuse_is_one_message(tmp_path: Path) -> None:

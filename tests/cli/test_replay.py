@@ -8,7 +8,7 @@ from pathlib import Path
 from typer.testing import Result
 
 from mjfim.output import rerun as rerun_log
-from tests.support.cli import misused, run
+from tests.support.cli import done, misused, run
 from tests.support.paths import MODELS
 
 
@@ -30,7 +30,7 @@ def test_replay_of_a_lonely_archive(archived: Path, tmp_path: Path) -> None:
     assert (result.exit_code, target.exists()) == (2, False)
     assert "give its file with --experiment" in result.stderr
     stated = ("--experiment", MODELS / "cart_pendulum.toml")
-    assert run("replay", tmp_path / "design.npz", "--save", target, *stated).exit_code == 0
+    done("replay", tmp_path / "design.npz", "--save", target, *stated)
 
 
 def test_replay_into_a_folder(home: Path, designed: Result, tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_replay_of_an_archive_leaves_the_full_picture_alone(
     shown: list[Path] = []
     monkeypatch.setattr(rerun_log, "show", shown.append)
     before = (home / "out" / "design.rrd").read_bytes()
-    assert run("replay", home / "out" / "design.npz").exit_code == 0
+    done("replay", home / "out" / "design.npz")
     assert (home / "out" / "design.rrd").read_bytes() == before
     assert shown[0].is_file()
     assert shown[0].parent != home / "out"

@@ -14,18 +14,18 @@ from mjfim.output.plots import draw
 from mjfim.output.plots.pictures import picture_names
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from tests.support import results
-from tests.support.cli import misused, run
+from tests.support.cli import done, misused, run
 
 
 def test_report_writes_the_report_of_a_folder(tmp_path: Path) -> None:
     """A report of the user is replaced with --force only."""
     results.design().save(tmp_path)
-    assert run("report", tmp_path).exit_code == 0
+    done("report", tmp_path)
     first = (tmp_path / REPORT).read_bytes()
 
     (tmp_path / REPORT).write_text("mine", encoding="utf-8")
     misused(run("report", tmp_path), f"{REPORT}: changed after mjfim wrote it", "--force")
-    assert run("report", tmp_path, "--force").exit_code == 0
+    done("report", tmp_path, "--force")
     assert (tmp_path / REPORT).read_bytes() == first
 
 
@@ -34,11 +34,10 @@ def test_report_draws_pictures_that_are_missing(tmp_path: Path) -> None:
     """Only on request, and only those of which there is no file in any format."""
     results.design().save(tmp_path)
     (tmp_path / "convergence.svg").write_text("<svg/>", encoding="utf-8")
-    assert run("report", tmp_path).exit_code == 0
+    done("report", tmp_path)
     assert not list(tmp_path.glob("*.png"))
 
-    result = run("report", tmp_path, "--pictures")
-    assert result.exit_code == 0
+    result = done("report", tmp_path, "--pictures")
     drawn = {path.stem for path in tmp_path.glob("*.png")}
     assert drawn == set(picture_names(results.design())) - {"convergence"}
     assert all(f"wrote {tmp_path / name}.png" in result.stderr for name in drawn)
@@ -48,13 +47,13 @@ def test_report_draws_pictures_that_are_missing(tmp_path: Path) -> None:
 def test_report_draws_pictures_again_that_are_older_than_their_result(tmp_path: Path) -> None:
     """Ctrl-C during a second run leaves the pictures of the first one, in whatever format."""
     results.design().save(tmp_path)
-    assert run("report", tmp_path, "--pictures", "--format", "svg").exit_code == 0
+    done("report", tmp_path, "--pictures", "--format", "svg")
     drawn = sorted(tmp_path.glob("*.svg"))
     written = (tmp_path / "design.npz").stat().st_mtime_ns
     os.utime(drawn[0], ns=(0, written - 1))
     os.utime(drawn[1], ns=(0, written))
 
-    assert run("report", tmp_path, "--pictures").exit_code == 0
+    done("report", tmp_path, "--pictures")
     assert [path.stem for path in tmp_path.glob("*.png")] == [drawn[0].stem]
     assert sorted(tmp_path.glob("*.svg")) == drawn[1:]
 
@@ -77,8 +76,7 @@ def test_a_press_while_pictures_are_drawn_keeps_those_that_are_written(
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(draw, "save", press)
-    result = run("report", folder, "--pictures")
-    assert result.exit_code == 1
+    result = done("report", folder, "--pictures", code=1)
     assert NOTHING_SENTENCE not in result.stderr
     names = picture_names(results.design())
     assert len(list(folder.glob("*.png"))) == len(written) == (len(names) if presses == 1 else 1)

@@ -14,6 +14,7 @@ from mjfim.output import archive
 from mjfim.output.manifest import OutputGuard
 from mjfim.recordings import read as logs
 from tests.support.cli import (
+    done,
     misused,
     names,
     run,
@@ -36,8 +37,7 @@ def test_the_seed_determines_the_recording(
     """An equal seed gives an equal file, another seed gives another file."""
     again = tmp_path / "again.csv"
     for seed, equal in ((1, True), (2, False)):
-        result = run("simulate", study, archived, "-o", again, "--seed", seed)
-        assert result.exit_code == 0
+        done("simulate", study, archived, "-o", again, "--seed", seed)
         assert (again.read_bytes() == recorded.read_bytes()) is equal
 
 
@@ -60,8 +60,7 @@ def test_the_folder_of_a_design_stands_for_its_file(
     folder.mkdir()
     shutil.copy(archived, folder)
     for _ in range(2):
-        result = run("simulate", study, folder, "--seed", 1)
-        assert result.exit_code == 0
+        result = done("simulate", study, folder, "--seed", 1)
         assert f"wrote {folder / 'recording.csv'}" in result.stderr
     assert (folder / "recording.csv").read_bytes() == recorded.read_bytes()
 
@@ -78,7 +77,7 @@ def test_a_foreign_recording_beside_the_design_stays(
     (tmp_path / "recording.csv").write_text("t\n", encoding="utf-8")
     misused(run("simulate", study, tmp_path), "recording.csv", "--force")
     assert (tmp_path / "recording.csv").read_text(encoding="utf-8") == "t\n"
-    assert run("simulate", study, tmp_path, "--force").exit_code == 0
+    done("simulate", study, tmp_path, "--force")
     assert (tmp_path / "recording.csv").read_text(encoding="utf-8") != "t\n"
 
 
@@ -104,8 +103,7 @@ def test_without_a_renderer_there_is_no_video_and_a_sentence_says_so(
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "disable")
     target, film = tmp_path / "recording.csv", tmp_path / "film.gif"
-    result = run("simulate", study, archived, "-o", target, "--video", film)
-    assert result.exit_code == 0
+    result = done("simulate", study, archived, "-o", target, "--video", film)
     assert "there is no video: the variable MUJOCO_GL turns drawing off" in result.stderr
     assert not film.exists()
     assert target.exists()
@@ -116,8 +114,7 @@ def test_without_a_renderer_there_is_no_video_and_a_sentence_says_so(
 def test_video_of_a_recording_is_written(study: Path, archived: Path, tmp_path: Path) -> None:
     """A second run may replace what the first one wrote."""
     target, film = tmp_path / "recording.csv", tmp_path / "film.gif"
-    result = run("simulate", study, archived, "-o", target, "--video", film)
-    assert result.exit_code == 0, result.stderr
+    result = done("simulate", study, archived, "-o", target, "--video", film)
     if "there is no video" in result.stderr:
         pytest.skip(result.stderr)
     assert "film.gif: The simulated motion, 5 times slower" in result.stderr

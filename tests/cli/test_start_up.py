@@ -17,7 +17,7 @@ from typer.main import get_command
 
 from mjfim.cli.main import ORDER, app
 from mjfim.parallel import cores
-from tests.support.cli import MODELS, run, write_experiment
+from tests.support.cli import MODELS, done, run, write_experiment
 from tests.support.paths import ROOT
 
 # Packages that take long to import, and that no help and no message about misuse needs.
@@ -86,11 +86,6 @@ def imported(calls: list[list[str]], modules: tuple[str, ...]) -> list[tuple[str
     return [tuple(row) for row in json.loads(done.stdout)]
 
 
-def short_experiment(folder: Path) -> Path:
-    """The short study with a horizon that is shorter still, and a single iteration."""
-    return write_experiment(folder, horizon="0.4", max_iterations="1")
-
-
 def verbs() -> dict[str, Any]:
     """The verbs of the command line by their names."""
     return dict(get_command(app).commands)  # type: ignore[attr-defined]
@@ -124,32 +119,23 @@ def test_a_wrong_key_is_said_before_the_engine_is_imported(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_design_imports_only_the_parts_of_scipy_that_it_needs(tmp_path: Path) -> None:
-    words = ["design", str(short_experiment(tmp_path)), "-o", str(tmp_path / "out")]
-    unused = ("scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.stats", "pandas")
-    unused = (*unused, "mjfim.identification")
-
-    # On several processors, another process draws the pictures.
-    if cores() > 1:
-        unused = (*unused, "matplotlib")
-    assert [found for _, _, found in imported([words], unused)] == [[], []]
-
-
-@pytest.mark.slow
-def test_a_fit_imports_nothing_of_a_design(tmp_path: Path) -> None:
-    experiment, log = str(short_experiment(tmp_path)), str(tmp_path / "log.csv")
-    assert run("simulate", experiment, "-o", log).exit_code == 0
-    words = ["identify", experiment, log, "-o", str(tmp_path / "out")]
-    report = imported([words], ("mjfim.excitation", "mjfim.identification"))
-    assert report[1][1:] == (0, ["mjfim.identification"])
-
-
-@pytest.mark.slow
-def test_a_check_without_a_folder_imports_nothing_that_draws(tmp_path: Path) -> None:
-    experiment, model = str(short_experiment(tmp_path)), str(tmp_path / "cart_pendulum.xml")
-    calls = [["list", model], ["validate", experiment], ["check", experiment]]
-    report = imported(calls, UNUSED_WITHOUT_FOLDER)
-    assert report == [(name, 0, []) for name, _, _ in report]
+@pytest.mark.parametrize("verb", ["design", "identify", "list", "validate", "check"])
+def test_a_verb_imports_what_it_needs_only(verb: str, tmp_path: Path) -> None:
+    """Nothing that draws or fits, where nothing is drawn or fitted."""
+    experiment = str(write_experiment(tmp_path, horizon="0.4", max_iterations="1"))
+    log, out = str(tmp_path / "log.csv"), ["-o", str(tmp_path / "out")]
+    done("simulate", experiment, "-o", log)
+    words = {"list": [str(tmp_path / "cart_pendulum.xml")], "identify": [experiment, log, *out]}
+    # On several processors, another process draws the pictures of a design.
+    drawing = [] if cores() > 1 else ["matplotlib"]
+    unused = {
+        "design": {"scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.stats", "pandas"}
+        | {"mjfim.identification", "matplotlib"} - {*drawing},
+        "identify": {"mjfim.excitation"},
+    }.get(verb, {*UNUSED_WITHOUT_FOLDER})
+    call = [verb, *words.get(verb, [experiment, *(out if verb == "design" else [])])]
+    report = imported([call], tuple(unused))
+    assert [row[1:] for row in report] == [(0, []), (0, [])]
 
 
 def test_help_lists_every_verb_with_its_first_sentence() -> None:

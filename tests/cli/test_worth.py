@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.support.cli import loads, names, read, run
+from tests.support.cli import done, loads, names, read, run
 
 
 def test_an_experiment_is_answered_with_and_without_a_sensor(study: Path, tmp_path: Path) -> None:
-    result = run("worth", study, "--add", "gyro:bob=0.01", "--json", "-o", tmp_path / "out")
-    assert result.exit_code == 0
+    result = done("worth", study, "--add", "gyro:bob=0.01", "--json", "-o", tmp_path / "out")
     found = loads(result.stdout)
     assert found == read(tmp_path / "out" / "worth.json")
     added = [each for each in found["sensors"] if each["is_added"]]

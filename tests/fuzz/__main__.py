@@ -17,50 +17,6 @@ from tests.fuzz.workers import run_cases
 from tests.support.paths import ROOT
 
 
-def cases_of(counts: dict[str, int], seed: int) -> Iterator[Case]:
-    """Cases of every kind with successive seeds.
-
-    Args:
-        counts: Number of cases by kind.
-        seed: First seed.
-    """
-    for kind, count in counts.items():
-        for i in range(count):
-            yield Case(kind=kind, seed=seed + i)
-
-
-def report(outcome: Outcome, verbose: bool) -> None:
-    """Print a case that failed; with `verbose` every case."""
-    if outcome.complaint:
-        known = outcome.known
-        word = f"known failure ({known.reason})" if known else "FAILED"
-        print(f"{word}: --only {outcome.case}: {outcome.description}", flush=True)
-        print("    " + outcome.complaint.replace("\n", "\n    "), flush=True)
-    elif verbose:
-        about = f"{outcome.group}, {outcome.seconds:.1f} s, {outcome.description}"
-        print(f"{outcome.case}: {about}", flush=True)
-
-
-def summarize(outcomes: list[Outcome], seconds: float) -> None:
-    """Print how many cases of each kind ended how, and the seeds of what failed."""
-    print(f"\n{len(outcomes)} cases in {seconds:.0f} s on {cores()} cores")
-    for kind in KINDS:
-        own = [outcome for outcome in outcomes if outcome.case.kind == kind]
-        if not own:
-            continue
-        seeds = [outcome.case.seed for outcome in own]
-        groups = ", ".join(f"{n} {group}" for group, n in Counter(o.group for o in own).items())
-        print(f"{kind}: {len(own)} cases, seeds {min(seeds)} to {max(seeds)}: {groups}")
-
-        failed = [outcome for outcome in own if outcome.complaint]
-        for word, chosen in (
-            ("failed", [outcome for outcome in failed if outcome.known is None]),
-            ("known failures", [outcome for outcome in failed if outcome.known is not None]),
-        ):
-            listed = " ".join(str(outcome.case) for outcome in chosen)
-            print(f"  {word}: {len(chosen)} {listed}".rstrip())
-
-
 def main() -> int:
     """Run the cases that the command line asks for; exit code 1 if a case failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
@@ -78,17 +34,24 @@ def main() -> int:
     parser.add_argument("--verbose", action="store_true", help="print every case")
     args = parser.parse_args()
 
-    counts = {kind: getattr(args, f"{kind}s") for kind in KINDS}
-    cases = args.only or list(cases_of(counts, args.seed))
-    begin = time.monotonic()
-    outcomes = []
-    found = _here(cases) if args.here else run_cases(cases, args.workers, args.seconds)
-    for outcome in found:
-        report(outcome, args.verbose or args.only is not None)
-        outcomes.append(outcome)
+    cases = args.only or [
+        Case(kind=kind, seed=args.seed + i)
+        for kind in KINDS
+        for i in range(getattr(args, f"{kind}s"))
+    ]
+    begin, failed = time.monotonic(), []
+    groups: Counter[str] = Counter()
+    for outcome in _here(cases) if args.here else run_cases(cases, args.workers, args.seconds):
+        groups[f"{outcome.case.kind}: {outcome.group}"] += 1
+        if outcome.complaint:
+            failed.append(f"FAILED: --only {outcome.case}")
+        if outcome.complaint or args.verbose or args.only:
+            about = f"{outcome.group}, {outcome.seconds:.1f} s, {outcome.description}"
+            print(f"{outcome.case}: {about}\n{outcome.complaint}".strip(), flush=True)
 
-    summarize(outcomes, time.monotonic() - begin)
-    return int(any(outcome.complaint and not outcome.known for outcome in outcomes))
+    print(f"\n{groups.total()} cases in {time.monotonic() - begin:.0f} s on {cores()} cores")
+    print("\n".join([*(f"{group}: {count}" for group, count in sorted(groups.items())), *failed]))
+    return int(bool(failed))
 
 
 def _here(cases: list[Case]) -> Iterator[Outcome]:

@@ -1,12 +1,13 @@
-"""Bad inputs: a valid study of which one thing is spoiled at random."""
+"""Bad inputs: a valid study of which one thing, or two, are spoiled at random."""
 
 from __future__ import annotations
 
+import functools
 import gzip
 import io
 import json
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,29 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow
+import pyarrow.csv
 import pyarrow.parquet
+import scipy.io
 
 Rng = np.random.Generator
 Key = tuple[Any, ...]
+
+# Calls of verbs with the files of the study.
+CHECK = ("check", "study.toml", "--threads", "1")
+DESIGN = ("design", "study.toml", "-o", "out", "--threads", "1")
+SIMULATE = ("simulate", "study.toml", "design.npz", "-o", "new.csv")
+IDENTIFY = ("identify", "study.toml", "run.csv", "-o", "out", "--threads", "1")
+MONTECARLO = ("montecarlo", "study.toml", "design.npz", "--trials", "2", "-o", "out")
+REPLAY = ("replay", "design.npz", "--experiment", "study.toml", "--save", "new.rrd")
+EXPERIMENT_VERBS = (CHECK, DESIGN, SIMULATE, SIMULATE, IDENTIFY)
+DESIGN_VERBS = (SIMULATE, (*CHECK, "--design", "design.npz"), MONTECARLO, REPLAY)
+WRITING_VERBS = (
+    SIMULATE,
+    (*CHECK, "-o", "out"),
+    (*IDENTIFY[:3], *IDENTIFY[5:], "-o", "out"),
+    REPLAY,
+    MONTECARLO,
+)
 
 # Numbers that no key expects.
 EXTREMES: tuple[Any, ...] = (
@@ -39,6 +59,14 @@ EXTREMES: tuple[Any, ...] = (
 
 # Values of a type that a number does not have.
 WRONG_TYPES: tuple[Any, ...] = ("text", "", "1.0", True, [], [1.0], ["x"], {}, {"x": 1.0})
+
+# A long text and a long list, a list inside a list and so on, and a large table.
+HUGE: tuple[Any, ...] = (
+    "x" * 100_000,
+    [0.5] * 20_000,
+    functools.reduce(lambda inner, _: [inner], range(200), []),
+    {f"k{i}": 1.0 for i in range(5000)},
+)
 
 # Tables whose keys are names that the user or the model chooses.
 TABLES_BY_NAME = ("parameters", "noise", "position", "velocity", "control", "tracking", "columns")
@@ -88,7 +116,7 @@ class Call:
         patience: Time after which the call is asked to stop, in place of an end of the case [s].
     """
 
-    words: list[str]
+    words: Sequence[str]
     spoiled: str
     refused: bool = False
     fails: bool = False
@@ -135,7 +163,6 @@ def leaves(value: Any, path: Key = ()) -> list[Key]:
 
 
 def at(value: Any, path: Key) -> Any:
-    """The part of a value at a path."""
     for key in path:
         value = value[key]
     return value
@@ -148,7 +175,6 @@ def pick(rng: Rng, choices: Any) -> Any:
 
 def spoil_bytes(rng: Rng, content: bytes) -> tuple[bytes, str]:
     """Spoil the content of a file without a look at what it says."""
-    name = pick(rng, ("cut", "flipped", "empty", "not UTF-8", "NUL", "repeated", "random"))
     place = int(rng.integers(max(len(content), 1)))
     flipped = bytearray(content)
     for i in rng.integers(len(content), size=5).tolist():
@@ -162,6 +188,7 @@ def spoil_bytes(rng: Rng, content: bytes) -> tuple[bytes, str]:
         "repeated": content + content,
         "random": rng.bytes(2000),
     }
+    name = pick(rng, tuple(results))
     return results[name], f"bytes {name}"
 
 
@@ -177,110 +204,49 @@ def spoiled_experiment(rng: Rng, folder: Path) -> Call:
             tables[name] = json.loads(json.dumps(table))
     write_toml(file, tables)
 
-    if rng.random() < 0.12:
+    spoil = pick(rng, (None, None, _remove, _rename, *(_replace,) * 5))
+    if spoil is not None:
+        spoiled, refused = spoil(rng, tables)
+        write_toml(file, tables)
+    elif rng.random() < 0.5:
         content, spoiled = spoil_bytes(rng, file.read_bytes())
         file.write_bytes(content)
         refused = False
     else:
-        spoil = pick(
-            rng, (_remove, _rename, _double, _extreme, _extreme, _retype, _retype, _inflate)
-        )
-        spoiled, refused = spoil(rng, tables, file)
-
-    call = _any_verb(rng)
-    call.spoiled = f"experiment: {spoiled}"
-    call.refused = refused
-    return call
+        lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+        line = pick(rng, lines)
+        file.write_text("".join([*lines, line]), encoding="utf-8")
+        spoiled, refused = f"{line.split(' =')[0]} stated twice", True
+    words = pick(rng, EXPERIMENT_VERBS)
+    return Call(words=words, spoiled=f"experiment: {spoiled}", refused=refused)
 
 
-def _any_verb(rng: Rng) -> Call:
-    """A call of a verb that reads the experiment file."""
-    words = pick(
-        rng,
-        (
-            ["check", "study.toml", "--threads", "1"],
-            ["design", "study.toml", "-o", "out", "--threads", "1"],
-            ["simulate", "study.toml", "design.npz", "-o", "new.csv"],
-            ["simulate", "study.toml", "design.npz", "-o", "new.csv"],
-            ["identify", "study.toml", "run.csv", "-o", "out", "--threads", "1"],
-        ),
-    )
-    return Call(words=list(words), spoiled="")
-
-
-def _numbers(tables: dict[str, Any]) -> list[Key]:
-    """Paths of all numbers."""
-    return [p for p in leaves(tables) if type(at(tables, p)) in (int, float)]
-
-
-def _remove(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+def _remove(rng: Rng, tables: dict[str, Any]) -> tuple[str, bool]:
     """Remove a key."""
     path = pick(rng, leaves(tables))
     del at(tables, path[:-1])[path[-1]]
-    write_toml(file, tables)
     return f"{path} removed", path in (("model",), ("rate",), ("parameters",))
 
 
-def _rename(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+def _rename(rng: Rng, tables: dict[str, Any]) -> tuple[str, bool]:
     """Rename a key."""
     path = pick(rng, [p for p in leaves(tables) if isinstance(p[-1], str)])
     table = at(tables, path[:-1])
     new = pick(rng, (f"{path[-1]}s", path[-1].upper(), "", " ", "ü", "x" * 2000))
     table[new] = table.pop(path[-1])
-    write_toml(file, tables)
     by_name = len(path) > 1 and path[-2] in TABLES_BY_NAME
     return f"{path} renamed to {new[:20]!r}", not by_name and new != path[-1]
 
 
-def _double(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
-    """State a key twice."""
-    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-    line = pick(rng, lines)
-    file.write_text("".join([*lines, line]), encoding="utf-8")
-    return f"{line.split(' =')[0]} stated twice", True
-
-
-def _extreme(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
-    """Replace a number by an extreme one."""
-    path, value = pick(rng, _numbers(tables)), pick(rng, EXTREMES)
+def _replace(rng: Rng, tables: dict[str, Any]) -> tuple[str, bool]:
+    """Replace a number by an extreme one, or a value by one of another type or a huge one."""
+    values = pick(rng, (EXTREMES, EXTREMES, WRONG_TYPES, WRONG_TYPES, HUGE))
+    paths = leaves(tables)
+    numbers = [path for path in paths if type(at(tables, path)) in (int, float)]
+    path, value = pick(rng, numbers if values is EXTREMES else paths), pick(rng, values)
     at(tables, path[:-1])[path[-1]] = value
-    write_toml(file, tables)
-    return f"{path} = {value!r}", value != value
-
-
-def _retype(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
-    """Replace a value by one of another type."""
-    path, value = pick(rng, leaves(tables)), pick(rng, WRONG_TYPES)
-    before = at(tables, path)
-    is_number = type(before) in (int, float)
-    at(tables, path[:-1])[path[-1]] = value
-    write_toml(file, tables)
-    return f"{path} = {value!r}", is_number and isinstance(value, str | bool)
-
-
-def _inflate(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
-    """Replace a value by a huge one."""
-    path = pick(rng, leaves(tables))
-    name, value = pick(
-        rng,
-        (
-            ("a long text", "x" * 100_000),
-            ("a long list", [0.5] * 20_000),
-            ("a deep list", _nested(200)),
-            ("a large table", {f"k{i}": 1.0 for i in range(5000)}),
-        ),
-    )
-    at(tables, path[:-1])[path[-1]] = value
-    write_toml(file, tables)
-    return f"{path} = {name}", False
-
-
-def _nested(depth: int) -> list[Any]:
-    """A list inside a list, and so on."""
-    value: list[Any] = []
-    for _ in range(depth):
-        value = [value]
-    return value
+    refused = value != value or (path in numbers and isinstance(value, str | bool))
+    return f"{path} = {repr(value)[:30]}", refused
 
 
 # The model.
@@ -304,23 +270,35 @@ MODEL_VALUES = (
 MOVING = ("mass", "timestep", "damping", "gravity", "qpos", "diaginertia")
 
 
+URDF = """<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0.1 0 0"/>
+<mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>
+</link><joint name="slide" type="revolute"><parent link="base"/><child link="arm"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="5" velocity="5"/></joint></robot>"""
+
+
 def spoiled_model(rng: Rng, folder: Path) -> Call:
-    """Spoil the MJCF."""
+    """Spoil the MJCF, or give a URDF, which lacks what the experiment names."""
     file = folder / "cart_pendulum.xml"
-    refused = False
+    text, refused = file.read_text(encoding="utf-8"), False
+    is_urdf = rng.random() < 0.1
+    if is_urdf:
+        text, file = URDF, folder / "robot.urdf"
+        experiment = folder / "study.toml"
+        stated = experiment.read_text(encoding="utf-8").replace("cart_pendulum.xml", file.name)
+        experiment.write_text(stated, encoding="utf-8")
     if rng.random() < 0.2:
-        content, spoiled = spoil_bytes(rng, file.read_bytes())
-        file.write_bytes(content)
+        content, spoiled = spoil_bytes(rng, text.encode())
     else:
-        tree = ElementTree.fromstring(file.read_text(encoding="utf-8"))
+        tree = ElementTree.fromstring(text)
         spoil = pick(rng, (_set_attribute, _set_attribute, _set_attribute, _change_element))
         spoiled, refused = spoil(rng, tree)
-        file.write_bytes(ElementTree.tostring(tree))
-
-    call = _any_verb(rng)
-    call.spoiled = f"model: {spoiled}"
-    call.refused = refused
-    return call
+        content = ElementTree.tostring(tree)
+    if not is_urdf and rng.random() < 0.2:
+        (folder / "inner.xml").write_bytes(content)
+        content, spoiled = b'<mujoco><include file="inner.xml"/></mujoco>', f"included, {spoiled}"
+    file.write_bytes(content)
+    words = pick(rng, EXPERIMENT_VERBS)
+    return Call(words=words, spoiled=f"{file.name}: {spoiled}", refused=refused or is_urdf)
 
 
 def _set_attribute(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
@@ -365,34 +343,42 @@ def _change_element(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
 
 def spoiled_recording(rng: Rng, folder: Path) -> Call:
     """Spoil the recording, in one of the formats that are read."""
-    rows = [line.split(",") for line in (folder / "run.csv").read_text("utf-8").splitlines()]
-    rows = [[cell.strip('"') for cell in row] for row in rows]
+    rows = rows_of(folder)
     spoil = pick(
         rng,
-        (_ragged, _bad_cell, _bad_cell, _columns, _columns, _times, _no_rows, _booleans, _bytes),
+        (
+            *(_ragged, _bad_cell, _bad_cell, _columns, _columns, odd_times, few_rows, _booleans),
+            *(odd_numbers, odd_numbers, None, None),
+        ),
     )
-    spoiled, refused = spoil(rng, rows)
+    spoiled, refused = ("intact", False) if spoil is None else spoil(rng, rows)
+    names = ["log.csv", "log.csv", "log.csv.gz"]
+    if len({len(row) for row in rows}) == 1:
+        names.append("log.parquet")
+        # The names of the columns of other formats differ.
+        names += ["log.npz", "log.json"] if len(set(rows[0])) == len(rows[0]) else []
+    if spoil is None:
+        names += ["log.npy", "log.mat", "log.jsonl"]
+    name = pick(rng, names)
+    content, is_spoiled = in_format(name, rows), spoil is None and rng.random() < 0.5
+    if is_spoiled:
+        content, spoiled = spoil_bytes(rng, content)
+        refused = spoiled in ("bytes empty", "bytes random")
+    (folder / name).write_bytes(content)
 
-    if spoil is _bytes:
-        name = pick(rng, ("log.csv", "log.csv.gz", "log.npz", "log.parquet", "log.json"))
-        content, how = spoil_bytes(rng, _in_format(name, rows))
-        (folder / name).write_bytes(content)
-        spoiled, refused = f"{how}", how in ("bytes empty", "bytes random")
-    else:
-        is_table = len({len(row) for row in rows}) == 1 and len(set(rows[0])) == len(rows[0])
-        names = ("log.csv", "log.csv", "log.csv.gz")
-        name = pick(rng, (*names, "log.npz", "log.parquet", "log.json") if is_table else names)
-        (folder / name).write_bytes(_in_format(name, rows))
-
-    words = ["identify", "study.toml", name, "-o", "out", "--threads", "1"]
-    if spoil is not _bytes and rng.random() < 0.08:
-        words, spoiled, refused = [*words[:2], "run.csv", "run.csv", *words[3:]], "twice", True
-    elif rng.random() < 0.1:
-        words = ["check", "study.toml", name, "--threads", "1"]
-    return Call(words=words, spoiled=f"recording {name}: {spoiled}", refused=refused)
+    words = (*IDENTIFY[:2], name, *IDENTIFY[3:]) if rng.random() < 0.9 else (*CHECK, name)
+    accepted = spoil is None and not is_spoiled
+    spoiled = f"recording {name}: {spoiled}"
+    return Call(words=words, spoiled=spoiled, refused=refused, accepted=accepted)
 
 
-def _in_format(name: str, rows: list[list[str]]) -> bytes:
+def rows_of(folder: Path) -> list[list[str]]:
+    """The header and the rows of the recording of the study."""
+    lines = (folder / "run.csv").read_text(encoding="utf-8").splitlines()
+    return [[cell.strip('"') for cell in line.split(",")] for line in lines]
+
+
+def in_format(name: str, rows: list[list[str]]) -> bytes:
     """A table in the format of a file name."""
     text = "\n".join(",".join(row) for row in rows) + "\n"
     if name.endswith(".csv"):
@@ -400,14 +386,23 @@ def _in_format(name: str, rows: list[list[str]]) -> bytes:
     if name.endswith(".gz"):
         return gzip.compress(text.encode(), mtime=0)
 
-    columns = {key: _column([row[i] for row in rows[1:]]) for i, key in enumerate(rows[0])}
-    stream = io.BytesIO()
+    header, stream = rows[0], io.BytesIO()
+    columns = [_column([row[i] for row in rows[1:]]) for i in range(len(header))]
+    named = {key or "x": np.array(column) for key, column in zip(header, columns, strict=True)}
     if name.endswith(".npz"):
-        np.savez(stream, **{key or "x": np.array(column) for key, column in columns.items()})
+        np.savez(stream, **named)
+    elif name.endswith(".npy"):
+        np.save(stream, np.rec.fromarrays(columns, names=header))
+    elif name.endswith(".mat"):
+        scipy.io.savemat(stream, named)
     elif name.endswith(".parquet"):
-        pyarrow.parquet.write_table(pyarrow.table(columns), stream)
+        table = pyarrow.Table.from_arrays([*map(pyarrow.array, columns)], names=header)
+        pyarrow.parquet.write_table(table, stream)
     else:
-        return json.dumps([dict(zip(rows[0], row, strict=False)) for row in rows[1:]]).encode()
+        records = [dict(zip(header, row, strict=True)) for row in zip(*columns, strict=True)]
+        if name.endswith(".jsonl"):
+            return "\n".join(map(json.dumps, records)).encode()
+        return json.dumps(records).encode()
     return stream.getvalue()
 
 
@@ -463,28 +458,27 @@ def _columns(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"column {title} {name}", refused
 
 
-def _times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def odd_times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     """Spoil the times."""
-    name = pick(rng, ("shuffled", "equal", "reversed", "negative", "huge", "a gap", "text", "tiny"))
     times = [float(row[0]) for row in rows[1:]]
-    changed: dict[str, Callable[[], list[Any]]] = {
-        "shuffled": lambda: rng.permutation(times).tolist(),
-        "equal": lambda: [1.0] * len(times),
-        "reversed": lambda: times[::-1],
-        "negative": lambda: [-t for t in times],
-        "huge": lambda: [1e300 * t for t in times],
-        "a gap": lambda: [t + 100.0 * (t > 0.5) for t in times],
-        "text": lambda: [f"12:00:{t}" for t in times],
-        "tiny": lambda: [5e-324 * k for k in range(len(times))],
+    changed = {
+        "shuffled": rng.permutation(times).tolist(),
+        "equal": [1.0] * len(times),
+        "reversed": times[::-1],
+        "negative": [-t for t in times],
+        "huge": [1e300 * t for t in times],
+        "a gap": [t + 100.0 * (t > 0.5) for t in times],
+        "text": [f"12:00:{t}" for t in times],
+        "tiny": [5e-324 * k for k in range(len(times))],
     }
-    for row, value in zip(rows[1:], changed[name](), strict=True):
+    name = pick(rng, tuple(changed))
+    for row, value in zip(rows[1:], changed[name], strict=True):
         row[0] = str(value)
     return f"times {name}", name in ("equal", "text")
 
 
-def _no_rows(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
-    """Keep few rows."""
-    count = int(rng.integers(0, 4))
+def few_rows(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    count = int(rng.integers(4))
     del rows[1 + count :]
     return f"{count} rows", count < 2
 
@@ -498,9 +492,18 @@ def _booleans(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"column {rows[0][j]} of truth values", not rows[0][j].startswith("ctrl:")
 
 
-def _bytes(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
-    """Leave the table alone; the bytes of the file are spoiled."""
-    return "", False
+def odd_numbers(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Write an odd number into some rows of a column or of all columns."""
+    count = len(rows[0])
+    columns = [int(rng.integers(count))] if rng.random() < 0.7 else list(range(count))
+    value = pick(rng, ("inf", "-inf", "nan", "1e300", "1e-300", "1e160", "0"))
+    share, certain = rng.choice([0.01, 0.3, 1.0]), int(rng.integers(1, len(rows) - 1))
+    for i, row in enumerate(rows[1:], start=1):
+        for j in columns:
+            if i == certain or rng.random() < share:
+                row[j] = value
+    necessary = any(rows[0][j] in ("t", "ctrl:force") for j in columns)
+    return f"{value} in {len(columns)} columns", value.endswith("inf") and necessary
 
 
 # Designs.
@@ -516,49 +519,26 @@ def spoiled_design(rng: Rng, folder: Path) -> Call:
     else:
         spoiled, refused = _spoil_array(rng, file)
 
-    words = pick(
-        rng,
-        (
-            ["simulate", "study.toml", "design.npz", "-o", "new.csv"],
-            ["check", "study.toml", "--design", "design.npz", "--threads", "1"],
-            ["montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"],
-            ["replay", "design.npz", "--experiment", "study.toml", "--save", "new.rrd"],
-        ),
-    )
-    return Call(words=list(words), spoiled=f"design: {spoiled}", refused=refused)
+    words = pick(rng, DESIGN_VERBS)
+    return Call(words=words, spoiled=f"design: {spoiled}", refused=refused)
 
 
 def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
-    """Spoil one array of an npz file."""
     with np.load(file, allow_pickle=False) as loaded:
         arrays = {name: loaded[name] for name in loaded.files}
     name = pick(rng, ["t", "qpos", "qvel", "ctrl", *sorted(arrays)])
     array = arrays[name]
-    how = pick(
-        rng,
-        (
-            "removed",
-            "shorter",
-            "flat",
-            "NaN",
-            "infinite",
-            "text",
-            "pickle",
-            "equal",
-            "reversed",
-            "npy",
-        ),
-    )
-    changes: dict[str, Callable[[], Any]] = {
-        "shorter": lambda: array[:-1] if array.ndim else array,
-        "flat": lambda: array.ravel()[:1],
-        "NaN": lambda: np.full(array.shape, np.nan),
-        "infinite": lambda: np.full(array.shape, np.inf),
-        "text": lambda: np.full(array.shape, "text"),
-        "pickle": lambda: np.array([{"a": 1}], dtype=object),
-        "equal": lambda: np.zeros(array.shape),
-        "reversed": lambda: array[::-1] if array.ndim else array,
+    changes: dict[str, Any] = {
+        "shorter": array[:-1] if array.ndim else array,
+        "flat": array.ravel()[:1],
+        "NaN": np.full(array.shape, np.nan),
+        "infinite": np.full(array.shape, np.inf),
+        "text": np.full(array.shape, "text"),
+        "pickle": np.array([{"a": 1}], dtype=object),
+        "equal": np.zeros(array.shape),
+        "reversed": array[::-1] if array.ndim else array,
     }
+    how = pick(rng, ("removed", "npy", *changes))
     if how == "npy":
         with file.open("wb") as stream:
             np.save(stream, np.zeros(3))
@@ -566,124 +546,10 @@ def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
     if how == "removed":
         del arrays[name]
     else:
-        arrays[name] = changes[how]()
+        arrays[name] = changes[how]
     np.savez(file, **arrays)
 
     necessary = name in ("t", "qpos", "ctrl")
     always = ("removed", "shorter", "flat", "NaN", "infinite", "text", "pickle")
     refused = necessary and (how in always or (name == "t" and how in ("equal", "reversed")))
     return f"array {name} {how}", refused
-
-
-# Output folders and options.
-
-
-def spoiled_output(rng: Rng, folder: Path) -> Call:
-    """Give a bad or an unusual output folder or file."""
-    (folder / "file").write_text("a file of the user\n", encoding="utf-8")
-    (folder / "locked").mkdir()
-    (folder / "locked").chmod(0o500)
-    place = pick(
-        rng,
-        (
-            "file",
-            "file/below",
-            "study.toml",
-            "design.npz",
-            "cart_pendulum.xml",
-            "run.csv",
-            ".",
-            "",
-            " ",
-            "[bold]x[/bold]",
-            "[/]",
-            "ünïcode/ö",
-            "x" * 300,
-            "a/b/c/d",
-            "/dev/null/x",
-            "/dev/full",
-            "locked/x",
-            "-",
-            "--",
-            "~",
-            "a\nb",
-            "%s{0}",
-        ),
-    )
-    words = pick(
-        rng,
-        (
-            ["simulate", "study.toml", "design.npz", "-o"],
-            ["simulate", "study.toml", "design.npz", "-o"],
-            ["check", "study.toml", "--threads", "1", "-o"],
-            ["identify", "study.toml", "run.csv", "--threads", "1", "-o"],
-            ["replay", "design.npz", "--experiment", "study.toml", "--save"],
-            ["montecarlo", "study.toml", "design.npz", "--trials", "2", "-o"],
-        ),
-    )
-    return Call(words=[*words, place], spoiled=f"output: {place[:30]!r}")
-
-
-OPTION_VALUES = ("-1", "0", "1", "nan", "inf", "1e300", "abc", "", "1.5", "99999999999999999999")
-
-OPTIONS: tuple[tuple[list[str], tuple[str, ...]], ...] = (
-    (["check", "study.toml"], ("--threads", "--design", "--nonsense")),
-    (["design", "study.toml", "-o", "out"], ("--threads", "--starts", "--shortest", "-x")),
-    (["simulate", "study.toml", "design.npz", "-o", "new.csv"], ("--seed", "--rate")),
-    (
-        ["identify", "study.toml", "run.csv", "-o", "out", "--threads", "1"],
-        ("--method", "--held-out", "--starts"),
-    ),
-    (
-        ["montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"],
-        ("--measure-rate", "--seed", "--trials"),
-    ),
-    (["compare", "study.toml", "-o", "out", "--seconds", "0.1"], ("--methods", "--seconds")),
-)
-
-# Files that no verb can read.
-PLACES = ("missing.toml", ".", "", "design.npz", "run.csv", "/dev/null", "study.toml/x", "x" * 5000)
-
-
-def spoiled_options(rng: Rng, folder: Path) -> Call:
-    """Give a bad value of an option, a bad file, or too few or too many words."""
-    verb, options = pick(rng, OPTIONS)
-    words = list(verb)
-    how = pick(rng, ("option", "option", "file", "dropped", "further"))
-    if how == "option":
-        words += [pick(rng, options), pick(rng, OPTION_VALUES)]
-    elif how == "file":
-        files = [i for i in range(1, len(words)) if "." in words[i]]
-        words[pick(rng, files)] = pick(rng, PLACES)
-    elif how == "dropped":
-        del words[int(rng.integers(len(words)))]
-    else:
-        words.append(pick(rng, ("study.toml", "", "-", "--", "--json=1")))
-    listed = " ".join(repr(word[:30]) for word in words)
-    return Call(words=words, spoiled=f"options: {listed}", refused=how == "dropped")
-
-
-# What is spoiled, with the share of the cases.
-SPOILERS: tuple[tuple[Callable[[Rng, Path], Call], float], ...] = (
-    (spoiled_experiment, 0.35),
-    (spoiled_model, 0.18),
-    (spoiled_recording, 0.22),
-    (spoiled_design, 0.12),
-    (spoiled_output, 0.06),
-    (spoiled_options, 0.07),
-)
-
-
-def bad_input(rng: Rng, folder: Path) -> Call:
-    """Spoil one thing of the valid study in a folder.
-
-    Args:
-        rng: Random numbers.
-        folder: Folder with the files of the study; one of them is changed.
-
-    Returns:
-        The call that has to cope with it.
-    """
-    shares = [share for _, share in SPOILERS]
-    spoiler = SPOILERS[int(rng.choice(len(SPOILERS), p=shares))][0]
-    return spoiler(rng, folder)

@@ -21,8 +21,8 @@ from pathlib import Path
 from mjfim.files import replacing
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import LAST_SECONDS
-from tests.fuzz.bad_inputs import Call, bad_input
-from tests.fuzz.faults import fault, long_log, no_permission
+from tests.fuzz.bad_inputs import Call
+from tests.fuzz.odd_inputs import bad_input, long_log, no_permission
 from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import announce
@@ -63,7 +63,7 @@ class Ending:
 def run(case: Case, folder: Path) -> Outcome:
     """Spoil something, call the command line, and judge how it ends."""
     rng = case.rng
-    spoils = {"fault": fault, "permission": no_permission, "log": long_log}
+    spoils = {"permission": no_permission, "log": long_log}
     spoil = spoils.get(case.kind, bad_input)
     if case.kind == "permission" and not may_be_refused():
         reason = "skipped: this user may do everything"
@@ -91,15 +91,26 @@ def run(case: Case, folder: Path) -> Outcome:
 def valid_study() -> Path:
     """Folder with the files of a valid study, made once in each process."""
     folder = Path(tempfile.mkdtemp(dir=Path.cwd()))
-    file = write_experiment(folder, max_iterations="2")
+    make_study(folder, folder, max_iterations="2")
+    return folder
+
+
+def make_study(folder: Path, designed: Path, **lines: str) -> None:
+    """Write a valid study, its design into a folder of its own, and a recording of it.
+
+    Args:
+        folder: Folder of the study.
+        designed: Folder of the design.
+        **lines: Values of keys of the experiment file.
+    """
+    file = write_experiment(folder, **lines)
     for words in (
-        ("design", file, "-o", folder, "--threads", 1),
-        ("simulate", file, folder / "design.npz", "-o", folder / "run.csv"),
+        ("design", file, "-o", designed, "--threads", 1),
+        ("simulate", file, designed / "design.npz", "-o", folder / "run.csv"),
     ):
         result = run_here(*words)
         if result.exit_code not in (0, 1):
             raise RuntimeError(f"the valid study fails: {result.stderr}")
-    return folder
 
 
 def _save_pixel(figure: object, path: Path, dpi: float = 0.0) -> Path:

@@ -1,4 +1,4 @@
-"""One case of the fuzz suite, its outcome, and the failures that are known."""
+"""One case of the fuzz suite, and its outcome."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 # Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
-KINDS = ("problem", "input", "kill", "mechanism", "fault", "permission", "log")
+KINDS = ("problem", "input", "kill", "mechanism", "permission", "log")
 
 # Time after which a case has failed [s]. It includes the time that a busy machine takes from it.
 TIME_LIMITS = {
@@ -15,7 +15,6 @@ TIME_LIMITS = {
     "input": 60.0,
     "kill": 300.0,
     "mechanism": 180.0,
-    "fault": 60.0,
     "permission": 180.0,
     "log": 600.0,
 }
@@ -67,35 +66,3 @@ class Outcome:
     description: str
     complaint: str = ""
     seconds: float = 0.0
-
-    @property
-    def known(self) -> KnownFailure | None:
-        """The known failure that this one is; None for new failures and where all is well."""
-        fitting = (known for known in KNOWN_FAILURES if known.fits(self))
-        return next(fitting, None)
-
-
-@dataclass(frozen=True, kw_only=True)
-class KnownFailure:
-    """A failure that is known and not mended yet.
-
-    Attributes:
-        kind: Kind of the cases that show it.
-        description: Part of the description of these cases.
-        complaint: Part of the complaint.
-        reason: Why it is not mended yet.
-    """
-
-    kind: str
-    description: str
-    complaint: str
-    reason: str
-
-    def fits(self, outcome: Outcome) -> bool:
-        """True if an outcome is this failure."""
-        is_place = outcome.case.kind == self.kind and self.description in outcome.description
-        return bool(outcome.complaint) and is_place and self.complaint in outcome.complaint
-
-
-# Failures that are reported, but do not make the suite fail. This list must be empty in the end.
-KNOWN_FAILURES: tuple[KnownFailure, ...] = ()

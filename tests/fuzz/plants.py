@@ -2,57 +2,72 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 Rng = np.random.Generator
 Range = tuple[float, float]
+Ranges = dict[tuple[str, str], Range]
 
 TIMESTEPS = (0.001, 0.002, 0.005, 0.01)
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 
+# Tags of the actuators of slides and hinges.
+TAGS = ("motor", "motor", "position", "general")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Joint:
-    """A joint and the body that it moves.
+    """A joint and the link that it moves.
 
     Attributes:
         name: Its name.
-        kind: "hinge" or "slide".
+        kind: "hinge", "slide", "ball" or "free".
         reach: Size of the motion that fits it [m or rad].
-        effort: Force that moves its load over the reach in about a second [N or N m].
-        attributes: Its attributes in the MJCF.
-        inertial: Attributes of the inertia of its body.
-        length: Distance from its body to the next one [m].
+        inertia: About what it accelerates [kg or kg m^2].
+        mass: Mass of the link [kg].
+        length: Distance from the link to the next one [m].
     """
 
     name: str
     kind: str
     reach: float
-    effort: float
-    attributes: dict[str, str]
-    inertial: dict[str, str]
+    inertia: float
+    mass: float
     length: float
+
+    @property
+    def effort(self) -> float:
+        """Force that moves the load over the reach in about a second [N or N m]."""
+        return 10.0 * self.inertia * self.reach
+
+    @property
+    def is_scalar(self) -> bool:
+        """True for a slide or a hinge."""
+        return self.kind in ("hinge", "slide")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drive:
-    """An actuator of one joint.
+    """An actuator.
 
     Attributes:
         name: Its name.
-        joint: The joint.
         tag: Tag of the MJCF.
-        attributes: Its attributes in the MJCF.
-        control: Size of a control that moves the joint by about its reach [actuator unit].
+        element: Its element of the MJCF.
+        control: Size of a control that moves the plant by about its reach [actuator unit].
+        force: Size of its force at this control.
+        is_held: False where it has a range that a design does not keep, and must mention.
     """
 
     name: str
-    joint: Joint
     tag: str
-    attributes: dict[str, str]
+    element: str
     control: float
+    force: float
+    is_held: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,55 +75,37 @@ class Plant:
     """A random plant.
 
     Attributes:
+        xml: The MJCF.
         timestep: Timestep of the engine [s].
-        integrator: Integrator of the engine.
-        gravity: Gravity [m/s^2].
         joints: The joints, from the base to the tip.
         drives: The actuators.
-        ranges: Ranges of the MJCF by kind and name.
+        targets: Paths of parameters that may be identified.
+        ranges: Ranges of the MJCF that a design has to keep, by kind and name; the angle of a ball
+            joint has a symmetric one.
+        can_rest: True where it can stand still at the start.
+        collides: True where geoms may collide.
+        features: What is special about it, in words.
     """
 
+    xml: str
     timestep: float
-    integrator: str
-    gravity: float
     joints: tuple[Joint, ...]
     drives: tuple[Drive, ...]
-    ranges: dict[tuple[str, str], Range]
-
-    @property
-    def xml(self) -> str:
-        """The MJCF."""
-        opened = "\n".join(_body(joint, i, self.joints) for i, joint in enumerate(self.joints))
-        closed = "</body>" * len(self.joints)
-        drives = "\n".join(
-            f'    <{d.tag} name="{d.name}" joint="{d.joint.name}"{words_of(d.attributes)}/>'
-            for d in self.drives
-        )
-        return (
-            '<mujoco model="chain">\n  <compiler angle="radian" autolimits="true"/>\n'
-            f'  <option timestep="{self.timestep}" integrator="{self.integrator}" '
-            f'gravity="0 0 {-self.gravity:.17g}"/>\n'
-            '  <default><geom contype="0" conaffinity="0" mass="0"/></default>\n'
-            f"  <worldbody>\n{opened}\n    {closed}\n  </worldbody>\n"
-            f"  <actuator>\n{drives}\n  </actuator>\n</mujoco>\n"
-        )
-
-
-def _body(joint: Joint, i: int, joints: tuple[Joint, ...]) -> str:
-    """The opening lines of a body of the chain."""
-    place = joints[i - 1].length if i else 0.0
-    return (
-        f'    <body name="link{i}" pos="{place:.17g} 0 0">\n'
-        f"      <inertial{words_of(joint.inertial)}/>\n"
-        f'      <joint name="{joint.name}"{words_of(joint.attributes)}/>\n'
-        f'      <geom type="capsule" fromto="0 0 0 {joint.length:.17g} 0 0" '
-        f'size="{0.1 * joint.length:.17g}"/>'
-    )
+    targets: tuple[str, ...]
+    ranges: Ranges
+    can_rest: bool
+    collides: bool = False
+    features: tuple[str, ...]
 
 
 def words_of(attributes: dict[str, str]) -> str:
     """Attributes as text, with a space before each."""
     return "".join(f' {name}="{value}"' for name, value in attributes.items())
+
+
+def numbers_of(values: Sequence[float]) -> str:
+    """Numbers as the MJCF writes them, with all digits."""
+    return " ".join(f"{value:.17g}" for value in values)
 
 
 def log_uniform(rng: Rng, low: float, high: float) -> float:
@@ -122,109 +119,185 @@ def about_zero(rng: Rng, size: float, least: float = 0.3) -> Range:
     return -float(low), float(high)
 
 
-def text_of(bounds: Range) -> str:
-    """A range as the MJCF writes it, with all digits."""
-    return f"{bounds[0]:.17g} {bounds[1]:.17g}"
-
-
 def random_plant(rng: Rng) -> Plant:
     """Make a chain of one to three joints, of which at least one is driven."""
     count = int(rng.integers(1, 4))
-    ranges: dict[tuple[str, str], Range] = {}
     masses = [log_uniform(rng, 0.05, 10.0) for _ in range(count)]
     lengths = [log_uniform(rng, 0.05, 1.0) for _ in range(count)]
+    targets = [f"body/link{i}:mass" for i in range(count)]
+    ranges: Ranges = {}
+    joints: list[Joint] = []
+    bodies = ""
 
-    joints = []
     for i in range(count):
         load, arm = sum(masses[i:]), sum(lengths[i:])
-        joints.append(_joint(rng, i, (masses[i], lengths[i]), (load, arm), ranges))
+        kind = str(rng.choice(["hinge", "hinge", "slide"]))
+        is_hinge = kind == "hinge"
+        joint = Joint(
+            name=f"joint{i}",
+            kind=kind,
+            reach=float(rng.uniform(0.3, 3.0)) if is_hinge else arm * float(rng.uniform(0.3, 1.0)),
+            inertia=load * arm**2 if is_hinge else load,
+            mass=masses[i],
+            length=lengths[i],
+        )
+        attributes = joint_attributes(rng, joint, ranges)
+        if attributes["damping"] != "0":
+            targets.append(f"joint/{joint.name}:damping")
+        thin = 0.02 * joint.mass * joint.length**2
+        place = lengths[i - 1] if i else 0.0
+        bodies += body_text(joint, attributes, place, (thin, 4 * thin), 0.1 * joint.length)
+        joints.append(joint)
 
     driven = [joint for joint in joints if rng.random() < 0.75] or [joints[0]]
+    timestep = float(rng.choice(TIMESTEPS))
+    integrator = str(rng.choice(INTEGRATORS))
+    gravity = float(rng.choice([0.0, 0.0, 9.81, 1.6]))
+    drives = [
+        random_drive(rng, f"drive_{joint.name}", f'joint="{joint.name}"', joint, ranges)
+        for joint in driven
+    ]
+    elements = "".join(drive.element for drive in drives)
     return Plant(
-        timestep=float(rng.choice(TIMESTEPS)),
-        integrator=str(rng.choice(INTEGRATORS)),
-        gravity=float(rng.choice([0.0, 0.0, 9.81, 1.6])),
+        xml=(
+            '<mujoco model="chain">\n  <compiler angle="radian" autolimits="true"/>\n'
+            f'  <option timestep="{timestep}" integrator="{integrator}" '
+            f'gravity="0 0 {-gravity:.17g}"/>\n'
+            f"  <worldbody>\n{bodies}{'</body>' * count}\n  </worldbody>\n"
+            f"  <actuator>\n{elements}  </actuator>\n</mujoco>\n"
+        ),
+        timestep=timestep,
         joints=tuple(joints),
-        drives=tuple(_drive(rng, joint, ranges) for joint in driven),
+        drives=tuple(drives),
+        targets=tuple(targets),
         ranges=ranges,
+        # Joints that fall and have no drive cannot stand still.
+        can_rest=gravity == 0.0 or len(drives) == count,
+        features=(
+            *(joint.kind for joint in joints),
+            *(drive.tag for drive in drives),
+            f"{integrator} {timestep:g} s; gravity {gravity:g}",
+        ),
     )
 
 
-def _joint(
-    rng: Rng,
-    i: int,
-    link: tuple[float, float],
-    carried: tuple[float, float],
-    ranges: dict[tuple[str, str], Range],
-) -> Joint:
-    """A joint for a link, given as its mass and length, that carries a load on an arm."""
-    name, (mass, length), (load, arm) = f"joint{i}", link, carried
-    kind = str(rng.choice(["hinge", "hinge", "slide"]))
-    is_hinge = kind == "hinge"
-    inertia = load * arm**2 if is_hinge else load
-    reach = float(rng.uniform(0.3, 3.0)) if is_hinge else arm * float(rng.uniform(0.3, 1.0))
-
+def joint_attributes(rng: Rng, joint: Joint, ranges: Ranges) -> dict[str, str]:
+    """Random attributes of a slide or a hinge, whose ranges are added to those of the plant."""
+    name, inertia = joint.name, joint.inertia
     axis = rng.normal(size=3) if rng.random() < 0.5 else np.eye(3)[rng.integers(3)]
     # 1 / s; a joint without damping is allowed.
     rate = rng.choice([0.0, 0.1, 1.0, 5.0])
     attributes = {
-        "type": kind,
-        "axis": " ".join(f"{number:.17g}" for number in axis),
+        "type": joint.kind,
+        "axis": numbers_of(axis),
         "damping": f"{inertia * rate:.17g}",
     }
-    if rng.random() < 0.3:
-        attributes["armature"] = f"{inertia * rng.uniform(0.01, 0.5):.17g}"
-    if rng.random() < 0.3:
-        attributes["stiffness"] = f"{inertia * rng.uniform(1.0, 50.0):.17g}"
-    if rng.random() < 0.15:
-        attributes["frictionloss"] = f"{inertia * rng.uniform(0.01, 0.3):.17g}"
+    for key, chance, low, high in (
+        ("armature", 0.3, 0.01, 0.5),
+        ("stiffness", 0.3, 1.0, 50.0),
+        ("frictionloss", 0.15, 0.01, 0.3),
+    ):
+        if rng.random() < chance:
+            attributes[key] = f"{inertia * rng.uniform(low, high):.17g}"
     if rng.random() < 0.5:
-        ranges["position", name] = about_zero(rng, reach)
-        attributes["range"] = text_of(ranges["position", name])
-    effort = 10.0 * inertia * reach
+        ranges["position", name] = about_zero(rng, joint.reach)
+        attributes["range"] = numbers_of(ranges["position", name])
     if rng.random() < 0.2:
-        ranges["joint_force", name] = about_zero(rng, effort)
-        attributes["actuatorfrcrange"] = text_of(ranges["joint_force", name])
+        ranges["joint_force", name] = about_zero(rng, joint.effort)
+        attributes["actuatorfrcrange"] = numbers_of(ranges["joint_force", name])
+    return attributes
 
-    thin = 0.02 * mass * length**2
+
+def body_text(
+    joint: Joint,
+    attributes: dict[str, str],
+    place: float,
+    inertia: tuple[float, float],
+    size: float,
+    *,
+    pose: str = "",
+    is_solid: bool = False,
+) -> str:
+    """The opening lines of a body of a chain.
+
+    Args:
+        joint: Its joint.
+        attributes: Attributes of the joint.
+        place: Where it begins on the body before [m].
+        inertia: About the link and across it [kg m^2].
+        size: Radius of the link [m].
+        pose: Further attributes of the body.
+        is_solid: True where the link collides.
+    """
+    name, number = joint.name.replace("joint", "link"), joint.name.removeprefix("joint")
+    contact = "" if is_solid else ' contype="0" conaffinity="0"'
     inertial = {
-        "pos": f"{0.5 * length:.17g} 0 0",
-        "mass": f"{mass:.17g}",
-        "diaginertia": f"{thin:.17g} {4 * thin:.17g} {4 * thin:.17g}",
+        "pos": f"{0.5 * joint.length:.17g} 0 0",
+        "mass": f"{joint.mass:.17g}",
+        "diaginertia": numbers_of((inertia[0], inertia[1], inertia[1])),
     }
-    return Joint(
-        name=name,
-        kind=kind,
-        reach=reach,
-        effort=effort,
-        attributes=attributes,
-        inertial=inertial,
-        length=length,
+    return (
+        f'    <body name="{name}" pos="{place:.17g} 0 0"{pose}>\n'
+        f"      <inertial{words_of(inertial)}/>\n"
+        f'      <joint name="{joint.name}"{words_of(attributes)}/>\n'
+        f'      <geom name="{name}" type="capsule" size="{size:.17g}"{contact} mass="0" '
+        f'fromto="{1.3 * size:.17g} 0 0 {joint.length:.17g} 0 0"/>\n'
+        f'      <site name="tip{number}" pos="{joint.length:.17g} 0 0"/>\n'
     )
 
 
-def _drive(rng: Rng, joint: Joint, ranges: dict[tuple[str, str], Range]) -> Drive:
-    """A motor, a position servo or a filtered motor for a joint."""
-    name = f"drive_{joint.name}"
-    tag = str(rng.choice(["motor", "motor", "position", "general"]))
-    gear = float(rng.choice([1.0, -1.0, 20.0, 0.1]))
-    attributes = {"gear": f"{gear:.17g}"}
+def random_drive(
+    rng: Rng,
+    name: str,
+    transmission: str,
+    joint: Joint,
+    ranges: Ranges,
+    *,
+    tags: Sequence[str] = TAGS,
+    gear: Sequence[float] = (),
+    is_bounded: bool = True,
+) -> Drive:
+    """A random actuator, whose ranges are added to those of the plant.
 
-    if tag == "position":
-        control = joint.reach * abs(gear)
-        kp = joint.effort / joint.reach * rng.uniform(1.0, 10.0) / gear**2
+    Args:
+        rng: Random numbers.
+        name: Its name.
+        transmission: Attribute that says on what it acts.
+        joint: A joint that moves about as it does.
+        ranges: Ranges of the plant.
+        tags: Tags from which one is chosen.
+        gear: The gear; empty chooses a number.
+        is_bounded: Whether its control has a range.
+    """
+    tag = str(rng.choice(tags))
+    gear = gear or (float(rng.choice([1.0, -1.0, 20.0, 0.1])),)
+    size = max(map(abs, gear))
+    force = control = joint.effort / size
+    attributes = {"gear": numbers_of(gear)}
+
+    if tag in ("position", "intvelocity"):
+        control = joint.reach * size
+        kp = joint.effort / joint.reach * rng.uniform(1.0, 10.0) / size**2
         attributes |= {"kp": f"{kp:.17g}", "kv": f"{0.2 * kp:.17g}"}
+        if tag == "intvelocity":
+            attributes["actrange"] = numbers_of((-2.0 * control, 2.0 * control))
     elif tag == "general":
         gain = log_uniform(rng, 0.1, 10.0)
-        control = joint.effort / abs(gear) / gain
+        control = force / gain
         filtered = f"{rng.uniform(0.02, 0.2):.17g}"
         attributes |= {"dyntype": "filter", "dynprm": filtered, "gainprm": f"{gain:.17g}"}
-    else:
-        control = joint.effort / abs(gear)
 
-    ranges["control", name] = about_zero(rng, control)
-    attributes["ctrlrange"] = text_of(ranges["control", name])
+    if is_bounded:
+        ranges["control", name] = about_zero(rng, control)
+        attributes["ctrlrange"] = numbers_of(ranges["control", name])
     if rng.random() < 0.4:
-        ranges["force", name] = about_zero(rng, joint.effort / abs(gear))
-        attributes["forcerange"] = text_of(ranges["force", name])
-    return Drive(name=name, joint=joint, tag=tag, attributes=attributes, control=control)
+        ranges["force", name] = about_zero(rng, force)
+        attributes["forcerange"] = numbers_of(ranges["force", name])
+    return Drive(
+        name=name,
+        tag=tag,
+        element=f'    <{tag} name="{name}" {transmission}{words_of(attributes)}/>\n',
+        control=control,
+        force=force,
+        is_held=tag != "intvelocity",
+    )

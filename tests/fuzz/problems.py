@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,17 @@ import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_design
-from mjfim.records.design import Design, keeps_limits
+from mjfim.records.design import keeps_limits
+from tests.fuzz.bad_inputs import pick
+from tests.fuzz.mechanisms import random_mechanism
 from tests.fuzz.outcome import Case, Outcome
-from tests.fuzz.plants import Plant, Range, Rng, about_zero, random_plant
+from tests.fuzz.plants import Plant, Ranges, Rng, about_zero, random_plant
 from tests.fuzz.player import (
+    NEAREST,
+    PLACE,
     ROUNDING,
     ROUNDING_WITH_FEEDBACK,
+    TURN,
     model_with_force_sensors,
     play,
     read_reference,
@@ -32,136 +35,115 @@ from tests.fuzz.workers import announce
 SECONDS = 15.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """A design problem.
-
-    Attributes:
-        xml: The MJCF.
-        tables: Tables of the experiment file.
-        ranges: Range of every limit by kind and name.
-        description: What was random in it, in words.
-        ignored: Pairs of bodies that may come closer than the clearance.
-    """
-
-    xml: str
-    tables: dict[str, Any]
-    ranges: dict[tuple[str, str], Range]
-    description: str
-    ignored: tuple[tuple[str, str], ...] = ()
-
-
 def run(case: Case, folder: Path) -> Outcome:
-    """Design an experiment for a random problem, and judge what the design claims."""
-    rng = case.rng
-    plant = random_plant(rng)
-    tables = random_tables(rng, plant)
-    problem = Problem(
-        xml=plant.xml,
-        tables=tables,
-        ranges=all_ranges(plant, tables),
-        description=describe(plant, tables),
-    )
-    return attempt(case, folder, problem)
-
-
-def attempt(
-    case: Case,
-    folder: Path,
-    problem: Problem,
-    omissions: Callable[[Design], list[str]] = lambda design: [],
-) -> Outcome:
-    """Design an experiment for a problem, and judge what the design claims.
+    """Design an experiment for a random problem, and judge what the design claims.
 
     Args:
-        case: The case.
+        case: The case; its plant is a chain or a mechanism.
         folder: Empty folder for its files.
-        problem: The problem.
-        omissions: Describes what a design does not say although it should.
     """
-    announce(problem.description)
-    (folder / "plant.xml").write_text(problem.xml, encoding="utf-8")
+    rng = case.rng
+    plant = random_plant(rng) if case.kind == "problem" else random_mechanism(rng)
+    tables = random_tables(rng, plant)
+    if case.kind == "mechanism":
+        complicate(rng, plant, tables)
+    description = describe(plant, tables)
+    announce(description)
+
+    (folder / "plant.xml").write_text(plant.xml, encoding="utf-8")
     source = str(folder / "fuzz.toml")
     try:
-        experiment = mjfim.Experiment(**problem.tables, directory=folder, source=source)
+        experiment = mjfim.Experiment(**tables, directory=folder, source=source)
         design = mjfim.design(experiment, threads=1)
     except MjfimError as error:
         text = str(error)
         complaint = "" if text.strip() else "the message of the refusal is empty"
-        description = f"{problem.description}; {text}"
-        return Outcome(case=case, group="refused", description=description, complaint=complaint)
+        about = f"{description}; {text}"
+        return Outcome(case=case, group="refused", description=about, complaint=complaint)
 
     # Without a design inside the limits nothing is claimed, but a limit has to be named.
     if not keeps_limits(design):
-        return Outcome(case=case, group="infeasible", description=problem.description)
+        return Outcome(case=case, group="infeasible", description=description)
 
-    system = System.resolve(experiment, threads=1)
-    write_design(folder, design, system)
-    found = [*violations(problem, folder), *omissions(design)]
-    return Outcome(
-        case=case, group="claimed", description=problem.description, complaint="; ".join(found)
-    )
+    write_design(folder, design, System.resolve(experiment, threads=1))
+    found = [*violations(plant, tables, folder), *omissions(plant, design.warnings)]
+    complaint = "; ".join(found)
+    return Outcome(case=case, group="claimed", description=description, complaint=complaint)
 
 
-def violations(problem: Problem, folder: Path) -> list[str]:
+def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
     """Describe what is violated where design.csv of a folder is played with and without feedback,
     and in the values of reference.csv.
     """
     model = model_with_force_sensors(mujoco.MjSpec.from_file(str(folder / "plant.xml")))
-    rows = read_rows(folder / "design.csv")
-    period = 1.0 / problem.tables.get("playback_rate", problem.tables["rate"])
+    rows, ranges = read_rows(folder / "design.csv"), all_ranges(plant, tables)
+    period = 1.0 / tables.get("playback_rate", tables["rate"])
+    ignored = tables["limits"].get("ignored", ())
 
-    judge = partial(play, model, rows, problem.ranges, period, ignored=problem.ignored)
+    judge = partial(play, model, rows, ranges, period, ignored=ignored)
     found = judge().sentences(ROUNDING)
     with_feedback = judge(feedback=True)
     found += [f"with gains: {text}" for text in with_feedback.sentences(ROUNDING_WITH_FEEDBACK)]
 
-    reference = read_reference(read_rows(folder / "reference.csv"), problem.ranges)
-    found += [f"in reference.csv: {text}" for text in reference.sentences(ROUNDING)]
-    return found
+    reference = read_reference(read_rows(folder / "reference.csv"), ranges)
+    return found + [f"in reference.csv: {text}" for text in reference.sentences(ROUNDING)]
 
 
-def narrowed(
-    ranges: dict[tuple[str, str], Range], stated: dict[str, dict[str, Any]]
-) -> dict[tuple[str, str], Range]:
-    """Ranges of the MJCF, narrowed by those that the file states, by kind and name."""
-    found = dict(ranges)
-    for kind, table in stated.items():
-        for name, value in table.items():
-            low, high = value if isinstance(value, tuple) else (-value, value)
-            lower, upper = found.get((kind, name), (-np.inf, np.inf))
-            found[kind, name] = (max(low, lower), min(high, upper))
-    return found
+def omissions(plant: Plant, warnings: tuple[str, ...]) -> list[str]:
+    """Describe what a design does not keep, and what its warnings do not say either."""
+    told = "\n".join(warnings)
+    unheld = [drive.name for drive in plant.drives if not drive.is_held]
+    return [f"no warning names the range of {name}" for name in unheld if name not in told]
 
 
-def all_ranges(plant: Plant, tables: dict[str, Any]) -> dict[tuple[str, str], Range]:
+def all_ranges(plant: Plant, tables: dict[str, Any]) -> Ranges:
     """Range of every limit by kind and name: where MJCF and file state one, both hold."""
-    stated = {kind: table for kind, table in tables["limits"].items() if kind != "bandwidth"}
-    ranges = narrowed(plant.ranges, stated)
+    joints = [joint.name for joint in plant.joints]
+    turning = [joint.name for joint in plant.joints if not joint.is_scalar]
+    owners = dict.fromkeys(("position", "velocity", "acceleration"), joints)
+    owners |= dict.fromkeys(("tilt", "angular_velocity"), turning)
 
+    ranges, limits = dict(plant.ranges), tables["limits"]
+    for kind, value in limits.items():
+        if kind in ("bandwidth", "clearance", "ignored"):
+            continue
+        # One number holds for all joints to which such a limit applies.
+        stated = value if isinstance(value, dict) else dict.fromkeys(owners[kind], value)
+        for name, bounds in by_coordinate(stated).items():
+            low, high = bounds if isinstance(bounds, tuple) else (-bounds, bounds)
+            lower, upper = ranges.get((kind, name), (-np.inf, np.inf))
+            ranges[kind, name] = (max(low, lower), min(high, upper))
+
+    if "clearance" in limits:
+        least = limits["clearance"]
+        ranges["clearance", NEAREST] = (least, 2.0 * least)
     boundary = tables["boundary"]
     if boundary.get("end", "free") != "free":
+        parts = {"ball": TURN, "free": (*PLACE, *TURN)}
         for joint in plant.joints:
-            for kind in ("position", "velocity"):
-                ranges[f"end_{kind}", joint.name] = (-boundary[kind], boundary[kind])
+            for part in parts.get(joint.kind, ("",)):
+                for kind in ("position", "velocity"):
+                    bound = boundary[kind]
+                    ranges[f"end_{kind}", f"{joint.name}{part}"] = (-bound, bound)
     return ranges
 
 
+def by_coordinate(stated: dict[str, Any]) -> dict[str, Any]:
+    """A table in which the three ranges of a free joint have the names of its coordinates."""
+    table = {}
+    for name, value in stated.items():
+        is_box = isinstance(value, tuple) and len(value) == len(PLACE)
+        parts = zip(PLACE, value, strict=True) if is_box else [("", value)]
+        table.update({f"{name}{part}": each for part, each in parts})
+    return table
+
+
 def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
-    """Tables of a random experiment file for a plant."""
     substeps = int(rng.choice([1, 2, 4, 5]))
     sample = substeps * plant.timestep
-    samples = int(rng.integers(20, 60))
-    horizon = samples * sample
-
-    targets = [f"body/link{i}:mass" for i in range(len(plant.joints))]
-    targets += [
-        f"joint/{joint.name}:damping"
-        for joint in plant.joints
-        if float(joint.attributes["damping"]) > 0.0
-    ]
-    count = min(int(rng.integers(1, 4)), len(targets))
-    chosen = rng.choice(targets, count, replace=False).tolist()
+    horizon = int(rng.integers(20, 60)) * sample
+    count = min(int(rng.integers(1, 4)), len(plant.targets))
+    chosen = rng.choice(plant.targets, count, replace=False).tolist()
     tables: dict[str, Any] = {
         "model": "plant.xml",
         "rate": 1.0 / sample,
@@ -171,6 +153,7 @@ def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
         "cost": {"control": 0.0, "criterion": str(rng.choice(["E", "A", "D"]))},
         "limits": _limits(rng, plant, horizon),
         "boundary": _boundary(rng, plant),
+        # A control that is small, or of the size of the range.
         "initial": {"control": _control(rng, plant, horizon)},
         "descent": {
             "max_iterations": int(rng.integers(3, 16)),
@@ -186,42 +169,38 @@ def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
 
 
 def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
-    """Random limits; each joint and each actuator states some of them."""
+    """Random limits; each slide or hinge and each actuator states some of them."""
     limits: dict[str, Any] = {}
-
     for joint in plant.joints:
-        speed = joint.reach / horizon * rng.uniform(0.5, 5.0)
-        wanted = {
-            "position": about_zero(rng, joint.reach * rng.choice([1.0, 0.3, 0.05]), 0.05),
-            "velocity": speed,
-            "acceleration": speed / horizon * rng.uniform(3.0, 30.0),
-        }
-        state_some(rng, limits, joint.name, wanted, (0.5, 0.4, 0.3))
-
+        if joint.is_scalar:
+            speed = joint.reach / horizon * rng.uniform(0.5, 5.0)
+            wanted = {
+                "position": about_zero(rng, joint.reach * rng.choice([1.0, 0.3, 0.05]), 0.05),
+                "velocity": speed,
+                "acceleration": speed / horizon * rng.uniform(3.0, 30.0),
+            }
+            _state_some(rng, limits, joint.name, wanted, (0.5, 0.4, 0.3))
     for drive in plant.drives:
-        effort = drive.joint.effort / abs(float(drive.attributes["gear"]))
         wanted = {
             "control": about_zero(rng, drive.control),
             "control_rate": drive.control / horizon * rng.uniform(2.0, 40.0),
-            "force": about_zero(rng, effort),
+            "force": about_zero(rng, drive.force),
         }
-        state_some(rng, limits, drive.name, wanted, (0.4, 0.3, 0.3))
-
+        _state_some(rng, limits, drive.name, wanted, (0.4, 0.3, 0.3))
     if rng.random() < 0.15:
         limits["bandwidth"] = float(rng.uniform(2.0, 6.0)) / horizon
     return limits
 
 
-def state_some(
+def _state_some(
     rng: Rng,
     limits: dict[str, Any],
     name: str,
     wanted: dict[str, Any],
     chances: tuple[float, ...],
 ) -> None:
-    """State each limit of a joint or an actuator with a chance."""
     for (kind, value), chance in zip(wanted.items(), chances, strict=True):
-        if rng.random() < chance and isinstance(limits.get(kind, {}), dict):
+        if rng.random() < chance:
             stated = value if isinstance(value, tuple) else float(value)
             limits.setdefault(kind, {})[name] = stated
 
@@ -229,35 +208,74 @@ def state_some(
 def _boundary(rng: Rng, plant: Plant) -> dict[str, Any]:
     """A random boundary; most problems state none."""
     boundary: dict[str, Any] = {"position": 0.01, "velocity": 0.02}
-
-    # Joints that fall and have no drive cannot stand still: most of such problems are refused.
-    can_rest = plant.gravity == 0.0 or len(plant.drives) == len(plant.joints)
-    if not can_rest and rng.random() < 0.9:
+    if not plant.can_rest and rng.random() < 0.9:
         return boundary
     if rng.random() < 0.3:
         boundary["start"] = "rest"
-    end = str(rng.choice(["free", "free", "free", "rest", "periodic"]))
-    return {**boundary, "end": end}
+    return {**boundary, "end": str(rng.choice(["free", "free", "free", "rest", "periodic"]))}
 
 
 def _control(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
-    """A random initial control, small or of the size of the range."""
+    """A random initial control."""
     size = float(rng.choice([0.01, 0.1, 0.5]))
     return {
         "kind": str(rng.choice(["sine", "chirp", "multisine"])),
-        "amplitude": {drive.name: size * drive.control for drive in plant.drives},
+        "amplitude": {drive.name: size * drive.control for drive in plant.drives} or 1.0,
         "frequency": float(rng.uniform(0.5, 3.0)) / horizon,
     }
 
 
+def complicate(rng: Rng, plant: Plant, tables: dict[str, Any]) -> None:
+    """Add to the tables what only mechanisms have, or what chains do not state."""
+    limits, horizon = tables["limits"], tables["horizon"]
+    tables["initial"]["keyframe"] = "start"
+
+    # A control without a range needs a weight.
+    bounded = {*limits.get("control", {}), *(n for k, n in plant.ranges if k == "control")}
+    weights = {
+        drive.name: 0.0 if drive.name in bounded else 1e-3 / drive.control**2
+        for drive in plant.drives
+    }
+    tables["cost"]["control"] = weights or 0.0
+
+    for joint in plant.joints:
+        if joint.is_scalar:
+            continue
+        speed = joint.reach / horizon
+        size = joint.reach * rng.uniform(0.5, 2.0)
+        box = tuple(about_zero(rng, size) for _ in PLACE)
+        wanted = {
+            "position": box if joint.kind == "free" else (0.0, float(rng.uniform(0.4, 2.0))),
+            "velocity": speed * rng.uniform(0.5, 5.0),
+            "acceleration": speed / horizon * rng.uniform(5.0, 50.0),
+            "angular_velocity": rng.uniform(0.5, 5.0) / horizon,
+            "tilt": rng.uniform(0.3, 1.5),
+        }
+        _state_some(rng, limits, joint.name, wanted, (0.4, 0.3, 0.2, 0.3, 0.4))
+
+    for kind, power in (("velocity", 1), ("acceleration", 2)):
+        if rng.random() < 0.15:
+            fastest = max(joint.reach for joint in plant.joints) / horizon**power
+            limits[kind] = float(fastest * rng.uniform(3.0, 30.0))
+    if plant.collides and rng.random() < 0.6:
+        shortest = min(joint.length for joint in plant.joints)
+        limits["clearance"] = float(shortest * rng.uniform(0.001, 0.1))
+        if len(plant.joints) > 2 and rng.random() < 0.3:
+            limits["ignored"] = (("link0", "link2"),)
+
+    if rng.random() < 0.15:
+        tables["descent"] |= pick(rng, ({"fourier": (1.0 / horizon,)}, {"repeats": (2,)}))
+    if rng.random() < 0.1:
+        for parameter in tables["parameters"].values():
+            parameter["prior"] = 1e-3
+        tables["robust"] = {"over": str(rng.choice(["mean", "worst"])), "samples": 2}
+
+
 def describe(plant: Plant, tables: dict[str, Any]) -> str:
     """Describe a problem in a line."""
-    joints = ", ".join(joint.kind for joint in plant.joints)
-    drives = ", ".join(drive.tag for drive in plant.drives)
-    limits = ", ".join(sorted({kind for kind, _ in all_ranges(plant, tables)}))
     boundary = tables["boundary"]
-    ends = f"{boundary.get('start', 'given')} to {boundary.get('end', 'free')}"
-    return (
-        f"{joints}; {drives}; {plant.integrator} {plant.timestep:g} s; gravity "
-        f"{plant.gravity:g}; {ends}; limits on {limits}"
-    )
+    words = [*plant.features, f"{boundary.get('start', 'given')} to {boundary.get('end', 'free')}"]
+    words += [key for key in ("fourier", "repeats") if key in tables["descent"]]
+    words += ["robust"] if "robust" in tables else []
+    kinds = {kind for kind, _ in all_ranges(plant, tables)}
+    return "; ".join([*words, f"limits on {', '.join(sorted(kinds))}"])

@@ -35,15 +35,14 @@ def run_case(case: Case, folder: Path) -> Outcome:
         case: The case.
         folder: Empty folder for its files.
     """
-    from tests.fuzz import inputs, kills, mechanism_problems, problems
+    from tests.fuzz import inputs, kills, problems
 
     begin = time.monotonic()
     runs = {
         "problem": problems.run,
         "input": inputs.run,
         "kill": kills.run,
-        "mechanism": mechanism_problems.run,
-        "fault": inputs.run,
+        "mechanism": problems.run,
         "permission": inputs.run,
         "log": inputs.run,
     }

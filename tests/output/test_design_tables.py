@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
@@ -16,6 +17,7 @@ from mjfim.optimize.lq import regulator
 from mjfim.output import archive
 from mjfim.output.archive import design_columns, reference_columns, simulate_playback
 from mjfim.records.trajectory import Playback
+from tests.fuzz.player import Layout, read_rows
 from tests.support.numerics import Array, body_task, cart_task, filtered_task
 
 COARSE = {"rate": 25.0, "horizon": 0.8}  # of engines at 100 Hz
@@ -57,32 +59,24 @@ def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Ar
     """States and controls of a loop that knows only the CSV and the model file, and the planned
     ones. push: (nx,) of the start
     """
-    rows = table(path)
+    rows = read_rows(path)
     model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
-    data, nv, na = mujoco.MjData(model), model.nv, model.na
-    qpos, qvel, ctrl = (starting(rows, prefix) for prefix in ("qpos:", "qvel:", "ctrl:"))
-    act = starting(rows, "act:") if na else np.zeros((len(qpos), 0))
-    controls = [name.removeprefix("ctrl:") for name in rows if name.startswith("ctrl:")]
-    K = np.stack([starting(rows, f"gain:{name}:") for name in controls], axis=1)
-    steps = round(float(rows["t"][1]) / model.opt.timestep)
-    data.qpos[:], data.qvel[:], data.act[:] = (
-        qpos[0],
-        qvel[0] + push[nv : 2 * nv],
-        act[0] + push[2 * nv :],
-    )
+    data, layout, nv = mujoco.MjData(model), Layout.of(model), model.nv
+    steps = round(rows[1]["t"] / model.opt.timestep)
+    data.qpos[:], qvel, act = layout.planned(rows[0])
+    data.qvel[:], data.act[:] = qvel + push[nv : 2 * nv], act + push[2 * nv :]
     mujoco.mj_integratePos(model, data.qpos, push[:nv], 1.0)
     states, used = [], []
-    for k in range(len(qpos)):
+    for row in rows:
         states.append(np.concatenate([data.qpos, data.qvel, data.act]))
-        if k < len(qpos) - 1:
-            error = np.zeros(nv)
-            mujoco.mj_differentiatePos(model, error, 1.0, data.qpos, qpos[k])
-            data.ctrl[:] = ctrl[k] + K[k] @ np.concatenate(
-                [error, qvel[k] - data.qvel, act[k] - data.act]
-            )
-            used.append(np.array(data.ctrl))
+        ctrl = np.array([row[f"ctrl:{name}"] for name in layout.drives])
+        ctrl += layout.gain(row) @ layout.deviation(layout.planned(row), data)
+        if np.isfinite(ctrl).all():
+            data.ctrl[:] = ctrl
+            used.append(ctrl)
             mujoco.mj_step(model, data, steps)
-    return np.array(states), np.array(used), np.concatenate([qpos, qvel, act], axis=1)
+    plan = [np.concatenate(layout.planned(row)) for row in rows]
+    return np.array(states), np.array(used), np.array(plan)
 
 
 @pytest.mark.parametrize("kind", BUILD)
@@ -95,11 +89,11 @@ def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: P
     path, _ = written(task, tmp_path)
     nx, rows = task.space.nx, table(path)
     states, used, plan = closed_loop(path, tmp_path, np.zeros(nx))
-    np.testing.assert_allclose(states, plan, rtol=0, atol=1e-9)
+    assert_allclose(states, plan, rtol=0, atol=1e-9)
     assert len(plan) == round(task.experiment.horizon * FINE[kind]) + 1
     times = len(used) // len(task.initial.ctrl)
-    np.testing.assert_allclose(used, np.repeat(task.initial.ctrl, times, axis=0), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(rows["t"], np.arange(len(plan)) / FINE[kind], rtol=0, atol=1e-12)
+    assert_allclose(used, np.repeat(task.initial.ctrl, times, axis=0), rtol=0, atol=1e-9)
+    assert_allclose(rows["t"], np.arange(len(plan)) / FINE[kind], rtol=0, atol=1e-12)
     assert np.isnan(starting(rows, "ctrl:")[-1]).all()
     assert np.isnan(starting(rows, "gain:")[-1]).all()
 
@@ -110,7 +104,7 @@ def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: P
     model = task.plant.model(task.theta)
     reference = np.array(task.initial.state)
     expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, gains(task))
-    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
+    assert_allclose(states, expected, rtol=0, atol=1e-9)
     assert np.abs(used - task.initial.ctrl).max() > 1e-3
 
 
@@ -121,20 +115,6 @@ def engine_loop(task: DesignTask, model: Any, start: Array, reference: Array, K:
         u = task.initial.ctrl[k] + K[k] @ task.space.minus(reference[k], states[-1])
         states.append(task.plant.simulator.step([model], states[-1][None], u[None])[0][0])
     return np.array(states)
-
-
-def assert_last_acceleration(qacc: Array, played: Playback, data: Any) -> None:
-    """The last row has the acceleration of the last engine step, (nv,)."""
-    model = data.model
-    state = np.split(played.state[-2], [model.nq, model.nq + model.nv])
-    data.qpos[:], data.qvel[:], data.act[:] = state
-    data.ctrl[:] = played.ctrl[-1]
-    steps = round((played.t[-1] - played.t[-2]) / model.opt.timestep)
-    for _ in range(steps):
-        before = data.qvel.copy()
-        mujoco.mj_step(model, data)
-    wanted = (data.qvel - before) / model.opt.timestep
-    np.testing.assert_allclose(qacc, wanted, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", BUILD)
@@ -152,17 +132,22 @@ def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     data = mujoco.MjData(model)
     qacc, force = starting(rows, "qacc:"), starting(rows, "force:")
+    nq, nv = task.space.nq, task.space.nv
+    steps = round((played.t[1] - played.t[0]) / model.opt.timestep)
     for k in (0, 3, len(qacc) - 1):
         data.qpos[:], data.qvel[:], data.act[:] = task.space.split(played.state[k])
         data.ctrl[:] = played.ctrl[min(k, len(played.ctrl) - 1)]
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(force[k], data.qfrc_actuator, rtol=1e-9, atol=1e-12)
-        if k < len(played.ctrl):
-            mujoco.mj_step(model, data)
-            change = data.qvel - played.state[k, task.space.nq : task.space.nq + task.space.nv]
-            wanted = change / model.opt.timestep
-            np.testing.assert_allclose(qacc[k], wanted, rtol=1e-9, atol=1e-9)
-    assert_last_acceleration(qacc[-1], played, data)
+        assert_allclose(force[k], data.qfrc_actuator, rtol=1e-9, atol=1e-12)
+        before = played.state[k, nq : nq + nv]
+        if k == len(played.ctrl):
+            # The last row has the acceleration of the last engine step.
+            data.qpos[:], data.qvel[:], data.act[:] = task.space.split(played.state[k - 1])
+            mujoco.mj_step(model, data, steps - 1)
+            before = data.qvel.copy()
+        mujoco.mj_step(model, data)
+        change = (data.qvel - before) / model.opt.timestep
+        assert_allclose(qacc[k], change, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : task.space.nq])
 
 

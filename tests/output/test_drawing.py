@@ -9,54 +9,36 @@ import signal
 import time
 from concurrent.futures import Future
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
-from mjfim.errors import MjfimError
 from mjfim.output.page import PictureFormat
-from mjfim.output.plots import pictures
 from mjfim.output.plots.draw import content
 from mjfim.output.plots.pictures import begin_pictures, drawing_elsewhere, pictures_of
 from tests.support import results
 
 
-def test_a_picture_that_cannot_be_drawn_names_its_reason() -> None:
-    without_figures: object = object()
-    with pytest.raises(MjfimError, match="a object has no figures"):
-        pictures._contents(without_figures, PictureFormat.PNG)  # type: ignore[arg-type]
+def failing(error: Exception) -> Future[Any]:
+    """A task that failed."""
+    future: Future[Any] = Future()
+    future.set_exception(error)
+    return future
 
 
-class FaultyPool:
-    """A pool that fails at its second task, or whose second task fails."""
-
-    def __init__(self, raised: Exception | None, failed: Exception | None) -> None:
-        self._raised, self._failed, self._tasks = raised, failed, 0
-
-    def submit(self, *_: Any) -> Future[Any]:
-        """Submit a task."""
-        self._tasks += 1
-        if self._tasks > 1 and self._raised is not None:
-            raise self._raised
-        future: Future[Any] = Future()
-        future.set_exception(self._failed)
-        return future
-
-    def end_running(self, *, wait: bool = False) -> None:
-        """There is nothing to end."""
-
-
-def without_semaphores(count: int) -> Any:
-    """Some systems can start no process."""
-    raise OSError("no semaphores")
+def faulty(*answers: Any) -> Mock:
+    """A pool, of which the first task and the second one have these answers."""
+    return Mock(return_value=Mock(submit=Mock(side_effect=answers)))
 
 
 @pytest.mark.parametrize(
     ("cores", "pool"),
     [
         (1, None),
-        (2, without_semaphores),
-        (2, lambda _: FaultyPool(OSError("no memory"), None)),
-        (2, lambda _: FaultyPool(None, pickle.PicklingError("record"))),
+        # Some systems can start no process.
+        (2, Mock(side_effect=OSError("no semaphores"))),
+        (2, faulty(Future(), OSError("no memory"))),
+        (2, faulty(Future(), failing(pickle.PicklingError("record")))),
     ],
 )
 def test_without_another_process_or_if_it_fails_this_one_draws(

@@ -70,10 +70,10 @@ def test_an_input_is_never_replaced(link: str, tmp_path: Path) -> None:
     """Neither with --force nor under another name of the same file."""
     source = tmp_path / "source.txt"
     source.write_text("mine", encoding="utf-8")
-    target = {"same": source, "spelling": tmp_path / "x" / ".." / "source.txt"}.get(
-        link, tmp_path / "result.txt"
-    )
     (tmp_path / "x").mkdir()
+    target = tmp_path / {"same": "source.txt", "spelling": "x/../source.txt"}.get(
+        link, "result.txt"
+    )
     if link == "symlink":
         target.symlink_to(source)
     if link == "hardlink":
@@ -134,10 +134,8 @@ def test_the_manifest_has_one_entry_per_file(tmp_path: Path) -> None:
     for name in ("a.txt", "b.txt", "a.txt"):
         write(tmp_path / name, name)
     files = json.loads((tmp_path / MANIFEST).read_text(encoding="utf-8"))["files"]
-    assert {name: [entry["size"] for entry in entries] for name, entries in files.items()} == {
-        "a.txt": [5],
-        "b.txt": [5],
-    }
+    sizes = {name: [entry["size"] for entry in entries] for name, entries in files.items()}
+    assert sizes == {"a.txt": [5], "b.txt": [5]}
     assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "a.txt", "b.txt"}
 
 

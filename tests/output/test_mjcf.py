@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import mjfim
@@ -70,7 +71,7 @@ RICH = """<?xml version="1.0"?>
     </body>
     <body name="c" pos="1 0 0">
       <inertial pos="0 0 0" mass="1" fullinertia="0.10 0.120 0.11 0.010 0.02 0.01"/>
-      <joint name="l" type="slide"/><site name="u"/>
+      <joint name="l" type="slide" range="-2 2"/><site name="u"/>
     </body>
   </worldbody>
   <tendon>
@@ -197,6 +198,11 @@ def system_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> Sy
     return System.resolve(mjfim.Experiment(model=str(path), rate=500.0, parameters=given, **tables))
 
 
+def compiled(path: Path) -> Any:
+    """The compiled model of a file."""
+    return mujoco.MjModel.from_xml_path(str(path))
+
+
 def elements(path: Path) -> list[str]:
     """Start tags and comments of a text, with one blank between words and one kind of quotes."""
     text = path.read_text(encoding="utf-8").replace("'", '"')
@@ -220,7 +226,7 @@ def written(system: System, *theta: float, said: str = "") -> Path:
 
 def assert_is_identified_model(path: Path, system: System, theta: Any) -> None:
     """Assert that the file is the identified model, to 1e-12 of each array's largest number."""
-    found = mujoco.MjModel.from_xml_path(str(path))
+    found = compiled(path)
     wanted = system.model_at(np.asarray(theta, float), at_keyframe=False)
     for name in dir(found):
         if not name.startswith(DYNAMICS) or name.startswith(NO_DYNAMICS):
@@ -228,10 +234,10 @@ def assert_is_identified_model(path: Path, system: System, theta: Any) -> None:
         a, b = np.asarray(getattr(found, name)), np.asarray(getattr(wanted, name))
         assert a.shape == b.shape, name
         size = PRECISE * np.abs(b).max(initial=0.0)
-        np.testing.assert_allclose(a, b, rtol=PRECISE, atol=size, err_msg=name)
+        assert_allclose(a, b, rtol=PRECISE, atol=size, err_msg=name)
     for name in ("gravity", "wind", "density", "viscosity", "timestep"):
         a, b = getattr(found.opt, name), getattr(wanted.opt, name)
-        np.testing.assert_allclose(a, b, rtol=1e-15, err_msg=name)
+        assert_allclose(a, b, rtol=1e-15, err_msg=name)
     mine, theirs = inertias(found), inertias(wanted)
     sizes = PRECISE * np.trace(theirs, axis1=1, axis2=2)[:, None, None]
     assert (np.abs(mine - theirs) <= sizes).all()
@@ -315,7 +321,7 @@ def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
     second = system_of(new, tmp_path / "again", *paths)
     straight = np.array([":rot" not in p for p in paths])
     found = second.parameters.guess
-    np.testing.assert_allclose(found[straight], theta[straight], rtol=1e-12, atol=1e-13)
+    assert_allclose(found[straight], theta[straight], rtol=1e-12, atol=1e-13)
     assert write_identified(tmp_path / "again.xml", second, found) == []
     assert (tmp_path / "again.xml").read_bytes() == new.read_bytes()
 
@@ -377,31 +383,21 @@ def test_mujoco_prints_values_that_the_text_cannot_express(
     system = system_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
     value = 0.6 + 1e-9
     new = written(system, value, said="it is printed by MuJoCo, without comments")
-    found = mujoco.MjModel.from_xml_path(str(new))
+    found = compiled(new)
     wanted = system.model_at(np.array([value]))
-    for name in ("dof_damping", "body_pos", "body_mass", "body_inertia", "actuator_gainprm"):
-        np.testing.assert_allclose(
-            getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12
-        )
+    for name in ("dof_damping", "body_pos", "body_mass", "actuator_gainprm"):
+        assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12)
 
 
-def stiffen(spec: Any, value: float) -> None:
-    """Function of the MjSpec that is a parameter, and changes a number."""
-    spec.joint("j").armature = value
-
-
-def soften(spec: Any, value: float) -> None:
-    """Another one, which changes what no parameter path names."""
-    spec.joint("j").margin = value
-
-
-@pytest.mark.parametrize("function", [stiffen, soften])
-def test_functions_of_the_spec(function: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("attribute", "said"), [("armature", ""), ("margin", "jnt_margin")])
+def test_functions_of_the_spec(attribute: str, said: str, tmp_path: Path) -> None:
     """A text states the numbers that a function changes; MuJoCo prints other changes."""
+
+    def function(spec: Any, value: float) -> None:
+        setattr(spec.joint("j"), attribute, value)
+
     system = system_of(RICH, tmp_path, {"function": function, "guess": 0.1, "scale": 1.0})
-    said = "jnt_margin" if function is soften else ""
-    new = written(system, 0.25, said=said)
-    found = mujoco.MjModel.from_xml_path(str(new))
+    found = compiled(written(system, 0.25, said=said))
     assert same_dynamics(found, system.model_at(np.array([0.25])))
 
 
@@ -489,42 +485,15 @@ DERIVED = {
         ("body/a:mass", 2.0),
         "",
     ),
+    "no option": (
+        (RICH[RICH.index("  <option") : RICH.index("  <default>")], ""),
+        ("option:gravity[0]", 0.1),
+        '<option gravity="0.1 0 -9.81"/>',
+    ),
 }
 
-
-@pytest.mark.parametrize("case", DERIVED)
-def test_numbers_that_the_compiler_would_derive_are_stated(case: str, tmp_path: Path) -> None:
-    (old, new), (path, value), words = DERIVED[case]
-    assert old in RICH
-    system = system_of(RICH.replace(old, new, 1), tmp_path, path)
-    file = written(system, value, said="" if words else "printed by MuJoCo")
-    if words:
-        assert words in " ".join(changes(tmp_path / "model.xml", file)[1])
-        assert_is_identified_model(file, system, [value])
-
-
-def test_an_option_is_made_where_there_is_none(tmp_path: Path) -> None:
-    xml = re.sub(r"\n +<option[^>]*/>[^\n]*", "", RICH)
-    system = system_of(xml, tmp_path, "option:gravity[0]", "option:density")
-    new = written(system, 0.1, 1.2)
-    stated = '<option gravity="0.1 0 -9.81" density="1.2"/>'
-    assert changes(tmp_path / "model.xml", new) == ([], [stated])
-    assert_is_identified_model(new, system, [0.1, 1.2])
-
-
-@pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
-def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: Path) -> None:
-    """`objtype="body"` reads the principal axes, whose order the matrix does not determine."""
-    xml = RICH.replace('mass="1.50"', f'mass="1.50"{turned}')
-    system = system_of(xml, tmp_path, "body/a:fullinertia[3]")
-    found = mujoco.MjModel.from_xml_path(str(written(system, 0.004)))
-    wanted = system.model_at(np.array([0.004]))
-    np.testing.assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
-
-
 # Actuators, a path of each, and what states its value: an attribute of its own, or <general>.
-ACTUATORS = [
+for element, field, stated in (
     ('position kp="3" kv="0.2" timeconst="0.1"', "dynprm", 'timeconst="0.7"'),
     ('position kp="3" inheritrange="1"', "gainprm", '<general name="x" joint="l" ctrlrange="-2 2"'),
     ('dcmotor input="none" resistance="1" lugre="9 1 0.1 0.2 0.3"', "biasprm[4]", "<dcmotor"),
@@ -534,54 +503,46 @@ ACTUATORS = [
     ('muscle force="5" lengthrange="0 1" ctrlrange="0 1"', "gainprm[3]", 'gaintype="muscle"'),
     ('cylinder area="2" timeconst="0.3"', "gainprm", 'dyntype="filter"'),
     ('pid kp="3" kv="1" ki="0.1"', "biasprm[2]", "<general"),
-]
-
-
-@pytest.mark.parametrize(("element", "field", "words"), ACTUATORS)
-def test_actuators(element: str, field: str, words: str, tmp_path: Path) -> None:
+):
     tag, _, attributes = element.partition(" ")
-    xml = RICH.replace('name="l" type="slide"', 'name="l" type="slide" range="-2 2"')
-    xml = xml.replace("</actuator>", f'<{tag} name="x" joint="l" {attributes}/></actuator>')
-    value = -0.7 if tag in ("damper", "pid") else 0.7
-    system = system_of(
-        xml, tmp_path, {"target": f"actuator/x:{field}", "guess": value, "scale": 1.0}
-    )
-    new = written(system, value)
-    assert_is_identified_model(new, system, [value])
-    lost, gained = changes(tmp_path / "model.xml", new)
-    assert len(lost) == len(gained) == 1
-    assert words in gained[0]
+    number = -0.7 if tag in ("damper", "pid") else 0.7
+    added = f'<{tag} name="x" joint="l" {attributes}/></actuator>'
+    DERIVED[element] = (("</actuator>", added), (f"actuator/x:{field}", number), stated)
 
 
-# Arrays of MjModel that the three parameters of the cart-pendulum set, and those that follow.
-IDENTIFIED = {"body_mass", "body_pos", "geom_pos", "geom_size", "dof_damping"}
-FOLLOWING = {"actuator_acc0", "body_invweight0", "body_subtreemass", "dof_M0", "dof_invweight0"}
-FOLLOWING |= {"dof_length", "geom_aabb", "geom_rbound", "light_poscom0"}
+@pytest.mark.parametrize("case", DERIVED)
+def test_numbers_that_the_compiler_would_derive_are_stated(case: str, tmp_path: Path) -> None:
+    (old, new), (path, value), words = DERIVED[case]
+    assert old in RICH
+    target = {"target": path, "guess": value, "scale": 1.0}
+    system = system_of(RICH.replace(old, new, 1), tmp_path, target)
+    file = written(system, value, said="" if words else "printed by MuJoCo")
+    if words:
+        assert words in " ".join(changes(tmp_path / "model.xml", file)[1])
+        assert_is_identified_model(file, system, [value])
 
 
-@pytest.mark.parametrize("limits", [{}, {"clearance": 0.01, "floor": -3.0}])
-def test_only_the_identified_values_differ(limits: dict[str, float], tmp_path: Path) -> None:
-    """All arrays of MjModel are compared; a negative mass is named, and nothing is written.
+@pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
+def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: Path) -> None:
+    """`objtype="body"` reads the principal axes, whose order the matrix does not determine."""
+    xml = RICH.replace('mass="1.50"', f'mass="1.50"{turned}')
+    system = system_of(xml, tmp_path, "body/a:fullinertia[3]")
+    found = compiled(written(system, 0.004))
+    wanted = system.model_at(np.array([0.004]))
+    assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
+    assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
 
-    A floor that only the experiment states is no part of the model.
-    """
-    experiment = cart_pendulum()
-    system = System.resolve(experiment.replace(limits=limits))
-    stated = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
-    path = tmp_path / "deep" / "identified.xml"
-    assert write_identified(path, system, np.array([2.3456789, 1.2345678, 0.7654321])) == []
-    found = mujoco.MjModel.from_xml_path(str(path))
-    changed = set()
-    for name in dir(found):
-        a, b = getattr(found, name), getattr(stated, name)
-        if isinstance(a, np.ndarray) and not np.allclose(a, b, rtol=1e-12, atol=1e-15):
-            changed.add(name)
-    assert changed - FOLLOWING == IDENTIFIED
-    assert found.body_mass[3] == 2.3456789
+
+def test_a_negative_mass_is_named_and_a_floor_of_the_experiment_is_left_out(tmp_path: Path) -> None:
+    """Nothing is written where a value is impossible; the floor is no part of the model."""
+    floor = System.resolve(cart_pendulum(limits={"clearance": 0.01, "floor": -3.0}))
+    path, theta = tmp_path / "deep" / "identified.xml", [2.3456789, 1.2345678, 0.7654321]
+    assert write_identified(path, floor, np.array(theta)) == []
+    assert_is_identified_model(path, System.resolve(cart_pendulum()), theta)
 
     before = path.read_bytes()
     with pytest.raises(MjfimError, match="mass"):
-        write_identified(path, system, np.array([-1.0, 1.0, 1.0]))
+        write_identified(path, floor, np.array([-1.0, 1.0, 1.0]))
     assert path.read_bytes() == before
     assert [each.name for each in path.parent.iterdir()] == ["identified.xml"]
 
@@ -616,15 +577,18 @@ def test_models_of_this_and_other_projects(name: str, tmp_path: Path) -> None:
 def test_what_counts_as_rounding_does_not_depend_on_units(
     one: tuple[float, float], other: tuple[float, float], same: bool
 ) -> None:
-    def model(armatures: tuple[float, float]) -> mujoco.MjModel:
-        joints = "".join(
-            f'<body><joint armature="{armature!r}"/><geom size="0.1"/></body>'
-            for armature in armatures
+    first, second = (
+        mujoco.MjModel.from_xml_string(
+            "<mujoco><worldbody>"
+            + "".join(
+                f'<body><joint armature="{a!r}"/><geom size="0.1"/></body>' for a in armatures
+            )
+            + "</worldbody></mujoco>"
         )
-        return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{joints}</worldbody></mujoco>")
+        for armatures in (one, other)
+    )
 
     # The inverse inertias at the reference position follow from the armatures.
-    first, second = model(one), model(other)
     first.dof_invweight0[:] = second.dof_invweight0
     first.dof_M0[:] = second.dof_M0
     assert same_dynamics(first, second) == same
@@ -647,23 +611,13 @@ def test_a_model_in_memory_is_written_with_the_files_that_it_needs(tmp_path: Pat
 
     assert write_identified(file, system, np.array([1.5])) == []
 
-    found = mujoco.MjModel.from_xml_path(str(file))
+    found = compiled(file)
     assert same_dynamics(found, system.model_at(np.array([1.5])))
     assert [each.name for each in file.parent.iterdir()] == [file.name]
 
 
 # ---- models of an estimate
 
-TETRAHEDRON = """
-v 0 0 0
-v .1 0 0
-v 0 .1 0
-v 0 0 .1
-f 1 3 2
-f 1 2 4
-f 1 4 3
-f 2 3 4
-"""
 MESH_ARM = """<mujoco>
   <asset><mesh name="t" file="tetra.obj"/></asset>
   <worldbody>
@@ -695,7 +649,7 @@ def test_an_estimate_gives_its_model(identified: Estimate, tmp_path: Path) -> No
 
     file = tmp_path / "arm.xml"
     assert identified.save_model(file) == []
-    written = mujoco.MjModel.from_xml_path(str(file))
+    written = compiled(file)
     assert same_dynamics(written, identified.model)
     head = file.read_text(encoding="utf-8").partition("-->")[0]
     assert f"mjfim {mjfim.__version__} and MuJoCo {mujoco.__version__}" in head
@@ -706,18 +660,16 @@ def test_an_estimate_gives_its_model(identified: Estimate, tmp_path: Path) -> No
 
 
 def test_meshes_of_the_memory_are_written_beside_the_model(tmp_path: Path) -> None:
-    (tmp_path / "tetra.obj").write_text(TETRAHEDRON)
+    (tmp_path / "tetra.obj").write_text(MESH)
     (tmp_path / "arm.xml").write_text(MESH_ARM)
-    experiment = with_model(
-        mjfim.Experiment(
-            model="arm.xml",
-            directory=tmp_path,
-            rate=100.0,
-            horizon=1.0,
-            parameters={"d": {"target": "joint/j:damping"}},
-            noise={"qpos:j": 1e-3},
-        )
+    stated = mjfim.Experiment(
+        model="arm.xml",
+        directory=tmp_path,
+        rate=100.0,
+        parameters={"d": "joint/j:damping"},
+        noise={"qpos:j": 1e-3},
     )
+    experiment = with_model(stated)
     for file in tmp_path.iterdir():
         file.unlink()
     estimate = bare_estimate(("d",), np.array([0.3]), np.array([0.1]), experiment=experiment)
@@ -729,7 +681,7 @@ def test_meshes_of_the_memory_are_written_beside_the_model(tmp_path: Path) -> No
     assert estimate.save_model(new / "first.xml") == estimate.save_model(new / "second.xml") == []
     names = {file.name for file in new.glob("[!.]*")}
     assert names == {"first.xml", "first_tetra.obj", "second.xml", "second_tetra.obj"}
-    assert mujoco.MjModel.from_xml_path(str(new / "second.xml")).dof_damping[0] == 0.3
+    assert compiled(new / "second.xml").dof_damping[0] == 0.3
     (new / "third_tetra.obj").write_text("mine")
     with pytest.raises(OutputError, match="third_tetra"):
         estimate.save_model(new / "third.xml")

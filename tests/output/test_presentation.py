@@ -7,13 +7,10 @@ from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-import mjfim
 from mjfim.errors import MjfimError
-from mjfim.excitation.task import DesignTask
 from mjfim.output.folders import write_pictures
 from mjfim.output.manifest import OutputGuard, claimed
 from mjfim.output.page import Emphasis, Listing, PictureFormat, Row, Table, Text
@@ -22,7 +19,6 @@ from mjfim.output.panels import Picture
 from mjfim.output.plots.pictures import Pictures
 from mjfim.output.report import STYLES, template
 from tests.support import results
-from tests.support.cart_pendulum import cart_pendulum
 from tests.support.pages import page_with
 
 # Many figures are drawn: these tests run in `.ci/run` only.
@@ -59,20 +55,6 @@ def test_a_figure_is_drawn_and_shown_as_png(verb: str) -> None:
     assert 300.0 < options["width"] < 1800.0
 
 
-@verbs
-def test_a_result_is_a_few_short_lines_and_can_be_saved_and_loaded(
-    verb: str, tmp_path: Path
-) -> None:
-    """In a terminal, the text of a design had 122,394 characters."""
-    record = results.MAKERS[verb]()
-    lines = repr(record).splitlines()
-    assert lines[0] == f"{type(record).__name__}("
-    assert max(map(len, lines)) < 100 and len(lines) <= 60
-
-    record.save(tmp_path)
-    assert repr(type(record).load(tmp_path)) == repr(record)
-
-
 def test_a_campaign_before_its_first_round_is_shown_in_words() -> None:
     begun = results.campaign(rounds=())
     assert "Campaign of designs and recordings" in texts(begun._repr_html_())
@@ -103,21 +85,6 @@ def test_every_part_of_a_page_is_escaped() -> None:
     assert found.count(HOSTILE) == 15
     assert f"Warning: {HOSTILE}" in found
     assert "<code>a&lt;b</code> or ` alone" in html
-
-
-# ---- what pictures of a fit need
-
-
-def test_a_fit_keeps_its_segments_and_the_nominal_model() -> None:
-    stated = cart_pendulum(horizon=0.4)
-    estimate = mjfim.identify(
-        stated, [mjfim.simulate(stated, DesignTask.resolve(stated).initial, seed=0)]
-    )
-    recording = estimate.recordings[0]
-    assert estimate.nominal[0].shape == recording.y.shape
-    assert np.abs(estimate.nominal[0] - estimate.predicted[0]).max() > 0.0
-    assert estimate.segments[0][0] == recording.t[0]
-    assert (np.diff(estimate.segments[0]) > 0.0).all()
 
 
 # ---- formats of pictures

@@ -6,10 +6,12 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
@@ -26,12 +28,11 @@ from mjfim.output.rerun.camera import (
     place_camera,
     seen_points,
 )
-from mjfim.output.rerun.plots import round_numbers
 from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses, entity_path
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
 from mjfim.records.estimate_parts import InformationInTime, ResidualForce
-from mjfim.records.rehearsal import FiniteSteps, RobotMotions
+from mjfim.records.rehearsal import RobotMotions
 from mjfim.records.trajectory import Trajectory
 from tests.support import results
 from tests.support.made_motions import designed, estimated, load, simulated
@@ -60,8 +61,21 @@ def column(
     return np.array(times)[order], np.array(values)[order]
 
 
+def scalars(path: Path, at: tuple[str, ...] | str) -> tuple[Array, Array]:
+    """Times [s] and values of a curve."""
+    times, values = column(path, at, "sim_time", "Scalars:scalars")
+    return 1e-9 * times, np.ravel(values)
+
+
+def logged(folder: Path, model: mujoco.MjModel, design: Design, *beside: tuple[Any, str]) -> Path:
+    """The recording of a design, whose views all show something."""
+    path = folder / "design.rrd"
+    log_design(path, model, design, labels_of_model(model), *beside)
+    assert empty_views(path) == []
+    return path
+
+
 def blueprint_column(path: Path, component: str) -> dict[str, Any]:
-    """One component of the blueprint by entity."""
     reader = RrdReader(path)
     found = {}
     for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
@@ -90,15 +104,25 @@ def opened_rows(path: Path) -> list[list[str]]:
 
 def empty_views(path: Path) -> list[str]:
     """Origins of views below which there is nothing."""
-    found = entities(path)
-    origins = [
-        origin[0] for origin in blueprint_column(path, "ViewBlueprint:space_origin").values()
-    ]
-    return [
-        origin
-        for origin in origins
-        if not any(name == origin or name.startswith(f"{origin}/") for name in found)
-    ]
+    found = [f"{name}/" for name in entities(path)]
+    origins = blueprint_column(path, "ViewBlueprint:space_origin").values()
+    return [at for (at,) in origins if not any(name.startswith(f"{at}/") for name in found)]
+
+
+def text_of(path: Path) -> str:
+    """The summary."""
+    return str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])
+
+
+def plain_poses(model: mujoco.MjModel, qpos: Array) -> tuple[Array, Array, Array]:
+    """Positions and orientations of the bodies, and positions of the geoms, by plain MuJoCo."""
+    data, rows = mujoco.MjData(model), []
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        rows.append((data.xpos.copy(), data.xquat.copy(), data.geom_xpos.copy()))
+    xpos, xquat, geom_xpos = (np.array(each) for each in zip(*rows, strict=True))
+    return xpos, xquat, geom_xpos
 
 
 @pytest.fixture(scope="module")
@@ -116,16 +140,13 @@ def design(cart: mujoco.MjModel) -> Design:
 @pytest.fixture(scope="module")
 def file(cart: mujoco.MjModel, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its recording."""
-    path = tmp_path_factory.mktemp("rerun") / "design.rrd"
-    log_design(path, cart, design, labels_of_model(cart))
-    return path
+    return logged(tmp_path_factory.mktemp("rerun"), cart, design)
 
 
 # ---- designs
 
 
-def test_every_view_of_a_design_has_content_and_nothing_warns(file: Path) -> None:
-    assert empty_views(file) == []
+def test_a_design_has_all_containers_and_nothing_warns(file: Path) -> None:
     assert not any("warning" in name for name in entities(file))
     assert len(RrdReader(file).blueprints()) == 1
     names = blueprint_column(file, "ContainerBlueprint:display_name").values()
@@ -143,12 +164,11 @@ def test_a_design_opens_on_limits_information_and_the_motion_nearest_to_its_limi
 
     (usage,) = design.usage
     other = replace(usage, name="hinge", share=2.0 * usage.share)
-    path = tmp_path / "design.rrd"
-    log_design(path, cart, replace(design, usage=(usage, other)), labels_of_model(cart))
+    path = logged(tmp_path, cart, replace(design, usage=(usage, other)))
     assert opened_rows(path)[2] == positions[::-1]
 
-    log_design(path, cart, replace(design, usage=()), labels_of_model(cart))
-    assert [row[0].split("/")[1] for row in opened_rows(path)] == ["accuracy", "positions"]
+    rows = opened_rows(logged(tmp_path, cart, replace(design, usage=())))
+    assert [row[0].split("/")[1] for row in rows] == ["accuracy", "positions"]
 
 
 def test_accuracy_over_time_is_that_of_the_picture(file: Path, design: Design) -> None:
@@ -157,49 +177,39 @@ def test_accuracy_over_time_is_that_of_the_picture(file: Path, design: Design) -
     assert len(curves) == 2
     for j, (k, mark) in enumerate(curves):
         path = ("accuracy", panel.title, f"{k} {mark.label}")
-        times, values = column(file, path, "sim_time", "Scalars:scalars")
+        times, values = scalars(file, path)
         percent = 100.0 * design.std_over_time[:, j] / design.sizes[j]
         shown = np.isfinite(mark.y)
-        np.testing.assert_allclose(np.ravel(values), percent[shown])
-        np.testing.assert_allclose(times * 1e-9, design.trajectory.t[shown], atol=1e-9)
+        assert_allclose(values, percent[shown])
+        assert_allclose(times, design.trajectory.t[shown], atol=1e-9)
 
 
 def test_series_are_exact(file: Path, design: Design) -> None:
-    for k, (name, evaluation) in enumerate(
-        (("initial", design.initial), ("designed", design.final))
-    ):
+    for name, evaluation in (("0 initial", design.initial), ("1 designed", design.final)):
         trajectory = evaluation.trajectory
         for at, expected in (
-            (("positions", "hinge [rad]", f"{k} {name}"), trajectory.qpos[:, 1]),
-            (("velocities", "slide [m/s]", f"{k} {name}"), trajectory.qvel[:, 0]),
-            (("controls", "force [N]", f"{k} {name}"), trajectory.ctrl[:, 0]),
+            (("positions", "hinge [rad]", name), trajectory.qpos[:, 1]),
+            (("velocities", "slide [m/s]", name), trajectory.qvel[:, 0]),
+            (("controls", "force [N]", name), trajectory.ctrl[:, 0]),
         ):
-            times, values = column(file, at, "sim_time", "Scalars:scalars")
-            np.testing.assert_allclose(np.ravel(values), expected)
-            np.testing.assert_allclose(times * 1e-9, trajectory.t[: len(expected)], atol=1e-9)
+            times, values = scalars(file, at)
+            assert_allclose(values, expected)
+            assert_allclose(times, trajectory.t[: len(expected)], atol=1e-9)
 
 
 def test_limits_that_are_near_are_lines(file: Path) -> None:
     shares = [name for name in entities(file) if name.startswith("/limits/position")]
-    levels = [
-        np.ravel(column(file, name, "sim_time", "Scalars:scalars")[1])
-        for name in shares
-        if "hline" in name
-    ]
-    assert sorted(level[0] for level in levels) == [-100.0, 100.0]
+    levels = [scalars(file, name)[1][0] for name in shares if "hline" in name]
+    assert sorted(levels) == [-100.0, 100.0]
 
 
 def test_poses_are_those_of_mujoco(file: Path, cart: mujoco.MjModel, design: Design) -> None:
-    data = mujoco.MjData(cart)
-    path = ("robots", "designed", "bodies", "bob")
-    times, translation = column(file, path, "sim_time", "Transform3D:translation")
+    bob, path = cart.body("bob").id, ("robots", "designed", "bodies", "bob")
+    positions, orientations, _ = plain_poses(cart, design.trajectory.qpos)
+    _, translation = column(file, path, "sim_time", "Transform3D:translation")
     _, quaternion = column(file, path, "sim_time", "Transform3D:quaternion")
-    assert len(times) == len(design.trajectory.t)
-    for k, q in enumerate(design.trajectory.qpos):
-        data.qpos[:] = q
-        mujoco.mj_forward(cart, data)
-        np.testing.assert_allclose(translation[k, 0], data.body("bob").xpos, atol=1e-6)
-        np.testing.assert_allclose(np.roll(quaternion[k, 0], 1), data.body("bob").xquat, atol=1e-6)
+    assert_allclose(translation[:, 0], positions[:, bob], atol=1e-6)
+    assert_allclose(np.roll(quaternion[:, 0], 1, axis=1), orientations[:, bob], atol=1e-6)
 
 
 def test_the_search_is_on_the_timeline_of_iterations(file: Path) -> None:
@@ -227,26 +237,20 @@ def test_robots_beside_both_motions_are_outlines_without_static_shapes(
 ) -> None:
     plans = design.initial.trajectory, design.final.trajectory
     beside = [[replace(plan, qpos=plan.qpos + shift) for shift in (0.1, -0.2)] for plan in plans]
-    path = tmp_path / "two.rrd"
-    log_design(path, cart, design, labels_of_model(cart), (beside, "Pale: two robots."))
+    path = logged(tmp_path, cart, design, (beside, "Pale: two robots."))
     for name, pair in zip(("initial", "designed"), beside, strict=True):
         for number, motion in enumerate(pair, start=1):
             root = ("robots", name, f"robot {number}", "bodies")
-            times, places = column(path, (*root, "bob"), "sim_time", "Transform3D:translation")
-            expected = body_poses(cart, motion.t, motion.qpos)
-            assert len(times) == len(motion.t)
-            bob = cart.body("bob").id
-            np.testing.assert_allclose(places[:, 0], expected.positions[:, bob], atol=1e-6)
+            _, places = column(path, (*root, "bob"), "sim_time", "Transform3D:translation")
+            expected = plain_poses(cart, motion.qpos)[0]
+            assert_allclose(places[:, 0], expected[:, cart.body("bob").id], atol=1e-6)
             # On the timeline of the iterations they would stand still in a wrong place.
             shape = (*root, "bob", "bob")
             assert not len(column(path, shape, None, "Ellipsoids3D:half_sizes")[1])
             _, fill = column(path, shape, "sim_time", "Ellipsoids3D:fill_mode")
             assert fill[0, 0] == OUTLINE.value
     assert not any("robot 1/bodies/world" in name for name in entities(path))
-    assert "Pale: two robots." in str(
-        column(path, ("summary",), None, "TextDocument:text")[1][0, 0]
-    )
-    assert empty_views(path) == []
+    assert "Pale: two robots." in text_of(path)
 
 
 def test_ends_of_rehearsed_robots_are_those_of_mujoco(
@@ -254,39 +258,27 @@ def test_ends_of_rehearsed_robots_are_those_of_mujoco(
 ) -> None:
     """Two robots, of which one leaves a limit; the bands are series."""
     t = np.linspace(0.0, 2.0, 30)
-    qpos = np.stack([a * np.stack([np.sin(t), np.cos(t)], axis=1) for a in (0.3, 0.6)])
+    swing = np.column_stack([np.sin(t), np.cos(t)])
+    motions = RobotMotions(robots=(7, 2), t=t, qpos=np.stack([0.3 * swing, 0.6 * swing]))
     std = np.array([0.1, 0.2])
-    steps = FiniteSteps(
-        names=design.parameters, predicted=std, std=std, length=np.ones(2), ratio=np.ones(2)
-    )
+    steps = replace(results.finite_steps(predicted=std), names=design.parameters)
     kept = results.rehearsal(steps=steps)
     margins = kept.margins.copy()
     margins[7] = -0.1
-    rehearsal = replace(kept, margins=margins, motions=RobotMotions(robots=(7, 2), t=t, qpos=qpos))
-    path = tmp_path / "design.rrd"
-    log_design(path, cart, replace(design, rehearsal=rehearsal), labels_of_model(cart))
-    assert empty_views(path) == []
-    data = mujoco.MjData(cart)
-    for positions, name in zip(qpos, ("a limit", "no limit"), strict=True):
-        expected = []
-        for row in positions:
-            data.qpos[:] = row
-            mujoco.mj_kinematics(cart, data)
-            expected.append(data.geom_xpos[-1].copy())
+    rehearsal = replace(kept, margins=margins, motions=motions)
+    path = logged(tmp_path, cart, replace(design, rehearsal=rehearsal))
+    for positions, name in zip(motions.qpos, ("a limit", "no limit"), strict=True):
+        expected = plain_poses(cart, positions)[2][:, -1]
         at = ("robots", "designed", f"robots that leave {name}")
         _, (strips,) = column(path, (*at, "paths"), None, "LineStrips3D:strips")
-        np.testing.assert_allclose(strips[0], expected, atol=1e-6)
+        assert_allclose(strips[0], expected, atol=1e-6)
         times, ends = column(path, (*at, "ends"), "sim_time", "Points3D:positions")
-        np.testing.assert_allclose(ends[:, 0], expected, atol=1e-6)
-        np.testing.assert_allclose(times * 1e-9, t, atol=1e-9)
+        assert_allclose(ends[:, 0], expected, atol=1e-6)
+        assert_allclose(1e-9 * times, t, atol=1e-9)
     fan = rehearsal.fans[0]
-    edges = [
-        np.ravel(column(path, entity, "sim_time", "Scalars:scalars")[1])
-        for entity in entities(path)
-        if entity.startswith("/robots/position") and "of" in entity.rpartition("/")[2]
-    ]
-    edges.sort(key=lambda edge: float(edge.sum()))
-    np.testing.assert_allclose(edges, fan.before)
+    below = [name for name in entities(path) if name.startswith("/robots/position")]
+    edges = [scalars(path, name)[1] for name in below if "of" in name.rpartition("/")[2]]
+    assert_allclose(sorted(edges, key=np.sum), fan.before)
 
 
 def test_in_the_view_of_both_robots_the_initial_one_is_translucent(file: Path) -> None:
@@ -299,46 +291,23 @@ def test_in_the_view_of_both_robots_the_initial_one_is_translucent(file: Path) -
 
 
 def test_the_summary_holds_outcome_warnings_and_colours(file: Path) -> None:
-    text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
+    text = text_of(file)
     assert "it violates limits (position)" in text
     assert "the two parameters are nearly confounded" in text
     assert text.rstrip().endswith("in place of the designed trajectory.")
-
-
-def test_a_file_is_replaced_only_when_the_new_one_is_complete(
-    cart: mujoco.MjModel, design: Design, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "design.rrd"
-    path.write_text("old")
-
-    def fail(*_: object) -> None:
-        """Run out of space."""
-        raise RuntimeError("disk full")
-
-    monkeypatch.setattr("mjfim.output.rerun.documents.log_series", fail)
-    with pytest.raises(RuntimeError, match="disk full"):
-        log_design(path, cart, design, labels_of_model(cart))
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_design_without_history_motions_or_information_is_logged(
     cart: mujoco.MjModel, design: Design, tmp_path: Path
 ) -> None:
     blind = replace(design.initial, std_over_time=np.full((41, 2), np.inf))
-    path = tmp_path / "design.rrd"
-    bare = replace(design, initial=blind, history=(), motions=None, usage=())
-    log_design(path, cart, bare, labels_of_model(cart))
-    assert empty_views(path) == []
+    logged(tmp_path, cart, replace(design, initial=blind, history=(), motions=None, usage=()))
 
 
 @pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo", "release"])
 def test_a_design_of_any_model_is_logged(name: str, tmp_path: Path) -> None:
     model = load(name)
-    made = designed(model)
-    path = tmp_path / "design.rrd"
-    log_design(path, model, replace(made, usage=()), labels_of_model(model))
-    assert empty_views(path) == []
+    path = logged(tmp_path, model, replace(designed(model), usage=()))
     positions = {entity.split("/")[2] for entity in entities(path) if "/positions/" in entity}
     assert len(positions) == model.nv
 
@@ -346,12 +315,27 @@ def test_a_design_of_any_model_is_logged(name: str, tmp_path: Path) -> None:
 # ---- cameras
 
 
+def moving(name: str) -> tuple[mujoco.MjModel, Any]:
+    """A model by its short name, and its poses in a motion."""
+    model = load(name)
+    trajectory = simulated(model, 1.0)
+    return model, body_poses(model, trajectory.t, trajectory.qpos)
+
+
+def logged_flight(path: Path, axis: int, way: float) -> None:
+    """Log the quadrotor that stays, as the initial motion, beside one that flies along an axis."""
+    model = load("quadrotor")
+    still = simulated(model, 0.5, samples=100)
+    qpos = np.array(still.qpos)
+    qpos[:, axis] += np.linspace(0.0, way, len(qpos))
+    motions = {"initial": still, "final": replace(still, qpos=qpos)}
+    log_trajectories(path, model, motions, labels_of_model(model))
+
+
 @pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo", "release"])
 def test_the_camera_is_as_near_as_the_motion_permits(name: str) -> None:
     """Something moving is at an edge of the picture, and nothing is beyond it."""
-    model = load(name)
-    trajectory = simulated(model, 1.0)
-    poses = body_poses(model, trajectory.t, trajectory.qpos)
+    model, poses = moving(name)
     eye = place_camera(model, [poses], views=1, aspect=1.3, follow=False)
     towards = np.subtract(eye.position, eye.target)
     distance = np.linalg.norm(towards)
@@ -366,9 +350,7 @@ def test_the_camera_is_as_near_as_the_motion_permits(name: str) -> None:
 def test_only_a_motion_in_an_upright_plane_is_seen_with_the_ground_edge_on(
     name: str, edge_on: bool
 ) -> None:
-    model = load(name)
-    trajectory = simulated(model, 1.0)
-    poses = body_poses(model, trajectory.t, trajectory.qpos)
+    model, poses = moving(name)
     assert place_camera(model, [poses], views=1, aspect=1.3).edge_on == edge_on
 
 
@@ -376,13 +358,8 @@ def test_the_camera_follows_a_body_that_flies_away_except_in_the_common_view(
     tmp_path: Path,
 ) -> None:
     """A view that is opened while a body flies would begin in a wrong place."""
-    model, path = load("quadrotor"), tmp_path / "replay.rrd"
-    still = simulated(model, 0.5, samples=100)
-    qpos = np.array(still.qpos)
-    qpos[:, 0] += np.linspace(0.0, 20.0, len(qpos))
-    log_trajectories(
-        path, model, {"initial": still, "final": replace(still, qpos=qpos)}, labels_of_model(model)
-    )
+    path = tmp_path / "replay.rrd"
+    logged_flight(path, 0, 20.0)
     tracked = blueprint_column(path, "EyeControls3D:tracking_entity")
     followed = {names[0] for names in tracked.values()}
     assert len(followed) == 2
@@ -395,12 +372,8 @@ def test_the_camera_follows_a_body_that_flies_away_except_in_the_common_view(
 def test_the_camera_follows_a_base_on_slides_that_drives_far() -> None:
     """A cart that stays near its rail is seen from where it is."""
     model = load("cart")
-    poses = [
-        body_poses(
-            model, np.arange(50.0), np.column_stack([np.linspace(0.0, way, 50), np.ones(50)])
-        )
-        for way in (1.0, 40.0)
-    ]
+    ways = (np.column_stack([np.linspace(0.0, way, 50), np.ones(50)]) for way in (1.0, 40.0))
+    poses = [body_poses(model, np.arange(50.0), qpos) for qpos in ways]
     near, far = (place_camera(model, [each], views=1, aspect=1.3) for each in poses)
     assert (near.followed, far.followed) == (None, model.body("cart").id)
 
@@ -418,12 +391,8 @@ def test_the_camera_follows_a_base_on_slides_that_drives_far() -> None:
 
 def test_a_robot_below_the_floor_is_seen_through_it(tmp_path: Path) -> None:
     """The floor between it and the camera is translucent; above it, the floor is as it was."""
-    model, path = load("quadrotor"), tmp_path / "replay.rrd"
-    above = simulated(model, 0.5, samples=50)
-    qpos = np.array(above.qpos)
-    qpos[:, 2] -= np.linspace(0.0, 4.0, len(qpos))
-    motions = {"initial": above, "final": replace(above, qpos=qpos)}
-    log_trajectories(path, model, motions, labels_of_model(model))
+    path = tmp_path / "replay.rrd"
+    logged_flight(path, 2, -4.0)
     for name, is_translucent in (("initial", False), ("designed", True)):
         floor = ("robots", name, "bodies", "world", "floor")
         _, colours = column(path, floor, None, "Mesh3D:albedo_factor")
@@ -453,18 +422,18 @@ def test_a_mesh_keeps_the_compiled_vertices_and_flat_normals(zoo_file: Path) -> 
     triangles = static(zoo_file, "Mesh3D:triangle_indices", "rock", "rock").reshape(-1, 3)
     assert triangles.shape == (4, 3)
     assert len(vertices) == len(np.unique(triangles))
-    corners = {tuple(np.round(v, 6)) for v in vertices}
-    assert corners == {tuple(np.round(v, 6)) for v in model.mesh_vert.astype(float)}
+    expected = model.mesh_vert[np.lexsort(model.mesh_vert.T)]
+    assert_allclose(vertices[np.lexsort(vertices.T)], expected, atol=1e-6)
 
 
 def test_a_height_field_has_heights_where_mujoco_has_them(zoo_file: Path) -> None:
     vertices = static(zoo_file, "Mesh3D:vertex_positions", "world", "hills")
-    model, data = load("zoo"), mujoco.MjData(load("zoo"))
+    model = load("zoo")
+    data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for x, y, z in vertices:
-        start = np.array([0.99 * x, 1.0 + 0.99 * y, 2.0])
-        down, geom = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
-        hit = mujoco.mj_ray(model, data, start, down, None, 1, -1, geom)
+        start, down = np.array([0.99 * x, 1.0 + 0.99 * y, 2.0]), np.array([0.0, 0.0, -1.0])
+        hit = mujoco.mj_ray(model, data, start, down, None, 1, -1, np.zeros(1, np.int32))
         assert 2.0 - hit == pytest.approx(z, abs=0.02)
 
 
@@ -477,12 +446,12 @@ def test_capsules_sticks_fixed_bodies_and_planes(zoo_file: Path) -> None:
     to_middle = np.empty(3)
     mujoco.mju_rotVecQuat(to_middle, np.array([0.0, 0.0, 0.25]), model.geom_quat[limb])
     begin = static(zoo_file, "Transform3D:translation", "a/b c", "limb")[0]
-    np.testing.assert_allclose(begin + to_middle, model.geom_pos[limb], atol=1e-7)
+    assert_allclose(begin + to_middle, model.geom_pos[limb], atol=1e-7)
 
     stick = static(zoo_file, "Capsules3D:lengths", "bare", "stick 6")[0]
     assert stick == pytest.approx(np.hypot(0.3, 0.5))
     fixed = static(zoo_file, "Transform3D:translation", "fixed")[0]
-    np.testing.assert_allclose(fixed, [0, -1, 0])
+    assert_allclose(fixed, [0, -1, 0])
     board = static(zoo_file, "Mesh3D:vertex_positions", "world", "floor")
     assert np.abs(board).max() == pytest.approx(INFINITE_REACH * model.stat.extent, rel=1e-6)
 
@@ -492,10 +461,8 @@ def test_capsules_sticks_fixed_bodies_and_planes(zoo_file: Path) -> None:
 
 def estimate_of(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
     """A hand-made estimate with a held-out recording."""
-    made = replace(estimated(model, trajectory), sigma={"qpos:slide": 0.01, "hinge_angle": 0.01})
-    errors = PredictionErrors(
-        name="held.csv", outputs=("qpos:slide", "hinge_angle"), rms=np.ones(2), mae=np.ones(2)
-    )
+    made, outputs = estimated(model, trajectory), ("qpos:slide", "hinge_angle")
+    errors = PredictionErrors(name="held.csv", outputs=outputs, rms=np.ones(2), mae=np.ones(2))
     held = Prediction(
         name="held.csv",
         identified=errors,
@@ -505,30 +472,38 @@ def estimate_of(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
         identified_outputs=made.predicted[0],
         nominal_outputs=1.1 * made.predicted[0],
     )
-    return replace(made, predictions=(held,))
+    return replace(made, sigma=dict.fromkeys(outputs, 0.01), predictions=(held,))
+
+
+def logged_estimate(
+    folder: Path, model: mujoco.MjModel, *, is_measured: bool = True, **changes: Any
+) -> tuple[Path, Estimate]:
+    """The recording of an estimate, whose views all show something."""
+    trajectory, path = simulated(model, 1.0), folder / "estimate.rrd"
+    estimate = replace(estimate_of(model, trajectory), **changes)
+    measured = trajectory if is_measured else None
+    log_estimate(path, model, estimate, measured, trajectory, labels_of_model(model))
+    assert empty_views(path) == []
+    return path, estimate
 
 
 def test_outputs_and_residuals_of_every_recording(cart: mujoco.MjModel, tmp_path: Path) -> None:
-    trajectory = simulated(cart, 1.0)
-    estimate = estimate_of(cart, trajectory)
-    path = tmp_path / "estimate.rrd"
-    log_estimate(path, cart, estimate, trajectory, trajectory, labels_of_model(cart))
-    assert empty_views(path) == []
+    path, estimate = logged_estimate(tmp_path, cart)
     for tab in ("1: run 0", "2: run 1", "held out 1: held.csv"):
         (measured,) = (
             name
             for name in entities(path)
             if name.startswith(entity_path((tab,))) and "slide" in name and "/0\\ measured" in name
         )
-        values = np.ravel(column(path, measured, "sim_time", "Scalars:scalars")[1])
+        values = scalars(path, measured)[1]
         y = estimate.recordings[0].y[:, 0]
-        np.testing.assert_allclose(values, y[np.isfinite(y)])
+        assert_allclose(values, y[np.isfinite(y)])
 
-    measured_bob = ("robots", "measured", "bodies", "bob", "bob")
-    identified_bob = ("robots", "identified", "bodies", "bob", "bob")
     fills = [
-        column(path, bob, None, "Ellipsoids3D:fill_mode")[1][0, 0]
-        for bob in (measured_bob, identified_bob)
+        column(path, ("robots", name, "bodies", "bob", "bob"), None, "Ellipsoids3D:fill_mode")[1][
+            0, 0
+        ]
+        for name in ("measured", "identified")
     ]
     assert fills == [OUTLINE.value, SOLID.value]
 
@@ -536,44 +511,36 @@ def test_outputs_and_residuals_of_every_recording(cart: mujoco.MjModel, tmp_path
 def test_without_measured_positions_there_is_no_measured_robot(
     cart: mujoco.MjModel, tmp_path: Path
 ) -> None:
-    trajectory = simulated(cart, 1.0)
-    path = tmp_path / "estimate.rrd"
-    log_estimate(path, cart, estimate_of(cart, trajectory), None, trajectory, labels_of_model(cart))
-    assert empty_views(path) == []
+    path, _ = logged_estimate(tmp_path, cart, is_measured=False)
     assert not any(name.startswith("/robots/measured") for name in entities(path))
 
 
 def test_ribbons_are_curves_over_time_and_residual_torques_are_planes(
     cart: mujoco.MjModel, tmp_path: Path
 ) -> None:
-    trajectory = simulated(cart, 1.0)
-    made = estimate_of(cart, trajectory)
-    count, speed = len(made.parameters), np.sin(np.arange(100.0))
-    end = float(made.recordings[0].t[-1])
+    made = estimated(cart, simulated(cart, 1.0))
+    speed, end = np.sin(np.arange(100.0)), float(made.recordings[0].t[-1])
     in_time = InformationInTime(
         parameters=made.parameters,
         recording=np.zeros(2),
         times=0.5 * end * np.array([[0.0, 1.0], [1.0, 2.0]]),
-        shares=np.tile([[0.25], [0.75]], (1, count)),
-        pulls=np.zeros((2, count)),
+        shares=np.tile([[0.25], [0.75]], 2),
+        pulls=np.zeros((2, 2)),
         scatter=1.0,
     )
     residual = ResidualForce(
         joint="slide", unit="N", position=speed, speed=speed, force=speed, sigma=0.1, size=1.0
     )
-    estimate = replace(made, in_time=in_time, residual_forces=(residual,))
-    path = tmp_path / "estimate.rrd"
-    log_estimate(path, cart, estimate, trajectory, trajectory, labels_of_model(cart))
-    assert empty_views(path) == []
+    path, _ = logged_estimate(tmp_path, cart, in_time=in_time, residual_forces=(residual,))
     information, outputs, residuals = opened_rows(path)
     assert information == [entity_path(("information [% per s]", "run 0"))]
     assert [f"{name}:" in other for name, other in zip(outputs, residuals, strict=True)]
 
     first = entity_path(("information [% per s]", "run 0")) + "/0"
     (curve,) = (name for name in entities(path) if name.startswith(first))
-    times, values = column(path, curve, "sim_time", "Scalars:scalars")
-    np.testing.assert_allclose(np.ravel(values), np.array([25.0, 75.0]) * 2.0 / end)
-    np.testing.assert_allclose(1e-9 * times, [0.0, 0.5 * end], atol=1e-6)
+    times, values = scalars(path, curve)
+    assert_allclose(values, np.array([25.0, 75.0]) * 2.0 / end)
+    assert_allclose(times, [0.0, 0.5 * end], atol=1e-6)
     plane = entity_path(("residual torque", "slide [N] over speed [m/s]"))
     assert any(name.startswith(plane) for name in entities(path))
 
@@ -581,37 +548,18 @@ def test_ribbons_are_curves_over_time_and_residual_torques_are_planes(
 # ---- numbers and the viewer
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [(0.0, 1.0, [0, 0.2, 0.4, 0.6, 0.8, 1]), (-3.1, 3.1, [-3, -2, -1, 0, 1, 2, 3][1:-1])],
-)
-def test_numbers_beside_axes_are_round(low: float, high: float, expected: list[float]) -> None:
-    found = round_numbers(low, high)
-    assert 2 <= len(found) <= 7
-    assert set(np.round(expected, 9)) & set(np.round(found, 9))
-    assert ((found >= low - 1e-9) & (found <= high + 1e-9)).all()
-
-
-class Viewer:
-    """A viewer that ends with a code, or stays open."""
-
-    def __init__(self, code: int | None) -> None:
-        self.code = code
-
-    def wait(self, timeout: float) -> int:
-        """Wait for its end."""
-        if self.code is None:
-            raise subprocess.TimeoutExpired("rerun", timeout)
-        return self.code
-
-
 def test_the_viewer_is_opened_or_says_why_not(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(RecordingError, match="there is no Rerun recording"):
         show(tmp_path / "none.rrd")
-    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: Viewer(None))
+    expired = Mock(side_effect=subprocess.TimeoutExpired("rerun", 1.0))
+    viewer = Mock(return_value=Mock(wait=expired))
+    monkeypatch.setattr(subprocess, "Popen", viewer)
     show(file)
-    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: Viewer(1))
+    # Python does not search for the viewer in the current folder.
+    command = viewer.call_args.args[0]
+    assert "-P" in command[: command.index("-m")]
+    viewer.return_value.wait = Mock(return_value=1)
     with pytest.raises(MjfimError, match="ended with code 1"):
         show(file)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -23,6 +22,7 @@ from mjfim.output.page import Text
 from mjfim.output.pages.estimate import sample_parts
 from mjfim.records.estimate import Estimate, PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
+from tests.output.test_mjcf import compiled
 from tests.support.cart_pendulum import cart_pendulum
 
 # A robot of which one link stands in an included file, and one in a URDF.
@@ -63,59 +63,44 @@ def system() -> System:
     return System.resolve(cart_pendulum())
 
 
-def test_every_model_is_the_one_in_memory(system: System, tmp_path: Path) -> None:
-    estimate = drawn(system, COVARIANCE, 5)
+def included_system(folder: Path) -> System:
+    """The system of a robot of an included file and a URDF."""
+    for name, text in {"main.xml": MAIN, "link.xml": LINK, "arm.urdf": ARM}.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    parameters = {"mass": "body/link:mass", "other": "body/x_upper:mass"}
+    tables: dict[str, Any] = {"rate": 100.0, "noise": {"state": 0.01}, "parameters": parameters}
+    return System.resolve(mjfim.Experiment(model="main.xml", directory=folder, **tables))
+
+
+@pytest.mark.parametrize("is_included", [False, True])
+def test_every_model_is_the_one_in_memory(
+    is_included: bool, system: System, tmp_path: Path
+) -> None:
+    """Also where links stand in an included file and in a URDF."""
+    if is_included:
+        system = included_system(tmp_path)
+    count = len(system.parameters)
+    estimate = drawn(system, np.diag([1e-4] * count) if is_included else COVARIANCE, 5)
     assert estimate.draws is not None
-    assert write_samples(tmp_path, estimate, system) == []
-    expected = sample_files(tmp_path, 5, system.model_path)
-    found = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")}
-    assert found == set(expected)
+    values, out = estimate.draws.values, tmp_path / "out"
+    assert write_samples(out, estimate, system) == []
+    found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
+    assert found == {*sample_files(out, 5, system.model_path)}
+    assert sample_files(out, 0, system.model_path) == ()
 
     for i in range(5):
-        path = tmp_path / "samples" / f"robot_{i + 1:04d}.xml"
-        written = mujoco.MjModel.from_xml_path(str(path))
+        written = compiled(out / "samples" / f"robot_{i + 1:04d}.xml")
         theta = np.array(estimate.theta)
-        theta[~system.parameters.initial_deviations] = estimate.draws.values[i]
+        theta[~system.parameters.initial_deviations] = values[i]
         assert same_dynamics(written, system.model_at(theta, at_keyframe=False))
-        assert written.body("bob").mass[0] == estimate.draws.values[i, 0]
+        assert written.body("link" if is_included else "bob").mass[0] == values[i, 0]
 
     # The table holds all digits.
-    with (tmp_path / "samples.csv").open(encoding="utf-8", newline="") as stream:
+    with (out / "samples.csv").open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
-    assert header == ["robot", "m [kg]", "l [m]", "c [N m s/rad]"]
-    assert [row[0] for row in rows] == ["1", "2", "3", "4", "5"]
-    table = np.array([[float(cell) for cell in row[1:]] for row in rows])
-    np.testing.assert_array_equal(table, estimate.draws.values)
-
-
-def test_included_files_and_urdfs_are_written_for_each_robot(tmp_path: Path) -> None:
-    for name, text in {"main.xml": MAIN, "link.xml": LINK, "arm.urdf": ARM}.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    tables: dict[str, Any] = {
-        "model": "main.xml",
-        "directory": tmp_path,
-        "rate": 100.0,
-        "noise": {"state": 0.01},
-        "parameters": {
-            "mass": {"target": "body/link:mass"},
-            "other": {"target": "body/x_upper:mass"},
-        },
-    }
-    system = System.resolve(mjfim.Experiment(**tables))
-    estimate = drawn(system, np.diag([1e-4, 1e-4]), 3)
-    out = tmp_path / "out"
-    assert write_samples(out, estimate, system) == []
-    assert estimate.draws is not None
-    found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
-    assert found == set(sample_files(out, 3, system.model_path))
-    for i in range(3):
-        model = mujoco.MjModel.from_xml_path(str(out / "samples" / f"robot_{i + 1:04d}.xml"))
-        masses = [model.body(name).mass[0] for name in ("link", "x_upper")]
-        assert masses == estimate.draws.values[i].tolist()
-
-
-def test_without_robots_there_are_no_files(system: System, tmp_path: Path) -> None:
-    assert sample_files(tmp_path, 0, system.model_path) == ()
+    assert header[:2] == ["robot", "mass [kg]" if is_included else "m [kg]"]
+    table = np.array([[float(cell) for cell in row] for row in rows])
+    np.testing.assert_array_equal(table, np.column_stack([np.arange(1.0, 6.0), values]))
 
 
 def test_all_models_are_written_or_none(

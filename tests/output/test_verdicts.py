@@ -22,9 +22,167 @@ from mjfim.records.check import findings_of_check
 from mjfim.records.design import Status
 from mjfim.records.studies import DESIGN
 from mjfim.records.verdict import Level
+from tests.output.test_pages import ALONE, BROKEN, STOPPED, UNSTABLE, selection
 from tests.support import results
 from tests.support.pages import printed
 from tests.support.results import THETA
+
+GOOD, DOUBTFUL, BAD = Level.GOOD, Level.DOUBTFUL, Level.BAD
+WAITING = {"status": CampaignStatus.WAITING}
+LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
+
+# A search that ended where it began, but for the last digit of its control.
+START = results.evaluation(0.1, 50)
+CTRL = np.nextafter(START.trajectory.ctrl, np.inf)
+MOVED = {"final": replace(START, trajectory=replace(START.trajectory, ctrl=CTRL))}
+
+# Eleven of the robots reach the clamp of a force, and one breaks a limit besides.
+CLAMPED: dict[str, Any] = {
+    "limits": tuple(replace(limit, kind="joint_force") for limit in results.rehearsal().limits[:1]),
+    "margins": np.array([0.4, *[0.0] * 11, *[0.4] * 9])[:, None],
+}
+POOR = replace(results.check().rows[0], relative=4.0, std=4.0 * THETA[0])
+AUTOCORRELATED = ("residuals are autocorrelated: q (lag-1 correlation +0.22)",)
+LENGTH_POOR = {"std": np.array([0.01, 0.2, 0.01]) * THETA}
+
+
+def costing(cost: float) -> dict[str, Any]:
+    """Other methods of a comparison, of which each has a cost."""
+    rows = results.comparison().rows
+    return {"rows": tuple(row if row.method == DESIGN else replace(row, cost=cost) for row in rows)}
+
+
+def heavier(second: float, interval: tuple[float, float], p: float) -> dict[str, Any]:
+    """Two robots, of which the second one is heavier."""
+    return {
+        "values": np.array([[1.0, 1.0, 1.0], [second, 1.0, 1.0]]),
+        "interval": np.array([interval, (-0.02, 0.02), (-0.02, 0.02)]),
+        "p": np.array([p, 1.0, 1.0]),
+        "joint_p": max(p, 0.1) if p > 0.05 else p,
+    }
+
+
+def scattered(name: str, **changes: Any) -> dict[str, Any]:
+    """A study, of which the trials along one motion differ."""
+    sets = results.study().sets
+    inside = replace(sets["initial"], efficiency_interval=np.tile([0.9, 1.1], (3, 1)))
+    return {"sets": {**sets, "initial": inside, name: replace(sets[name], **changes)}}
+
+
+# One interval of six may miss 1 by chance.
+BY_CHANCE = np.array([[1.01, 1.2], [0.9, 1.1], [0.9, 1.1]])
+
+
+@pytest.mark.parametrize(
+    ("verb", "changes", "level", "ok", "words"),
+    [
+        ("design", {}, GOOD, True, "Ready to play: one experiment"),
+        ("design", {"status": Status.INTERRUPTED}, DOUBTFUL, False, ""),
+        ("design", {"limits": {"position": -0.1}}, BAD, False, "violates limits (position)"),
+        ("design", LENGTH_UNKNOWN, DOUBTFUL, True, "length, damping: σ is 1000 % of its size for"),
+        ("design", {"rehearsal": results.rehearsal(**BROKEN)}, BAD, False, "Do not play"),
+        ("design", {"rehearsal": None}, DOUBTFUL, True, "not rehearsed"),
+        ("design", {"rehearsal": results.rehearsal(**CLAMPED)}, DOUBTFUL, True, "only 9 of 20"),
+        ("design", {"rehearsal": results.rehearsal(**ALONE)}, DOUBTFUL, True, "no robot that"),
+        ("design", {**MOVED, **STOPPED}, DOUBTFUL, False, "no better than its start"),
+        ("design", MOVED, GOOD, True, "It is no better than its start."),
+        ("design", {"final": results.evaluation(0.103, 50), **STOPPED}, GOOD, True, "Ready"),
+        ("design", {"final": results.evaluation(0.01, 50)}, DOUBTFUL, True, "less than its start"),
+        ("identify", {}, GOOD, True, "explains the recordings"),
+        ("identify", {"selection": selection()}, GOOD, True, "With dry friction of slide added, "),
+        ("identify", {"misfit": True, "chi2": 800.0}, DOUBTFUL, False, "2.01 times the noise"),
+        (
+            "identify",
+            {"misfit": True, "chi2": 30.0, "reasons": AUTOCORRELATED},
+            DOUBTFUL,
+            False,
+            "autocorrelated: q",
+        ),
+        ("identify", {"converged": False, "status": "stopped early"}, BAD, False, "stopped early."),
+        ("identify", {"converged": False, "combinations": ("a b",)}, BAD, False, "combination"),
+        ("identify", LENGTH_POOR, GOOD, True, "widest for length"),
+        ("identify", {**LENGTH_POOR, "nuisance": ("length",)}, GOOD, True, "± 2 %"),
+        (
+            "identify",
+            {"std": 0.8 * THETA},
+            DOUBTFUL,
+            True,
+            "the recordings determine no parameter.",
+        ),
+        ("check", {}, GOOD, True, "σ of 2 %"),
+        ("check", {"rehearsal": results.rehearsal(**UNSTABLE)}, DOUBTFUL, True, "σ of 2 %"),
+        ("check", {"refused": ("too long",), "findings": ("a b",)}, DOUBTFUL, False, "A b."),
+        (
+            "check",
+            {"rows": (POOR, *results.check().rows[1:])},
+            DOUBTFUL,
+            True,
+            "not determine mass",
+        ),
+        ("compare", {}, GOOD, True, "The design is the best"),
+        ("compare", costing(1.1), GOOD, True, "is the best"),
+        ("compare", costing(1.002), GOOD, True, "as good as"),
+        ("compare", costing(0.99), GOOD, True, "as good as"),
+        ("compare-robots", heavier(1.0, (-0.02, 0.02), 1.0), GOOD, True, "no difference between"),
+        (
+            "compare-robots",
+            heavier(1.6, (0.034, 1.06), 0.08),
+            DOUBTFUL,
+            True,
+            "friday is 60 % above",
+        ),
+        (
+            "compare-robots",
+            heavier(1.48, (-0.1, 1.06), 0.3),
+            DOUBTFUL,
+            True,
+            "friday is 48 % above",
+        ),
+        (
+            "compare-robots",
+            heavier(1.6, (0.5, 0.7), 1e-9),
+            DOUBTFUL,
+            False,
+            "There is a difference",
+        ),
+        ("montecarlo", {}, GOOD, True, "scatter as predicted"),
+        ("montecarlo", scattered("final", failed=3), DOUBTFUL, False, "3 of 200 (designed)"),
+        (
+            "montecarlo",
+            scattered("final", efficiency_interval=BY_CHANCE),
+            GOOD,
+            True,
+            "1 of 6 intervals of 95 % misses it",
+        ),
+        (
+            "montecarlo",
+            scattered("final", efficiency_interval=0.2 * BY_CHANCE),
+            DOUBTFUL,
+            True,
+            "the designed trajectory",
+        ),
+        ("rehearse", {}, GOOD, True, "20 of 20 robots whose parameters are up to 20 % off keep"),
+        ("rehearse", BROKEN, BAD, False, "20 leave the limit on position of hinge, by up to"),
+        ("rehearse", {"lowest": np.full(21, -0.2)}, BAD, False, "20 pass through the floor"),
+        ("rehearse", CLAMPED, DOUBTFUL, True, "only 9 of 20 robots reach no clamp (joint force"),
+        ("rehearse", CLAMPED, DOUBTFUL, True, "20 of 20 robots whose"),
+        ("rehearse", ALONE, DOUBTFUL, True, "no robot that differs from the model was rehearsed"),
+        ("rehearse", {**ALONE, "margins": [[-0.2, 0.4]]}, BAD, False, "The model leaves"),
+        ("campaign", {}, GOOD, True, "Reached"),
+        ("campaign", {"status": CampaignStatus.INFEASIBLE}, BAD, False, "No design keeps"),
+        ("campaign", {**WAITING, "rounds": ()}, GOOD, False, "waits"),
+        ("campaign", {**WAITING, "wanted": 0.015 * THETA}, GOOD, False, "waits"),
+        ("campaign", {**WAITING, "wanted": 0.005 * THETA}, DOUBTFUL, False, "wanted"),
+    ],
+)
+def test_the_verdict(
+    verb: str, changes: dict[str, Any], level: Level, ok: bool, words: str
+) -> None:
+    """Its level, what it says, and whether what was asked for is reached."""
+    verdict = page_of(results.MAKERS[verb](**changes)).verdict
+    assert (verdict.level, verdict.ok) == (level, ok)
+    assert words in verdict.sentence
+
 
 # Two recordings whose 95 % intervals of the length do not meet, and two of which they do.
 TWO = results.estimate().recording_comparison
@@ -60,31 +218,6 @@ def test_recordings_agree_only_where_their_intervals_meet(
     assert words in picture.title
 
 
-@pytest.mark.parametrize(
-    ("second", "interval", "p", "level", "words"),
-    [
-        (1.0, (-0.02, 0.02), 1.0, Level.GOOD, "no difference between monday and friday. A change"),
-        (1.6, (0.034, 1.06), 0.08, Level.DOUBTFUL, "mass of friday is 60 % above"),
-        (1.48, (-0.1, 1.06), 0.3, Level.DOUBTFUL, "mass of friday is 48 % above"),
-        (1.6, (0.5, 0.7), 1e-9, Level.DOUBTFUL, "There is a difference"),
-    ],
-)
-def test_robots_are_equal_only_where_the_numbers_are(
-    second: float, interval: tuple[float, float], p: float, level: Level, words: str
-) -> None:
-    found = results.robots(
-        values=np.array([[1.0, 1.0, 1.0], [second, 1.0, 1.0]]),
-        interval=np.array([interval, (-0.02, 0.02), (-0.02, 0.02)]),
-        p=np.array([p, 1.0, 1.0]),
-        joint_p=max(p, 0.1) if p > 0.05 else p,
-    )
-    verdict = page_of(found).verdict
-    assert (verdict.level, words in verdict.sentence) == (level, True), verdict.sentence
-    low, high = found.interval[0]
-    excludes_zero = low > 0.0 or high < 0.0
-    assert not (excludes_zero and "no difference" in verdict.sentence)
-
-
 @pytest.mark.parametrize("held_out", [True, False])
 def test_only_recordings_that_took_no_part_are_called_not_fitted(held_out: bool) -> None:
     estimate = results.estimate()
@@ -99,33 +232,6 @@ def test_only_recordings_that_took_no_part_are_called_not_fitted(held_out: bool)
 def test_a_share_of_a_whole_vector_names_the_size() -> None:
     assert relative(0.0031, 0.039, 0.00048) == "7.9 % of 0.039"
     assert relative(0.0031, 0.039, 0.039) == "7.9 %"
-
-
-def test_the_accuracy_in_the_verdict_is_of_a_parameter_that_was_asked_for() -> None:
-    std = np.array([0.01, 0.2, 0.01]) * THETA
-    asked, all_of_them = (
-        page_of(results.estimate(std=std, nuisance=nuisance)).verdict.sentence
-        for nuisance in (("length",), ())
-    )
-    assert "widest for length" in all_of_them
-    assert "length" not in asked and "± 2 %" in asked
-
-
-@pytest.mark.parametrize(
-    ("chi2", "reasons", "words"),
-    [
-        (30.0, ("residuals are autocorrelated: q (lag-1 correlation +0.22)",), "autocorrelated: q"),
-        (800.0, ("residuals are 2.01 times the stated noise",), "2.01 times the stated noise"),
-    ],
-)
-def test_a_misfit_says_only_what_is_wrong(
-    chi2: float, reasons: tuple[str, ...], words: str
-) -> None:
-    estimate = results.estimate(misfit=True, chi2=chi2, reasons=reasons)
-    verdict = page_of(estimate).verdict
-    assert verdict.level is Level.DOUBTFUL and words in verdict.sentence
-    assert " or are no " not in verdict.sentence
-    assert ("times the" in verdict.sentence) == (chi2 > estimate.dof)
 
 
 @pytest.mark.parametrize(
@@ -172,40 +278,6 @@ def test_a_design_and_a_fit_agree_on_what_is_determined(share: float) -> None:
     is_undetermined = "does not determine" in verdict.sentence
     assert ("except length (not determined)" in fit.sentence) == is_undetermined
     assert (fit.level is Level.GOOD) is not is_undetermined and fit.ok
-
-
-def test_a_fit_that_determines_nothing_is_not_praised() -> None:
-    verdict = page_of(results.estimate(std=0.8 * THETA)).verdict
-    assert verdict.level is Level.DOUBTFUL
-    assert verdict.sentence.endswith("but the recordings determine no parameter.")
-
-
-def test_what_is_not_determined_has_no_green_box() -> None:
-    check = results.check()
-    rows = (replace(check.rows[0], relative=4.0, std=4.0 * check.rows[0].size), *check.rows[1:])
-    verdict = page_of(replace(check, rows=rows)).verdict
-    assert verdict.level is Level.DOUBTFUL and "does not determine mass" in verdict.sentence
-
-
-@pytest.mark.parametrize(
-    ("cost", "words"), [(1.002, "as good as"), (0.99, "as good as"), (1.1, "is the best")]
-)
-def test_equal_methods_are_called_equal(cost: float, words: str) -> None:
-    comparison = results.comparison()
-    rows = tuple(
-        row if row.method == DESIGN else replace(row, cost=cost) for row in comparison.rows
-    )
-    found = replace(comparison, rows=rows)
-    assert words in page_of(found).verdict.sentence
-    assert not found.beating
-
-
-def test_a_campaign_that_waits_with_a_missed_target_has_no_green_box() -> None:
-    waiting = {"status": CampaignStatus.WAITING}
-    for wanted, level in ((0.005, Level.DOUBTFUL), (0.015, Level.GOOD)):
-        page = page_of(results.campaign(wanted=wanted * THETA, **waiting))
-        assert page.verdict.level is level
-        assert ("wanted" in page.verdict.sentence) == (level is Level.DOUBTFUL)
 
 
 # ---- what stands together
@@ -421,22 +493,3 @@ def test_a_printed_result_is_its_page_on_a_small_terminal(verb: str) -> None:
     assert str(verdict).startswith(f"{verdict.level.upper()}: {verdict.sentence}")
     page = page_of(record)
     assert (verdict.reasons, verdict.next) == ((*page.causes, *page.warnings), page.next_steps)
-
-
-@pytest.mark.parametrize(
-    ("record", "level", "ok"),
-    [
-        (results.design(), Level.GOOD, True),
-        (results.design(status=Status.INTERRUPTED), Level.DOUBTFUL, False),
-        (results.design(rehearsal=None), Level.DOUBTFUL, True),
-        (results.design(limits={"position": -0.1}), Level.BAD, False),
-        (results.estimate(misfit=True), Level.DOUBTFUL, False),
-        (results.estimate(converged=False), Level.BAD, False),
-        (results.campaign(status=CampaignStatus.WAITING), Level.GOOD, False),
-        (results.robots(), Level.DOUBTFUL, False),
-    ],
-)
-def test_what_was_asked_for_is_reached_only_where_a_person_would_say_so(
-    record: Any, level: Level, ok: bool
-) -> None:
-    assert (record.verdict.level, record.verdict.ok) == (level, ok)

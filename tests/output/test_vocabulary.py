@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import pickle
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from mjfim.output.page import TERMS, Term
+from mjfim.output.pages import page_of
+from mjfim.output.plots.pictures import pictures_of
+from tests.support import results
+from tests.support.pages import printed
 from tests.support.paths import ROOT
 
 PAGE = ROOT / "docs" / "how-to" / "read-results.md"
@@ -24,15 +26,6 @@ REPLACED = {
     r"from one to the next": "lag-1 correlation",
     r"\b(the|predicted|wanted|stated|of) sigma\b": "σ",
 }
-
-# Any of these words. To parse all modules takes seconds, so only those are parsed that hold one.
-ANY_REPLACED = re.compile("|".join(f"(?:{pattern})" for pattern in REPLACED), re.IGNORECASE)
-
-# What stands between the parts of a text that is written over several lines.
-BETWEEN_PARTS = re.compile(r"""["']\s+f?["']""")
-
-# Folders whose sentences users see.
-SHOWN = ("cli", "output", "records", "studies", "identification", "excitation")
 
 
 @pytest.mark.parametrize("term", TERMS, ids=str)
@@ -47,30 +40,16 @@ def test_the_page_has_the_words_colours_and_meanings(term: Term) -> None:
     assert shown.__doc__ is not None and meaning in shown.__doc__
 
 
-def sentences_of_modules() -> Iterator[tuple[str, str]]:
-    """Yield the texts of the modules that show something, without docstrings, with their place."""
-    for folder in SHOWN:
-        for path in sorted((ROOT / "mjfim" / folder).rglob("*.py")):
-            source = path.read_text(encoding="utf-8")
-            if not ANY_REPLACED.search(BETWEEN_PARTS.sub("", source)):
-                continue
-            tree = ast.parse(source)
-            documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
-            nodes = [node for node in ast.walk(tree) if isinstance(node, documented)]
-            docstrings = {id(node.body[0].value) for node in nodes if _has_docstring(node)}  # type: ignore[attr-defined]
-            for node in ast.walk(tree):
-                is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
-                if is_text and id(node) not in docstrings:
-                    yield f"{path.name}:{node.lineno}", str(node.value)  # type: ignore[attr-defined]
-
-
-def _has_docstring(node: ast.Module | ast.ClassDef | ast.FunctionDef) -> bool:
-    """Whether a module, class or function begins with an expression."""
-    return bool(node.body) and isinstance(node.body[0], ast.Expr)
-
-
-def sentences_of_pages() -> Iterator[tuple[str, str]]:
-    """Yield the lines of the documentation and of the notebooks, with their place."""
+def sentences() -> Iterator[tuple[str, str]]:
+    """Yield the lines of results, of the documentation and of the notebooks, with their place."""
+    for verb, make in results.MAKERS.items():
+        record = make()
+        yield verb, printed(page_of(record), verbose=True)
+        for name, picture in pictures_of(record).items():
+            drawn = picture()
+            panels = [f"{panel.title} {panel.remark} {panel.message}" for panel in drawn.panels]
+            marks = [key.label for key in drawn.legend()]
+            yield f"{verb}, {name}", " ".join([drawn.title, drawn.note, *panels, *marks])
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         for k, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
             yield f"{path.name}:{k}", line
@@ -82,7 +61,7 @@ def sentences_of_pages() -> Iterator[tuple[str, str]]:
 def test_shown_sentences_use_the_words_of_the_page() -> None:
     found = [
         f"{place}: write {word!r} instead of {match[0]!r}"
-        for place, text in (*sentences_of_modules(), *sentences_of_pages())
+        for place, text in sentences()
         for pattern, word in REPLACED.items()
         if (match := re.search(pattern, text, re.IGNORECASE))
     ]
@@ -93,7 +72,3 @@ def test_shown_sentences_use_the_words_of_the_page() -> None:
 def test_a_copied_word_keeps_its_colours(term: Term) -> None:
     copied = pickle.loads(pickle.dumps(term))
     assert (copied, copied.rgb, copied.colour_name) == (term, term.rgb, term.colour_name)
-
-
-def test_the_page_is_part_of_the_documentation() -> None:
-    assert f"how-to/{PAGE.name}" in Path(ROOT / "mkdocs.yml").read_text(encoding="utf-8")

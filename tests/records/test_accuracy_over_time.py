@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.design import design_task
 from mjfim.output.words import when_learnt
@@ -23,18 +24,18 @@ def test_the_last_row_is_the_stated_accuracy(tmp_path) -> None:
     prior["c"]["nuisance"] = True
     task = cart_task(tmp_path, parameters=prior, descent={"max_iterations": 1, "starts": 1})
     design = design_task(task)
-    np.testing.assert_allclose(design.std_over_time[-1], design.stated_std, rtol=1e-9)
-    np.testing.assert_allclose(design.final.std_over_time[-1], design.final.std, rtol=1e-9)
-    np.testing.assert_allclose(design.final.std_over_time[0], 0.5, rtol=1e-9)
+    assert_allclose(design.std_over_time[-1], design.stated_std, rtol=1e-9)
+    assert_allclose(design.final.std_over_time[-1], design.final.std, rtol=1e-9)
+    assert_allclose(design.final.std_over_time[0], 0.5, rtol=1e-9)
 
 
 def test_finite_steps_scale_the_whole_curve() -> None:
     design = results.design()
     steps = replace(results.rehearsal().steps, std=2.0 * design.final.std)
     odd = replace(design, rehearsal=replace(results.rehearsal(), steps=steps))
-    np.testing.assert_allclose(odd.std_over_time[-1], odd.stated_std)
+    assert_allclose(odd.std_over_time[-1], odd.stated_std)
     ratio = odd.stated_std / design.final.std
-    np.testing.assert_allclose(odd.std_over_time[1:], design.final.std_over_time[1:] * ratio)
+    assert_allclose(odd.std_over_time[1:], design.final.std_over_time[1:] * ratio)
 
 
 def test_times_are_those_of_a_plain_loop() -> None:
@@ -57,7 +58,7 @@ def test_without_wanted_accuracies_the_target_is_round(share: float, rounded: fl
     assert round_share(share) == pytest.approx(rounded)
     design = make_design()
     design = replace(design, final=replace(design.final, std=share * design.sizes))
-    np.testing.assert_allclose(design.targets, rounded * design.sizes)
+    assert_allclose(design.targets, rounded * design.sizes)
     ignored = replace(design, nuisance=design.parameters[:1])
     assert np.isinf(ignored.targets).tolist() == [True, False, False]
 

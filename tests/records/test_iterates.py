@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.testing import assert_array_equal
 
 from mjfim.records.design import (
     MAX_MOTIONS,
@@ -31,15 +32,14 @@ def test_a_motion_has_both_ends_and_evenly_spread_samples() -> None:
     assert motion.t.shape == (MOTION_SAMPLES,) and motion.qpos.shape == (MOTION_SAMPLES, 1)
     assert motion.t[0] == 0.0 and motion.t[-1] == 10.0
     assert np.ptp(np.diff(motion.t)) < 0.011
-    np.testing.assert_array_equal(motion.qpos[:, 0], motion.t)
-    np.testing.assert_array_equal(motion.ctrl[:-1, 0], motion.t[:-1])
+    assert_array_equal(motion.qpos[:, 0], motion.t)
+    assert_array_equal(motion.ctrl[:-1, 0], motion.t[:-1])
 
 
 def test_short_and_diverged_iterates_are_taken() -> None:
     short = IterateMotion.of(moved(3))
-    assert short is not None and set(short.t.tolist()) == {
-        float(np.float32(value)) for value in (0.0, 0.01, 0.02, 0.03)
-    }
+    assert short is not None
+    assert set(short.t.tolist()) == {*moved(3).t.astype(np.float32).tolist()}
     assert IterateMotion.of(None) is None
     diverged = replace(moved(3), qpos=np.full((4, 1), np.inf))
     assert IterateMotion.of(diverged) is None

@@ -10,6 +10,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
@@ -18,14 +19,9 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim import files
 from mjfim.errors import RecordingError
-from mjfim.excitation.design import design_task
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
 from mjfim.files import as_json
-from mjfim.identification.identify import identify_system
 from mjfim.records.base import RECORD, SavedRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -36,9 +32,7 @@ from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import Comparison, MonteCarloStudy
 from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.records.worth import Worth
-from mjfim.studies.check import check_task
-from mjfim.studies.monte_carlo import monte_carlo
-from tests.support.cart_pendulum import cart_pendulum
+from tests.support import results
 
 SAVED: tuple[type[SavedRecord], ...] = (
     Campaign,
@@ -62,25 +56,23 @@ def saved_fields(record: Any) -> list[str]:
     return [each.name for each in dataclasses.fields(record) if each.metadata.get("saved", True)]
 
 
-def assert_same(left: Any, right: Any, path: str = "record") -> None:
-    """Compare two records field by field; arrays bit by bit."""
-    assert type(left) is type(right), path
-    if isinstance(left, np.ndarray):
-        assert left.dtype == right.dtype and left.shape == right.shape, path
-        assert left.tobytes() == right.tobytes(), path
-    elif dataclasses.is_dataclass(left):
-        for name in saved_fields(left):
-            assert_same(getattr(left, name), getattr(right, name), f"{path}.{name}")
-    elif isinstance(left, tuple):
-        assert len(left) == len(right), path
-        for i, (a, b) in enumerate(zip(left, right, strict=True)):
-            assert_same(a, b, f"{path}[{i}]")
-    elif isinstance(left, dict):
-        assert list(left) == list(right), path
-        for key in left:
-            assert_same(left[key], right[key], f"{path}[{key!r}]")
-    else:
-        assert left == right or (left != left and right != right), path
+def canonical(value: Any) -> Any:
+    """Types and values of a record, field by field; arrays and numbers bit by bit."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if dataclasses.is_dataclass(value):
+        fields = {name: canonical(getattr(value, name)) for name in saved_fields(value)}
+        return type(value), fields
+    if isinstance(value, tuple):
+        return tuple(map(canonical, value))
+    if isinstance(value, dict):
+        return [(key, canonical(entry)) for key, entry in value.items()]
+    return type(value), repr(value)
+
+
+def assert_same(left: Any, right: Any) -> None:
+    """Compare two records."""
+    assert canonical(left) == canonical(right)
 
 
 # ---- values that files spoil easily
@@ -128,9 +120,7 @@ class AwkwardValues:
             return self.build(inner) if is_given else None
         if origin is np.ndarray:
             shape = (self.count, self.next_of((1, 2, 3)))
-            return np.array([self.next_of(NUMBERS) for _ in range(shape[0] * shape[1])]).reshape(
-                shape
-            )
+            return np.resize(NUMBERS, shape)
         if origin is tuple:
             entries = get_args(hint)
             if entries[-1] is Ellipsis:
@@ -164,35 +154,7 @@ def test_awkward_values_survive(
     assert_same(kind.load(tmp_path / "new" / "folder"), record)
 
 
-# ---- records of real runs
-
-
-@pytest.fixture(scope="module")
-def task() -> DesignTask:
-    """The cart-pendulum for 0.4 s with limits."""
-    experiment = cart_pendulum()
-    return DesignTask.resolve(
-        experiment.replace(
-            horizon=0.4,
-            descent={"max_iterations": 2, "starts": 2},
-            limits={"position": {"slide": [-2.0, 2.0]}},
-            parameters={"c": {"nuisance": True}},
-            rehearsal={"robots": 4},
-        )
-    )
-
-
-@pytest.fixture(scope="module")
-def design(task: DesignTask) -> Design:
-    """Two iterations from two initial controls."""
-    return design_task(task)
-
-
-@pytest.fixture(scope="module")
-def estimate(task: DesignTask, design: Design) -> Estimate:
-    """An estimate from two recordings and one that is held out."""
-    recordings = [simulate_system(task.system, design.trajectory, seed=seed) for seed in range(3)]
-    return identify_system(task.system, recordings[:2], held_out=recordings[2:])
+# ---- results of verbs
 
 
 def round_trip(record: SavedRecord, folder: Path) -> None:
@@ -208,74 +170,40 @@ def round_trip(record: SavedRecord, folder: Path) -> None:
     assert (folder / f"{stem}.json").read_text(encoding="utf-8") == as_json(record.summary())
 
 
-def test_a_design_is_loaded_as_it_was(design: Design, tmp_path: Path) -> None:
-    """With its history, its starts and the usage of its limits."""
-    assert design.usage and len(design.starts) == 2 and design.nuisance
-    slide = next(used for used in design.usage if used.name == "slide")
-    assert (slide.lower, slide.upper) == (-2.0, 2.0)
-    assert design.motions is not None and len(design.motions.iteration) == len(design.history)
-    round_trip(design, tmp_path)
+@pytest.mark.parametrize("verb", results.MAKERS)
+def test_a_result_is_loaded_as_it_was(verb: str, tmp_path: Path) -> None:
+    """Where it is printed, it is a few short lines."""
+    record = results.MAKERS[verb]()
+    round_trip(record, tmp_path)
+    lines = repr(record).splitlines()
+    assert lines[0] == f"{type(record).__name__}("
+    assert max(map(len, lines)) < 100 and len(lines) <= 60
+
+
+def test_a_design_that_ends_where_it_began_has_all_arrays(tmp_path: Path) -> None:
+    design = results.design()
+    replace(design, final=design.initial).save(tmp_path)
     assert not Design.load(tmp_path).theta.flags.writeable
-
-
-def test_a_design_that_ends_where_it_began_has_all_arrays(design: Design, tmp_path: Path) -> None:
-    unchanged = dataclasses.replace(design, final=design.initial)
-    unchanged.save(tmp_path)
     with np.load(tmp_path / "design.npz") as arrays:
         for name in ("t", "qpos", "qvel", "act", "ctrl", "gain", "sensitivity"):
             assert np.array_equal(arrays[name], arrays[f"initial_{name}"])
 
 
-def test_large_arrays_are_not_compressed(
-    estimate: Estimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_arrays_are_not_compressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Noise can hardly be compressed, and the record is the same."""
     monkeypatch.setattr(files, "MAX_COMPRESSED_BYTES", 1000)
-    round_trip(estimate, tmp_path)
-    with zipfile.ZipFile(next(tmp_path.rglob("estimate.npz"))) as stored:
+    round_trip(results.estimate(), tmp_path)
+    with zipfile.ZipFile(tmp_path / "estimate.npz") as stored:
         assert all(member.compress_type == zipfile.ZIP_STORED for member in stored.infolist())
-
-
-def test_a_check_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
-    """With its self-test."""
-    round_trip(check_task(task), tmp_path)
-
-
-def test_a_study_is_loaded_as_it_was(task: DesignTask, design: Design, tmp_path: Path) -> None:
-    """With all estimates."""
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    round_trip(monte_carlo(task.experiment, curves, trials=3), tmp_path)
-
-
-@pytest.mark.slow
-def test_a_comparison_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
-    """The control of each method is part of the record."""
-    methods = ["chirp", "steps"]
-    comparison = mjfim.compare(task.experiment, seconds=0.5, methods=methods)
-    assert all(row.control is not None for row in comparison.rows)
-    round_trip(comparison, tmp_path)
-
-
-@pytest.mark.slow
-def test_a_campaign_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
-    """One round with its design, recording and estimate, and a design that is not recorded yet."""
-    wanted = task.experiment.replace(parameters={"m": {"wanted": 1e-6}})
-
-    def measure(design: Design, number: int) -> Recording | None:
-        return mjfim.simulate(wanted, design.trajectory, seed=0) if number == 1 else None
-
-    campaign = mjfim.run_campaign(wanted, measure, rounds=2)
-    assert len(campaign.rounds) == 1 and campaign.pending is not None
-    round_trip(campaign, tmp_path)
 
 
 # ---- files that cannot be loaded
 
 
 @pytest.fixture
-def saved(design: Design, tmp_path: Path) -> Path:
+def saved(tmp_path: Path) -> Path:
     """Folder of a saved design."""
-    design.save(tmp_path / "saved")
+    results.design().save(tmp_path / "saved")
     return tmp_path / "saved"
 
 
@@ -346,29 +274,27 @@ def test_damaged_files_are_described(name: str, saved: Path) -> None:
         Design.load(saved)
 
 
-def test_fields_with_a_default_may_be_missing(saved: Path, design: Design) -> None:
+def test_fields_with_a_default_may_be_missing(saved: Path) -> None:
     """A later version can add a field."""
     with_content(saved / "design.npz", lambda content: content["fields"].pop("found_by"))
-    assert_same(Design.load(saved), dataclasses.replace(design, found_by="initial control"))
+    assert_same(Design.load(saved), results.design(found_by="initial control"))
 
 
 def test_missing_files_are_named(saved: Path, tmp_path: Path) -> None:
     """Each with what the call takes."""
-    with pytest.raises(RecordingError, match=r"gone: no such file or folder"):
-        Design.load(tmp_path / "gone")
-    with pytest.raises(
-        RecordingError,
-        match=r"estimate\.npz: this file is missing, but Estimate\.load needs it; write",
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    needs = r"estimate\.npz: this file is missing, but Estimate\.load needs it; write"
+    takes = r"notes\.txt: Design\.load takes a folder, a design\.json or a design"
+    for kind, place, said in (
+        (Design, tmp_path / "gone", "gone: no such file or folder"),
+        (Estimate, saved, needs),
+        (Design, tmp_path / "notes.txt", takes),
     ):
-        Estimate.load(saved)
+        with pytest.raises(RecordingError, match=said):
+            kind.load(place)
     (saved / "design.npz").unlink()
     with pytest.raises(RecordingError, match=rf"design\.npz: this file is missing, .*{AGAIN}"):
         Design.load(saved / "design.json")
-    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    with pytest.raises(
-        RecordingError, match=r"notes\.txt: Design\.load takes a folder, a design\.json or a design"
-    ):
-        Design.load(tmp_path / "notes.txt")
 
 
 def test_headers_that_announce_too_much(tmp_path: Path) -> None:
@@ -382,7 +308,7 @@ def test_headers_that_announce_too_much(tmp_path: Path) -> None:
         Design.load(tmp_path)
 
 
-def test_records_may_be_moved(saved: Path, design: Design, tmp_path: Path) -> None:
+def test_records_may_be_moved(saved: Path, tmp_path: Path) -> None:
     """The npz file alone is enough, under any name."""
     shutil.copy(saved / "design.npz", tmp_path / "best.npz")
-    assert_same(Design.load(tmp_path / "best.npz"), design)
+    assert_same(Design.load(tmp_path / "best.npz"), results.design())

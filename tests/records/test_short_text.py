@@ -11,7 +11,6 @@ import pytest
 import mjfim
 from mjfim.arrays import Array, record
 from mjfim.records.base import Record
-from mjfim.records.trajectory import Trajectory
 
 
 class Colour(Enum):
@@ -39,18 +38,6 @@ def test_each_field_is_one_short_line() -> None:
     assert "  many=(0, 1, 2, 3, ...)" in lines
     assert "  table=<1 entries>" in lines
     assert max(map(len, lines)) < 80
-
-
-def test_saved_records_use_it() -> None:
-    trajectory = Trajectory(
-        t=np.arange(1001.0),
-        qpos=np.zeros((1001, 2)),
-        qvel=np.zeros((1001, 2)),
-        act=np.zeros((1001, 0)),
-        ctrl=np.zeros((1000, 1)),
-    )
-    assert len(repr(trajectory)) < 400
-    assert "<1000 × 1 numbers, 0 to 0>" in repr(trajectory)
 
 
 @pytest.mark.parametrize(

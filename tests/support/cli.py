@@ -82,6 +82,13 @@ def run(*words: object, answers: str | None = None) -> Result:
         return CliRunner().invoke(cli.app, [str(word) for word in words], input=answers)
 
 
+def done(*words: object, code: int = 0) -> Result:
+    """Run `mjfim` with these words in this process, and assert its exit code."""
+    result = run(*words)
+    assert result.exit_code == code, result.output
+    return result
+
+
 def write_experiment(home: Path, **lines: str) -> Path:
     """Write the study of the paper with a short horizon and a loose tolerance.
 

@@ -267,7 +267,7 @@ def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
         "not_separable": (),
         "not_excited": (),
         "self_test": SelfTest(recursion=1e-8, slope=1e-6),
-        "findings": ("every identifiable parameter reaches its wanted sigma",),
+        "findings": ("every identifiable parameter reaches its wanted σ",),
         "is_start": True,
     }
     return Check(**{**fields, **changes})  # type: ignore[arg-type]
