@@ -51,8 +51,7 @@ PUBLISHED = {
     "k-scale": "17.8 | -17.8 | 0 | 0.040 | 0.162 | 1.23",
 }
 
-# Five engine steps of 4.012 ms are a period of the logs. All servos are alike, so that they share
-# the gain from an angle to a torque; gravity at the lift and the elbow determines it.
+# Five engine steps of 4.012 ms are a period of the logs.
 ARM = """model = "so101.xml"
 rate = 49.850448654037886
 initial.qpos = [0.0, 0.0, 0.5, 0.0, 0.0, 0.5]
@@ -63,12 +62,30 @@ fit = { segments = "whole", start = "measured" }
 OUTPUT = """noise."qpos:JOINT" = 0.004
 nuisance.bias."qpos:JOINT" = 0.02
 """
-GAIN = """
+# Servos are alike, so that they share three numbers. Gravity at the lift and the elbow determines
+# the gain from an angle to a torque. The gripper's largest duty is its own.
+SHARED = """
 [parameters.kp]
-targets = [TARGETS]
+targets = [KPS]
 guess = 16.0
 bounds = [0.3, 200.0]
+[parameters.armature]
+targets = [ARMATURES]
+guess = 0.005
+bounds = [1e-4, 0.3]
+[parameters.limit]
+targets = [LIMITS]
+guess = 2.0
+bounds = [0.1, 30.0]
+[parameters.limit_gripper]
+targets = [LIMIT_OF_GRIPPER]
+guess = 1.0
+bounds = [0.1, 30.0]
 """
+LIMIT = (
+    '{ path = "controller/JOINT:saturation[1]" }, '
+    '{ path = "controller/JOINT:saturation[0]", scale = -1.0 }'
+)
 # The profile is that of the register `Acceleration`: 254 times 100 steps/s^2 of 2 pi / 4096 rad.
 # Jumps of 0.24 rad in one log pass faster than such a profile; all other changes are below 0.08.
 JOINT = """
@@ -91,21 +108,10 @@ bounds = [0.0, 10.0]
 target = "joint/JOINT:frictionloss"
 guess = 0.15
 bounds = [0.0, 2.0]
-[parameters.armature_JOINT]
-target = "joint/JOINT:armature"
-guess = 0.005
-bounds = [1e-4, 0.3]
 [parameters.drag_JOINT]
 target = "joint/JOINT:damping[1]"
 guess = 0.1
 bounds = [0.0, 5.0]
-[parameters.limit_JOINT]
-targets = [
-  { path = "controller/JOINT:saturation[1]" },
-  { path = "controller/JOINT:saturation[0]", scale = -1.0 },
-]
-guess = 2.0
-bounds = [0.1, 30.0]
 """
 
 # Changes of the model: motors, what touches the table, and no creep in dry friction, which is 1 to
@@ -172,7 +178,8 @@ def ratios_table(found: mjfim.Estimate) -> Table:
     for number, joint in enumerate(JOINTS):
         cells = []
         for name, (_, scale) in quantities.items():
-            pair = [places[f"{name}_{joint}"], places["kp"]]
+            own = f"{name}_{joint}"
+            pair = [places[own if own in places else name], places["kp"]]
             value, kp = found.theta[pair]
             slope = np.array([1.0 / kp, -value / kp**2])
             std = np.sqrt(slope @ found.honest_covariance[np.ix_(pair, pair)] @ slope)
@@ -197,11 +204,19 @@ def main() -> int:
     for change in CHANGES.items():
         text = text.replace(*change)
     (output / "so101.xml").write_text(text, encoding="utf-8")
+    duty = [LIMIT.replace("JOINT", joint) for joint in JOINTS]
+    shared = {
+        "KPS": ", ".join(f'{{ path = "controller/{joint}:kp" }}' for joint in JOINTS),
+        "ARMATURES": ", ".join(f'{{ path = "joint/{joint}:armature" }}' for joint in JOINTS),
+        "LIMITS": ", ".join(duty[:-1]),
+        "LIMIT_OF_GRIPPER": duty[-1],
+    }
     outputs, laws = (
         "".join(text.replace("JOINT", each) for each in JOINTS) for text in (OUTPUT, JOINT)
     )
-    gains = ", ".join(f'{{ path = "controller/{joint}:kp" }}' for joint in JOINTS)
-    tables = ARM + outputs + GAIN.replace("TARGETS", gains) + laws
+    tables = ARM + outputs + SHARED + laws
+    for name, paths in shared.items():
+        tables = tables.replace(f"[{name}]", f"[{paths}]")
     (output / "so101.toml").write_text(tables, encoding="utf-8")
     experiment = mjfim.Experiment.from_file(output / "so101.toml")
 
