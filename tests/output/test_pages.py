@@ -388,7 +388,7 @@ FALLEN = {"lowest": np.full(21, -0.2)}
     ("changes", "words"),
     [
         (FALLEN, "ranges of `position`"),
-        ({**FALLEN, "has_floor": False}, '`<geom type="plane" size="0 0 1"/>`'),
+        ({**FALLEN, "has_floor": False}, "`[rehearsal] floor`"),
         ({**BROKEN, "growth": 5.1}, "`reserve = {"),
         ({**BROKEN, "margins": BROKEN["margins"] * 3.0, "growth": 4.9}, "`reserve = {"),
         (UNSTABLE, "grow 70-fold"),
