@@ -346,6 +346,10 @@ def test_a_start_outside_its_limits_is_equal_to_its_scaled_control() -> None:
         design = results.design(scaled_start=start, **outside)
         assert (design.is_start, design.verdict.ok) == (is_equal, not is_equal)
     assert not results.design(**outside).is_start
+    # A share that determines nothing is no measure.
+    for least, words in ((1e-9, "it determines next to nothing"), (0.1, "times better than that")):
+        design = results.design(scaled_start=replace(scaled, min_eigenvalue=least), **outside)
+        assert words in printed(page_of(design), verbose=True)
 
 
 def test_a_design_that_stops_at_its_budget_is_ready_in_its_short_form() -> None:

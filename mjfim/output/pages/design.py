@@ -62,8 +62,9 @@ MAX_FAULTS_TEXT = 320
 # Digits as subscripts.
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
-# Smallest divisor of the improvement of an eigenvalue; avoids a division by zero.
-TINY = 1e-300
+# Smallest divisor of the improvement of an eigenvalue; avoids a division by zero. Above the largest
+# improvement, a control determines next to nothing: a σ is 100 times larger.
+TINY, LARGEST_IMPROVEMENT = 1e-300, 1e4
 
 # Steps that follow a motion which can be played.
 PLAY = (
@@ -594,6 +595,10 @@ def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
         return f"{share}; the design does not."
     after = float(design.final.eigenvalues[0])
     times = after / max(scaled.min_eigenvalue, TINY)
+    if times > LARGEST_IMPROVEMENT:
+        return f"{share}, but then it determines next to nothing."
+    if times < RELEVANT_RATIO:
+        return f"{share}; the design is no better than that."
     return (
         f"{share}; the design is {times:.3g} times better than that (λ_min "
         f"{scaled.min_eigenvalue:.4g} → {after:.4g})."
