@@ -26,15 +26,10 @@ from mjfim.experiment.given import check_fits
 from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_model
 from mjfim.information.finite_steps import finite_steps
-from mjfim.model.clearance import (
-    PLANE,
-    PRIMITIVES,
-    GeomDistances,
-    farthest_points,
-    find_geom_pairs,
-)
+from mjfim.model.clearance import GeomDistances, find_geom_pairs
 from mjfim.model.coordinates import TRANSLATION, joint_dofs, joint_names, split_unit
 from mjfim.model.elements import model_length
+from mjfim.model.floor import find_floor, moving_heights, pose_of
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.units import ANGLE, LENGTH, joint_unit, per_second
 from mjfim.parallel import one_blas_thread
@@ -85,15 +80,8 @@ MAX_AFTER, MAX_MOTIONS, MOTION_STEP = 30, 8, 2
 # Largest number of values of the states that are simulated at once.
 MAX_VALUES = 1 << 22
 
-# Height below the floor that counts as passing through it, over the length of the model. Soft
-# contacts give way by less.
-PASSED_SHARE = 0.02
-
 # Type of the constraints of joints at the ends of their ranges.
 JOINT_AT_STOP = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
-
-# Cosine of the largest angle between a floor and the horizontal plane.
-LEVEL_FLOOR = 0.99
 
 
 @checked
@@ -239,9 +227,9 @@ def rehearsed(
         units=tuple(group.unit for group in player.groups),
         unlimited=tuple(group.name for group in player.groups if not group.is_limited),
         unplaced=tuple(group.name for group in player.groups if not group.is_placed),
-        floor=player.floor,
-        has_floor=player.has_floor,
-        depth=player.depth,
+        floor=player.floor.height,
+        has_floor=player.floor.is_stated,
+        depth=player.floor.depth,
         unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
         steps=steps,
         growth=growth,
@@ -478,29 +466,13 @@ class _RobotPlayer:
             )
 
         self.groups = tuple(_speed_groups(task))
-        gravity = np.array(model.opt.gravity)
-        strength = float(np.linalg.norm(gravity))
-        self._up = -gravity / strength if strength > 0.0 else np.array([0.0, 0.0, 1.0])
-        self._moving = np.flatnonzero(model.body_weldid > 0)
-        shapes = np.isin(model.geom_type, (*PRIMITIVES, int(mujoco.mjtGeom.mjGEOM_MESH)))
-        moves = model.body_weldid[model.geom_bodyid] > 0
-        self._geoms = np.flatnonzero(shapes & moves)
-        self._base = np.flatnonzero(shapes & ~moves & (model.geom_bodyid > 0))
-        length = float(model_length(model))
-        self.depth = PASSED_SHARE * length
-        self.floor, self.has_floor = self._floor_of(model, trajectory.state[0])
-        # What touches the floor sinks in as far as its contact is soft, but not by half of itself.
-        is_plane = (model.geom_type == PLANE) & (model.body_weldid[model.geom_bodyid] == 0)
-        for plane in np.flatnonzero(is_plane & self.has_floor).tolist():
-            touch = model.geom_contype[self._geoms] & model.geom_conaffinity[plane]
-            touch |= model.geom_conaffinity[self._geoms] & model.geom_contype[plane]
-            halves = model.geom_aabb[self._geoms[touch != 0], 3:].min(axis=1)
-            self.depth = max(self.depth, float(halves.min())) if len(halves) else self.depth
+        height = -np.inf if spec.floor == "none" else spec.floor
+        self.floor = find_floor(model, trajectory.state[0, : model.nq], height)
         ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
         self._distances: GeomDistances | None = None
         with suppress(ExperimentError):
             pairs = find_geom_pairs(model, ignored)
-            self._distances = GeomDistances(model, pairs, length)
+            self._distances = GeomDistances(model, pairs, float(model_length(model)))
 
     def rehearsed_limits(self) -> tuple[RehearsedLimit, ...]:
         """The limits in the order of the margins."""
@@ -605,12 +577,13 @@ class _RobotPlayer:
             data.qpos[:], data.qvel[:], data.act[:] = qpos[row], qvel[row], act[row]
             data.ctrl[:] = applied[min(row, len(applied) - 1)]
             mujoco.mj_forward(model, data)
-            poses.append(_pose(data))
+            poses.append(pose_of(data))
             touches += bool(data.ncon and (data.contact.dist < 0.0).any())
             stops += bool(data.nefc and (data.efc_type == JOINT_AT_STOP).any())
-        lowest = self._lowest(model, poses, self._geoms)
-        # Above the plane under a robot without a floor, the robot may come as low as it begins.
-        floor = self.floor if self.has_floor else min(self.floor, float(lowest[0]))
+        lowest = moving_heights(model, poses)
+        # Above a floor that is assumed, the robot may come as low as it begins.
+        floor = self.floor.height
+        floor = floor if self.floor.is_stated else min(floor, float(lowest[0]))
         heights = lowest - (floor if np.isfinite(floor) else 0.0)
         nearest = np.nan
         if self._distances is not None:
@@ -630,58 +603,6 @@ class _RobotPlayer:
             paths=self.paths(motion),
             qpos=qpos[self._rows[::MOTION_STEP] + 1].astype(np.float32),
         )
-
-    def _lowest(self, model: Any, poses: Sequence[tuple[Array, ...]], geoms: np.ndarray) -> Array:
-        """(n,) heights of the lowest of some geoms and of the moving bodies in n poses [m]."""
-        bodies, places, frames = (np.array(each) for each in zip(*poses, strict=True))
-        lowest = (bodies[:, self._moving] @ self._up).min(axis=1, initial=np.inf)
-        frames = frames[:, geoms].reshape(len(poses), len(geoms), 3, 3)
-        along = np.einsum("ngij,i->ngj", frames, self._up)
-        centre, half = np.split(model.geom_aabb[geoms], 2, axis=1)
-        height = places[:, geoms] @ self._up
-        bound = height + (along * centre - np.abs(along) * half).sum(axis=2)
-        # The boxes about the geoms are lower bounds; geoms are measured where these are lower.
-        for i in np.argsort(bound.min(axis=0)).tolist():
-            below = np.flatnonzero(bound[:, i] < lowest)
-            geom, down = int(geoms[i]), -along[below, i]
-            kind, mesh = int(model.geom_type[geom]), int(model.geom_dataid[geom])
-            if not len(below):
-                continue
-            if kind in PRIMITIVES:
-                points = farthest_points(kind, model.geom_size[geom], down)
-                reach = (points * down).sum(axis=1)
-            else:
-                first = int(model.mesh_vertadr[mesh])
-                points = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-                reach = (points @ down.T).max(axis=0)
-            lowest[below] = np.minimum(lowest[below], height[below, i] - reach)
-        return np.asarray(lowest)
-
-    def _floor_of(self, model: Any, start: Array) -> tuple[float, bool]:
-        """Height of the floor [m], and whether the experiment or the model states it.
-
-        Without a floor it is the lower end of a base that does not move, or 0 for a free body. The
-        lowest point of the start counts if it is lower. A robot without a base has no floor.
-        """
-        stated = self.task.experiment.rehearsal.floor
-        if stated is not None:
-            return (-np.inf, False) if stated == "none" else (float(stated), True)
-        data = mujoco.MjData(model)
-        data.qpos[:] = start[: model.nq]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        lowest = float(self._lowest(model, [_pose(data)], self._geoms)[0])
-        is_fixed = model.body_weldid[model.geom_bodyid] == 0
-        normals = data.geom_xmat[:, 2::3] @ self._up
-        is_floor = (model.geom_type == PLANE) & is_fixed & (normals > LEVEL_FLOOR)
-        heights = data.geom_xpos[is_floor] @ self._up
-        below = heights[heights <= lowest + self.depth]
-        if len(below):
-            return float(below.max()), True
-        if len(self._base):
-            return min(float(self._lowest(model, [_pose(data)], self._base)[0]), lowest), False
-        is_free = bool((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
-        return (min(0.0, lowest) if is_free else -np.inf), False
 
     def _unbraked(self, model: Any, data: Any, qvel: Array) -> Iterator[str]:
         """Joints that reach a limit after the end, however the controls brake them.
@@ -852,11 +773,6 @@ class _RobotPlayer:
         for q, _ in self.task.space.quaternions:
             measured[q : q + 4] /= np.linalg.norm(measured[q : q + 4])
         return self.task.space.minus(planned, measured)
-
-
-def _pose(data: Any) -> tuple[Array, ...]:
-    """Copies of the places of bodies and geoms, and of the frames of geoms (MjData)."""
-    return data.xipos.copy(), data.geom_xpos.copy(), data.geom_xmat.copy()
 
 
 def _speed_groups(task: DesignTask) -> Iterator[_SpeedGroup]:

@@ -106,6 +106,8 @@ def _recordings(system: System, given: RecordingLike) -> Iterator[Recording]:
     channels = system.channels
     if isinstance(given, Recording):
         yield given
+    elif given == "":
+        raise RecordingError('recordings: "" names no log; give the path of one')
     elif isinstance(given, (str, Path)):
         for path in recording_paths([Path(given)], channels):
             yield read_recording(path, channels)
@@ -120,7 +122,7 @@ def _recordings(system: System, given: RecordingLike) -> Iterator[Recording]:
                     f"{name}: {channels.spec.time!r} is missing, the time of each row [s]"
                 )
             table = table_of_arrays(Path(name), _by_column(name, columns), channels.spec)
-            yield log_of(table, channels).recording
+            yield log_of(replace(table, is_file=False), channels).recording
 
 
 def _by_column(name: str, columns: Mapping[str, Any]) -> dict[str, Any]:

@@ -466,8 +466,9 @@ class RehearsalSpec(Section):
         default=None,
         description=(
             "Height in the world below which no part of the robot may come [m]. Default: the floor "
-            "of the model, else the lower end of a base that does not move, 0 for a free body, or "
-            'the lowest point of the start if that is lower. "none": there is no floor.'
+            "of the model, else the lower end of the base above which an arm begins, else 0 for a "
+            "free body and for a robot that hangs and begins above 0. The lowest point of the "
+            'start counts if it is lower than these. "none": there is no floor.'
         ),
     )
     seed: Integer = Field(default=0, ge=0, description="Seed of the robots.")

@@ -200,7 +200,9 @@ class ParameterPath:
 
     def error(self, fault: str) -> ExperimentError:
         """Exception that names the path and says what is wrong with it."""
-        return ExperimentError(f"in parameter path {shortened(repr(self.text))}: {fault}")
+        hint = f'; a pattern with * stands in a list, parameters = ["{self.text}"]'
+        path = f"in parameter path {shortened(repr(self.text))}"
+        return ExperimentError(f"{path}: {fault}{hint if WILDCARD in self.text else ''}")
 
 
 def fields_of(kind: str) -> list[str]:

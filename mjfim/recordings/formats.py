@@ -254,12 +254,14 @@ class Table:
             say why it cannot be used.
         units: Units of the columns whose titles state one, such as `q [deg]`; their names are `q`.
         unit_hint: How to state units that the file does not name; it ends messages about them.
+        is_file: Whether they come from a file; Python may give arrays in place of one.
     """
 
     source: Path
     contents: dict[str, Any]
     units: dict[str, str]
     unit_hint: str = ""
+    is_file: bool = True
 
     @classmethod
     def of(

@@ -403,10 +403,16 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
 
 def _unfit(table: Table, channels: Channels, fault: str, otherwise: str = "") -> RecordingError:
     """The error of a log whose columns do not fit, with a table that may read it."""
+    fault = f"{table.source}: {fault}; found: {listed(table.names)}"
+    if not table.is_file:
+        return RecordingError(
+            f"{fault}; arrays are called `t`, `ctrl`, `qpos`, `qvel` and `sensordata`, or as one "
+            "of their columns"
+        )
     proposal = proposed_recording(table, channels).replace("\n", "\n  ")
     return RecordingError(
-        f"{table.source}: {fault}; found: {listed(table.names)}. Other names are stated in "
-        f"{channels.source}{otherwise}. Proposed, to be checked:\n  {proposal}"
+        f"{fault}. Other names are stated in {channels.source}{otherwise}. Proposed, to be "
+        f"checked:\n  {proposal}"
     )
 
 

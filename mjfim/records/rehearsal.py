@@ -302,8 +302,8 @@ class Rehearsal(ShownRecord):
         unplaced: Names of those joints whose position nothing limits on at least one side.
         lowest: (n+1,) smallest height of any geom or body that moves, above the floor, or in the
             world where there is none [m].
-        floor: Height of the floor in the world, or of the plane under the robot; minus infinity
-            where there is neither [m].
+        floor: Height of the floor in the world, or of the one that is assumed; minus infinity where
+            there is neither [m].
         has_floor: Whether the model or the experiment states the floor.
         depth: Height below the floor that counts as passing through it [m].
         end_height: (n+1,) height of the lowest geom or body at the end, likewise [m].

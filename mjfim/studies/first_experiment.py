@@ -812,7 +812,7 @@ BEHIND = {
     "limits.position": "about the start; for a soft range of the MJCF, so wide that it holds there",
     "limits.tendon_length": "wider than in the MJCF, whose soft range the state at rest exceeds",
     "limits.clearance": "between bodies [m]; ignored pairs are nearer at the start",
-    "limits.floor": "height of a plane below the robot, which the MJCF does not have [m]",
+    "limits.floor": "height of a floor with which the MJCF has no contacts [m]",
     "limits.reserve": "as much as robots that differ from the model need",
     "limits.bandwidth": "of the controls [Hz]; a larger one gives more information",
     "rehearsal.feedback": "open loop, a small error of the thrust lets the robot fall",

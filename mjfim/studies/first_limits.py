@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import mujoco
@@ -11,9 +12,10 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.limits import SOFT_KINDS, SOFT_SHARE, limits_of_model
-from mjfim.model.clearance import FLOOR, GeomDistances, find_geom_pairs, with_floor
+from mjfim.model.clearance import PLANE, GeomDistances, find_geom_pairs, with_floor
 from mjfim.model.coordinates import joint_dofs, joint_names
-from mjfim.model.elements import identifier, translations, unique_names
+from mjfim.model.elements import translations, unique_names
+from mjfim.model.floor import find_floor
 from mjfim.model.limited_elements import tilt_weights
 from mjfim.model.loading import ModelSource
 from mjfim.studies.first_candidates import rounded
@@ -34,6 +36,9 @@ SOFT_ROOM = 4.0
 # Clearance, relative to the length of the robot. Pairs of bodies that are nearer than twice this
 # at rest are ignored.
 CLEARANCE_SHARE = 0.02
+
+# Height of a floor that is written as zero, relative to the clearance.
+ZERO_HEIGHT = 1e-3
 
 # Bandwidth of the control in characteristic periods of the motion, and fewest periods of it within
 # the horizon.
@@ -173,34 +178,22 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
     return {**found}
 
 
-def _clearance(
-    source: ModelSource, positions: Array, least: float, *, may_add_floor: bool = True
-) -> dict[str, Any]:
-    """The least distance [m], a floor, and the pairs of bodies that are nearer at rest.
+def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:
+    """The least distance [m], the floor, and the pairs of bodies that are nearer at rest.
 
-    A robot above its base, without anything around it, gets a floor at the height of its base, and
-    one that flies a floor at height 0.
+    The floor is stated where the MJCF has none, or where it does not collide with every body.
 
     Args:
         source: The model.
         positions: (n, nq) positions at rest.
         least: The least distance [m].
-        may_add_floor: Whether a floor may be stated that the MJCF does not have.
     """
-    data, model = mujoco.MjData(source.model), source.model
-    data.qpos[:] = positions[0]
-    mujoco.mj_kinematics(model, data)
-    moves = model.body_weldid > 0
-    bases = set(model.body_parentid[moves].tolist()) - {0, *np.flatnonzero(moves).tolist()}
-    around = [b for b in model.geom_bodyid.tolist() if not moves[b] and b not in bases]
-    height = min((float(data.xpos[body, 2]) for body in bases), default=0.0)
-    stated = {"clearance": least}
-    is_fixed = not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
-    has_below = is_fixed or has_gravity(model)
-    lowest = data.geom_xpos[moves[model.geom_bodyid], 2].min(initial=np.inf)
-    if may_add_floor and has_below and not around and lowest > height:
-        stated["floor"] = rounded(height, 6)
-        model = with_floor(source, stated["floor"]).model
+    model, stated = source.model, {"clearance": least}
+    height = find_floor(model, positions[0]).height
+    height = rounded(height, 6) if abs(height) > ZERO_HEIGHT * least else 0.0
+    if np.isfinite(height) and not _collides_with_planes(model):
+        stated["floor"] = height
+        model = with_floor(source, height).model
     try:
         pairs = find_geom_pairs(model, ())
         distances = GeomDistances(model, pairs, 2.0 * least)
@@ -209,13 +202,17 @@ def _clearance(
 
     nearest = distances(positions, slopes=False)[0].min(axis=0)
     near = {name for name, d in zip(distances.columns, nearest, strict=True) if d < 2.0 * least}
-    # A hand that lies at the height of its base has no floor there.
-    floor = identifier(model, "geom", FLOOR)
-    above = {pair.bodies for pair in pairs if pair.second == floor}
-    if 2 * len(above & near) > len(above):
-        return _clearance(source, positions, least, may_add_floor=False)
     if len(near) == len(nearest):
         return {}
     names = np.array(unique_names(model, "body"))[model.geom_bodyid]
     ignored = {(names[p.first], names[p.second]): None for p in pairs if p.bodies in near}
     return stated | ({"ignored": [[str(end) for end in each] for each in ignored]} if near else {})
+
+
+def _collides_with_planes(model: Any) -> bool:
+    """Whether every moving body that has a geom can collide with a plane of the world."""
+    moving = set(model.geom_bodyid[model.body_weldid[model.geom_bodyid] > 0].tolist())
+    with suppress(ExperimentError):
+        pairs = find_geom_pairs(model, ())
+        moving -= {model.geom_bodyid[p.first] for p in pairs if model.geom_type[p.second] == PLANE}
+    return not moving

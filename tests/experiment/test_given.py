@@ -100,6 +100,7 @@ def test_lists_and_arrays_are_taken() -> None:
     ("tables", "message"),
     [
         ({"parameters": ["joint/*:dampng"]}, "unknown parameter path 'joint/*:dampng'"),
+        ({"parameters": {"d": "joint/*:damping"}}, 'in a list, parameters = ["joint/*:damping"]'),
         ({"parameters": [3]}, "parameters: should be a table"),
         ({"parameters": {"a": None}}, "parameters.a: should be a table"),
         ({"noise": {"qvel:slide": None}}, "noise.qvel:slide: should be a number or a table"),
@@ -255,8 +256,13 @@ def test_a_wrong_array_is_named(
         mjfim.identify(system.experiment, **{**arrays, **change}, progress=False)
 
     assert message in str(caught.value)
-    with pytest.raises(MjfimError, match="'t' is missing"):
-        recordings_of(system, {"qpos": recording.y[:, :2]})
+    for given, words in (
+        ({"qpos": recording.y[:, :2]}, "'t' is missing"),
+        ({"t": recording.t, "qpos": recording.y[:, :2]}, r"found: t, .*; arrays are called `t`"),
+        ("", '"" names no log'),
+    ):
+        with pytest.raises(MjfimError, match=words):
+            recordings_of(system, given)
 
 
 def test_each_verb_takes_one_recording_without_a_list(

@@ -264,6 +264,10 @@ def test_a_start_outside_its_limits_is_equal_to_its_scaled_control() -> None:
         design = results.design(scaled_start=start, **outside)
         assert (design.is_start, design.verdict.ok) == (is_equal, not is_equal)
     assert not results.design(**outside).is_start
+    # A share that determines nothing is no measure.
+    for least, words in ((1e-9, "it determines next to nothing"), (0.1, "times better than that")):
+        design = results.design(scaled_start=replace(scaled, min_eigenvalue=least), **outside)
+        assert words in printed(page_of(design), verbose=True)
 
 
 def test_a_design_that_stops_at_its_budget_is_ready_in_its_short_form() -> None:
@@ -307,7 +311,7 @@ FALLEN = {"lowest": np.full(21, -0.2)}
     ("changes", "words"),
     [
         (FALLEN, "ranges of `position`"),
-        ({**FALLEN, "has_floor": False}, '`<geom type="plane" size="0 0 1"/>`'),
+        ({**FALLEN, "has_floor": False}, "`[rehearsal] floor`"),
         ({**BROKEN, "growth": 5.1}, "`reserve = {"),
         ({**BROKEN, "margins": BROKEN["margins"] * 3.0, "growth": 4.9}, "`reserve = {"),
         (UNSTABLE, "grow 70-fold"),

@@ -293,16 +293,17 @@ def test_a_payload_is_unknown_or_refused(tmp_path: Path) -> None:
     assert load.scale == pytest.approx(0.05 * 0.92, rel=0.05)
 
     # The load of a light wrist follows from what the motors lift.
-    path = written(tmp_path, SERVO_ARM.format(floor=""))
+    floor = '<geom type="plane" size="1 1 1" pos="0 0 -0.1" contype="0" conaffinity="0"/>'
+    path = written(tmp_path, SERVO_ARM.format(floor=floor))
     found = propose_experiment(path, tmp_path, Wishes(payload="wrist"))
     assert found.chosen[0].name == "payload"
-    # Nothing is below this arm: it gets a floor at the height of its base.
-    assert found.limits["floor"] == 0.0
+    # Nothing collides with this floor, so a limit states it.
+    assert found.limits["floor"] == -0.1
     assert found.chosen[0].scale is not None
     assert 0.01 < found.chosen[0].scale < 1.0
 
 
-def test_a_hand_that_lies_at_the_height_of_its_base_has_no_floor(tmp_path: Path) -> None:
+def test_the_floor_of_a_hand_is_below_its_palm(tmp_path: Path) -> None:
     path = written(
         tmp_path,
         """
@@ -320,8 +321,8 @@ def test_a_hand_that_lies_at_the_height_of_its_base_has_no_floor(tmp_path: Path)
     """,
     )
     _, experiment = proposed(path, tmp_path)
-    assert experiment.limits.floor is None
-    assert experiment.limits.clearance is not None
+    assert experiment.limits.floor == -0.02
+    assert experiment.limits.clearance is not None and not experiment.limits.ignored
 
 
 # Four equal servos, the last of which turns a light wrist; no joint has a damping.

@@ -62,8 +62,9 @@ MAX_FAULTS_TEXT = 320
 # Digits as subscripts.
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
-# Smallest divisor of the improvement of an eigenvalue; avoids a division by zero.
-TINY = 1e-300
+# Smallest divisor of the improvement of an eigenvalue; avoids a division by zero. Above the largest
+# improvement, a control determines next to nothing: a σ is 100 times larger.
+TINY, LARGEST_IMPROVEMENT = 1e-300, 1e4
 
 # Steps that follow a motion which can be played.
 PLAY = (
@@ -189,9 +190,8 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
     if rehearsal.diverged:
         yield f"{_that(rehearsal.diverged, 'diverge')} in the simulation"
     if rehearsal.passes_floor.any():
-        floor = "the floor" if rehearsal.has_floor else "the plane under the robot"
-        deepest = -np.nanmin(rehearsal.lowest)
-        yield f"{_that(rehearsal.below_floor, 'pass')} through {floor}, by up to {deepest:.3g} m"
+        passing, deepest = _that(rehearsal.below_floor, "pass"), -np.nanmin(rehearsal.lowest)
+        yield f"{passing} through {_floor(rehearsal)}, by up to {deepest:.3g} m"
     worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
     order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
@@ -202,6 +202,14 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
         yield f"{_that(count, 'leave')} the limit on {_kind(limit)} of {limit.name}, {manner}"
     for name, count in rehearsal.unbraked.items():
         yield f"{_that(count, 'end')} too fast to be braked before the limit of {name}"
+
+
+def _floor(rehearsal: Rehearsal) -> str:
+    """Name the floor, with the height of one that is assumed."""
+    if not np.isfinite(rehearsal.floor):
+        return "the origin of the world"
+    height = f"{rehearsal.floor:.3g} m"
+    return "the floor" if rehearsal.has_floor else f"the floor that is assumed at {height}"
 
 
 def _kind(limit: RehearsedLimit) -> str:
@@ -384,16 +392,12 @@ def _cures(rehearsal: Rehearsal, *, is_designed: bool = True) -> Iterator[str]:
 
 
 def _known_cures(rehearsal: Rehearsal, *, is_designed: bool) -> Iterator[str]:
-    if rehearsal.passes_floor.any() and rehearsal.has_floor:
+    if rehearsal.passes_floor.any():
+        other = ' Where it is another one, state `[rehearsal] floor`: its height, or "none".'
         yield (
-            "Keep the robot above the floor: state ranges of `position` in `[limits]` for what "
-            "moves down, or a `clearance`."
-        )
-    elif rehearsal.passes_floor.any():
-        yield (
-            'The MJCF has no floor. For a robot that stands on one, add `<geom type="plane" '
-            'size="0 0 1"/>` to its worldbody. Otherwise keep it up by ranges of `position` in '
-            "`[limits]`, or state `[rehearsal] floor` where it may go lower."
+            f"Keep the robot above the floor: state `clearance` and `floor = {rehearsal.floor:.3g}`"
+            " in `[limits]`, or ranges of `position` for what moves down."
+            f"{'' if rehearsal.has_floor else other}"
         )
     if rehearsal.is_unstable:
         yield (
@@ -487,7 +491,8 @@ def _rehearsal_parts(rehearsal: Rehearsal, *, is_detail: bool = False) -> Iterat
         spare=("acceleration", "limited"),
         detail=True,
     )
-    yield Text(_surroundings(rehearsal), detail=True)
+    is_assumed = np.isfinite(rehearsal.floor) and not rehearsal.has_floor
+    yield Text(_surroundings(rehearsal), detail=is_detail or not is_assumed)
 
 
 def _valley_parts(valley: Valley) -> Sequence[Part]:
@@ -509,10 +514,9 @@ def _valley_parts(valley: Valley) -> Sequence[Part]:
 def _surroundings(rehearsal: Rehearsal) -> str:
     """Heights, distances, contacts and stops of all robots in a sentence."""
     parts = []
-    place = "the floor" if rehearsal.has_floor else "the plane under the robot"
-    place = place if np.isfinite(rehearsal.floor) else "the origin of the world"
     lowest = float(np.nanmin(rehearsal.lowest))
-    parts.append(f"lowest point {abs(lowest):.3g} m {'below' if lowest < 0.0 else 'above'} {place}")
+    side = "below" if lowest < 0.0 else "above"
+    parts.append(f"lowest point {abs(lowest):.3g} m {side} {_floor(rehearsal)}")
     if np.isfinite(rehearsal.nearest).any():
         parts.append(f"smallest distance {np.nanmin(rehearsal.nearest):.3g} m")
     for share, name in ((rehearsal.in_contact, "in contact"), (rehearsal.at_stop, "at a stop")):
@@ -591,6 +595,10 @@ def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
         return f"{share}; the design does not."
     after = float(design.final.eigenvalues[0])
     times = after / max(scaled.min_eigenvalue, TINY)
+    if times > LARGEST_IMPROVEMENT:
+        return f"{share}, but then it determines next to nothing."
+    if times < RELEVANT_RATIO:
+        return f"{share}; the design is no better than that."
     return (
         f"{share}; the design is {times:.3g} times better than that (λ_min "
         f"{scaled.min_eigenvalue:.4g} → {after:.4g})."
