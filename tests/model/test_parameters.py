@@ -21,7 +21,7 @@ from mjfim.model.targets import ModelField, SpecField
 from mjfim.model.variants import PlantModel
 from mjfim.output.export.mjcf import write_identified
 from tests.support.numerics import make_task
-from tests.support.specs import write_spec
+from tests.support.specs import arrays_of, write_spec
 
 # Two links with inertia from skewed geoms; a position servo; sensors that see sites and geoms.
 ARM = """
@@ -340,13 +340,6 @@ def rollout(model: Any, steps: int = 300) -> np.ndarray:
     return np.array(rows)
 
 
-def arrays(model: Any) -> dict[str, np.ndarray]:
-    """Every array of a model, options included."""
-    found = {n: getattr(model, n) for n in dir(model) if not n.startswith("_")}
-    found |= {f"opt.{n}": getattr(model.opt, n) for n in dir(model.opt) if not n.startswith("_")}
-    return {n: np.array(v) for n, v in found.items() if isinstance(v, np.ndarray)}
-
-
 def plant_of(spec: Any) -> PlantModel:
     """A plant whose bodies may all be moved."""
     bodies = frozenset(body.name for body in spec.bodies[1:])
@@ -383,11 +376,12 @@ def test_writing_in_place_equals_a_compile_bit_for_bit(xml: str, path: str, valu
     again = spec.compile()
 
     assert resolved.parameters[0].targets[0].field.read(own) == value
-    mine, theirs = arrays(own), arrays(again)
+    mine, theirs = arrays_of(own), arrays_of(again)
     unequal = {n for n in theirs if not np.allclose(mine[n], theirs[n], 0.0, 0.0, equal_nan=True)}
     # A tendon that gains inertia ends the shortcut of "simple" bodies, which MuJoCo then does not
     # take either; the weights of constraints follow a compile only.
     simple = {"body_simple", "dof_simplenum", "body_invweight0", "dof_invweight0"}
+    simple = {f"model.{name}" for name in simple}
     assert unequal <= (simple if path == "tendon/t:armature" else set())
     require_same_motion(own, again, base, 0.0)
 
@@ -430,18 +424,19 @@ def test_a_value_of_a_path_is_the_value_in_the_mjcf(
 ) -> None:
     spec, edited = (mujoco.MjSpec.from_string(text) for text in (xml, xml.replace(old, new)))
     source, base = plant_of(spec), spec.compile()
-    before = arrays(source.model)
+    before = arrays_of(source.model)
     resolved = parameter_set([one(path)], base, decoration=decoration(spec, base))
     assert resolved.needs_compile.tolist() == [path.startswith("geom")]
     own, again = ParameterWriter(resolved).model(source, np.array([value])), plant_of(edited).model
 
-    mine, wanted = arrays(own), arrays(again)
+    mine, wanted = arrays_of(own), arrays_of(again)
     if old == CAPSULE:  # A capsule is round, so that its other two axes are arbitrary.
-        mine["geom_quat"], mine["body_iquat"] = wanted["geom_quat"], wanted["body_iquat"]
+        for name in ("model.geom_quat", "model.body_iquat"):
+            mine[name] = wanted[name]
     for name, array in wanted.items():
         np.testing.assert_allclose(mine[name], array, rtol=1e-12, atol=1e-14, err_msg=name)
     require_same_motion(own, again, base, 1e-9)
-    for name, array in arrays(source.model).items():
+    for name, array in arrays_of(source.model).items():
         np.testing.assert_array_equal(array, before[name], err_msg=name)
 
 
