@@ -21,25 +21,14 @@ def curve(t: Array) -> Array:
     return np.stack([np.sin(5.0 * t) + 0.3 * t, np.exp(-t) * np.cos(9.0 * t)], axis=1)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.003, 0.01, 0.0337, 0.25])
-def test_a_delayed_curve_is_the_shifted_curve(delay: float) -> None:
-    """Cubic interpolation is of fourth order: at half the period the error falls sixteenfold."""
-    errors = []
-    for dt in (DT, DT / 2):
-        t = np.arange(round(1.2 / dt)) * dt
-        delayed = OutputDelay.on_grid(len(t), delay, dt).apply(curve(t))
-        inside = t - delay >= 2 * dt
-        errors.append(np.abs(delayed - curve(t - delay))[inside].max())
-    assert errors[0] < 1e-5
-    assert errors[1] < max(errors[0] / 8, 1e-14)
-
-
-def test_a_cubic_is_shifted_exactly_and_a_quartic_is_not() -> None:
+@pytest.mark.parametrize("delay", [0.3, 0.97, 2.6])
+def test_a_cubic_is_shifted_exactly_and_a_quartic_is_not(delay: float) -> None:
     """This holds at all samples, including the first ones."""
-    output_delay = OutputDelay.on_grid(30, 0.3, 1.0)
+    output_delay = OutputDelay.on_grid(30, delay, 1.0)
     t = np.arange(30.0)
     for degree in range(5):
-        error = np.abs(output_delay.apply(t**degree) - np.maximum(t - 0.3, 0.0) ** degree)[1:].max()
+        shifted = np.where(t < delay, 0.0**degree, (t - delay) ** degree)
+        error = np.abs(output_delay.apply(t**degree) - shifted).max()
         assert (error < 1e-8) == (degree <= 3)
 
 
@@ -74,7 +63,7 @@ def test_before_the_first_sample_the_first_value_is_held() -> None:
 
 @pytest.mark.parametrize("delay", [0.0042, 0.0337, -0.0125])
 def test_the_derivative_by_the_delay(delay: float) -> None:
-    """It agrees with differences of the operator, and roughly with minus the slope of the curve."""
+    """It agrees with differences of the operator."""
     y = curve(T)
     rate = OutputDelay.on_grid(len(T), delay, DT).derivative(y)
     for k in range(0, len(T), 7):
@@ -86,10 +75,6 @@ def test_the_derivative_by_the_delay(delay: float) -> None:
                 1e-4,
             )
             assert rate[k, i] == pytest.approx(slope, rel=1e-7, abs=1e-8)
-    t = T - delay
-    inside = (t > 0) & (t < T[-1])
-    slope = (curve(t + 1e-6) - curve(t - 1e-6)) / 2e-6
-    np.testing.assert_allclose(rate[inside], -slope[inside], rtol=0, atol=2e-2)
 
 
 def test_adjoints_by_dot_products() -> None:
@@ -118,11 +103,8 @@ def test_the_sensitivity_to_a_delay_is_the_derivative_of_delayed_outputs(tmp_pat
     assert task.parameters.names[-1] == "delay"
     y, G = task.plant.derivatives.predict(theta, task.control)
     plain, _ = task.plant.derivatives.predict(task.parameters.guess, task.control)
-    inside = task.t[4:] - 0.0137
-    shifted = np.stack(
-        [np.interp(inside, np.arange(len(plain)) * task.dt, c) for c in plain.T], axis=1
-    )
-    np.testing.assert_allclose(y[4:-1], shifted, rtol=0, atol=2e-3)
+    shifted = OutputDelay.on_grid(len(plain), 0.0137, task.dt).apply(plain)
+    np.testing.assert_allclose(y, shifted, rtol=0, atol=1e-12)
     for k, i in ((10, 1), (30, 3), (50, 2)):
 
         def at(h: float, k: int = k, i: int = i) -> float:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from mjfim.plant.outputs import Noise
-from tests.support.numerics import independent_noise
 
 Array = NDArray[np.float64]
 
@@ -28,21 +27,6 @@ def correlated(strides: tuple[int, ...] = (1, 1, 1, 1)) -> Noise:
 def half_square(rows: Array) -> float:
     """Half the squares of whitened residuals: their part of minus the log-density."""
     return 0.5 * float(rows @ rows)
-
-
-def test_whitened_residuals_are_the_normal_density() -> None:
-    """Differences of log-densities are differences of half squares, sample by sample."""
-    rng = np.random.default_rng(0)
-    values = rng.standard_normal((6, 4)) * [1.0, 2.0, 3.0, 0.2]
-    density = multivariate_normal(np.zeros(4), FULL)
-    for row, white in zip(values, correlated().whiten(values), strict=True):
-        assert density.logpdf(np.zeros(4)) - density.logpdf(row) == pytest.approx(
-            half_square(white), rel=1e-10
-        )
-    wrong = independent_noise(np.sqrt(np.diag(FULL))).whiten(values)
-    assert half_square(wrong[0]) != pytest.approx(
-        half_square(correlated().whiten(values)[0]), rel=1e-2
-    )
 
 
 def test_jacobians_are_whitened_like_residuals() -> None:
