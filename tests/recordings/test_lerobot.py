@@ -13,6 +13,7 @@ from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment import System
 from mjfim.recordings import RecordingSpec, read_recording, recording_paths
 from mjfim.recordings.formats import read_columns
+from mjfim.records.trajectory import Recording
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import misused, run
 from tests.support.lerobot import write_dataset
@@ -55,11 +56,9 @@ def test_each_episode_is_a_recording(version: str, tmp_path: Path) -> None:
         recording = read_recording(path, cart().channels)
         assert recording.outputs == ("qpos:slide", "qpos:hinge")
         np.testing.assert_array_equal(recording.t, np.arange(40) / 100.0)
-        single = data[number]["observation.state"].astype(np.float32)
-        np.testing.assert_array_equal(recording.y, single)
-        np.testing.assert_array_equal(
-            recording.ctrl[:, 0], data[number]["action"].astype(np.float32)[:-1]
-        )
+        state, action = (values.astype(np.float32) for values in reversed(data[number].values()))
+        np.testing.assert_array_equal(recording.y, state)
+        np.testing.assert_array_equal(recording.ctrl[:, 0], action[:-1])
 
     with pytest.raises(RecordingError, match=r"set: has 3 episodes; name one, as in episode_0000"):
         read_columns(folder, ALL)
@@ -90,35 +89,30 @@ def test_names_have_many_forms(stated: Any, columns: list[str], tmp_path: Path) 
 
 def test_degrees_are_refused_with_the_way_to_state_units(tmp_path: Path) -> None:
     """A joint with a range whose positions are in degrees; then commands without a unit."""
-    model = System.resolve(mjfim.Experiment.from_file(MODELS / "servo_arm.toml")).model
+    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
+    model = System.resolve(stated).model
     joints = [model.joint(i).name for i in range(model.njnt)]
-    k = np.arange(100)[:, None]
-    angles = np.rad2deg(0.8 + 0.3 * np.sin(0.05 * k + np.arange(4)))
-    names = [f"{joint}.pos" for joint in joints]
+    angles = np.rad2deg(0.8 + 0.3 * np.sin(0.05 * np.arange(100)[:, None] + np.arange(4)))
     features = {"action": angles, "observation.state": angles}
+    names = [f"{joint}.pos" for joint in joints]
     folder = write_dataset(tmp_path / "set", [features], dict.fromkeys(features, names))
 
-    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
-    noise = {f"qpos:{joint}": 0.01 for joint in joints}
-    arm = stated.replace(noise=noise)
+    def read(*stated_kinds: str) -> Recording:
+        feature = {"qpos": "observation.state", "ctrl": "action"}
+        columns = {
+            f"{kind}:{joint}": {"column": f"{feature[kind]}:{joint}.pos", "unit": "deg"}
+            for kind in stated_kinds
+            for joint in joints
+        }
+        noise = {f"qpos:{joint}": 0.01 for joint in joints}
+        arm = stated.replace(noise=noise, recording={"columns": columns})
+        return read_recording(folder, System.resolve(arm).channels)
+
     with pytest.raises(RecordingError, match=r"probably in deg.*LeRobot robots store degrees.*sca"):
-        read_recording(folder, System.resolve(arm).channels)
-
-    columns: dict[str, Any] = {
-        f"qpos:{joint}": {"column": f"observation.state:{joint}.pos", "unit": "deg"}
-        for joint in joints
-    }
-    half = System.resolve(arm.replace(recording={"columns": columns}))
-    with pytest.raises(
-        RecordingError, match=r"but the command 'ctrl:yaw' has none; state the same"
-    ):
-        read_recording(folder, half.channels)
-
-    columns |= {
-        f"ctrl:{joint}": {"column": f"action:{joint}.pos", "unit": "deg"} for joint in joints
-    }
-    whole = System.resolve(arm.replace(recording={"columns": columns}))
-    recording = read_recording(folder, whole.channels)
+        read()
+    with pytest.raises(RecordingError, match="the command 'ctrl:yaw' has none; state the same"):
+        read("qpos")
+    recording = read("qpos", "ctrl")
     np.testing.assert_allclose(recording.y, np.deg2rad(angles), rtol=1e-5)
     np.testing.assert_allclose(recording.ctrl, np.deg2rad(angles[:-1]), rtol=1e-5)
 
