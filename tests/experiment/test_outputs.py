@@ -52,57 +52,34 @@ def strides(task: DesignTask) -> dict[str, int]:
 def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
     """In the order of qpos and qvel, with its unit; quaternions by half the stated angle."""
     task = body_task(tmp_path, noise={"state": 0.02})
-    assert list(task.system.outputs.names) == [*FREE, *BALL, *RATES]
-    assert [o.state for o in task.system.outputs.outputs] == list(range(11 + 9))
-    assert [o.unit for o in task.system.outputs.outputs] == [
-        *["m"] * 3, *[""] * 8, *["m/s"] * 3, *["rad/s"] * 6
-    ]  # fmt: skip
-    found = sigmas(task)
-    assert {found[n] for n in (*FREE[:3], *RATES)} == {0.02}
-    assert {found[n] for n in (*FREE[3:], *BALL)} == {0.01}
-    sensors = [
-        "gyro[0]",
-        "gyro[1]",
-        "gyro[2]",
-        "acc[0]",
-        "acc[1]",
-        "acc[2]",
-        "tip[0]",
-        "tip[1]",
-        "tip[2]",
-    ]
-    assert list(measurable_columns(task.system.model)) == [*FREE, *BALL, *RATES, *sensors]
+    outputs = task.system.outputs
+    assert outputs.names == (*FREE, *BALL, *RATES)
+    assert [o.state for o in outputs.outputs] == list(range(11 + 9))
+    units = [*["m"] * 3, *[""] * 8, *["m/s"] * 3, *["rad/s"] * 6]
+    assert [o.unit for o in outputs.outputs] == units
+    angles = {*FREE[3:], *BALL}
+    assert sigmas(task) == {n: 0.01 if n in angles else 0.02 for n in outputs.names}
+    sensors = [f"{sensor}[{i}]" for sensor in ("gyro", "acc", "tip") for i in range(3)]
+    assert list(measurable_columns(task.system.model)) == [*outputs.names, *sensors]
 
 
-@pytest.mark.parametrize("joint", ["ball", "float"])
+@pytest.mark.parametrize(("key", "q", "v"), [("qpos:ball", 7, 6), ("qpos:float.rot", 3, 3)])
 def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
-    joint: str, tmp_path: Path
+    key: str, q: int, v: int, tmp_path: Path
 ) -> None:
-    """At every attitude of a tumbling body: derivatives of the quaternion by MuJoCo's own
-    integration, over sigma / 2.
-    """
+    """At every attitude of a tumbling body, against quaternions that MuJoCo integrates."""
     sigma = 0.05
-    task = body_task(
-        tmp_path, noise={f"qpos:{joint}.rot": sigma} if joint == "float" else {"qpos:ball": sigma}
-    )
-    trajectory, loop = task.initial, Loop(task.system.model, 1)
-    q = {"ball": 7, "float": 3}[joint]
-    v = {"ball": 6, "float": 3}[joint]
+    task = body_task(tmp_path, noise={key: sigma})
+    loop, steps = Loop(task.system.model, 1), 1e-6 * np.eye(task.space.nx)[v : v + 3]
     assert [o.state for o in task.system.outputs.outputs] == list(range(q, q + 4))
-    _, _, C, D = task.plant.derivatives.jacobians(task.theta, trajectory)
+    _, _, C, D = task.plant.derivatives.jacobians(task.theta, task.initial)
     assert not D.any()
-    for k in range(0, len(C), 10):
-        by_hand = np.empty((4, 3))
-        for i in range(3):
-            step = np.zeros(task.space.nx)
-            step[v + i] = 1e-6
-            up, down = loop.plus(trajectory.state[k], step), loop.plus(trajectory.state[k], -step)
-            by_hand[:, i] = (up[q : q + 4] - down[q : q + 4]) / 2e-6
-        np.testing.assert_allclose(C[k, :, v : v + 3], by_hand, rtol=0, atol=1e-9)
-        white = task.system.noise.whiten(C[k : k + 1])[0]
-        wanted = np.zeros((task.space.nx, task.space.nx))
-        wanted[v : v + 3, v : v + 3] = np.eye(3) / sigma**2
-        np.testing.assert_allclose(white.T @ white, wanted, rtol=0, atol=1e-9 / sigma**2)
+    for slope, state in zip(C[::10], task.initial.state[::10], strict=True):
+        ends = [[loop.plus(state, s * e)[q : q + 4] for e in steps] for s in (1, -1)]
+        by_hand = np.subtract(*ends).T / 2e-6
+        np.testing.assert_allclose(slope[:, v : v + 3], by_hand, rtol=0, atol=1e-9)
+        white = task.system.noise.whiten(slope[None])[0][:, v : v + 3] * sigma
+        np.testing.assert_allclose(white.T @ white, np.eye(3), rtol=0, atol=1e-9)
 
 
 def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: Path) -> None:
@@ -167,17 +144,6 @@ def test_every_output_has_its_rate(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_information_of_rates_is_the_sum_over_the_measured_samples(tmp_path: Path) -> None:
-    """Output by output from G; twice the rate is not twice a weight."""
-    task = cart_task(tmp_path, noise={"qpos:hinge": {"sigma": 0.05, "rate": 20.0}, "rate": 0.2})
-    found = sensitivity_of(task)
-    G = found.G
-    assert task.system.outputs.names == ("qpos:hinge", "rate")
-    wanted = sum(np.outer(G[k, 0], G[k, 0]) / 0.05**2 for k in range(5, 51, 5))
-    wanted = wanted + sum(np.outer(G[k, 1], G[k, 1]) / 0.2**2 for k in range(1, 51))
-    np.testing.assert_allclose(task.information.matrix(found), wanted, rtol=1e-10)
-
-
 def test_components_of_a_sensor_have_their_own_sigmas(tmp_path: Path) -> None:
     task = cart_task(
         tmp_path, noise={"acc": {"sigma": [0.1, 0.2, 0.3]}, "qpos:slide": {"sigma": [0.4]}}
@@ -188,55 +154,42 @@ def test_components_of_a_sensor_have_their_own_sigmas(tmp_path: Path) -> None:
 
 
 BLOCK = np.array([[0.09, 0.03, 0.0], [0.03, 0.16, -0.02], [0.0, -0.02, 0.04]])
+ALL = (0.01 * (np.eye(4) + 0.3)).tolist()
 
 
-def test_a_covariance_stands_in_the_rows_of_its_outputs(tmp_path: Path) -> None:
-    """The covariance of a sensor; all other outputs stay independent."""
-    task = cart_task(tmp_path, noise={"state": 0.1, "acc": {"covariance": BLOCK.tolist()}})
-    at = [task.system.outputs.names.index(f"acc[{i}]") for i in range(3)]
-    wanted = 0.01 * np.eye(7)
-    wanted[np.ix_(at, at)] = BLOCK
-    np.testing.assert_allclose(task.system.noise.covariance, wanted, rtol=1e-15)
-    assert task.system.noise.correlated
+ACC = [f"acc[{i}]" for i in range(3)]
+STATE = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
+MIXED = ["acc[2]", "qpos:hinge", "drive"]
+COVARIANCE = {"covariance": BLOCK.tolist()}
 
 
-def test_a_key_of_one_column_overrules_a_covariance(tmp_path: Path) -> None:
-    """The column has the stated sigma and no correlation with the others."""
-    whole = 0.01 * (np.eye(4) + 0.3)
-    task = cart_task(tmp_path, noise={"qpos:hinge": 0.5, "state": {"covariance": whole.tolist()}})
-    hinge = task.system.outputs.names.index("qpos:hinge")
-    wanted = np.array(whole)
-    wanted[hinge] = wanted[:, hinge] = 0.0
-    wanted[hinge, hinge] = 0.25
-    np.testing.assert_allclose(task.system.noise.covariance, wanted, rtol=1e-15)
-
-
-def test_correlated_outputs_replace_their_sigmas(tmp_path: Path) -> None:
-    """In the order in which the block names them, and measured even where the noise table does not
-    name them.
-    """
-    names = ["acc[2]", "qpos:hinge", "drive"]
-    task = cart_task(
-        tmp_path,
-        noise={"state": 0.1},
-        correlated=[{"outputs": names, "covariance": BLOCK.tolist()}],
-    )
-    assert task.system.outputs.names == (
-        "qpos:slide",
-        "qpos:hinge",
-        "qvel:slide",
-        "qvel:hinge",
-        "acc[2]",
-        "drive",
-    )
-    at = [task.system.outputs.names.index(n) for n in names]
-    np.testing.assert_allclose(task.system.noise.covariance[np.ix_(at, at)], BLOCK, rtol=1e-15)
-    rest = np.setdiff1d(np.arange(6), at)
-    np.testing.assert_allclose(
-        task.system.noise.covariance[np.ix_(rest, rest)], 0.01 * np.eye(3), rtol=1e-15
-    )
-    assert not task.system.noise.covariance[np.ix_(rest, at)].any()
-    assert sigmas(task)["acc[2]"] == pytest.approx(0.3)
+@pytest.mark.parametrize(
+    ("tables", "names", "further"),
+    [
+        ({"noise": {"state": 0.1, "acc": COVARIANCE}}, ACC, STATE),
+        # The order is that of the block; outputs are measured also where no other key names them.
+        ({"noise": {"state": 0.1}, "correlated": [{"outputs": MIXED, **COVARIANCE}]}, MIXED, STATE),
+        # The key of one column overrules the covariance of all.
+        (
+            {"noise": {"acc": COVARIANCE, "qpos:hinge": 0.1, "state": {"covariance": ALL}}},
+            ACC,
+            ["qpos:hinge"],
+        ),
+    ],
+)
+def test_a_covariance_stands_in_the_rows_of_its_outputs(
+    tables: dict[str, Any], names: list[str], further: list[str], tmp_path: Path
+) -> None:
+    """It is correlated with no other output."""
+    task = cart_task(tmp_path, **tables)
+    found = list(task.system.outputs.names)
+    at = [found.index(name) for name in names]
+    covariance = task.system.noise.covariance
+    np.testing.assert_allclose(covariance[np.ix_(at, at)], BLOCK, rtol=1e-15)
+    assert not np.delete(covariance[at], at, axis=1).any()
+    for name in {*further} - {*names}:
+        assert sigmas(task)[name] == pytest.approx(0.1)
+        assert np.count_nonzero(covariance[found.index(name)]) == 1
 
 
 def square(n: int, value: float = 1.0) -> list[list[float]]:
