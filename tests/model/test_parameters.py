@@ -610,27 +610,17 @@ def test_mass_beside_first_moments_keeps_them() -> None:
 
 def test_measurement_and_initial_state_are_outside_the_model() -> None:
     """Linear maps of theta outside the model, by the scale of their targets."""
-    paths = ["initial/k:qvel", "initial/j:qpos", "output/b:bias", "output:delay", "body/a:mass"]
-    parameters = [
-        Parameter(name=p, targets=(target_at(p, s),), guess=1.0)
-        for p, s in zip(paths, (2.0, -1.0, 0.5, 3.0, 1.0), strict=True)
-    ]
-    _, base = compiled(ARM, [])
-    resolved = parameter_set(parameters, base, outputs=("a", "b"))
-    start = np.zeros((4, 5))
-    start[3, 0], start[0, 1] = 2.0, -1.0
-    np.testing.assert_array_equal(resolved.initial_state_derivative(4), start)
-    np.testing.assert_array_equal(
-        resolved.bias_derivative(2), [[0.0] * 5, [0.0, 0.0, 0.5, 0.0, 0.0]]
-    )
+    scales = {"initial/k:qvel": 2.0, "initial/j:qpos": -1.0, "output/b:bias": 0.5}
+    scales |= {"output:delay": 3.0, "body/a:mass": 1.0}
+    parameters = [replace(one(path, scale), name=path) for path, scale in scales.items()]
+    resolved = parameter_set(parameters, compiled(ARM, [])[1], outputs=("a", "b"))
+    start, bias = resolved.initial_state_derivative(4), resolved.bias_derivative(2)
+    assert (start[3, 0], start[0, 1], bias[1, 2]) == (2.0, -1.0, 0.5)
+    assert (np.count_nonzero(start), np.count_nonzero(bias)) == (2, 1)
     np.testing.assert_array_equal(resolved.delay_derivative, [0.0, 0.0, 0.0, 3.0, 0.0])
     assert resolved.changes_model.tolist() == [False] * 4 + [True]
     assert resolved.changes_motion.tolist() == [True, True, False, False, True]
     assert not resolved.needs_compile.any()
-    own = ParameterWriter(resolved).model(
-        base, np.array([9.0, 9.0, 9.0, 9.0, base.body("a").mass[0]])
-    )
-    np.testing.assert_array_equal(rollout(own, 20), rollout(base, 20))
 
 
 # A ball that can only slide: MuJoCo gives such a body another constraint weight than others.
@@ -709,30 +699,6 @@ def test_the_message_about_a_wrong_path_names_valid_values(path: str, said: list
     assert repr(path) in message
     for part in said:
         assert part in message
-
-
-def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
-    _, base = compiled(ARM, [])
-    large = Parameter(
-        name="large", targets=(target_at("body/a:mass"),), guess=-3.0, scale=0.5, prior=0.1
-    )
-    zero = Parameter(
-        name="zero",
-        targets=(target_at("joint/j:damping"),),
-        guess=0.0,
-        scale=0.2,
-        true=0.4,
-        bounds=(0.0, 1.0),
-    )
-    resolved = parameter_set([large, zero], base)
-    np.testing.assert_array_equal(resolved.magnitude, [3.0, 0.2])
-    np.testing.assert_allclose(resolved.prior_information, np.diag([100.0, 0.0]), rtol=1e-14)
-    np.testing.assert_array_equal(resolved.true, [-3.0, 0.4])
-    assert (resolved.names, resolved.lower[0], resolved.upper[1]) == (
-        ("large", "zero"),
-        -np.inf,
-        1.0,
-    )
 
 
 def in_arm(folder: Path, tables: dict) -> Any:

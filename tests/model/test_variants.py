@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 
 from mjfim.arrays import Array
-from mjfim.excitation.design import design_task
 from mjfim.excitation.search.levels import DescentLevel, first_point
 from mjfim.excitation.task import DesignTask
 from mjfim.model.variants import RELAXED, SMOOTHING_SPEED_FRACTION, STATED
 from mjfim.plant.active_constraints import nothing_acts_along
 from mjfim.plant.mixed_derivatives import SHARED_ORIGIN, SHARED_ORIGIN_SHORT
-from mjfim.records.design import Status
 from tests.support.numerics import make_task
 
 ARM = """
@@ -160,21 +158,6 @@ def test_derivatives_are_compared_unless_nothing_can_rub_touch_or_clamp(
     model = task.system.model_at(task.theta)
     acts = not nothing_acts_along(model, task.initial, task.system.grid.substeps)
     assert acts == is_compared
-
-
-@pytest.mark.slow
-def test_a_design_with_dry_friction_improves_and_keeps_its_limits(tmp_path: Path) -> None:
-    limits = {
-        "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
-        "control_rate": 20.0,
-        "velocity": 6.0,
-    }
-    task = arm(tmp_path, limits=limits, descent={"max_iterations": 60})
-    design = design_task(task)
-    assert design.status is not Status.INFEASIBLE
-    assert min(design.limits.values()) >= 0.0
-    assert design.final.cost < 0.5 * design.initial.cost
-    assert design.parameters == ("mass", "drag", "dry")
 
 
 def test_with_sensors_only_mixed_differences_are_taken_on_the_smoothed_plant(
