@@ -7,6 +7,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.arrays import Array
@@ -185,7 +186,7 @@ def test_a_log_with_references_is_read(tmp_path: Path) -> None:
 
     goal, elbow = (np.sin(7.0 * T[:-1] + i) for i in (1, 2))
     expected = np.column_stack([np.deg2rad(goal), np.ones(59), elbow])
-    np.testing.assert_allclose(found.ctrl, expected)
+    assert_allclose(found.ctrl, expected)
     assert found.outputs == ("qpos:shoulder",)
 
 
@@ -259,10 +260,10 @@ def test_a_signal_states_references_and_controls() -> None:
     inputs = dict(zip(system.inputs, stated_inputs(system).T, strict=True))
 
     t = np.arange(500) * 0.002
-    np.testing.assert_allclose(inputs["reference:shoulder"], 0.2 + 0.3 * np.sin(2 * np.pi * t))
+    assert_allclose(inputs["reference:shoulder"], 0.2 + 0.3 * np.sin(2 * np.pi * t))
     velocity = 0.6 * np.pi * np.cos(2 * np.pi * t)
-    np.testing.assert_allclose(inputs["reference_velocity:shoulder"], velocity, atol=2e-2)
-    np.testing.assert_allclose(inputs["ctrl:elbow"], 2.0 * np.sin(2.34 * np.pi * t))
+    assert_allclose(inputs["reference_velocity:shoulder"], velocity, atol=2e-2)
+    assert_allclose(inputs["ctrl:elbow"], 2.0 * np.sin(2.34 * np.pi * t))
     assert (inputs["enable:shoulder"] == 1.0).all()
     assert (inputs["gain:shoulder"] == 1.0).all()
     assert (inputs["feedforward:shoulder"] == 0.0).all()

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import ExperimentError, MjfimError
@@ -183,9 +184,9 @@ def test_a_recording_is_taken_in_all_kinds(
     for given in given_kinds(recording, tmp_path, system):
         (found,) = recordings_of(system, given)
         assert found.outputs == recording.outputs
-        np.testing.assert_allclose(found.t, recording.t, rtol=0.0, atol=1e-12)
-        np.testing.assert_allclose(found.ctrl, recording.ctrl, rtol=1e-12)
-        np.testing.assert_allclose(found.y, recording.y, rtol=1e-12)
+        assert_allclose(found.t, recording.t, rtol=0.0, atol=1e-12)
+        assert_allclose(found.ctrl, recording.ctrl, rtol=1e-12)
+        assert_allclose(found.y, recording.y, rtol=1e-12)
 
 
 def test_the_table_of_a_log_says_how_columns_are_read_and_not_arrays(
@@ -202,7 +203,7 @@ def test_the_table_of_a_log_says_how_columns_are_read_and_not_arrays(
     (column,) = recordings_of(stated, {"s": t, "u": ctrl, "q": np.rad2deg(hinge)})
     (array,) = recordings_of(stated, {"t": t, "ctrl": ctrl, "qpos": {"hinge": hinge}})
 
-    np.testing.assert_allclose(column.y, array.y, rtol=1e-12)
+    assert_allclose(column.y, array.y, rtol=1e-12)
     assert column.outputs == array.outputs == ("qpos:hinge",)
 
 
@@ -217,7 +218,7 @@ def test_arrays_of_sensors_are_in_the_order_of_mujoco(recording: mjfim.Recording
     )
 
     assert found.outputs == ("hinge_velocity",)
-    np.testing.assert_array_equal(found.y[:, 0], 0.1 * np.sin(data[:, address]))
+    assert_array_equal(found.y[:, 0], 0.1 * np.sin(data[:, address]))
 
 
 def test_positions_of_joints_serve_their_sensors(recording: mjfim.Recording) -> None:
@@ -231,7 +232,7 @@ def test_positions_of_joints_serve_their_sensors(recording: mjfim.Recording) -> 
     assert set(found.outputs) == {"slide_position", "hinge_angle"}
     assert found.outputs[0] in system.outputs.names
     order = [found.outputs.index(name) for name in ("slide_position", "hinge_angle")]
-    np.testing.assert_array_equal(found.y[:, order], recording.y[:, :2])
+    assert_array_equal(found.y[:, order], recording.y[:, :2])
 
 
 @pytest.mark.parametrize(
@@ -286,7 +287,7 @@ def test_a_path_stands_for_the_experiment_and_a_design_for_its_motion() -> None:
         by_design, by_motion = verb(file, design), verb(str(file), design.trajectory)
         names = ("ctrl", "y") if verb is mjfim.simulate else ("information", "std")
         for name in names:
-            np.testing.assert_array_equal(getattr(by_design, name), getattr(by_motion, name))
+            assert_array_equal(getattr(by_design, name), getattr(by_motion, name))
     checked = mjfim.check(file, trajectory=design, progress=False)
     assert checked.source == "the given trajectory"
     assert list(mjfim.monte_carlo(file, design, trials=4, progress=False).sets) == ["final"]

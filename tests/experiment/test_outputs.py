@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
@@ -77,9 +78,9 @@ def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
     for slope, state in zip(C[::10], task.initial.state[::10], strict=True):
         ends = [[loop.plus(state, s * e)[q : q + 4] for e in steps] for s in (1, -1)]
         by_hand = np.subtract(*ends).T / 2e-6
-        np.testing.assert_allclose(slope[:, v : v + 3], by_hand, rtol=0, atol=1e-9)
+        assert_allclose(slope[:, v : v + 3], by_hand, rtol=0, atol=1e-9)
         white = task.system.noise.whiten(slope[None])[0][:, v : v + 3] * sigma
-        np.testing.assert_allclose(white.T @ white, np.eye(3), rtol=0, atol=1e-9)
+        assert_allclose(white.T @ white, np.eye(3), rtol=0, atol=1e-9)
 
 
 def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: Path) -> None:
@@ -90,7 +91,7 @@ def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: P
     found = sensitivity_of(task)
     psi = found.psi[1:, 6:9] / 0.05
     wanted = np.einsum("kip,kiq->pq", psi, psi)
-    np.testing.assert_allclose(
+    assert_allclose(
         task.information.matrix(found), wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max()
     )
     assert np.linalg.eigvalsh(wanted)[-1] > 1.0
@@ -185,7 +186,7 @@ def test_a_covariance_stands_in_the_rows_of_its_outputs(
     found = list(task.system.outputs.names)
     at = [found.index(name) for name in names]
     covariance = task.system.noise.covariance
-    np.testing.assert_allclose(covariance[np.ix_(at, at)], BLOCK, rtol=1e-15)
+    assert_allclose(covariance[np.ix_(at, at)], BLOCK, rtol=1e-15)
     assert not np.delete(covariance[at], at, axis=1).any()
     for name in {*further} - {*names}:
         assert sigmas(task)[name] == pytest.approx(0.1)
@@ -367,4 +368,4 @@ def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:
     sensed = loop.h(state, task.control[20])
     wanted: Array = np.concatenate([state[:3], sensed[:3], sensed[6:9]])
     assert task.system.outputs.names[3:6] == ("gyro[0]", "gyro[1]", "gyro[2]")
-    np.testing.assert_allclose(y[0, 20], wanted, rtol=0, atol=1e-9)
+    assert_allclose(y[0, 20], wanted, rtol=0, atol=1e-9)

@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
@@ -41,11 +42,11 @@ def test_the_inertia_of_a_body_is_ten_parameters(coordinates: str | None, tmp_pa
     assert task.parameters.names == (*(f"arm.{n}" for n in chart.names), "d")
     *ten, damping = task.parameters.parameters
     guesses = [p.guess for p in ten]
-    np.testing.assert_allclose(guesses, chart.coordinates(inertia), rtol=1e-12, atol=1e-15)
+    assert_allclose(guesses, chart.coordinates(inertia), rtol=1e-12, atol=1e-15)
     magnitudes = chart.magnitudes(inertia)
-    np.testing.assert_array_equal([p.scale for p in ten], magnitudes)
-    np.testing.assert_array_equal(task.parameters.magnitude[:10], magnitudes)
-    np.testing.assert_allclose([p.prior for p in ten], 0.1 * magnitudes)
+    assert_array_equal([p.scale for p in ten], magnitudes)
+    assert_array_equal(task.parameters.magnitude[:10], magnitudes)
+    assert_allclose([p.prior for p in ten], 0.1 * magnitudes)
     assert tuple(p.unit for p in ten) == chart.units
     assert {(p.group, p.nuisance) for p in ten} == {("arm", True)}
     assert (damping.group, damping.nuisance) == ("", False)
@@ -53,13 +54,13 @@ def test_the_inertia_of_a_body_is_ten_parameters(coordinates: str | None, tmp_pa
     own = task.system.model_at(task.parameters.guess)
     for field in ("body_mass", "body_ipos", "dof_M0"):
         found, wanted = getattr(own, field), getattr(model, field)
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+        assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
     found = body_inertia(own, number).inertia
-    np.testing.assert_allclose(found, inertia.inertia, rtol=1e-9, atol=1e-12)
+    assert_allclose(found, inertia.inertia, rtol=1e-9, atol=1e-12)
 
     stated = {"hull": {"inertial": "hull", "scale": "guess", "coordinates": "barycentric"}}
     scaled = body_task(tmp_path, parameters=stated).parameters
-    np.testing.assert_allclose(scaled.scale, np.abs(scaled.guess), rtol=1e-15)
+    assert_allclose(scaled.scale, np.abs(scaled.guess), rtol=1e-15)
 
 
 PLATE = CART_PENDULUM.format(integrator="RK4").replace(
@@ -238,8 +239,8 @@ def test_deviations_of_all_components_of_the_initial_state(tmp_path: Path) -> No
     assert {(p.nuisance, p.prior, p.guess) for p in deviations} == {(True, 0.02, 0.0)}
     assert [p.unit for p in deviations[:9]] == ["m"] * 3 + ["rad"] * 6
     assert task.parameters.interest.tolist() == [0]
-    np.testing.assert_array_equal(task.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
-    np.testing.assert_allclose(np.diag(task.parameters.prior_information)[1:], 2500.0)
+    assert_array_equal(task.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
+    assert_allclose(np.diag(task.parameters.prior_information)[1:], 2500.0)
 
 
 POSE = ("x", "y", "z", "rx", "ry", "rz")
@@ -376,9 +377,9 @@ def test_a_function_edits_the_spec(tmp_path: Path) -> None:
         cart_task(tmp_path, parameters={"l": {"guess": 0.7, **table}}) for table in tables
     )
     assert [t.parameters.needs_compile.all() for t in (first, second)] == [True, False]
-    np.testing.assert_allclose(first.initial.state, second.initial.state, rtol=0, atol=1e-12)
+    assert_allclose(first.initial.state, second.initial.state, rtol=0, atol=1e-12)
     found, wanted = (sensitivity_of(task).G for task in (first, second))
-    np.testing.assert_allclose(found, wanted, rtol=1e-7, atol=1e-7)
+    assert_allclose(found, wanted, rtol=1e-7, atol=1e-7)
     assert np.abs(wanted).max() > 0.1
     (p,) = first.parameters.parameters
     assert (p.unit, p.scale, p.targets) == ("m", 0.7, ())

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import sysid
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.experiment.given import recordings_of
@@ -118,8 +119,8 @@ def test_modifiers_become_functions_that_edit_as_sysid_does() -> None:
     bob.update_from_vector(np.array([1.2, -0.4]))
     set_body(spec, bob)
     wanted = spec.compile()
-    np.testing.assert_allclose(model.body("bob").mass, wanted.body("bob").mass, rtol=1e-12)
-    np.testing.assert_allclose(model.body("bob").ipos, wanted.body("bob").ipos, rtol=1e-12)
+    assert_allclose(model.body("bob").mass, wanted.body("bob").mass, rtol=1e-12)
+    assert_allclose(model.body("bob").ipos, wanted.body("bob").ipos, rtol=1e-12)
     assert model.joint("hinge").damping[0] == 0.6
 
 
@@ -150,8 +151,8 @@ def test_sequences_are_recordings_at_the_times_of_both_series() -> None:
 
     assert (one.name, two.name) == ("a", "b")
     assert one.outputs == ("qpos:slide", "qvel:hinge")
-    np.testing.assert_allclose(one.ctrl[:, 0], np.repeat(np.sin(t), 2)[:-1])
-    np.testing.assert_allclose(one.y[1::2, 0], np.cos(t))
+    assert_allclose(one.ctrl[:, 0], np.repeat(np.sin(t), 2)[:-1])
+    assert_allclose(one.y[1::2, 0], np.cos(t))
     assert np.isnan(one.y[::2]).all()
 
 
@@ -165,7 +166,7 @@ def test_what_is_exported_comes_back() -> None:
     found = mjfim.identify(experiment, problem.sequences, progress=False)
 
     wanted = mjfim.identify(experiment, recording, progress=False)
-    np.testing.assert_allclose(found.theta, wanted.theta, rtol=1e-6)
+    assert_allclose(found.theta, wanted.theta, rtol=1e-6)
     tables = parameter_tables(problem.parameters)
     assert tables["m"]["guess"] == experiment.replace(parameters=tables).parameters["m"].guess
 
@@ -200,6 +201,6 @@ def test_the_control_of_a_design_plays_in_sysid() -> None:
         )
     step = round(motion.dt / system.model.opt.timestep)
     assert list(series.signal_mapping) == ["force_ctrl"]
-    np.testing.assert_allclose(
+    assert_allclose(
         played.state.data[step - 1 :: step][: len(motion.ctrl), 1:3], motion.qpos[1:], atol=1e-9
     )

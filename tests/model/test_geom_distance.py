@@ -9,6 +9,7 @@ from itertools import combinations_with_replacement
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.model.clearance import BOX, CAPSULE, GeomDistances, find_geom_pairs
@@ -234,7 +235,7 @@ def test_all_distances_within_reach_are_found(reach: float) -> None:
     shapes = [{int(model.geom_type[g]) for g in (p.first, p.second)} for p in chosen.pairs]
     trusted = (d > -0.05) | np.array([s != {CAPSULE, BOX} for s in shapes])  # see below
     assert trusted.mean() > 0.99
-    np.testing.assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
+    assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
     assert (d[expected == reach] == reach).all()
     assert d.max() <= reach
     assert (
@@ -253,7 +254,7 @@ def test_planes_agree_with_contacts(kind: str) -> None:
         mujoco.mj_fwdPosition(model, data)
         deepest.append(data.contact.dist.min())
     assert d.min() < -0.3 and d.max() > 0.3
-    np.testing.assert_allclose(d, deepest, rtol=0, atol=1e-12)
+    assert_allclose(d, deepest, rtol=0, atol=1e-12)
 
 
 def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
@@ -272,7 +273,7 @@ def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
     chosen, qpos = between(model, 1.0), scattered(model, 500, 0.06)
     d = chosen(qpos, False)[0]
     assert (d[:, 0] < -0.06).mean() > 0.5
-    np.testing.assert_allclose(d[:, 0], d[:, 1], rtol=0, atol=2e-8)
+    assert_allclose(d[:, 0], d[:, 1], rtol=0, atol=2e-8)
     worst = asked(model, chosen, qpos, 1.0)[:, 0] - d[:, 0]
     assert worst.max() > 0.05  # what is avoided
 
@@ -344,8 +345,8 @@ def test_columns_are_pairs_of_bodies() -> None:
     for i, column in enumerate(chosen.columns):
         own = np.flatnonzero(names == column)
         least = own[geoms[:, own].argmin(axis=1)]
-        np.testing.assert_array_equal(bodies[:, i], geoms[range(50), least])
-        np.testing.assert_array_equal(by_bodies[:, i], by_geoms[range(50), least])
+        assert_array_equal(bodies[:, i], geoms[range(50), least])
+        assert_array_equal(by_bodies[:, i], by_geoms[range(50), least])
 
 
 @pytest.mark.parametrize("spread", [0.4, 4.0])

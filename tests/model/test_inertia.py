@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from mjfim.model.inertia import (
@@ -99,8 +100,8 @@ def test_every_parametrisation_has_an_inverse(chart: InertiaParametrisation) -> 
         again = chart.inertia(v)
         assert v.shape == (10,)
         assert again.mass == pytest.approx(body.mass, rel=1e-12)
-        np.testing.assert_allclose(again.com, body.com, rtol=1e-11, atol=1e-13)
-        np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
+        assert_allclose(again.com, body.com, rtol=1e-11, atol=1e-13)
+        assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
 
 
 def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
@@ -109,7 +110,7 @@ def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
     I = tensor(weights, points)  # noqa: E741
     entries = [*np.diag(I), I[0, 1], I[0, 2], I[1, 2]]
     found = to_barycentric(solid(2))
-    np.testing.assert_allclose(found, [weights.sum(), *(weights @ points), *entries], rtol=1e-12)
+    assert_allclose(found, [weights.sum(), *(weights @ points), *entries], rtol=1e-12)
 
 
 def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
@@ -157,7 +158,7 @@ def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
     J[:3, :3] = body.second_moments + np.outer(h, h) / body.mass
     J[3, :3] = J[:3, 3] = h
     J[3, 3] = body.mass
-    np.testing.assert_allclose(np.exp(2.0 * a) * U @ U.T, J, rtol=1e-12, atol=1e-14)
+    assert_allclose(np.exp(2.0 * a) * U @ U.T, J, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +182,7 @@ def test_points_rods_and_plates_have_no_log_cholesky(
         assert np.isfinite(INERTIA_PARAMETRISATIONS[chart].coordinates(body)).all()
     if is_solid:
         again = from_logcholesky(to_logcholesky(body)).inertia
-        np.testing.assert_allclose(again, body.inertia, rtol=1e-8, atol=1e-12)
+        assert_allclose(again, body.inertia, rtol=1e-8, atol=1e-12)
         return
     with pytest.raises(ValueError, match=r"a point, a rod or a plate"):
         to_logcholesky(body)
@@ -199,4 +200,4 @@ def test_magnitudes_follow_the_units() -> None:
         own = chart.magnitudes(body)
         assert (own > 0.0).all()
         converted = own * [factor[u] for u in chart.units]
-        np.testing.assert_allclose(chart.magnitudes(other), converted, rtol=1e-12)
+        assert_allclose(chart.magnitudes(other), converted, rtol=1e-12)

@@ -10,6 +10,7 @@ from typing import Any, cast
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
@@ -350,7 +351,7 @@ def plant_of(spec: Any) -> PlantModel:
 def require_same_motion(own: Any, again: Any, base: Any, tolerance: float) -> None:
     """Two models move alike, and not as the base model does."""
     moved = rollout(own)
-    np.testing.assert_allclose(moved, rollout(again), rtol=tolerance, atol=tolerance)
+    assert_allclose(moved, rollout(again), rtol=tolerance, atol=tolerance)
     assert np.abs(moved - rollout(base)).max() > 1e-6, "the edit has no effect: a weak test"
 
 
@@ -402,7 +403,7 @@ def test_inertias_written_in_place_equal_a_compile(path: str, aligned: bool) -> 
         number = base.body(name).id
         values = parametrisation.coordinates(body_inertia(base, number))
         before = writer.model(base, values[[place]])
-        np.testing.assert_allclose(rollout(before), rollout(base), rtol=1e-10, atol=1e-10)
+        assert_allclose(rollout(before), rollout(base), rtol=1e-10, atol=1e-10)
 
         values[place] += 0.01 * parametrisation.magnitudes(body_inertia(base, number))[place]
         own, wanted = writer.model(base, values[[place]]), parametrisation.inertia(values)
@@ -410,10 +411,10 @@ def test_inertias_written_in_place_equal_a_compile(path: str, aligned: bool) -> 
         element.mass, element.ipos, element.explicitinertial = wanted.mass, wanted.com, True
         element.fullinertia = [*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]]
         again = spec.compile()
-        np.testing.assert_allclose(body_inertia(own, number).inertia, tensor, rtol=1e-9, atol=1e-9)
+        assert_allclose(body_inertia(own, number).inertia, tensor, rtol=1e-9, atol=1e-9)
         for array in ("dof_M0", "dof_invweight0", "body_subtreemass"):
-            np.testing.assert_allclose(getattr(own, array), getattr(again, array), rtol=1e-10)
-        np.testing.assert_allclose(rollout(own), rollout(again), rtol=1e-9, atol=1e-9)
+            assert_allclose(getattr(own, array), getattr(again, array), rtol=1e-10)
+        assert_allclose(rollout(own), rollout(again), rtol=1e-9, atol=1e-9)
         # What of body a lies across its only hinge cannot be felt.
         assert name == "a" or np.abs(rollout(own) - rollout(base)).max() > 1e-5
 
@@ -434,10 +435,10 @@ def test_a_value_of_a_path_is_the_value_in_the_mjcf(
         for name in ("model.geom_quat", "model.body_iquat"):
             mine[name] = wanted[name]
     for name, array in wanted.items():
-        np.testing.assert_allclose(mine[name], array, rtol=1e-12, atol=1e-14, err_msg=name)
+        assert_allclose(mine[name], array, rtol=1e-12, atol=1e-14, err_msg=name)
     require_same_motion(own, again, base, 1e-9)
     for name, array in arrays_of(source.model).items():
-        np.testing.assert_array_equal(array, before[name], err_msg=name)
+        assert_array_equal(array, before[name], err_msg=name)
 
 
 @pytest.mark.parametrize(
@@ -499,8 +500,8 @@ def test_elements_inside_frames_are_placed_in_the_coordinates_of_their_body(
     same, own = task.system.model_at(task.theta), task.system.model_at(moved)
     write_identified(tmp_path / "identified.xml", task.system, moved)
     again = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
-    np.testing.assert_allclose(rollout(same, 50), rollout(plain, 50), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(rollout(again, 50), rollout(own, 50), rtol=0, atol=1e-4)
+    assert_allclose(rollout(same, 50), rollout(plain, 50), rtol=1e-10, atol=1e-10)
+    assert_allclose(rollout(again, 50), rollout(own, 50), rtol=0, atol=1e-4)
     assert np.abs(rollout(own, 50) - rollout(plain, 50)).max() > 1e-3
     parsed = ParameterPath.parse(path)
     if parsed.field == "pos":
@@ -526,8 +527,8 @@ def test_a_mesh_moves_from_its_compiled_place() -> None:
     again = mujoco.MjModel.from_xml_string(MESHED.replace('pos=".1 0 .2"', 'pos=".1 0 .3"'))
     for value, wanted in ((now, base), (now + 0.1, again)):
         own = ParameterWriter(resolved).model(plant_of(spec), np.array([value]))
-        np.testing.assert_allclose(own.geom_pos, wanted.geom_pos, rtol=0, atol=1e-14)
-        np.testing.assert_allclose(own.body_ipos, wanted.body_ipos, rtol=0, atol=1e-14)
+        assert_allclose(own.geom_pos, wanted.geom_pos, rtol=0, atol=1e-14)
+        assert_allclose(own.body_ipos, wanted.body_ipos, rtol=0, atol=1e-14)
     with pytest.raises(ExperimentError, match="size of a mesh"):
         resolve(base, "geom/h:size")
 
@@ -566,7 +567,7 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     element.alt.type, element.quat = mujoco.mjtOrientation.mjORIENTATION_QUAT, quat
     require_same_motion(writer.model(base, vector), spec.compile(), base, 1e-9)
     again = writer.model(base, np.zeros(3))  # Nothing of the first value is left.
-    np.testing.assert_allclose(rollout(again), rollout(base), rtol=1e-9, atol=1e-9)
+    assert_allclose(rollout(again), rollout(base), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -603,9 +604,9 @@ def test_mass_beside_first_moments_keeps_them() -> None:
     both = parameter_set([mass, replace(one("body/a:firstmoment[2]"), name="h")], base)
     own = ParameterWriter(both).model(base, wanted[[0, 3]])
     after = barycentric(body_inertia(own, own.body("a").id))
-    np.testing.assert_allclose(after, wanted, rtol=1e-12, atol=1e-15)
+    assert_allclose(after, wanted, rtol=1e-12, atol=1e-15)
     alone = ParameterWriter(parameter_set([mass], base)).model(base, np.array([1.5]))
-    np.testing.assert_array_equal(alone.body("a").ipos, base.body("a").ipos)
+    assert_array_equal(alone.body("a").ipos, base.body("a").ipos)
 
 
 def test_measurement_and_initial_state_are_outside_the_model() -> None:
@@ -617,7 +618,7 @@ def test_measurement_and_initial_state_are_outside_the_model() -> None:
     start, bias = resolved.initial_state_derivative(4), resolved.bias_derivative(2)
     assert (start[3, 0], start[0, 1], bias[1, 2]) == (2.0, -1.0, 0.5)
     assert (np.count_nonzero(start), np.count_nonzero(bias)) == (2, 1)
-    np.testing.assert_array_equal(resolved.delay_derivative, [0.0, 0.0, 0.0, 3.0, 0.0])
+    assert_array_equal(resolved.delay_derivative, [0.0, 0.0, 0.0, 3.0, 0.0])
     assert resolved.changes_model.tolist() == [False] * 4 + [True]
     assert resolved.changes_motion.tolist() == [True, True, False, False, True]
     assert not resolved.needs_compile.any()
@@ -648,7 +649,7 @@ def test_a_body_that_only_slides_touches_the_floor_as_in_the_users_model(tmp_pat
     plain = rollout(mujoco.MjModel.from_xml_string(SLIDING_BALL))
 
     for model in (task.system.model_at(task.theta), task.plant.model(task.theta)):
-        np.testing.assert_allclose(rollout(model), plain, rtol=1e-7, atol=1e-7)
+        assert_allclose(rollout(model), plain, rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import scipy
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
@@ -196,7 +197,7 @@ def test_motor_and_link_move_as_two_inertias(tmp_path: Path, kind: str, encoder:
     write_pendulum(tmp_path, timestep=0.0005, joint=f'armature="{ROTOR}"')
     system = System.resolve(experiment)
     assert system.outputs.names == ("qpos:pivot", "qvel:pivot")
-    np.testing.assert_array_equal(system.nominal_initial_state, [0.5, 0.0, 0.0, 0.0])
+    assert_array_equal(system.nominal_initial_state, [0.5, 0.0, 0.0, 0.0])
 
     # The friction of the joint is on its side.
     of_motor, of_link = (DAMPING, 0.0) if encoder == "motor" else (0.0, DAMPING)
@@ -228,13 +229,13 @@ def test_motor_and_link_move_as_two_inertias(tmp_path: Path, kind: str, encoder:
 def test_a_keyframe_of_the_file_gets_the_new_joint(tmp_path: Path) -> None:
     experiment = experiment_of(tmp_path, "joint_elasticity")
     source = System.resolve(experiment).source
-    np.testing.assert_array_equal(source.model.key_qpos, [[0.5, 0.0]])
-    np.testing.assert_array_equal(source.stated.model.key_qpos, [[0.5]])
+    assert_array_equal(source.model.key_qpos, [[0.5, 0.0]])
+    assert_array_equal(source.stated.model.key_qpos, [[0.5]])
 
     # Stated positions may leave out the joint that the term adds.
     for qpos in ([0.7], [0.7, 0.0]):
         start = System.resolve(experiment.replace(initial={"qpos": qpos})).nominal_initial_state
-        np.testing.assert_array_equal(start, [0.7, 0.0, 0.0, 0.0])
+        assert_array_equal(start, [0.7, 0.0, 0.0, 0.0])
     with pytest.raises(ExperimentError, match=r"initial\.qpos: 3 numbers; this model needs 2"):
         System.resolve(experiment.replace(initial={"qpos": [0.7, 0.0, 0.0]}))
 
@@ -255,7 +256,7 @@ def test_values_written_in_place_equal_a_compile(tmp_path: Path, kind: str) -> N
     expected = arrays_of(compiled.model_at(compiled.parameters.guess))
     assert set(written) == set(expected)
     for name, value in expected.items():
-        np.testing.assert_allclose(written[name], value, rtol=1e-12, atol=1e-16, err_msg=name)
+        assert_allclose(written[name], value, rtol=1e-12, atol=1e-16, err_msg=name)
 
     # The guess is the value in the model.
     assert compiled.parameters.guess == pytest.approx([*true.values()], rel=1e-15)
@@ -283,7 +284,7 @@ def test_the_identified_text_moves_as_the_identified_model(tmp_path: Path, kind:
         data.ctrl[0] = u
         mujoco.mj_step(model, data, 10)
         angles.append(data.qpos[0])
-    np.testing.assert_allclose(angles, simulated(system, ctrl)[:, 0], atol=1e-8)
+    assert_allclose(angles, simulated(system, ctrl)[:, 0], atol=1e-8)
 
 
 # ---- wrong tables

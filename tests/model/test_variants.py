@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.arrays import Array
 from mjfim.excitation.search.levels import DescentLevel, first_point
@@ -91,7 +92,7 @@ def test_a_plant_with_dry_friction_moves_as_the_model_and_its_smoothed_variant_n
         mujoco.mj_step(model, data, task.system.grid.substeps)
     free = task.relaxed()
     own = free.plant.simulate(task.theta, task.control).qpos[-1]
-    np.testing.assert_allclose(own, data.qpos, rtol=0, atol=1e-6)
+    assert_allclose(own, data.qpos, rtol=0, atol=1e-6)
     level = free.smoothed()
     softened = level.plant.simulate(task.theta, task.control).qpos[-1]
     assert 1e-5 < np.abs(softened - own).max() < 0.02
@@ -170,7 +171,7 @@ def test_with_sensors_only_mixed_differences_are_taken_on_the_smoothed_plant(
         plant.derivatives.bilinear(task.theta, task.initial, psi, np.eye(3)[:1], careful)
         for plant in (task.plant, task.plant.smooth)
     )
-    np.testing.assert_array_equal(both.F_mixed, soft.F_mixed)
+    assert_array_equal(both.F_mixed, soft.F_mixed)
     assert np.abs(both.A - soft.A).max() > 1e-3
 
 

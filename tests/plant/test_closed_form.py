@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
@@ -109,7 +110,7 @@ def curve(task: DesignTask) -> Trajectory:
 
 def assert_close(found: Any, expected: Any, accuracy: float) -> None:
     """Compare arrays, relative to the largest number of each."""
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=accuracy * np.abs(expected).max())
+    assert_allclose(found, expected, rtol=0.0, atol=accuracy * np.abs(expected).max())
 
 
 # The damping of Euler's method is implicit or explicit.
@@ -152,7 +153,7 @@ def test_first_derivatives_and_sensitivities_agree_with_differences(tmp_path, op
     for column in range(len(task.theta)):
         assert_close(found.psi[..., column], expected.psi[..., column], 1e-6)
         assert_close(found.G[..., column], expected.G[..., column], 1e-6)
-    np.testing.assert_array_equal(found.psi[..., -1], expected.psi[..., -1])
+    assert_array_equal(found.psi[..., -1], expected.psi[..., -1])
 
 
 def test_mixed_derivatives_agree_with_differences(tmp_path) -> None:
@@ -169,10 +170,10 @@ def test_mixed_derivatives_agree_with_differences(tmp_path) -> None:
     expected = with_differences(task).plant.derivatives.bilinear(*given, CENTRAL_DIFFERENCES)
 
     # Central differences never come from the closed form.
-    np.testing.assert_array_equal(central.F_mixed, expected.F_mixed)
+    assert_array_equal(central.F_mixed, expected.F_mixed)
     assert_close(found.A, expected.A, 1e-6)
     assert_close(found.B, expected.B, 1e-6)
-    np.testing.assert_array_equal(found.C, expected.C)
+    assert_array_equal(found.C, expected.C)
     assert found.h_mixed is None and expected.h_mixed is None
     assert_close(found.F_mixed, expected.F_mixed, 1e-5)
 
@@ -275,4 +276,4 @@ def test_other_equations_of_motion_are_differentiated_by_the_engine(
     found = derivatives.sensitivity(task.theta, trajectory, closed_form=True)
     expected = derivatives.sensitivity(task.theta, trajectory)
     assert found is not None and expected is not None
-    np.testing.assert_array_equal(found.psi, expected.psi)
+    assert_array_equal(found.psi, expected.psi)

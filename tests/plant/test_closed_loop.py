@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.experiment.system import System
 from mjfim.model.loading import silence_mujoco_log
@@ -113,7 +114,7 @@ def test_a_law_equals_a_plain_loop(name: str) -> None:
 
     assert found.finite.all()
     expected = oracle(system, LAWS[name], inputs)
-    np.testing.assert_allclose(found.states[0], expected, atol=1e-11)
+    assert_allclose(found.states[0], expected, atol=1e-11)
 
     # The law has an effect, so that a wrong law would be seen.
     assert np.abs(expected - oracle(system, {"kp": 0.0}, inputs)).max() > 0.05
@@ -138,7 +139,7 @@ def test_simulations_of_one_batch_have_their_own_numbers() -> None:
     starts = np.stack([START * (1.0 + 0.1 * i) for i in range(4)])
     found = system.plant.simulator.rollout(models, starts, inputs)
 
-    np.testing.assert_allclose(found.states, expected, atol=1e-11)
+    assert_allclose(found.states, expected, atol=1e-11)
     assert np.abs(np.diff(found.states, axis=0)).max(axis=(1, 2)).min() > 1e-3
 
 
@@ -163,7 +164,7 @@ def test_a_law_on_the_voltage_of_a_motor_with_a_current(tmp_path: Path) -> None:
     made = plain({**law, "saturation": (-24.0, 24.0)}, "shoulder")
     columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
     states, _ = simulate(model, {0: made}, columns, system.dt, SAMPLES, start)
-    np.testing.assert_allclose(found.states[0], states, atol=1e-11)
+    assert_allclose(found.states[0], states, atol=1e-11)
 
 
 def test_measured_forces_are_those_of_the_law(tmp_path: Path) -> None:
@@ -179,7 +180,7 @@ def test_measured_forces_are_those_of_the_law(tmp_path: Path) -> None:
     assert found.sensors is not None
     q, v = found.states[0, :-1, 0], found.states[0, :-1, 2]
     expected = np.clip(60.0 * (inputs[:, 0] - q) - 4.0 * v, -20.0, 20.0)
-    np.testing.assert_allclose(found.sensors[0, :-1, 0], expected, atol=1e-11)
+    assert_allclose(found.sensors[0, :-1, 0], expected, atol=1e-11)
     assert np.ptp(expected) > 10.0
 
 
@@ -210,7 +211,7 @@ def test_intervals_equal_one_rollout(name: str) -> None:
     for part in parts:
         assert part is not None
         expected = whole.states[0, part.first : part.first + part.y.shape[1]]
-        np.testing.assert_allclose(part.y[0], expected, atol=1e-11)
+        assert_allclose(part.y[0], expected, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", ["pd", "slow", "late", "linear", "shaped", "columns"])
@@ -231,7 +232,7 @@ def test_a_curve_may_begin_inside_a_recording(name: str) -> None:
     found = plant.simulator.rollout(
         [model], whole[None, begin], inputs[None, begin:], context=context
     )
-    np.testing.assert_allclose(found.states[0], whole[begin:], atol=1e-9)
+    assert_allclose(found.states[0], whole[begin:], atol=1e-9)
 
 
 def test_a_diverging_loop_is_found() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.plant.outputs import OutputDelay
 from tests.support.numerics import Array, cart_task, richardson
@@ -48,17 +49,15 @@ def test_before_the_first_sample_the_first_value_is_held() -> None:
     """
     y = curve(T)
     output_delay = OutputDelay.on_grid(len(T), 0.055, DT)
-    np.testing.assert_array_equal(output_delay.apply(y)[:6], np.broadcast_to(y[0], (6, 2)))
+    assert_array_equal(output_delay.apply(y)[:6], np.broadcast_to(y[0], (6, 2)))
     assert not output_delay.derivative(y)[:6].any()
     assert output_delay.derivative(y)[6:].any(axis=1).all()
     lead = OutputDelay.on_grid(len(T), -0.055, DT)
-    np.testing.assert_allclose(
-        lead.apply(y)[-6:], np.broadcast_to(y[-1], (6, 2)), rtol=0, atol=1e-14
-    )
+    assert_allclose(lead.apply(y)[-6:], np.broadcast_to(y[-1], (6, 2)), rtol=0, atol=1e-14)
     assert not lead.derivative(y)[-5:].any()
-    np.testing.assert_allclose(lead.apply(y)[:-8], curve(T + 0.055)[:-8], rtol=0, atol=1e-5)
+    assert_allclose(lead.apply(y)[:-8], curve(T + 0.055)[:-8], rtol=0, atol=1e-5)
     late = OutputDelay.on_grid(len(T), 100.0, DT)
-    np.testing.assert_array_equal(late.apply(y), np.broadcast_to(y[0], y.shape))
+    assert_array_equal(late.apply(y), np.broadcast_to(y[0], y.shape))
 
 
 @pytest.mark.parametrize("delay", [0.0042, 0.0337, -0.0125])
@@ -104,7 +103,7 @@ def test_the_sensitivity_to_a_delay_is_the_derivative_of_delayed_outputs(tmp_pat
     y, G = task.plant.derivatives.predict(theta, task.control)
     plain, _ = task.plant.derivatives.predict(task.parameters.guess, task.control)
     shifted = OutputDelay.on_grid(len(plain), 0.0137, task.dt).apply(plain)
-    np.testing.assert_allclose(y, shifted, rtol=0, atol=1e-12)
+    assert_allclose(y, shifted, rtol=0, atol=1e-12)
     for k, i in ((10, 1), (30, 3), (50, 2)):
 
         def at(h: float, k: int = k, i: int = i) -> float:

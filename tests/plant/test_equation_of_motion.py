@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.model.variants import RELAXED, Relaxation
 from mjfim.plant.equation_of_motion import EquationOfMotion, MotionPoints, activations
@@ -97,7 +98,7 @@ def test_needed_forces_are_those_of_mujocos_inverse_dynamics(
             expected, found = expected[6:], terms.needed[k][6:]
         else:
             found = terms.needed[k]
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
@@ -150,7 +151,7 @@ def test_stops_are_found_and_friction_is_not_a_stop(tmp_path: Path) -> None:
     ctrl = np.stack([np.zeros(5), states[:, 1]], axis=1)
     moved = MotionPoints(states=states, acceleration=points.acceleration, ctrl=ctrl)
     found = equation.constrained(task.plant.model(task.parameters.guess), moved)
-    np.testing.assert_array_equal(found[:, 1], [False, True, False, True, False])
+    assert_array_equal(found[:, 1], [False, True, False, True, False])
 
 
 def test_activations_are_those_of_a_simulation(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.task import DesignTask
@@ -88,7 +89,7 @@ def test_A_B_C_and_D_are_those_of_a_plain_loop_for_any_integrator_and_substeps(
         assert relative_error(found.B[k], B) < 1e-6
         if rows:
             assert relative_error(found.C[k][rows], C[address]) < 1e-6
-            np.testing.assert_allclose(found.D[k][rows], D[address], rtol=1e-6, atol=1e-6)
+            assert_allclose(found.D[k][rows], D[address], rtol=1e-6, atol=1e-6)
 
 
 def rebuilt(task: DesignTask, theta: Array) -> Any:
@@ -201,8 +202,8 @@ def test_rollout_and_sensors_agree_with_a_plain_loop(make, tmp_path) -> None:
     # The last control is held.
     points = list(zip(curve.state, [*curve.ctrl, curve.ctrl[-1]], strict=True))
     states, sensed = ([each(x, u) for x, u in points] for each in (loop.F, loop.h))
-    np.testing.assert_allclose(curve.state[1:], states[:-1], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(y[0], sensed, rtol=0, atol=1e-11)
+    assert_allclose(curve.state[1:], states[:-1], rtol=0, atol=1e-13)
+    assert_allclose(y[0], sensed, rtol=0, atol=1e-11)
     period = task.system.grid.substeps * task.system.model.opt.timestep
     assert curve.t[-1] == pytest.approx(task.samples * period)
 
@@ -235,12 +236,12 @@ def test_projection_is_idempotent_and_feasible(make, tmp_path) -> None:
     if make is not body_task:
         alpha, mu = task.initial.state + 0.5 * zeta.z, task.initial.ctrl + 0.5 * zeta.v
         law = mu + np.einsum("kui,ki->ku", K, alpha[:-1] - once.state[:-1])
-        np.testing.assert_allclose(once.ctrl, law, rtol=0, atol=1e-12)
+        assert_allclose(once.ctrl, law, rtol=0, atol=1e-12)
     # The projection is a trajectory, and projected again it stays where it is.
     twice = plant.project(theta, task.initial, moved, 1.0, K)
     for again in (plant.simulate(theta, once.ctrl), twice):
-        np.testing.assert_allclose(again.state, once.state, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(again.ctrl, once.ctrl, rtol=0, atol=1e-9)
+        assert_allclose(again.state, once.state, rtol=0, atol=1e-9)
+        assert_allclose(again.ctrl, once.ctrl, rtol=0, atol=1e-9)
 
 
 @STILL
@@ -315,15 +316,15 @@ def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None
     for count in (2, 6, 1, 70, 3, 5):
         y, finite = task.plant.measure(thetas[:count], task.control)
         assert finite.tolist() == [True] * count
-        np.testing.assert_array_equal(y[:6], alone[:count])
+        assert_array_equal(y[:6], alone[:count])
     wild = thetas[:4].copy()
     wild[1] *= -1.0  # a negative mass: this one may do as it likes, its neighbours may not
     y, _ = task.plant.measure(wild, task.control)
-    np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
+    assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
     states, model = task.initial.state, task.plant.model(task.theta)
     for count in (5, 50, 1, 12):
         out, _, _ = task.plant.simulator.step([model], states[:count], task.control[:count])
-        np.testing.assert_array_equal(out, states[1 : count + 1])
+        assert_array_equal(out, states[1 : count + 1])
 
 
 @pytest.mark.parametrize("integrator", ["RK4", "Euler", "implicitfast"])
@@ -333,7 +334,7 @@ def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_b
     plain, lean = stated_and_lean(tmp_path, False, loss=0.0, integrator=integrator)
     off = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR
     assert (plain.opt.disableflags & off, lean.opt.disableflags & off) == (0, off)
-    np.testing.assert_array_equal(motion_with_reversals(lean), motion_with_reversals(plain))
+    assert_array_equal(motion_with_reversals(lean), motion_with_reversals(plain))
 
 
 # One joint with dry friction. The body may be followed by others, and the model by other trees.
@@ -396,9 +397,7 @@ def test_one_row_of_friction_has_the_same_force_by_the_quicker_solver(
         mujoco.mjtSolver.mjSOL_NEWTON,
         mujoco.mjtSolver.mjSOL_PGS,
     )
-    np.testing.assert_allclose(
-        motion_with_reversals(lean), motion_with_reversals(plain), rtol=0.0, atol=1e-9
-    )
+    assert_allclose(motion_with_reversals(lean), motion_with_reversals(plain), rtol=0.0, atol=1e-9)
 
 
 LINK = (
@@ -429,7 +428,7 @@ def test_the_stated_solver_stays_where_there_may_be_more_rows(
     assert lean.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
     islands = lean.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
     assert bool(islands) is not has_islands
-    np.testing.assert_array_equal(motion_with_reversals(lean), motion_with_reversals(plain))
+    assert_array_equal(motion_with_reversals(lean), motion_with_reversals(plain))
 
 
 @pytest.mark.parametrize("solver", ["CG", "Newton"])
@@ -447,7 +446,7 @@ def test_a_design_is_verified_with_the_stated_solver(solver: str, tmp_path) -> N
 def test_an_unknown_initial_orientation_moves_in_its_tangent_space(tmp_path) -> None:
     task = body_task(tmp_path, nuisance={"initial": {"qpos:ball.rz": True, "qvel:float.ry": True}})
     S = sensitivity_of(task)
-    np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
+    assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
     slopes = measured_slopes(task)
     assert relative_error(S.G, slopes) < 1e-6
     assert relative_error(S.G[..., 4:], slopes[..., 4:]) < 1e-6
@@ -486,7 +485,7 @@ def test_start_biases_and_scales_change_what_is_measured(tmp_path) -> None:
     (h, y), _ = task.plant.measure(np.stack([exact, moved]), task.control)
     wanted = np.array(h)
     wanted[:, columns] = wanted[:, columns] * [1.1, 1.3] + [0.7, -0.2]
-    np.testing.assert_allclose(y, wanted, rtol=0, atol=1e-12)
+    assert_allclose(y, wanted, rtol=0, atol=1e-12)
 
     # All ways to the derivatives agree, and they are those of what is measured.
     slopes, S, L = measured_slopes(task), sensitivity_of(task), linear(task)
@@ -496,7 +495,7 @@ def test_start_biases_and_scales_change_what_is_measured(tmp_path) -> None:
         assert (errors < 1e-6 * np.abs(slopes).max(axis=(0, 1))).all()
 
     # (dq, dv): the angle of the hinge, the speed of the slide
-    np.testing.assert_allclose(S.psi[0][:, 5:7], np.eye(4)[:, [1, 2]], rtol=0, atol=1e-9)
+    assert_allclose(S.psi[0][:, 5:7], np.eye(4)[:, [1, 2]], rtol=0, atol=1e-9)
 
 
 def test_parameters_of_little_effect_get_longer_difference_steps_and_others_keep_theirs(
@@ -507,7 +506,7 @@ def test_parameters_of_little_effect_get_longer_difference_steps_and_others_keep
     relative = task.plant.derivatives.parameter_scale / task.parameters.magnitude
     assert relative[0] > 5.0
     assert (relative >= 1.0).all() and (relative <= 100.0).all()
-    np.testing.assert_array_equal(relative[1:3], 1.0)
+    assert_array_equal(relative[1:3], 1.0)
     # A longer step reduces round-off and leaves the derivative unchanged.
     S = sensitivity_of(task).psi[..., 0]
     far = task.plant.derivatives.sensitivity(task.theta, task.initial, 1e-4).psi[..., 0]
@@ -590,12 +589,12 @@ def test_mocap_bodies_stand_where_the_keyframe_puts_them(function: bool, tmp_pat
         (closed, wanted),
         (stepped, wanted[1:]),
     ):
-        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6)
+        assert_allclose(found, expected, rtol=0.0, atol=1e-6)
     whole = task.system.model_at(task.theta)
-    np.testing.assert_allclose(whole.eq_data, plain.eq_data, atol=1e-12)
-    np.testing.assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
+    assert_allclose(whole.eq_data, plain.eq_data, atol=1e-12)
+    assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
     compiled = task.system.model_at(task.theta, at_keyframe=False)
-    np.testing.assert_array_equal(compiled.body_pos, plain.body_pos)
+    assert_array_equal(compiled.body_pos, plain.body_pos)
 
 
 def test_parameters_move_mocap_bodies_without_a_keyframe(tmp_path) -> None:
@@ -606,7 +605,7 @@ def test_parameters_move_mocap_bodies_without_a_keyframe(tmp_path) -> None:
     ends = [task.plant.simulate(task.theta + h, task.control).state[-1] for h in (1e-4, -1e-4)]
     slope = (ends[0] - ends[1]) / 2e-4
     assert np.abs(slope).max() > 0.1
-    np.testing.assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
+    assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
     initial = {"keyframe": "moved", "control": {"kind": "sine"}}
     with pytest.raises(
         ExperimentError, match=r"parameters\.x: the keyframe states the pose of mocap body 'near'"
@@ -621,7 +620,7 @@ def test_clock_sensors_begin_at_zero(tmp_path) -> None:
     parameters = {"c": {"target": "joint/hinge:damping"}}
     task = make_task(xml, tmp_path, rate=50.0, parameters=parameters, noise={"clock": 0.1})
     y, _ = task.plant.measure(task.theta[None], task.control)
-    np.testing.assert_allclose(y[0, :, 0], np.arange(task.samples + 1) * task.dt, atol=1e-12)
+    assert_allclose(y[0, :, 0], np.arange(task.samples + 1) * task.dt, atol=1e-12)
     model = task.plant.model(task.theta)
     _, sensed, _ = task.plant.simulator.step([model], task.initial.state[:1], task.control[:1])
     assert sensed[0, model.sensor("clock").adr[0]] == 0.0
@@ -634,8 +633,8 @@ def test_quaternions_of_the_initial_state_are_normalised_or_refused(tmp_path) ->
         ).plant.nominal_initial_state
 
     unit = start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0)
-    np.testing.assert_array_equal(unit[:11], [1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0])
-    np.testing.assert_allclose(start(1, 2, 3, 1.2, 0, 1.6, 0, 0, 0, 5, 0), unit, atol=1e-15)
+    assert_array_equal(unit[:11], [1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0])
+    assert_allclose(start(1, 2, 3, 1.2, 0, 1.6, 0, 0, 0, 5, 0), unit, atol=1e-15)
     with pytest.raises(
         ExperimentError,
         match=r"initial\.qpos: the quaternion of joint 'ball' \(numbers 7 to 10\) is zero",

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import derivative_substeps_of
@@ -102,7 +103,7 @@ def test_observations_agree_with_plain_steps_at_every_engine_step(
     watched = plant.observe(task.theta, task.control, observations_of(task))
     assert watched is not None
     trajectory, observed = watched
-    np.testing.assert_array_equal(trajectory.state, plant.simulate(task.theta, task.control).state)
+    assert_array_equal(trajectory.state, plant.simulate(task.theta, task.control).state)
     wanted, forces = played_with_forces(
         model, task.plant.initial_state(task.theta), task.control, task.system.grid.substeps
     )
@@ -110,8 +111,8 @@ def test_observations_agree_with_plain_steps_at_every_engine_step(
     assert observed.shape == wanted.shape == (30, 5, len(SHOWN))
     # with RK4 there are rows for the beginning of every step; the last row is the sample's end
     for step, row in zip(range(6) if integrator == "RK4" else [5], range(6), strict=False):
-        np.testing.assert_allclose(further[:, row, 5:], forces[:, step], rtol=1e-9, atol=1e-9)
-        np.testing.assert_array_equal(further[:, row, :5], observed[:, min(step, 4), :5])
+        assert_allclose(further[:, row, 5:], forces[:, step], rtol=1e-9, atol=1e-9)
+        assert_array_equal(further[:, row, :5], observed[:, min(step, 4), :5])
     assert further.shape[1] == (6 if integrator == "RK4" else 1)
     for i, (kind, name) in enumerate(SHOWN):
         assert relative_error(observed[..., i], wanted[..., i]) < 1e-9, (kind, name)

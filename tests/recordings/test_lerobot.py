@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError
@@ -55,10 +56,10 @@ def test_each_episode_is_a_recording(version: str, tmp_path: Path) -> None:
     for number, path in enumerate(paths[:3]):
         recording = read_recording(path, cart().channels)
         assert recording.outputs == ("qpos:slide", "qpos:hinge")
-        np.testing.assert_array_equal(recording.t, np.arange(40) / 100.0)
+        assert_array_equal(recording.t, np.arange(40) / 100.0)
         state, action = (values.astype(np.float32) for values in reversed(data[number].values()))
-        np.testing.assert_array_equal(recording.y, state)
-        np.testing.assert_array_equal(recording.ctrl[:, 0], action[:-1])
+        assert_array_equal(recording.y, state)
+        assert_array_equal(recording.ctrl[:, 0], action[:-1])
 
     with pytest.raises(RecordingError, match=r"set: has 3 episodes; name one, as in episode_0000"):
         read_columns(folder, ALL)
@@ -113,16 +114,14 @@ def test_degrees_are_refused_with_the_way_to_state_units(tmp_path: Path) -> None
     with pytest.raises(RecordingError, match="the command 'ctrl:yaw' has none; state the same"):
         read("qpos")
     recording = read("qpos", "ctrl")
-    np.testing.assert_allclose(recording.y, np.deg2rad(angles), rtol=1e-5)
-    np.testing.assert_allclose(recording.ctrl, np.deg2rad(angles[:-1]), rtol=1e-5)
+    assert_allclose(recording.y, np.deg2rad(angles), rtol=1e-5)
+    assert_allclose(recording.ctrl, np.deg2rad(angles[:-1]), rtol=1e-5)
 
 
 def test_stamps_of_a_clock_are_kept(tmp_path: Path) -> None:
     """Time stamps that are not those of the frame numbers are the times."""
     folder = write_dataset(tmp_path / "set", episodes(1), NAMES, info={"fps": 90.0})
-    np.testing.assert_allclose(
-        read_columns(folder, ALL).column("t"), np.arange(40) / 100, rtol=1e-6
-    )
+    assert_allclose(read_columns(folder, ALL).column("t"), np.arange(40) / 100, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

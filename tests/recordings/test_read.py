@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from mjfim.errors import ExperimentError, RecordingError
@@ -387,7 +388,7 @@ def test_sound_logs(columns: dict[str, Array], recording: dict[str, Any], read: 
     logged = read({"qpos:pin": wave(), **columns}, **recording)
     assert len(logged.recording.t) == M
     for name in {*columns} & {*logged.recording.outputs}:
-        np.testing.assert_array_equal(column(logged, name), columns[name])
+        assert_array_equal(column(logged, name), columns[name])
 
 
 @pytest.mark.parametrize(("columns", "recording", "said"), REFUSED)
@@ -547,12 +548,12 @@ def test_rows_are_read_as_files_are(read: Read, tmp_path: Path) -> None:
     reader = RowReader(header, channels, "stdin")
     rows = [row for row in map(reader.row, lines) if row is not None]
     t, ctrl, y = map(np.array, zip(*rows, strict=True))
-    np.testing.assert_allclose(t - t[0], logged.t, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ctrl[:-1], logged.ctrl)
+    assert_allclose(t - t[0], logged.t, rtol=0, atol=1e-9)
+    assert_allclose(ctrl[:-1], logged.ctrl)
     for name in logged.outputs:
         found = y[:, channels.outputs.index(name)]
         expected = logged.y[:, logged.outputs.index(name)]
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+        assert_allclose(found, expected, rtol=0, atol=1e-9)
     assert np.isnan(y[:, channels.outputs.index("ruler")]).all()
 
 
