@@ -25,7 +25,6 @@ from mjfim.model.coordinates import (
 )
 from tests.support.numerics import (
     FREE_BODY,
-    Array,
     Loop,
     body_task,
     cart_task,
@@ -40,14 +39,13 @@ RATES = [f"qvel:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [
 ]
 
 
+ACC = [f"acc[{i}]" for i in range(3)]
+STATE = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
+
+
 def sigmas(task: DesignTask) -> dict[str, float]:
     """Standard deviation of every output."""
     return dict(zip(task.system.outputs.names, task.system.noise.sigma.tolist(), strict=True))
-
-
-def strides(task: DesignTask) -> dict[str, int]:
-    """Samples between two measurements of every output."""
-    return dict(zip(task.system.outputs.names, task.system.noise.strides.tolist(), strict=True))
 
 
 def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
@@ -136,21 +134,16 @@ def test_every_output_has_its_rate(tmp_path: Path) -> None:
         "acc": {"sigma": 0.3, "rate": 10.0},
     }
     task = cart_task(tmp_path, measure_rate=50.0, noise=noise)
-    plain = {"qpos:slide": 2, "qvel:slide": 2, "qvel:hinge": 2}
-    assert strides(task) == {**plain, "qpos:hinge": 1, **{f"acc[{i}]": 10 for i in range(3)}}
-    assert sigmas(task)["qpos:hinge"] == 0.05
-    counts = task.system.noise.measured(task.samples).sum(axis=0)
-    assert dict(zip(task.system.outputs.names, counts.tolist(), strict=True)) == {
-        **dict.fromkeys(plain, 25.0), "qpos:hinge": 50.0, **{f"acc[{i}]": 5.0 for i in range(3)}
-    }  # fmt: skip
+    assert task.system.outputs.names == (*STATE, *ACC)
+    assert task.system.noise.strides.tolist() == [2, 1, 2, 2, 10, 10, 10]
+    assert task.system.noise.sigma.tolist() == [0.1, 0.05, 0.1, 0.1, 0.3, 0.3, 0.3]
 
 
 def test_components_of_a_sensor_have_their_own_sigmas(tmp_path: Path) -> None:
-    task = cart_task(
-        tmp_path, noise={"acc": {"sigma": [0.1, 0.2, 0.3]}, "qpos:slide": {"sigma": [0.4]}}
-    )
-    assert sigmas(task) == pytest.approx(
-        {"qpos:slide": 0.4, "acc[0]": 0.1, "acc[1]": 0.2, "acc[2]": 0.3}
+    noise = {"acc": {"sigma": [0.1, 0.2, 0.3]}, "qpos:slide": {"sigma": [0.4]}}
+    found = sigmas(cart_task(tmp_path, noise=noise))
+    assert found == pytest.approx(
+        {"qpos:slide": 0.4, **dict(zip(ACC, (0.1, 0.2, 0.3), strict=True))}
     )
 
 
@@ -158,8 +151,6 @@ BLOCK = np.array([[0.09, 0.03, 0.0], [0.03, 0.16, -0.02], [0.0, -0.02, 0.04]])
 ALL = (0.01 * (np.eye(4) + 0.3)).tolist()
 
 
-ACC = [f"acc[{i}]" for i in range(3)]
-STATE = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
 MIXED = ["acc[2]", "qpos:hinge", "drive"]
 COVARIANCE = {"covariance": BLOCK.tolist()}
 
@@ -213,14 +204,9 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"noise": {"accel": 0.1}},
         r"noise: unknown sensor 'accel'.*'acc'.*valid: .*qpos:hinge.*state",
     ),
-    "one component": ({"noise": {"acc[0]": 0.1}}, r"noise: unknown sensor 'acc\[0\]'"),
     "too few sigmas": (
         {"noise": {"acc": {"sigma": [1.0, 2.0]}}},
         r"noise\.acc\.sigma: 2 numbers; .* each of 3",
-    ),
-    "sigmas of a scalar": (
-        {"noise": {"rate": {"sigma": [1.0, 2.0]}}},
-        r"noise\.rate\.sigma: 2 numbers",
     ),
     "rate": (
         {"noise": {"acc": {"sigma": 1.0, "rate": 30.0}}},
@@ -238,20 +224,12 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"noise": {"acc": {"covariance": square(2)}}},
         r"noise\.acc\.covariance: expected 3 rows of 3",
     ),
-    "covariance ragged": (
-        {"noise": {"acc": {"covariance": [[1.0, 0.0, 0.0], [0.0, 1.0], [0.0, 0.0, 1.0]]}}},
-        r"noise\.acc\.covariance: expected 3 rows of 3",
-    ),
     "covariance skew": (
         {"noise": {"acc": {"covariance": [[1.0, 0.5, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]]}}},
         r"noise\.acc\.covariance: not symmetric",
     ),
     "covariance indefinite": (
         {"noise": {"acc": {"covariance": [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}}},
-        r"noise\.acc\.covariance: not positive definite",
-    ),
-    "covariance singular": (
-        {"noise": {"acc": {"covariance": np.ones((3, 3)).tolist()}}},
         r"noise\.acc\.covariance: not positive definite",
     ),
     "both": (
@@ -266,10 +244,6 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"noise": {"acc": {"sigma": [1.0, 0.0, 1.0]}}},
         r"noise\.acc\.sigma\.1: .*greater than 0",
     ),
-    "unknown key": (
-        {"noise": {"acc": {"sigm": 1.0}}},
-        r"noise\.acc\.sigm: unknown key .*'sigma'.*covariance, rate, sigma",
-    ),
     "correlated unknown": (
         {"correlated": pair("acc", "rate")},
         r"correlated\.outputs: unknown output 'acc'.*acc\[0\]",
@@ -281,14 +255,6 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "correlated alone": (
         {"correlated": pair("rate")},
         r"correlated\.0\.outputs: needs 2 or more entries",
-    ),
-    "correlated size": (
-        {"correlated": pair("rate", "angle", covariance=square(3))},
-        r"correlated\.covariance: expected 2 rows of 2",
-    ),
-    "correlated indefinite": (
-        {"correlated": pair("rate", "angle", covariance=[[1.0, 2.0], [2.0, 1.0]])},
-        r"correlated\.covariance: not positive definite",
     ),
     "correlated rates": (
         {
@@ -363,9 +329,7 @@ def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:
     """The columns have the order in which MuJoCo writes the numbers."""
     task = body_task(tmp_path, noise={"tip": 0.1, "gyro": 0.2, "qpos:float.pos": 0.3})
     y, _ = task.plant.measure(task.theta[None], task.control)
-    loop = Loop(task.system.model, 1)
     state = task.initial.state[20]
-    sensed = loop.h(state, task.control[20])
-    wanted: Array = np.concatenate([state[:3], sensed[:3], sensed[6:9]])
-    assert task.system.outputs.names[3:6] == ("gyro[0]", "gyro[1]", "gyro[2]")
+    sensed = Loop(task.system.model, 1).h(state, task.control[20])
+    wanted = np.concatenate([state[:3], sensed[:3], sensed[6:9]])
     assert_allclose(y[0, 20], wanted, rtol=0, atol=1e-9)

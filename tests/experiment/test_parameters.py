@@ -247,26 +247,30 @@ POSE = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @pytest.mark.parametrize(
-    ("joint", "written", "right"),
+    ("quantity", "part", "written", "right"),
     [
-        ("float", "qpos[3]", "qpos.rx"),
-        ("float", "qvel[0]", "qvel.x"),
-        ("ball", "qpos[2]", "qpos.rz"),
+        ("qpos", "float", "[3]", ".rx"),
+        ("qvel", "float", "[0]", ".x"),
+        ("qpos", "ball", "[2]", ".rz"),
     ],
 )
 def test_an_index_of_a_joint_is_refused_with_its_present_name(
-    joint: str, written: str, right: str, tmp_path: Path
+    quantity: str, part: str, written: str, right: str, tmp_path: Path
 ) -> None:
     """In the nuisance table, and in the paths of parameters."""
-    quantity, right_quantity = (f"{w[:4]}:{joint}{w[4:]}" for w in (written, right))
-    message = f"nuisance.initial: '{quantity}' is now written '{right_quantity}'"
-    with pytest.raises(ExperimentError, match=re.escape(message)):
-        body_task(tmp_path, parameters=MASS, nuisance={"initial": {quantity: 0.1}})
-
-    path = f"initial/{joint}:{written}"
-    message = f"parameter path '{path}': '{path}' is now written 'initial/{joint}:{right}'"
-    with pytest.raises(ExperimentError, match=re.escape(f"parameters.p: in {message}")):
-        body_task(tmp_path, parameters={"p": {"target": path}})
+    name, path = f"{quantity}:{part}", f"initial/{part}:{quantity}"
+    for tables, said in (
+        (
+            {"parameters": MASS, "nuisance": {"initial": {f"{name}{written}": 0.1}}},
+            f"nuisance.initial: '{name}{written}' is now written '{name}{right}'",
+        ),
+        (
+            {"parameters": {"p": {"target": f"{path}{written}"}}},
+            f"'{path}{written}' is now written '{path}{right}'",
+        ),
+    ):
+        with pytest.raises(ExperimentError, match=re.escape(said)):
+            body_task(tmp_path, **tables)
 
 
 def test_deviations_and_biases_by_name(tmp_path: Path) -> None:

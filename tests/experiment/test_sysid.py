@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -31,32 +31,13 @@ installed = pytest.mark.skipif(
 )
 
 
-class SignalType(Enum):
-    """Kinds of signals as sysid has them."""
-
-    MjSensor = 0
-    CustomObs = 1
-    MjStateQPos = 2
-    MjStateQVel = 3
-    MjCtrl = 5
-
-
-@dataclass
-class TimeSeries:
-    """The attributes of sysid's class that are read."""
-
-    times: np.ndarray
-    data: np.ndarray
-    signal_mapping: Any = None
-
-
-@dataclass
-class Sequences:
-    """The attributes of sysid's `ModelSequences` that are read."""
-
-    sequence_name: list[str]
-    control: list[TimeSeries]
-    sensordata: list[TimeSeries]
+def series(t: Any, data: Any, **signals: Any) -> SimpleNamespace:
+    """A `TimeSeries`; a signal has the name of its kind, and columns."""
+    mapping = {
+        name: (SimpleNamespace(name=kind), np.array([column]))
+        for name, (kind, column) in signals.items()
+    }
+    return SimpleNamespace(times=t, data=data, signal_mapping=mapping)
 
 
 class Parameter:
@@ -137,17 +118,16 @@ def test_sequences_are_recordings_at_the_times_of_both_series() -> None:
     """Controls and measurements may have other times; a control is held."""
     system = System.resolve(mjfim.Experiment(**STATED))
     t = 0.02 * np.arange(11)
-    control = TimeSeries(t, np.sin(t)[:, None], {"force_ctrl": (SignalType.MjCtrl, np.array([0]))})
-    measured = TimeSeries(
-        t + 0.01,
-        np.stack([np.cos(t), np.sin(3 * t)], axis=1),
-        {
-            "slide_qpos": (SignalType.MjStateQPos, np.array([0])),
-            "qvel:hinge": (SignalType.CustomObs, np.array([1])),
-        },
+    control = series(t, np.sin(t)[:, None], force_ctrl=("MjCtrl", 0))
+    data = np.stack([np.cos(t), np.sin(3 * t)], axis=1)
+    signals = {"slide_qpos": ("MjStateQPos", 0), "qvel:hinge": ("CustomObs", 1)}
+    sequences = SimpleNamespace(
+        sequence_name=["a", "b"],
+        control=[control] * 2,
+        sensordata=[series(t + 0.01, data, **signals)] * 2,
     )
 
-    one, two = recordings_of(system, Sequences(["a", "b"], [control] * 2, [measured] * 2))
+    one, two = recordings_of(system, sequences)
 
     assert (one.name, two.name) == ("a", "b")
     assert one.outputs == ("qpos:slide", "qvel:hinge")

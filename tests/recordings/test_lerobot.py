@@ -48,23 +48,24 @@ def test_each_episode_is_a_recording(version: str, tmp_path: Path) -> None:
     """Episodes of a folder, chosen ones, and one by its name; times have no rounding."""
     data = episodes(3)
     folder = write_dataset(tmp_path / "set", data, NAMES, version=version)
+    names = [f"episode_{i:06d}" for i in range(3)]
     paths = recording_paths([folder, tmp_path / "other.csv"], cart().channels)
-    assert [path.name for path in paths] == [*(f"episode_{i:06d}" for i in range(3)), "other.csv"]
+    assert [path.name for path in paths] == [*names, "other.csv"]
     chosen = recording_paths([folder], cart(episodes=[2, 0]).channels)
-    assert [path.name for path in chosen] == ["episode_000002", "episode_000000"]
+    assert [path.name for path in chosen] == [names[2], names[0]]
 
-    for number, path in enumerate(paths[:3]):
+    for features, path in zip(data, paths[:3], strict=True):
         recording = read_recording(path, cart().channels)
         assert recording.outputs == ("qpos:slide", "qpos:hinge")
         assert_array_equal(recording.t, np.arange(40) / 100.0)
-        state, action = (values.astype(np.float32) for values in reversed(data[number].values()))
+        action, state = (values.astype(np.float32) for values in features.values())
         assert_array_equal(recording.y, state)
         assert_array_equal(recording.ctrl[:, 0], action[:-1])
+    table = read_columns(folder, RecordingSpec(episodes=(1,)))
+    assert table.column("observation.state:slide.pos")[0] == 1.0
 
     with pytest.raises(RecordingError, match=r"set: has 3 episodes; name one, as in episode_0000"):
         read_columns(folder, ALL)
-    table = read_columns(folder, RecordingSpec(episodes=(1,)))
-    assert table.column("observation.state:slide.pos")[0] == 1.0
     with pytest.raises(RecordingError, match="no episode 3; the dataset has the episodes 0 to 2"):
         recording_paths([folder], cart(episodes=[3]).channels)
     with pytest.raises(RecordingError, match="has no "):

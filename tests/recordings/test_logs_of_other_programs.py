@@ -56,7 +56,7 @@ PENDULUM = """
 </mujoco>
 """
 
-Cells = Sequence[Iterable[Any]]
+Read = Callable[..., Log]
 
 
 def rows(*columns: Iterable[Any], head: str = "", between: str = ",", end: str = "\n") -> str:
@@ -195,7 +195,7 @@ TEXTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[..., Log]:
+def read(tmp_path: Path) -> Read:
     """Read a file of the pendulum by a table [recording]."""
 
     def run(name: str, content: bytes | None = None, **recording: Any) -> Log:
@@ -230,7 +230,7 @@ def is_whole(log: Log, tolerance: float = 0.0) -> bool:
 
 @pytest.mark.parametrize("case", TEXTS)
 @pytest.mark.parametrize("ending", [".csv", ".txt.gz"])
-def test_text(case: str, ending: str, read: Callable[..., Log]) -> None:
+def test_text(case: str, ending: str, read: Read) -> None:
     text, recording = TEXTS[case]
     content = text.encode()
     packed = gzip.compress(content, mtime=0) if ending.endswith(".gz") else content
@@ -238,32 +238,31 @@ def test_text(case: str, ending: str, read: Callable[..., Log]) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
-def test_encodings(encoding: str, read: Callable[..., Log]) -> None:
+def test_encodings(encoding: str, read: Read) -> None:
     text = rows(T, DEGREES, U, head="t;q [°];u", between=";")
     mark = "\ufeff" if encoding.endswith(("le", "be")) else ""
     content = f"{mark}{text}".encode(encoding)
     assert is_whole(read("log.csv", content, columns=NAMED), tolerance=1e-14)
 
 
-def test_tables_of_one_clock(tmp_path: Path, read: Callable[..., Log]) -> None:
+def test_tables_of_one_clock(tmp_path: Path, read: Read) -> None:
     """A folder with a table of commands and one of states, as SAGE writes it."""
     folder = tmp_path / "chirp"
     folder.mkdir()
     stamp = 1e6 * T + 4.956964403390884
-    texts = {
+    for name, text in {
         "control": rows(["CONTROL"] * M, stamp, (f'"[{u}]"' for u in U), head=SAGE),
         "state_motor": rows(["STATE"] * M, stamp, (f'"[{q}, 7]"' for q in Q), head=SAGE),
         "event": rows(["EVENT"] * 2, [0, 7e6], ["START", "STOP"], head="type,timestamp,event"),
-    }
-    for name, text in texts.items():
+    }.items():
         (folder / f"{name}.csv.gz").write_bytes(gzip.compress(text.encode(), mtime=0))
     (folder / "joint_list.md").write_text("hinge", encoding="utf-8")
     with pytest.raises(RecordingError, match="column 't' is missing") as refused:
         read("chirp")
     proposed = tomllib.loads(str(refused.value).partition("\n")[2])["recording"]
-    assert (proposed["time"], proposed["time_unit"]) == ("timestamp", "us")
-    assert proposed["columns"] == {"ctrl:motor": "control:positions[0]"}
-    columns = {**proposed["columns"], "qpos:hinge": "state_motor:positions[0]"}
+    command = {"ctrl:motor": "control:positions[0]"}
+    assert proposed == {"time": "timestamp", "time_unit": "us", "columns": command}
+    columns = {**command, "qpos:hinge": "state_motor:positions[0]"}
     assert is_whole(read("chirp", **{**proposed, "columns": columns}))
 
 
@@ -291,7 +290,7 @@ PLOTJUGGLER = {
 HEAD = "__time,/joint_states/hinge/position,/command/data[0]"
 
 
-def test_messages_of_one_time_are_one_row(read: Callable[..., Log]) -> None:
+def test_messages_of_one_time_are_one_row(read: Read) -> None:
     """PlotJuggler: one topic in each row, also where their times are equal."""
     text = sparse_rows((T, Q), (T, U))
     assert text.count("\n") == 2 * M + 1
@@ -299,7 +298,7 @@ def test_messages_of_one_time_are_one_row(read: Callable[..., Log]) -> None:
     assert is_whole(log) and log.summary.dropped == 0
 
 
-def test_a_topic_that_begins_later(read: Callable[..., Log]) -> None:
+def test_a_topic_that_begins_later(read: Read) -> None:
     """Rows before the first command are left out and counted, if it is one period late at most."""
     text = sparse_rows((T, Q), (T[::2] + 0.013, U[::2]))
     with pytest.warns(
@@ -323,7 +322,7 @@ def test_a_topic_that_begins_later(read: Callable[..., Log]) -> None:
     [{7: T[6]}, {7: T[5] + 0.001}, {7: 1e3}, {7: T[6], 150: T[20]}],
     ids=["repeated", "too early", "too late", "two of them"],
 )
-def test_a_few_stamps_out_of_order(changes: dict[int, float], read: Callable[..., Log]) -> None:
+def test_a_few_stamps_out_of_order(changes: dict[int, float], read: Read) -> None:
     """They are counted, said and left out; the other rows are exactly those of the log."""
     t, left = np.array(T), [*changes]
     t[left] = [*changes.values()]
@@ -347,7 +346,7 @@ def test_a_few_stamps_out_of_order(changes: dict[int, float], read: Callable[...
         (TWO_UNITS, r"'q' is missing; found: t, q \[deg\], q \[rad\], u"),
     ],
 )
-def test_titles_whose_unit_is_not_clear(text: str, said: str, read: Callable[..., Log]) -> None:
+def test_titles_whose_unit_is_not_clear(text: str, said: str, read: Read) -> None:
     with pytest.raises(RecordingError, match=said):
         read("log.csv", text.encode(), columns=NAMED)
 
@@ -356,7 +355,7 @@ WORDS = ("NaN", ".nan", "", "None", "-nan(ind)", "--", " NaN", "  ", "NaN ")
 
 
 @pytest.mark.parametrize("word", WORDS)
-def test_missing_numbers(word: str, read: Callable[..., Log]) -> None:
+def test_missing_numbers(word: str, read: Read) -> None:
     text = rows(T, [word if i == 50 else q for i, q in enumerate(Q)], U, head="t,q,u")
     recording = read("log.csv", text.encode(), columns=NAMED).recording
     assert np.flatnonzero(np.isnan(recording.y[:, 0])).tolist() == [50]
@@ -365,7 +364,7 @@ def test_missing_numbers(word: str, read: Callable[..., Log]) -> None:
 # ---- other formats
 
 
-def test_stamps_of_parquet_and_npz(tmp_path: Path, read: Callable[..., Log]) -> None:
+def test_stamps_of_parquet_and_npz(tmp_path: Path, read: Read) -> None:
     """Times of a calendar as pandas and NumPy keep them."""
     times = np.array(stamps(), dtype="datetime64[ns]")
     table = pyarrow.table({"t": times, "q": Q, "u": U})
@@ -376,7 +375,7 @@ def test_stamps_of_parquet_and_npz(tmp_path: Path, read: Callable[..., Log]) -> 
 
 
 @pytest.mark.parametrize("structure", [False, True])
-def test_matlab(structure: bool, tmp_path: Path, read: Callable[..., Log]) -> None:
+def test_matlab(structure: bool, tmp_path: Path, read: Read) -> None:
     """Columns and rows of numbers, matrices that lie on their side, and structures."""
     contents = {"t": T[:, None], "q": np.array([Q, 7 + Q]), "u": U[None, :], "note": "run 3"}
     scipy.io.savemat(tmp_path / "log.mat", {"run": contents} if structure else contents)
@@ -385,14 +384,14 @@ def test_matlab(structure: bool, tmp_path: Path, read: Callable[..., Log]) -> No
     assert is_whole(read("log.mat", time=f"{prefix}t", columns=columns))
 
 
-def test_matlab_hdf5_is_refused(read: Callable[..., Log]) -> None:
+def test_matlab_hdf5_is_refused(read: Read) -> None:
     """The message says how to save the file."""
     head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
     with pytest.raises(RecordingError, match=r"log\.mat: not a readable MATLAB .*'-v7'"):
         read("log.mat", head + bytes(512), columns=NAMED)
 
 
-def test_npy(tmp_path: Path, read: Callable[..., Log]) -> None:
+def test_npy(tmp_path: Path, read: Read) -> None:
     """A matrix has columns by place; no object is unpickled."""
     np.save(tmp_path / "log.npy", np.column_stack([T, Q, U]))
     assert is_whole(read("log.npy", **BY_PLACE))
@@ -439,7 +438,7 @@ TENSORS = {"time": "time", "columns": {"qpos:hinge": "dof_pos[0]", "ctrl:motor":
 TIME = text("time") + tensor("0", [M], [1])
 
 
-def test_tensors(read: Callable[..., Log]) -> None:
+def test_tensors(read: Read) -> None:
     """Columns of a matrix, and a vector that is every second number of a storage."""
     table = b"}(" + TIME
     table += text("dof_pos") + tensor("1", [M, 2], [2, 1])
@@ -473,7 +472,7 @@ def test_hostile_tensors(
     said: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    read: Callable[..., Log],
+    read: Read,
 ) -> None:
     """Nothing of the file is called, and no memory outside of its numbers is read."""
     monkeypatch.chdir(tmp_path)
@@ -483,7 +482,7 @@ def test_hostile_tensors(
     assert not (tmp_path / "sprung").exists()
 
 
-def test_a_memo_far_away(read: Callable[..., Log]) -> None:
+def test_a_memo_far_away(read: Read) -> None:
     """A place of a memo beyond all memory costs nothing."""
     table = b"}r\xff\xff\xff\x7f(" + TIME + b"u"
     with pytest.raises(RecordingError, match=r"column 'torque' is missing; found: time"):
@@ -609,16 +608,6 @@ PROPOSALS: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
             ),
         },
     ),
-    "measured, not filtered": (
-        {"t": T, "u1": U, "u2": P, "pos_filt1": V, "pos_filt2": V, "pos_meas1": Q, "pos_meas2": P},
-        MOTORS,
-        {"time": "t", "columns": named("u1", "u2", "pos_meas1", "pos_meas2")},
-    ),
-    "a sensor, no command": (
-        {"t": T, "cell[0]": P, "q1": Q, "q2": P, "goal_q1": Q, "goal_q2": P},
-        MOTORS,
-        {"time": "t", "columns": named("q1", "q2", kinds="qpos") | {"cell[0]": "cell[0]"}},
-    ),
     "nothing that fits": ({"x": Q, "y": P, "z": V}, MOTORS, {"columns": {}}),
 }
 
@@ -629,7 +618,7 @@ def test_proposals(case: str, tmp_path: Path) -> None:
     assert proposal(columns, actuators, tmp_path) == expected
 
 
-def test_a_proposal_reads_the_log(read: Callable[..., Log]) -> None:
+def test_a_proposal_reads_the_log(read: Read) -> None:
     """What the message of a log that does not fit proposes, pasted as it is, reads the log."""
     text, _ = TEXTS["rostopic echo -p"]
     with pytest.raises(RecordingError, match="column 't' is missing") as refused:
