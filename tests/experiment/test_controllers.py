@@ -114,7 +114,6 @@ def test_laws_follow_the_experiment() -> None:
     system = System.resolve(experiment)
 
     assert system.inputs == ("reference:shoulder", "feedforward:shoulder", "ctrl:elbow")
-    assert system.laws is not None
     assert system.laws.period == 2
     paths = {"kp": "V/rad", "kd": "V s/rad", "latency": "s", "slew": "V/s", "saturation[1]": "V"}
     for path, unit in paths.items():
@@ -267,5 +266,4 @@ def test_an_actuator_without_a_joint_needs_one(tmp_path: Path) -> None:
         System.resolve(arm_experiment({"elbow": PD}, model=str(path)))
 
     system = System.resolve(arm_experiment({"elbow": PD | {"joint": "elbow"}}, model=str(path)))
-    assert system.laws is not None
     assert system.laws.laws[0].joint == "elbow"

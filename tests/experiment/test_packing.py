@@ -86,7 +86,6 @@ def test_a_changed_copy_keeps_the_files_and_takes_new_ones(tmp_path: Path) -> No
 
     assert packed.packed() is packed
     assert changed.packed() is changed
-    assert further.files is not None
     assert further.files.content(tmp_path / "tables" / "other.csv") is not None
     assert further.files.content(tmp_path / "robot/tool.xml") is not None
 

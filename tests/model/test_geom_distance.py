@@ -114,7 +114,6 @@ def between(model: mujoco.MjModel, reach: float, grouped: bool = False) -> GeomD
 def slope_error(model: mujoco.MjModel, chosen: GeomDistances, qpos: Array) -> float:
     """Largest error of the slopes of the first column against differences along every dof."""
     slope = chosen(qpos[None], True)[1]
-    assert slope is not None
     curves = [
         lambda t, e=e: float(chosen(moved(model, qpos, t * e)[None], True)[0][0, 0])
         for e in np.eye(model.nv)

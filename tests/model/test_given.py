@@ -52,7 +52,6 @@ PART = """
 def model_of(given: Any, folder: Path = Path()) -> Any:
     """The compiled model of what is given, from the files that hold it."""
     name, files = packed(given, folder)
-    assert files is not None
     return packed_model(files, folder / name).model
 
 

@@ -101,7 +101,6 @@ def test_observations_agree_with_plain_steps_at_every_engine_step(
             .replace('forcerange="-0.7 0.7"', "")
         )
     watched = plant.observe(task.theta, task.control, observations_of(task))
-    assert watched is not None
     trajectory, observed = watched
     assert_array_equal(trajectory.state, plant.simulate(task.theta, task.control).state)
     wanted, forces = played_with_forces(
