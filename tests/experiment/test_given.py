@@ -117,18 +117,6 @@ def test_what_is_wrong_is_named(tables: dict[str, Any], message: str) -> None:
 # ---- models
 
 
-def test_a_spec_in_memory_gives_what_its_file_gives() -> None:
-    """All numbers of a check and of an estimate are equal, and no file is needed."""
-    spec = mujoco.MjSpec.from_string(MODEL.read_text())
-    experiments = [Experiment(**{**STATED, "model": model}) for model in (MODEL, spec)]
-
-    found = [mjfim.check(each, progress=False) for each in experiments]
-    assert found[0].information.tolist() == found[1].information.tolist()
-
-    logs = [mjfim.simulate(each) for each in experiments]
-    assert logs[0].y.tolist() == logs[1].y.tolist()
-
-
 def test_patterns_match_in_a_model_whose_files_are_bytes() -> None:
     text = """
     <mujoco><asset><mesh name="part" file="part.obj"/></asset><worldbody>

@@ -62,25 +62,6 @@ def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
     assert list(measurable_columns(task.system.model)) == [*outputs.names, *sensors]
 
 
-@pytest.mark.parametrize(("key", "q", "v"), [("qpos:ball", 7, 6), ("qpos:float.rot", 3, 3)])
-def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
-    key: str, q: int, v: int, tmp_path: Path
-) -> None:
-    """At every attitude of a tumbling body, against quaternions that MuJoCo integrates."""
-    sigma = 0.05
-    task = body_task(tmp_path, noise={key: sigma})
-    loop, steps = Loop(task.system.model, 1), 1e-6 * np.eye(task.space.nx)[v : v + 3]
-    assert [o.state for o in task.system.outputs.outputs] == list(range(q, q + 4))
-    _, _, C, D = task.plant.derivatives.jacobians(task.theta, task.initial)
-    assert not D.any()
-    for slope, state in zip(C[::10], task.initial.state[::10], strict=True):
-        ends = [[loop.plus(state, s * e)[q : q + 4] for e in steps] for s in (1, -1)]
-        by_hand = np.subtract(*ends).T / 2e-6
-        assert_allclose(slope[:, v : v + 3], by_hand, rtol=0, atol=1e-9)
-        white = task.system.noise.whiten(slope[None])[0][:, v : v + 3] * sigma
-        assert_allclose(white.T @ white, np.eye(3), rtol=0, atol=1e-9)
-
-
 def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: Path) -> None:
     """Through the whole chain: from measured quaternions, against psi in the tangent space over
     sigma.

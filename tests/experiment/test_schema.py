@@ -288,17 +288,6 @@ def test_replace_merges_and_checks(folder: Path) -> None:
         e.replace(horizon=-1.0)
 
 
-@pytest.mark.parametrize("name", ["cart_pendulum.toml", "cart_pendulum_guess.toml"])
-def test_shipped_experiments_resolve(name: str) -> None:
-    """They are the study of the paper, designed at the true values and at a guess."""
-    task = DesignTask.resolve(Experiment.from_file(MODELS / name))
-    assert task.samples == 400
-    assert task.parameters.true.tolist() == [2.0, 1.0, 1.0]
-    assert task.theta.tolist() == ([2.5, 1.4, 1.4] if "guess" in name else [2.0, 1.0, 1.0])
-    t = np.arange(400) * 0.01
-    assert np.allclose(task.control[:, 0], (1 + t / 4) * np.sin(2 * t), rtol=0, atol=1e-12)
-
-
 HOME = "bad.toml"
 
 # By name: text of the file, and parts of the message, which begins with the name of the file.

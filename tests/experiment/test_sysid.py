@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -149,17 +148,6 @@ def test_what_is_exported_comes_back() -> None:
     assert_allclose(found.theta, wanted.theta, rtol=1e-6)
     tables = parameter_tables(problem.parameters)
     assert tables["m"]["guess"] == experiment.replace(parameters=tables).parameters["m"].guess
-
-
-@installed
-def test_modifiers_of_sysid_run(tmp_path: Path) -> None:
-    modifier = lambda spec, p: spec.joint("hinge").damping.__setitem__(0, p.value[0])  # noqa: E731
-    given = sysid.ParameterDict()
-    given.add(sysid.Parameter("c", 0.5, 0.0, 2.0, modifier=modifier))
-
-    system = System.resolve(mjfim.Experiment(**{**STATED, "parameters": given}))
-
-    assert system.model_at(np.array([0.8])).joint("hinge").damping[0] == 0.8
 
 
 @installed

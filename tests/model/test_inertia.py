@@ -4,16 +4,12 @@ refuse.
 
 from __future__ import annotations
 
-from typing import Any
-
-import mujoco
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from mjfim.model.inertia import (
-    INERTIA_ENTRIES,
     INERTIA_PARAMETRISATIONS,
     BodyInertia,
     InertiaParametrisation,
@@ -23,27 +19,6 @@ from mjfim.model.inertia import (
 )
 
 Array = NDArray[np.float64]
-
-# A chain of a hinge, a ball joint and a slide with an offset body at its end.
-CHAIN = """
-<mujoco>
-  <option gravity="1 -2 -9.81"/>
-  <worldbody>
-    <body name="base">
-      <joint type="hinge" axis="0 .6 .8"/>
-      <inertial pos=".1 0 .2" mass="1" diaginertia=".1 .12 .11"/>
-      <body name="middle" pos=".2 .1 .5" euler="20 40 10">
-        <joint type="ball"/>
-        <inertial pos="0 .1 .2" mass=".7" diaginertia=".05 .04 .03"/>
-        <body name="tip" pos=".1 -.2 .3" euler="-50 10 70">
-          <joint type="slide" axis=".6 0 .8"/><joint type="hinge" axis="1 0 0" pos=".1 0 0"/>
-          <inertial pos="{com}" mass="{mass}" fullinertia="{inertia}"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 
 def cloud(seed: int) -> tuple[Array, Array]:
@@ -66,32 +41,6 @@ def solid(seed: int) -> BodyInertia:
     return BodyInertia(mass=float(weights.sum()), com=com, inertia=tensor(weights, points - com))
 
 
-def compiled(body: BodyInertia) -> Any:
-    """The chain with this body at its end; MuJoCo refuses to compile unphysical bodies."""
-    tensor = [body.inertia[pair] for pair in INERTIA_ENTRIES]
-    text = CHAIN.format(com=spelled(body.com), mass=repr(body.mass), inertia=spelled(tensor))
-    return mujoco.MjModel.from_xml_string(text)
-
-
-def spelled(numbers: Any) -> str:
-    """Numbers of an MJCF attribute with every digit."""
-    return " ".join(repr(float(n)) for n in numbers)
-
-
-def dynamics(body: BodyInertia) -> Array:
-    """Mass matrix, bias forces and energies of the chain in some pose and motion, as one vector."""
-    model = compiled(body)
-    data, M = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    rng = np.random.default_rng(5)
-    mujoco.mj_integratePos(model, data.qpos, rng.standard_normal(model.nv), 1.0)
-    data.qvel[:] = rng.standard_normal(model.nv)
-    mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, M)
-    mujoco.mj_energyPos(model, data)
-    mujoco.mj_energyVel(model, data)
-    return np.concatenate([M.ravel(), data.qfrc_bias, data.energy])
-
-
 @pytest.mark.parametrize("chart", INERTIA_PARAMETRISATIONS.values(), ids=INERTIA_PARAMETRISATIONS)
 def test_every_parametrisation_has_an_inverse(chart: InertiaParametrisation) -> None:
     """Coordinates give the inertia, and the inertia gives the coordinates."""
@@ -111,39 +60,6 @@ def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
     entries = [*np.diag(I), I[0, 1], I[0, 2], I[1, 2]]
     found = to_barycentric(solid(2))
     assert_allclose(found, [weights.sum(), *(weights @ points), *entries], rtol=1e-12)
-
-
-def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
-    """MuJoCo's mass matrix, bias forces and energies of a mixture are the mixture of those; not so
-    in the others.
-    """
-    first, second = solid(3), solid(4)
-    wanted = 0.4 * dynamics(first) + 0.6 * dynamics(second)
-    errors = {}
-    for name, chart in INERTIA_PARAMETRISATIONS.items():
-        mixture = 0.4 * chart.coordinates(first) + 0.6 * chart.coordinates(second)
-        mixed = dynamics(chart.inertia(mixture))
-        errors[name] = np.abs(mixed - wanted).max() / np.abs(mixed).max()
-    assert errors["barycentric"] < 1e-12
-    assert errors["logcholesky"] > 1e-3 and errors["central"] > 1e-3, "a weak test"
-
-
-def test_log_cholesky_is_physical_for_every_vector() -> None:
-    """MuJoCo compiles each of them, triangle inequality included; ten random central ones mostly
-    fail.
-    """
-    rng = np.random.default_rng(6)
-    failed = 0
-    for v in rng.standard_normal((100, 10)):
-        body = from_logcholesky(v)
-        moments, _ = body.principal_axes()
-        assert body.mass > 0.0 and moments[2] > 0.0 and moments[1] + moments[2] > moments[0]
-        assert compiled(body).body("tip").mass[0] == pytest.approx(body.mass)
-        try:
-            compiled(INERTIA_PARAMETRISATIONS["central"].inertia(np.append(abs(v[0]), v[1:])))
-        except ValueError:
-            failed += 1
-    assert failed > 90
 
 
 def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:

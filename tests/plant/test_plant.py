@@ -109,28 +109,15 @@ def sensed(task: DesignTask) -> tuple[list[int], list[int]]:
     return [i for i, _ in found], [s for _, s in found]
 
 
-@STILL
-def test_E_and_H_are_differences_of_rebuilt_models(make, tmp_path) -> None:
-    task = make(tmp_path)
-    found, curve, theta = linear(task), task.initial, task.theta
-    rows, address = sensed(task)
-    for j, h in enumerate(1e-5 * np.abs(theta)):
-        step = h * np.eye(len(theta))[j]
-        up, down = (
-            Loop(rebuilt(task, theta + s), task.system.grid.substeps) for s in (step, -step)
-        )
-        F, H = [], []
-        for x, u in zip(curve.state[[*SAMPLES]], curve.ctrl[[*SAMPLES]], strict=True):
-            F.append(up.minus(up.F(x, u), down.F(x, u)) / (2 * h))
-            H.append(((up.h(x, u) - down.h(x, u)) / (2 * h))[address])
-        assert relative_error(found.E[[*SAMPLES], :, j], np.array(F)) < 1e-6
-        if np.abs(H).max(initial=0.0) > 1e-9:
-            assert relative_error(found.H[[*SAMPLES]][:, rows, j], np.array(H)) < 1e-6
-
-
 @pytest.mark.parametrize(
     "make",
-    [body_task, filtered_task, lambda f: cart_task(f, noise={**SENSED, "state": 0.1}), furuta],
+    [
+        body_task,
+        lambda f: body_task(f, noise={"state": 0.1}),
+        filtered_task,
+        lambda f: cart_task(f, noise={**SENSED, "state": 0.1}),
+        furuta,
+    ],
 )
 def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     task = make(tmp_path)
@@ -148,27 +135,19 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
 
 
 @STILL
-@pytest.mark.parametrize(
-    "accuracy", [CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES], ids=["central", "fast"]
-)
-def test_bilinear_derivatives_contain_A_B_C_D(make, accuracy, tmp_path) -> None:
-    task = make(tmp_path)
-    L, psi = linear(task), sensitivity_of(task).psi
-    w = np.abs(task.theta)[None] * np.linspace(0.5, 1.0, len(task.theta))
-    found = task.plant.derivatives.bilinear(task.theta, task.initial, psi, w, accuracy)
-    tolerance = 1e-5 if accuracy.central else 1e-3
-    for name in ("A", "B", "C", "D"):
-        if np.abs(getattr(L, name)).max() > 0:
-            assert relative_error(getattr(found, name), getattr(L, name)) < tolerance
-
-
-@STILL
 def test_mixed_derivatives_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
     task = make(tmp_path)
     theta, curve, nx = task.theta, task.initial, task.space.nx
     psi = task.plant.derivatives.sensitivity(theta, curve).psi
     w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
-    found = task.plant.derivatives.bilinear(theta, curve, psi, w[None], CENTRAL_DIFFERENCES)
+    given = (theta, curve, psi, w[None])
+    found = task.plant.derivatives.bilinear(*given, CENTRAL_DIFFERENCES)
+    quick = task.plant.derivatives.bilinear(*given, FORWARD_DIFFERENCES)
+    for name in "ABCD":
+        first = getattr(linear(task), name)
+        if first.any():
+            assert relative_error(getattr(found, name), first) < 1e-5
+            assert relative_error(getattr(quick, name), first) < 1e-3
     h = 3e-4
     rows, address = sensed(task)
     plus, minus = (
