@@ -69,13 +69,11 @@ def test_nothing_unpickles_or_evaluates() -> None:
     ],
 )
 def test_unsafe_code_is_found(source: str) -> None:
-    """Each of these sources holds one unsafe use."""
     assert len(unsafe_code(source)) == 1
     assert unsafe_code("np.load('x', allow_pickle=False)  # eval") == []
 
 
 def test_importing_the_package_stays_light() -> None:
-    """`import mjfim` loads no library that only figures and the command line need."""
     assert heavy_libraries_after("import mjfim") == set()
 
 
@@ -86,5 +84,4 @@ def test_a_campaign_begins_to_compute_before_it_imports_what_draws() -> None:
 
 
 def test_heavy_libraries_are_found() -> None:
-    """A new process reports a heavy library that its code imports."""
     assert heavy_libraries_after("from matplotlib import figure") == {"matplotlib"}

@@ -76,7 +76,6 @@ def test_signals_begin_without_a_jump(kind: str) -> None:
 
 
 def test_chirp_ends_at_five_times_its_start_by_default() -> None:
-    """The end of the sweep may be left out."""
     default = generate(Signal(kind="chirp", frequency=0.5), T, ("u",), REST[:1])
     assert np.array_equal(
         default,
@@ -95,7 +94,6 @@ def test_multisine_contains_its_harmonics_only() -> None:
 
 
 def test_multisine_seed() -> None:
-    """Equal seeds give equal signals, other seeds and other actuators do not."""
     first, again, other = (
         generate(Signal(kind="multisine", amplitude=1.0, seed=seed), T, NAMES, REST)
         for seed in (1, 1, 2)
@@ -107,7 +105,6 @@ def test_multisine_seed() -> None:
 
 @pytest.mark.parametrize("key", ["amplitude", "offset"])
 def test_unknown_actuator(key: str) -> None:
-    """The message names the key, the unknown actuator and the valid names."""
     signal = Signal(kind="sine", **{key: {"lift": 1.0}})
     with pytest.raises(ExperimentError, match=rf"initial\.control\.{key}: .*'lift'.*left, right"):
         generate(signal, T, NAMES, REST)

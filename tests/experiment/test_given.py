@@ -251,7 +251,6 @@ def test_a_wrong_array_is_named(
 def test_each_verb_takes_one_recording_without_a_list(
     recording: mjfim.Recording, system: System
 ) -> None:
-    """The number of each is that of the list."""
     experiment = system.experiment
     verbs: list[Callable[[Any], Any]] = [
         lambda given: mjfim.identify(experiment, given, progress=False).theta,

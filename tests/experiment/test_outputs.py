@@ -21,10 +21,8 @@ from mjfim.model.coordinates import (
     joint_names,
     measurable_columns,
     scalar_joints,
-    state_components,
 )
 from tests.support.numerics import (
-    FREE_BODY,
     Loop,
     body_task,
     cart_task,
@@ -76,18 +74,6 @@ def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: P
     assert np.linalg.eigvalsh(wanted)[-1] > 1.0
 
 
-def test_unnamed_joints_are_called_by_their_number(tmp_path: Path) -> None:
-    xml = FREE_BODY.format(integrator="RK4").replace('name="float"', "").replace(' name="ball"', "")
-    xml = xml.replace('<motor name="twist" joint="ball" gear="0.2 0.1 0.3"/>', "")
-    model = mujoco.MjModel.from_xml_string(xml)
-    assert joint_names(model) == ("joint0", "joint1")
-    assert [c.name for c in state_components(model)][6:9] == [
-        "qpos:joint0.qz",
-        "qpos:joint1.qw",
-        "qpos:joint1.qx",
-    ]
-
-
 def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> None:
     xml = """<mujoco><worldbody><body><joint type="slide"/><geom size="1"/>
       <body><joint name="joint0"/><geom size="1"/></body></body></worldbody>
@@ -108,7 +94,6 @@ def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> N
 
 
 def test_every_output_has_its_rate(tmp_path: Path) -> None:
-    """Slower than, and faster than, the measurement rate of the others."""
     noise = {
         "state": 0.1,
         "qpos:hinge": {"sigma": 0.05, "rate": 100.0},
@@ -257,7 +242,6 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_messages_about_wrong_tables(name: str, tmp_path: Path) -> None:
-    """They name the key, the fault and the valid values."""
     tables, message = WRONG[name]
     with pytest.raises(ExperimentError, match=rf"experiment: {message}"):
         cart_task(tmp_path, **tables)
@@ -307,7 +291,6 @@ def test_a_model_without_joints_has_no_state_to_measure(tmp_path: Path) -> None:
 
 
 def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:
-    """The columns have the order in which MuJoCo writes the numbers."""
     task = body_task(tmp_path, noise={"tip": 0.1, "gyro": 0.2, "qpos:float.pos": 0.3})
     y, _ = task.plant.measure(task.theta[None], task.control)
     state = task.initial.state[20]

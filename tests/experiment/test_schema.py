@@ -213,7 +213,6 @@ seed = 5
 
 
 def test_extended_contract_parses_and_resolves(resolve: Resolve) -> None:
-    """Each table keeps the values of the file, and the system uses them."""
     task = resolve(EXTENDED)
     e, outputs, noise = task.experiment, task.system.outputs.names, task.system.noise
     assert e.robust == Robust(over="worst", samples=3, seed=4)
@@ -233,7 +232,6 @@ def test_extended_contract_parses_and_resolves(resolve: Resolve) -> None:
 
 
 def test_contract_resolves(resolve: Resolve) -> None:
-    """The numbers arrive where they act."""
     task = resolve(CONTRACT)
     parameters, grid = task.parameters, task.system.grid
     assert parameters.names == ("m", "l", "c")
@@ -265,7 +263,6 @@ def test_mjcf_noise_is_the_default(resolve: Resolve) -> None:
 
 
 def test_start_from_qpos(resolve: Resolve) -> None:
-    """Stated positions and velocities are used; the others are those of the model."""
     task = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
     assert task.plant.nominal_initial_state.tolist() == [0.5, 3.0, 0.0, -1.0]
     task = resolve(edited('keyframe = "hanging"', ""))
@@ -489,7 +486,6 @@ OTHER_FAULTS: dict[str, tuple[str, type[MjfimError], str]] = {
     ids=[*FAULTS, *OTHER_FAULTS],
 )
 def test_faults_are_named(text: str, kind: type[MjfimError], parts: str, resolve: Resolve) -> None:
-    """The message names the file, the key, the fault and the valid choices."""
     with pytest.raises(kind) as caught:
         resolve(text)
     message = str(caught.value)
@@ -501,7 +497,6 @@ def test_faults_are_named(text: str, kind: type[MjfimError], parts: str, resolve
 
 
 def test_a_free_control_is_named_by_its_actuator(resolve: Resolve) -> None:
-    """An unknown actuator in cost.control_about is refused when the cost is built."""
     with pytest.raises(ExperimentError, match=r"cost\.control_about: .*actuator 'motor'.*force"):
         _ = resolve(edited("[cost]", "[cost]\ncontrol_about = { motor = 1 }")).problem
 
@@ -520,7 +515,6 @@ def test_the_short_experiment_has_no_fault(resolve: Resolve) -> None:
     ],
 )
 def test_not_toml(data: bytes, fragment: str, tmp_path: Path) -> None:
-    """Wrong syntax and wrong encoding name the file and the place."""
     path = tmp_path / "broken.toml"
     path.write_bytes(data)
     with pytest.raises(ExperimentError) as caught:
@@ -538,7 +532,6 @@ def test_a_log_in_place_of_an_experiment_is_named_as_one(name: str, tmp_path: Pa
 
 
 def test_no_file(tmp_path: Path) -> None:
-    """A missing file and a folder are refused."""
     with pytest.raises(
         ExperimentError, match=r"gone\.toml: cannot read the experiment file: No such file"
     ):
@@ -548,7 +541,6 @@ def test_no_file(tmp_path: Path) -> None:
 
 
 def test_all_faults_at_once(resolve: Resolve) -> None:
-    """Every fault is reported on a line with the file and the key."""
     with pytest.raises(ExperimentError) as caught:
         resolve(
             edited("rate = 100.0", "rate = -1.0")

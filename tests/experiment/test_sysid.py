@@ -137,7 +137,6 @@ def test_sequences_are_recordings_at_the_times_of_both_series() -> None:
 
 @installed
 def test_what_is_exported_comes_back() -> None:
-    """The estimate from exported sequences is that from the recording."""
     experiment = mjfim.Experiment(**STATED)
     recording = mjfim.simulate(experiment, seed=1)
     problem = export_sysid(experiment, recording)

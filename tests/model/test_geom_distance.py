@@ -214,7 +214,6 @@ def test_height_fields_are_refused_unless_ignored() -> None:
 
 
 def test_no_pairs_are_refused() -> None:
-    """The message says that a moving geom is needed."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     with pytest.raises(ExperimentError, match="no two geoms can come near each other"):
         GeomDistances(model, (), 0.1)
@@ -244,7 +243,6 @@ def test_all_distances_within_reach_are_found(reach: float) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_planes_agree_with_contacts(kind: str) -> None:
-    """The distance is that of the deepest contact of MuJoCo's collision detection."""
     model = two("floor", kind)
     chosen, qpos, data = between(model, 9.0), scattered(model, 200, 1.0), mujoco.MjData(model)
     d, deepest = chosen(qpos, False)[0][:, 0], []
@@ -329,7 +327,6 @@ def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
 
 
 def test_columns_are_pairs_of_bodies() -> None:
-    """Each has the smallest distance of its geoms, with the slope that belongs to it."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, single = between(model, 0.5, grouped=True), between(model, 0.5)
     qpos = scattered(model, 50, 0.4)

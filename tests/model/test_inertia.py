@@ -43,7 +43,6 @@ def solid(seed: int) -> BodyInertia:
 
 @pytest.mark.parametrize("chart", INERTIA_PARAMETRISATIONS.values(), ids=INERTIA_PARAMETRISATIONS)
 def test_every_parametrisation_has_an_inverse(chart: InertiaParametrisation) -> None:
-    """Coordinates give the inertia, and the inertia gives the coordinates."""
     for body in map(solid, range(20)):
         v = chart.coordinates(body)
         again = chart.inertia(v)
@@ -54,7 +53,6 @@ def test_every_parametrisation_has_an_inverse(chart: InertiaParametrisation) -> 
 
 
 def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
-    """They agree with sums over points, by their definition."""
     weights, points = cloud(2)
     I = tensor(weights, points)  # noqa: E741
     entries = [*np.diag(I), I[0, 1], I[0, 2], I[1, 2]]
@@ -91,7 +89,6 @@ def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
 def test_points_rods_and_plates_have_no_log_cholesky(
     moments: tuple[float, ...], is_solid: bool
 ) -> None:
-    """Bodies with a singular or unphysical pseudo-inertia are refused, thicker ones accepted."""
     turned = solid(8).principal_axes()[1]
     body = BodyInertia.from_principal(2.0, np.array([0.1, 0.2, 0.3]), np.array(moments), turned)
     for chart in ("central", "barycentric"):
@@ -105,7 +102,6 @@ def test_points_rods_and_plates_have_no_log_cholesky(
 
 
 def test_magnitudes_follow_the_units() -> None:
-    """Magnitudes in other units of mass and length are those converted."""
     body, kilo, centi = solid(9), 1000.0, 100.0
     other = BodyInertia(
         mass=kilo * body.mass, com=centi * body.com, inertia=kilo * centi**2 * body.inertia

@@ -583,7 +583,6 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     ],
 )
 def test_mixed_parametrisations_of_one_body_are_refused(first: str, second: str) -> None:
-    """They are refused in either order; on two bodies they are allowed."""
     _, base = compiled(SOLID, [])
     p, q = (replace(one(f"body/a:{f}"), name=f) for f in (first, second))
     for pair in ([p, q], [q, p]):

@@ -119,7 +119,6 @@ def test_a_law_equals_a_plain_loop(name: str) -> None:
 
 
 def test_simulations_of_one_batch_have_their_own_numbers() -> None:
-    """Gains, latencies and start states of one batch differ, and so do the results."""
     law = LAWS["late feedback"] | {"latency": 0.003, "time_constant": 0.01, "ki": 20.0}
     system = System.resolve(arm_experiment({"shoulder": law, "elbow": LAWS["slow"]}))
     numbers = [{}, {"kp": 55.0}, {"latency": 0.0081}, {"feedback_latency": 0.0139, "ki": 40.0}]

@@ -62,7 +62,6 @@ def test_before_the_first_sample_the_first_value_is_held() -> None:
 
 @pytest.mark.parametrize("delay", [0.0042, 0.0337, -0.0125])
 def test_the_derivative_by_the_delay(delay: float) -> None:
-    """It agrees with differences of the operator."""
     at = [OutputDelay.on_grid(len(T), delay + h, DT).apply(curve(T)) for h in (1e-6, -1e-6)]
     slope = (at[0] - at[1]) / 2e-6
     rate = OutputDelay.on_grid(len(T), delay, DT).derivative(curve(T))

@@ -48,7 +48,6 @@ def test_jacobians_are_whitened_like_residuals() -> None:
 
 
 def test_strides_select_the_samples_of_each_output() -> None:
-    """The initial state is never measured; each output has its rate."""
     measured = correlated((2, 2, 2, 3)).measured(7)
     assert measured[:, 0].tolist() == [0, 0, 1, 0, 1, 0, 1, 0]
     assert measured[:, 3].tolist() == [0, 0, 0, 1, 0, 0, 1, 0]

@@ -126,7 +126,6 @@ def test_formats_agree(ending: str, columns: Columns, tmp_path: Path) -> None:
 
 @formats
 def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """A CSV file that ends inside a row is recognised by its number of fields."""
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     whole = path.read_bytes()
@@ -169,7 +168,6 @@ def test_empty_files(ending: str, tmp_path: Path) -> None:
 
 
 def test_unknown_endings(tmp_path: Path) -> None:
-    """The message lists the known endings."""
     (tmp_path / "log.xlsx").write_text("x", encoding="utf-8")
     with pytest.raises(
         RecordingError,
@@ -186,7 +184,6 @@ def test_unknown_endings(tmp_path: Path) -> None:
 
 
 def test_text_is_a_fault_only_if_it_is_used(tmp_path: Path) -> None:
-    """A column of text does not affect the numbers beside it; using it is an error."""
     path = tmp_path / "log.csv"
     path.write_text(
         "t,mode,q,big,odd\n0,idle,1.5,1700000000000000123,1\n0.1,run,,1700000000000000124,abc\n",
@@ -401,7 +398,6 @@ def test_json_with_several_lists_of_records(tmp_path: Path) -> None:
 
 
 def test_json_lists(tmp_path: Path) -> None:
-    """Lists are columns; one of another length is refused when it is used."""
     table = read_json(
         {"t": [0, 1, 2], "q": [1, None, 3], "short": [1, 2], "k": 4, "s": ["a", 1, 2]}, tmp_path
     )

@@ -120,7 +120,6 @@ def test_degrees_are_refused_with_the_way_to_state_units(tmp_path: Path) -> None
 
 
 def test_stamps_of_a_clock_are_kept(tmp_path: Path) -> None:
-    """Time stamps that are not those of the frame numbers are the times."""
     folder = write_dataset(tmp_path / "set", episodes(1), NAMES, info={"fps": 90.0})
     assert_allclose(read_columns(folder, ALL).column("t"), np.arange(40) / 100, rtol=1e-6)
 
@@ -142,7 +141,6 @@ def test_wrong_descriptions(info: dict[str, Any], said: str, tmp_path: Path) -> 
 
 
 def test_damage_is_one_sentence(tmp_path: Path) -> None:
-    """Overwritten or missing data, and an info.json that is none."""
     folder = write_dataset(tmp_path / "set", episodes(1), NAMES)
     file = next(folder.rglob("*.parquet"))
     whole = file.read_bytes()

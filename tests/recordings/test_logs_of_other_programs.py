@@ -124,23 +124,9 @@ NAMED_TEXTS: dict[str, str] = {
 # Text of a log, and the table [recording] that reads it.
 TEXTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{case: (text, {"columns": NAMED}) for case, text in NAMED_TEXTS.items()},
-    "spaces (UR RTDE)": (
-        rows(T, Q, U, head="timestamp actual_q_0 target_moment_0", between=" "),
-        {
-            "time": "timestamp",
-            "columns": {"qpos:hinge": "actual_q_0", "ctrl:motor": "target_moment_0"},
-        },
-    ),
     "aligned spaces without a header (MATLAB -ascii)": (
         "".join(f"  {t: .7e}  {q: .16e}  {u: .16e}\n" for t, q, u in zip(T, Q, U, strict=True)),
         BY_PLACE,
-    ),
-    "units in the header, titles named": (
-        rows(1e3 * T, DEGREES, 1e3 * U, head="t [ms],q (deg),u [mNm]"),
-        {
-            "time": "t [ms]",
-            "columns": {"qpos:hinge": "q (deg)", "ctrl:motor": "u [mNm]"},
-        },
     ),
     "rostopic echo -p": (
         rows(
@@ -157,20 +143,6 @@ TEXTS: dict[str, tuple[str, dict[str, Any]]] = {
             "time": "%time",
             "time_unit": "ns",
             "columns": {"qpos:hinge": "field.position0", "ctrl:motor": "field.effort0"},
-        },
-    ),
-    "lists in cells (SAGE)": (
-        rows(
-            ["STATE"] * M,
-            1e6 * T,
-            (f'"[{q}, 7]"' for q in Q),
-            (f'"[{u}]"' for u in U),
-            head="type,timestamp,positions,torques",
-        ),
-        {
-            "time": "timestamp",
-            "time_unit": "us",
-            "columns": {"qpos:hinge": "positions[0]", "ctrl:motor": "torques[0]"},
         },
     ),
     **{
@@ -323,7 +295,6 @@ def test_a_topic_that_begins_later(read: Read) -> None:
     ids=["repeated", "too early", "too late", "two of them"],
 )
 def test_a_few_stamps_out_of_order(changes: dict[int, float], read: Read) -> None:
-    """They are counted, said and left out; the other rows are exactly those of the log."""
     t, left = np.array(T), [*changes]
     t[left] = [*changes.values()]
     text = rows(t, Q, U, head="t,q,u")
@@ -385,7 +356,6 @@ def test_matlab(structure: bool, tmp_path: Path, read: Read) -> None:
 
 
 def test_matlab_hdf5_is_refused(read: Read) -> None:
-    """The message says how to save the file."""
     head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
     with pytest.raises(RecordingError, match=r"log\.mat: not a readable MATLAB .*'-v7'"):
         read("log.mat", head + bytes(512), columns=NAMED)

@@ -149,7 +149,6 @@ def test_formula(read: Read) -> None:
     ],
 )
 def test_units(name: str, unit: str, factor: float, read: Read) -> None:
-    """Each unit is converted to the model's unit."""
     columns = {"qvel:stop": "raw", name: {"column": "raw", "unit": unit}}
     found = column(read({"raw": wave(7.0)}, columns=columns), name)
     assert np.allclose(found, factor * wave(7.0)[: len(found)], rtol=1e-14, atol=0)
@@ -199,7 +198,6 @@ def test_signed(read: Read) -> None:
 
 
 def test_counters_wrap_around(read: Read) -> None:
-    """Raw numbers of a 12-bit encoder are unwrapped across empty rows, before they are scaled."""
     truth = hole(np.rint(9000.0 * np.sin(2.0 * T)), 50, 53)
     scale = 2 * np.pi / 4096
     source = {"column": "raw", "period": 4096.0, "scale": scale}
@@ -266,7 +264,6 @@ def test_window(read: Read) -> None:
     ],
 )
 def test_clocks_that_are_wrong(change: Callable[[Array], Array], said: str, read: Read) -> None:
-    """The message names the row and the kind of fault."""
     t = change(T)
     columns = {"t": t, **{n: c[: len(t)] for n, c in CTRL.items()}, "qpos:pin": wave()[: len(t)]}
     with pytest.raises(RecordingError, match=rf"lab\.csv: column 't'.*{said}"):
@@ -417,7 +414,6 @@ def test_a_control_may_be_a_constant_that_no_column_holds(read: Read) -> None:
 
 
 def test_summary(read: Read) -> None:
-    """The summary has numbers that can be counted by hand."""
     t = T + 0.02 * (COUNT > 99)
     q = np.round(wave(1.0, 3.0) / 0.01) * 0.01
     q[:40:4] = np.nan
