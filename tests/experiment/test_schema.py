@@ -327,6 +327,10 @@ FAULTS: dict[str, tuple[str, str]] = {
         "initial.keyframe … 'hangin' … did you mean 'hanging'",
     ),
     "path form": (target("body/bob"), "parameters.m … 'body/bob' … kind/name:field[index]"),
+    "rate vanishing": (
+        edited("rate = 100.0", "rate = 5e-324"),
+        "rate … should be of a size from 1e-100 to 1e+100 … 5e-324",
+    ),
     "rate far too low": (
         edited("rate = 100.0", "rate = 1e-6"),
         "rate: at 1e-06 Hz … 1e+08 timesteps … at most 100000 … 0.001 Hz or more",

@@ -107,7 +107,7 @@ NAMED_TEXTS: dict[str, str] = {
     "comments between rows": rows(T, Q, U, head="t,q,u").replace(
         "\n0.5,", "\n# gripper, closed\n0.5,"
     )
-    + "# end\n",
+    + "# a long end\n" * 10_000,
     "units in the header": rows(1e3 * T, DEGREES, 1e3 * U, head="t [ms],q (deg),u [mNm]"),
     "row of units": rows(T, DEGREES, U, ["run"] * M, head="t;q;u;mode\ns;°;N·m;-", between=";"),
     "spaces around names": rows(T, Q, U, head=" t , q ,u ", between=" , "),
@@ -577,6 +577,11 @@ PROPOSALS: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
                 ),
             ),
         },
+    ),
+    "a sensor, no command": (
+        {"t": T, "cell[0]": P, "q1": Q, "q2": P, "goal_q1": Q, "goal_q2": P},
+        MOTORS,
+        {"time": "t", "columns": named("q1", "q2", kinds="qpos") | {"cell[0]": "cell[0]"}},
     ),
     "nothing that fits": ({"x": Q, "y": P, "z": V}, MOTORS, {"columns": {}}),
 }
