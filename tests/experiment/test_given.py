@@ -143,13 +143,14 @@ def test_another_model_replaces_the_one_in_memory() -> None:
 # ---- recordings
 
 
-def given_kinds(recording: mjfim.Recording, folder: Path, system: System) -> list[Any]:
-    """One recording in all kinds."""
-    t, ctrl, y = recording.t, recording.ctrl, recording.y
-    table = folder / "log.csv"
+def test_a_recording_is_taken_in_all_kinds(
+    recording: mjfim.Recording, system: System, tmp_path: Path
+) -> None:
+    t, ctrl, qpos, hinge = recording.t, recording.ctrl, recording.y[:, :2], recording.y[:, 2]
+    table = tmp_path / "log.csv"
     write_recording(table, recording, system)
-    qpos, hinge = y[:, :2], y[:, 2]
-    return [
+    padded = {"force": np.append(ctrl[:, 0], np.nan)}
+    for given in (
         recording,
         [recording],
         table,
@@ -157,24 +158,12 @@ def given_kinds(recording: mjfim.Recording, folder: Path, system: System) -> lis
         (table,),
         {"t": t, "ctrl": ctrl, "qpos": qpos, "qvel": {"hinge": hinge}},
         {"t": t.tolist(), "ctrl": ctrl.tolist(), "qpos": qpos.tolist(), "qvel:hinge": hinge},
-        {
-            "t": t,
-            "ctrl": {"force": np.append(ctrl[:, 0], np.nan)},
-            "qpos": qpos.T,
-            "qvel:hinge": hinge,
-        },
-    ]
-
-
-def test_a_recording_is_taken_in_all_kinds(
-    recording: mjfim.Recording, system: System, tmp_path: Path
-) -> None:
-    for given in given_kinds(recording, tmp_path, system):
+        {"t": t, "ctrl": padded, "qpos": qpos.T, "qvel:hinge": hinge},
+    ):
         (found,) = recordings_of(system, given)
         assert found.outputs == recording.outputs
-        assert_allclose(found.t, recording.t, rtol=0.0, atol=1e-12)
-        assert_allclose(found.ctrl, recording.ctrl, rtol=1e-12)
-        assert_allclose(found.y, recording.y, rtol=1e-12)
+        for name in ("t", "ctrl", "y"):
+            assert_allclose(getattr(found, name), getattr(recording, name), rtol=1e-12, atol=1e-12)
 
 
 def test_the_table_of_a_log_says_how_columns_are_read_and_not_arrays(

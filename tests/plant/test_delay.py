@@ -48,16 +48,14 @@ def test_before_the_first_sample_the_first_value_is_held() -> None:
     sample.
     """
     y = curve(T)
-    output_delay = OutputDelay.on_grid(len(T), 0.055, DT)
-    assert_array_equal(output_delay.apply(y)[:6], np.broadcast_to(y[0], (6, 2)))
-    assert not output_delay.derivative(y)[:6].any()
-    assert output_delay.derivative(y)[6:].any(axis=1).all()
-    lead = OutputDelay.on_grid(len(T), -0.055, DT)
-    assert_allclose(lead.apply(y)[-6:], np.broadcast_to(y[-1], (6, 2)), rtol=0, atol=1e-14)
-    assert not lead.derivative(y)[-5:].any()
+    late, lead = (OutputDelay.on_grid(len(T), delay, DT) for delay in (0.055, -0.055))
+    assert_array_equal(late.apply(y)[:6], y[[0] * 6])
+    assert_allclose(lead.apply(y)[-6:], y[[-1] * 6], rtol=0, atol=1e-14)
     assert_allclose(lead.apply(y)[:-8], curve(T + 0.055)[:-8], rtol=0, atol=1e-5)
-    late = OutputDelay.on_grid(len(T), 100.0, DT)
-    assert_array_equal(late.apply(y), np.broadcast_to(y[0], y.shape))
+    slope = late.derivative(y)
+    assert not slope[:6].any() and slope[6:].any(axis=1).all()
+    assert not lead.derivative(y)[-5:].any()
+    assert_array_equal(OutputDelay.on_grid(len(T), 100.0, DT).apply(y), y[[0] * len(T)])
 
 
 @pytest.mark.parametrize("delay", [0.0042, 0.0337, -0.0125])

@@ -47,9 +47,8 @@ def random_states(space, rng: np.random.Generator, count: int = COUNT) -> np.nda
 def random_rotations(count: int, longest: float, rng: np.random.Generator) -> np.ndarray:
     """Rotation vectors of every direction, up to a length [rad]."""
     axis = rng.normal(size=(count, 3))
-    return (
-        axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0.0, longest, (count, 1))
-    )
+    length = rng.uniform(0.0, longest, (count, 1))
+    return length * axis / np.linalg.norm(axis, axis=1, keepdims=True)
 
 
 def random_steps(space, longest: float, rng: np.random.Generator, count: int = COUNT) -> np.ndarray:

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -278,29 +276,12 @@ def test_single_array_instead_of_an_archive(tmp_path: Path) -> None:
         read_columns(tmp_path / "log.npz", ALL)
 
 
-class Trap:
-    """Object that makes a folder when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.mkdir, (str(self.path),)
-
-
 def test_pickles_are_not_loaded(tmp_path: Path) -> None:
-    """An array of pickled objects is refused whether it is needed or not; the trap itself works."""
-    np.savez(
-        tmp_path / "log.npz",
-        t=np.arange(3.0),
-        q=np.array([Trap(tmp_path / "sprung")], dtype=object),
-    )
+    """An array of pickled objects is refused whether it is needed or not."""
+    np.savez(tmp_path / "log.npz", t=np.arange(3.0), q=np.array([{}], dtype=object))
     for spec in (ALL, RecordingSpec(columns={"qpos:j": "t", "ctrl:m": "t"})):
         with pytest.raises(RecordingError, match=r"log\.npz: not a log archive .*without pickles"):
             read_columns(tmp_path / "log.npz", spec)
-    assert not (tmp_path / "sprung").exists()
-    pickle.loads(pickle.dumps(Trap(tmp_path / "sprung")))
-    assert (tmp_path / "sprung").exists()
 
 
 def test_matrices_become_columns(tmp_path: Path) -> None:
@@ -380,20 +361,15 @@ def test_json_records(tmp_path: Path) -> None:
 def test_json_with_several_lists_of_records(tmp_path: Path) -> None:
     """The experiment file must select one of several lists of records, by a path that exists."""
     content = {"k": 1, "a": {"gain": 2, "left": [{"t": 0}], "right": [{"t": 1}, {"t": 2}]}}
-    with pytest.raises(
-        RecordingError, match=r"several lists of records: a\.left, a\.right; .*recording\.records"
-    ):
+    said = r"several lists of records: a\.left, a\.right; .*recording\.records"
+    with pytest.raises(RecordingError, match=said):
         read_json(content, tmp_path)
     table = read_json(content, tmp_path, RecordingSpec(records="a.right"))
-    assert {name: table.column(name).tolist() for name in table.names} == {
-        "t": [1, 2],
-        "k": [1, 1],
-        "a.gain": [2, 2],
-    }
+    found = {name: table.column(name).tolist() for name in table.names}
+    assert found == {"t": [1, 2], "k": [1, 1], "a.gain": [2, 2]}
     for wrong in ("a.rigth", "k.right", "k"):
-        with pytest.raises(
-            RecordingError, match=rf"recording\.records: .*'{wrong}'.*a\.left, a\.right"
-        ):
+        said = rf"recording\.records: .*'{wrong}'.*a\.left, a\.right"
+        with pytest.raises(RecordingError, match=said):
             read_json(content, tmp_path, RecordingSpec(records=wrong))
 
 
