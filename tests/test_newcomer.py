@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from scripts import newcomer
-from scripts.newcomer import Walk, _judge_estimate, markdown, violations, walk
+from scripts.newcomer import Walk, markdown, violations, walk
 
 SERVO = """
 <mujoco>
@@ -123,22 +122,6 @@ def test_the_table_has_a_row_for_each_model() -> None:
     assert lines[2].startswith("| arm | 0 | 0 (2 s) | 1 (3 s) | 0 (50 s) | no end (600 s) |")
     assert "12.3 (start breaks limits) | 9 of 10 | no: force of servo" in lines[2]
     assert lines[3] == "| odd | 0 | 2 (1 s) | — | — | — | — | — | — | — | — |"
-
-
-def test_an_interval_without_ends_is_missed(tmp_path: Path) -> None:
-    """An unknown initial state, which has no table in the file, is not judged."""
-    (tmp_path / "fit").mkdir()
-    estimate = {
-        "parameters": ["initial qpos:hinge", "m", "c"],
-        "interval": [[0.0, 0.1], [0.9, 1.2], [None, None]],
-        "misfit": False,
-    }
-    (tmp_path / "fit" / "estimate.json").write_text(json.dumps(estimate), encoding="utf-8")
-    robot = "[parameters]\nm = { true = 1.05 }\nc = { true = 0.1 }\n"
-    (tmp_path / "robot.toml").write_text(robot, encoding="utf-8")
-    found = Walk(model="arm")
-    _judge_estimate(found, tmp_path)
-    assert (found.inside, found.parameters) == (1, 2)
 
 
 # Upright, so that the experiment is short.

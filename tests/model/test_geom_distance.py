@@ -80,15 +80,13 @@ def moved(model: mujoco.MjModel, qpos: Array, dq: Array) -> Array:
 def scattered(model: mujoco.MjModel, count: int, spread: float, seed: int = 0) -> Array:
     """Random configurations about qpos0: (count, nq)."""
     rng = np.random.default_rng(seed)
-    size = np.full(model.nv, 2.0)
-    for j in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
-        size[model.jnt_dofadr[j] : model.jnt_dofadr[j] + 3] = spread
-    size[
-        model.dof_jntid[np.isin(model.jnt_type[model.dof_jntid], int(mujoco.mjtJoint.mjJNT_SLIDE))]
-    ] = spread
-    return np.array(
-        [moved(model, model.qpos0, size * rng.normal(size=model.nv)) for _ in range(count)]
+    kind, first = model.jnt_type[model.dof_jntid], model.jnt_dofadr[model.dof_jntid]
+    place = np.where(
+        kind == int(mujoco.mjtJoint.mjJNT_FREE), np.arange(model.nv) - first < 3, False
     )
+    size = np.where(place | (kind == int(mujoco.mjtJoint.mjJNT_SLIDE)), spread, 2.0)
+    moves = size * rng.normal(size=(count, model.nv))
+    return np.array([moved(model, model.qpos0, move) for move in moves])
 
 
 def asked(model: mujoco.MjModel, chosen: GeomDistances, qpos: Array, limit: float) -> Array:
