@@ -111,10 +111,8 @@ def test_unknown_actuator(key: str) -> None:
 
 
 def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path) -> None:
-    """The signal starts at the keyframe's control; an offset in the file replaces it."""
     model = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
     held = model.replace('name="hanging"', 'name="hanging" ctrl="1.5"')
-    assert held != model
     (tmp_path / "held.xml").write_text(held, encoding="utf-8")
     e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
         model=str(tmp_path / "held.xml"),
@@ -123,7 +121,3 @@ def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path)
     )
     control = DesignTask.resolve(e).control[:, 0]
     assert (control[0], control.max(), control.min()) == pytest.approx((1.5, 2.0, 1.5), abs=1e-2)
-    stated = DesignTask.resolve(
-        e.replace(initial={"control": {"kind": "sine", "amplitude": 0.5, "offset": -1.0}})
-    )
-    assert stated.control[:, 0] == pytest.approx(control - 2.5, abs=1e-12)
