@@ -236,6 +236,20 @@ def test_a_wrong_array_is_named(
         recordings_of(system, {"qpos": recording.y[:, :2]})
 
 
+def test_each_verb_takes_one_recording_without_a_list(
+    recording: mjfim.Recording, system: System
+) -> None:
+    experiment = system.experiment
+    verbs = [
+        lambda given: mjfim.identify(experiment, given, progress=False).theta,
+        lambda given: mjfim.check(experiment, given, progress=False).information,
+        lambda given: mjfim.predict(experiment, [1.0, 1.0], given)[0].rms,
+        lambda given: mjfim.inverse_dynamics(experiment, given).theta,
+    ]
+    for verb in verbs:
+        assert np.array_equal(verb(recording), verb([recording]), equal_nan=True)
+
+
 # ---- experiments and motions
 
 
