@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import tomlkit
 from PIL import Image
 
 from scripts import gallery
@@ -84,23 +82,3 @@ def test_the_numbers_of_the_page_are_those_of_this_version(
 ) -> None:
     monkeypatch.setattr("sys.argv", ["gallery", "--check"])
     assert gallery.main() == 0, capsys.readouterr().err
-
-
-def test_the_simulated_robot_differs_where_nothing_is_known(tmp_path: Path) -> None:
-    experiment = tmp_path / "models" / "arm.toml"
-    experiment.parent.mkdir()
-    experiment.write_text(
-        'model = "arm.xml"\n[parameters]\na = { target = "x" }\nb = { target = "y" }\n'
-        'c = { target = "z", prior = 0.1 }\n[parameters.d]\ntarget = "w"\ntrue = 3.0\n',
-        encoding="utf-8",
-    )
-    folder = tmp_path / "arm"
-    (folder / "check").mkdir(parents=True)
-    rows = [{"name": name, "value": -1.0, "size": 2.0} for name in "abcd"]
-    (folder / "check" / "check.json").write_text(json.dumps({"parameters": rows}))
-
-    file = tmp_path / gallery.simulated_robot(tmp_path, "models/arm.toml", "arm")
-    robot = tomlkit.parse(file.read_text("utf-8")).unwrap()
-    values = {name: table.get("true") for name, table in robot["parameters"].items()}
-    assert values == {"a": -0.8, "b": -1.2, "c": None, "d": 3.0}
-    assert (folder / robot["model"]).resolve() == experiment.parent.resolve() / "arm.xml"

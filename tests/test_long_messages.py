@@ -13,7 +13,6 @@ from mjfim.errors import ExperimentError, MjfimError, UnidentifiableError
 from mjfim.excitation.shortest_horizon import require_reachable
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.identification.assessment.report import _limits_of_search
 from mjfim.identification.starts import divergence_at_start
 from mjfim.output.campaign_folder import accuracy_sentence
 from mjfim.records.campaign import missed_targets
@@ -34,19 +33,6 @@ MANY = 40
 NAMES = tuple(f"inertia_of_link_{i}" for i in range(300))
 
 
-def test_warnings_about_many_parameters_list_the_first_ones_and_count_the_others() -> None:
-    result = SimpleNamespace(
-        task=SimpleNamespace(elsewhere=(), noise_is_stated=False),
-        touches="",
-        begun_instead="",
-        quality=SimpleNamespace(chi2=1.0, dof=1),
-        accuracy=SimpleNamespace(singular=False),
-    )
-    (warning,) = _limits_of_search(result, NAMES, (), interrupted=False)
-    assert len(warning) < LONGEST_MESSAGE
-    assert "inertia_of_link_0" in warning and " more" in warning
-
-
 # ---- other messages about many parameters, joints, sensors or bodies
 
 GROUP = ParameterGroup(
@@ -63,47 +49,48 @@ SHORT = ParameterGroup(
 )
 
 
+STEPS = FiniteSteps(
+    names=NAMES,
+    predicted=np.ones(300),
+    std=np.full(300, 3.0),
+    length=np.ones(1),
+    ratio=np.ones(1),
+    causes=tuple(f"limit of {name}" for name in NAMES),
+)
+STD = np.linspace(2.0, 1.0, 300)
+ESTIMATE = SimpleNamespace(parameters=NAMES, theta=np.ones(300), std=np.full(300, 0.1))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        GROUP.short,
+        SILENT.short,
+        groups_in_words([GROUP, SILENT, SHORT]),
+        str(STEPS),
+        missed_targets(NAMES, STD, np.full(300, 0.5)),
+        accuracy_sentence(ESTIMATE, np.ones(300)),
+    ],
+)
+def test_messages_of_records_are_short(message: str) -> None:
+    require_short(message)
+
+
+def test_files_are_whole_and_short_messages_are_not_shortened() -> None:
+    for group in (GROUP, SILENT):
+        assert all(name in group.summary()["words"] for name in NAMES)
+    assert STEPS.summary()["causes"] == list(STEPS.causes)
+    assert SHORT.short == str(SHORT) == "mass and gravity only as mass + 2 gravity"
+    assert groups_in_words([SHORT, SHORT]) == f"{SHORT}; {SHORT}"
+    assert missed_targets(NAMES[:2], STD[:2], np.array([3.0, 0.5])).startswith(NAMES[1])
+    assert missed_targets(NAMES, STD, np.full(300, 3.0)) == ""
+    assert accuracy_sentence(ESTIMATE, np.full(300, np.inf)) == ""
+
+
 def require_short(message: str) -> None:
     """Require that a message lists the first names and counts the others."""
     assert len(message) < LONGEST_MESSAGE, message
     assert "inertia_of_link_0" in message and " more" in message, message
-
-
-def test_groups_of_parameters_are_short_in_messages_and_whole_in_files() -> None:
-    for group in (GROUP, SILENT):
-        require_short(group.short)
-        words = group.summary()["words"]
-        assert all(name in words for name in NAMES)
-    require_short(groups_in_words([GROUP, SILENT, SHORT]))
-    assert SHORT.short == str(SHORT) == "mass and gravity only as mass + 2 gravity"
-    assert groups_in_words([SHORT, SHORT]) == f"{SHORT}; {SHORT}"
-
-
-def test_the_causes_of_an_approximation_are_short() -> None:
-    causes = tuple(f"limit of {name}" for name in NAMES)
-    steps = FiniteSteps(
-        names=NAMES,
-        predicted=np.ones(300),
-        std=np.full(300, 3.0),
-        length=np.ones(1),
-        ratio=np.ones(1),
-        causes=causes,
-    )
-    require_short(str(steps))
-    assert steps.summary()["causes"] == list(causes)
-
-
-def test_missed_targets_are_short_with_the_worst_first() -> None:
-    std, wanted = np.linspace(2.0, 1.0, 300), np.full(300, 0.5)
-    require_short(missed_targets(NAMES, std, wanted))
-    assert missed_targets(NAMES[:2], std[:2], np.array([3.0, 0.5])).startswith("inertia_of_link_1")
-    assert missed_targets(NAMES, std, np.full(300, 3.0)) == ""
-
-
-def test_the_estimates_of_a_round_are_short() -> None:
-    estimate = SimpleNamespace(parameters=NAMES, theta=np.ones(300), std=np.full(300, 0.1))
-    require_short(accuracy_sentence(estimate, np.ones(300)))
-    assert accuracy_sentence(estimate, np.full(300, np.inf)) == ""
 
 
 @pytest.mark.parametrize("combinations", [(str(GROUP),), (str(SHORT),) * 40, ()])

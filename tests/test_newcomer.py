@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
 from scripts import newcomer
-from scripts.newcomer import Walk, _judge_estimate, markdown, violations, walk
+from scripts.newcomer import Walk, markdown, violations, walk
 
 SERVO = """
 <mujoco>
@@ -28,99 +28,80 @@ SERVO = """
 """
 
 
-def judged(amplitude: float, stated: dict[str, object] | None = None) -> list[str]:
-    """Violations of a servo that follows one slow wave [rad]."""
-    model = mujoco.MjModel.from_xml_string(SERVO)
-    t = 0.01 * np.arange(401)
+def judged(text: str, ctrl: Any, stated: dict[str, Any] | None = None, qvel: Any = 0.0) -> set[str]:
+    """Limits that the motion of a model under some controls exceeds."""
+    model = mujoco.MjModel.from_xml_string(text)
     trajectory = {
-        "t": t,
-        "qpos": np.zeros((401, 1)),
-        "qvel": np.zeros((401, 1)),
-        "act": np.zeros((401, 0)),
-        "ctrl": amplitude * np.sin(0.5 * np.pi * t[:-1, None]),
+        "t": model.opt.timestep * np.arange(len(ctrl) + 1),
+        "qpos": model.qpos0[None],
+        "qvel": np.broadcast_to(qvel, (1, model.nv)),
+        "act": np.zeros((1, 0)),
+        "ctrl": ctrl,
     }
-    return violations(model, trajectory, stated or {})
+    return {each.split(" by ")[0] for each in violations(model, trajectory, stated or {})}
 
 
 def test_the_judge_sees_each_kind_of_limit() -> None:
-    assert judged(0.2) == []
-    assert [text.split(" by ")[0] for text in judged(1.2)] == ["position of hinge"]
-
+    """A servo follows one slow wave [rad]."""
+    wave = np.sin(0.005 * np.pi * np.arange(400))[:, None]
+    assert judged(SERVO, 0.2 * wave) == set()
+    assert judged(SERVO, 1.2 * wave) == {"position of hinge"}
     stated = {"velocity": {"hinge": 0.1}, "control": {"servo": [-0.1, 0.3]}}
-    found = {text.split(" by ")[0] for text in judged(0.2, stated)}
-    assert found == {"velocity of hinge", "control of servo"}
-
+    assert judged(SERVO, 0.2 * wave, stated) == {"velocity of hinge", "control of servo"}
     # MuJoCo clamps the force; the judge sees what the servo asks for.
-    kinds = {text.split(" by ")[0] for text in judged(2.5)}
-    assert {"force of servo", "control of servo", "position of hinge"} == kinds
+    every = {"force of servo", "control of servo", "position of hinge"}
+    assert judged(SERVO, 2.5 * wave) == every
 
 
-def test_the_judge_sees_where_and_how_fast_a_free_body_goes() -> None:
+EXCEEDED = {"x of base", *(f"{kind} of base" for kind in ("velocity", "angular_velocity", "tilt"))}
+FREE = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody><body name="b"><freejoint name="base"/><geom size="0.1" mass="1"/></body></worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(("factor", "kinds"), [(1.1, set()), (0.9, EXCEEDED)])
+def test_the_judge_sees_where_and_how_fast_a_free_body_goes(factor: float, kinds: set[str]) -> None:
     """A body without weight flies along x at 2 m/s and turns about y at 1 rad/s for 1 s."""
-    model = mujoco.MjModel.from_xml_string("""
-    <mujoco>
-      <option timestep="0.01" gravity="0 0 0"/>
-      <worldbody><body name="b"><freejoint name="base"/><geom size="0.1" mass="1"/></body>
-      </worldbody>
-    </mujoco>
-    """)
-    trajectory = {
-        "t": np.array([0.0, 1.0]),
-        "qpos": np.array([[0.0, 0, 0, 1, 0, 0, 0]]),
-        "qvel": np.array([[2.0, 0, 0, 0, 1, 0]]),
-        "act": np.zeros((2, 0)),
-        "ctrl": np.zeros((1, 0)),
+    stated = {
+        "position": {"base": [[-2.0 * factor, 2.0 * factor]] * 3},
+        "velocity": {"base": 2.0 * factor},
+        "angular_velocity": {"base": factor},
+        "tilt": {"base": factor},
     }
-
-    def found(side: float, speed: float, turn: float, tilt: float) -> set[str]:
-        """Limits that are exceeded, of a box, of both speeds and of the tilt."""
-        box = {"position": {"base": [[-side, side]] * 3}, "velocity": {"base": speed}}
-        stated = {**box, "angular_velocity": {"base": turn}, "tilt": {"base": tilt}}
-        return {text.split(" by ")[0] for text in violations(model, trajectory, stated)}
-
-    assert found(2.1, 2.1, 1.1, 1.1) == set()
-    assert found(1.9, 1.9, 0.9, 0.9) == {
-        "x of base",
-        "velocity of base",
-        "angular_velocity of base",
-        "tilt of base",
-    }
+    assert judged(FREE, np.zeros((100, 0)), stated, [2.0, 0, 0, 0, 1, 0]) == kinds
 
 
-def test_the_judge_sees_ball_joints_and_tendons() -> None:
-    model = mujoco.MjModel.from_xml_string("""
-    <mujoco>
-      <option timestep="0.01" gravity="0 0 0"/>
-      <worldbody>
-        <body><joint name="ball" type="ball" limited="true" range="0 30" damping="1"/>
-          <geom size="0.1" mass="1" pos="0.5 0 0"/></body>
-        <body pos="3 0 0"><joint name="slide" type="slide" damping="1"/>
-          <geom size="0.1" mass="1"/></body>
-      </worldbody>
-      <tendon><fixed name="rope" limited="true" range="-0.2 0.2" actuatorfrcrange="-0.5 0.5"
-        actuatorfrclimited="true"><joint joint="slide" coef="1"/></fixed></tendon>
-      <actuator><motor name="turn" joint="ball" gear="0 1 0"/>
-        <motor name="pull" tendon="rope" gear="2"/></actuator>
-    </mujoco>
-    """)
-    t = 0.01 * np.arange(301)
-    start = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+BALL = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="ball" type="ball" limited="true" range="0 30" damping="1"/>
+      <geom size="0.1" mass="1" pos="0.5 0 0"/></body>
+    <body pos="3 0 0"><joint name="slide" type="slide" damping="1"/>
+      <geom size="0.1" mass="1"/></body>
+  </worldbody>
+  <tendon><fixed name="rope" limited="true" range="-0.2 0.2" actuatorfrcrange="-0.5 0.5"
+    actuatorfrclimited="true"><joint joint="slide" coef="1"/></fixed></tendon>
+  <actuator><motor name="turn" joint="ball" gear="0 1 0"/>
+    <motor name="pull" tendon="rope" gear="2"/></actuator>
+</mujoco>
+"""
 
-    def found(turn: float, pull: float) -> set[str]:
-        """Kinds of violations under constant controls."""
-        trajectory = {
-            "t": t,
-            "qpos": np.tile(start, (301, 1)),
-            "qvel": np.zeros((301, 4)),
-            "act": np.zeros((301, 0)),
-            "ctrl": np.tile([turn, pull], (300, 1)),
-        }
-        return {text.split(" by ")[0] for text in violations(model, trajectory, {})}
 
-    assert found(0.01, 0.01) == set()
-    assert found(0.6, 0.01) == {"angle of ball"}
-    assert found(0.01, 0.2) == {"length of rope"}
-    assert found(0.01, 0.3) == {"length of rope", "force on rope"}
+@pytest.mark.parametrize(
+    ("turn", "pull", "kinds"),
+    [
+        (0.01, 0.01, set()),
+        (0.6, 0.01, {"angle of ball"}),
+        (0.01, 0.2, {"length of rope"}),
+        (0.01, 0.3, {"length of rope", "force on rope"}),
+    ],
+)
+def test_the_judge_sees_ball_joints_and_tendons(turn: float, pull: float, kinds: set[str]) -> None:
+    assert judged(BALL, np.tile([turn, pull], (300, 1))) == kinds
 
 
 def test_the_table_has_a_row_for_each_model() -> None:
@@ -141,22 +122,6 @@ def test_the_table_has_a_row_for_each_model() -> None:
     assert lines[2].startswith("| arm | 0 | 0 (2 s) | 1 (3 s) | 0 (50 s) | no end (600 s) |")
     assert "12.3 (start breaks limits) | 9 of 10 | no: force of servo" in lines[2]
     assert lines[3] == "| odd | 0 | 2 (1 s) | — | — | — | — | — | — | — | — |"
-
-
-def test_an_interval_without_ends_is_missed(tmp_path: Path) -> None:
-    """An unknown initial state, which has no table in the file, is not judged."""
-    (tmp_path / "fit").mkdir()
-    estimate = {
-        "parameters": ["initial qpos:hinge", "m", "c"],
-        "interval": [[0.0, 0.1], [0.9, 1.2], [None, None]],
-        "misfit": False,
-    }
-    (tmp_path / "fit" / "estimate.json").write_text(json.dumps(estimate), encoding="utf-8")
-    robot = "[parameters]\nm = { true = 1.05 }\nc = { true = 0.1 }\n"
-    (tmp_path / "robot.toml").write_text(robot, encoding="utf-8")
-    found = Walk(model="arm")
-    _judge_estimate(found, tmp_path)
-    assert (found.inside, found.parameters) == (1, 2)
 
 
 # Upright, so that the experiment is short.

@@ -44,14 +44,6 @@ def outputs(path: Path) -> Iterator[dict[str, Any]]:
         yield from cell["outputs"]
 
 
-def test_there_are_three_notebooks() -> None:
-    assert [path.stem for path in NOTEBOOKS] == [
-        "arm-under-limits",
-        "first-design",
-        "identify-a-log",
-    ]
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_are_kept_without_outputs(path: Path) -> None:
     assert list(outputs(path)) == []

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,6 @@ from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.identify import identify
-from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording
 from mjfim.studies.check import check
 from tests.support.rescaling import Rescaled, Units, rescale
@@ -83,31 +80,43 @@ def stated(folder: Path, **tables: Any) -> Experiment:
 
 # Powers of two, which change no digit of a number. No quantity of mechanics stays the same: its
 # factor is 2 to the power of 9 (length) + 7 (mass) - 5 (time), or one over it.
-SCALES = {
-    "long, heavy, quick": Units(length=2.0**9, mass=2.0**7, time=2.0**-5),
-    "short, light, slow": Units(length=2.0**-9, mass=2.0**-7, time=2.0**5),
-}
+SCALES = (
+    Units(),
+    Units(length=2.0**9, mass=2.0**7, time=2.0**-5),
+    Units(length=2.0**-9, mass=2.0**-7, time=2.0**5),
+)
+
+
+def in_all_units(folder: Path, model: str = CART, **tables: Any) -> list[Rescaled]:
+    """The cart-pendulum in its own units, and in others."""
+    original = stated(folder / "original", **tables)
+    (folder / "original" / "cart.xml").write_text(model)
+    return [rescale(original, units, folder / str(i)) for i, units in enumerate(SCALES)]
 
 
 def in_units(rescaled: Rescaled, found: Any) -> dict[str, Any]:
     """Numbers of a design in the units of the original experiment."""
     units = rescaled.units
     control = np.array(list(rescaled.controls.values()))
-    coordinates = [units.factor(unit) for unit in rescaled.coordinates.values()]
-    state = np.array([*coordinates, *(np.array(coordinates) / units.time)])
-    parameters = [units.factor(p["unit"]) for p in EXPERIMENT["parameters"].values()]
+    coordinates = np.array([units.factor(unit) for unit in rescaled.coordinates.values()])
+    state = np.array([*coordinates, *(coordinates / units.time)])
 
     return {
         "state": found.trajectory.state / state,
         "control": found.trajectory.ctrl / control,
         "gain": found.final.gain * state / control[:, None],
-        "std": found.final.std / parameters,
+        "std": found.final.std / parameter_factors(rescaled),
         "cost": found.final.cost * units.time,
         "growth": found.final.growth,
         "status": found.status,
         "warnings": len(found.warnings),
         "iterations": found.iterations,
     }
+
+
+def parameter_factors(rescaled: Rescaled) -> list[float]:
+    """Factors of the units of the parameters."""
+    return [rescaled.units.factor(p["unit"]) for p in EXPERIMENT["parameters"].values()]
 
 
 # Limits with a single bound, also zero.
@@ -128,28 +137,15 @@ DESIGNS = {
 }
 
 
-@pytest.fixture(scope="module")
-def own_designs(tmp_path_factory) -> dict[str, dict[str, Any]]:
-    """Numbers of each design of `DESIGNS` in the units of the experiment."""
-    found = {}
-    for key, tables in DESIGNS.items():
-        folder = tmp_path_factory.mktemp("own")
-        original = stated(folder / "original", **tables)
-        found[key] = in_units(rescale(original, Units(), folder / "own"), design(original))
-    return found
-
-
-@pytest.mark.parametrize("name", SCALES)
 @pytest.mark.parametrize("tables", DESIGNS)
-def test_a_design_is_the_same_in_all_units(
-    tmp_path, own_designs: dict[str, dict[str, Any]], tables: str, name: str
-) -> None:
-    original = stated(tmp_path / "original", **DESIGNS[tables])
-    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
-    found = in_units(rescaled, design(rescaled.experiment))
-
+def test_a_design_is_the_same_in_all_units(tmp_path, tables: str) -> None:
+    own, *others = (
+        in_units(each, design(each.experiment))
+        for each in in_all_units(tmp_path, **DESIGNS[tables])
+    )
     # Powers of two are exact; only linear algebra that mixes units may round differently.
-    assert_same(found, own_designs[tables], exact=("status", "warnings", "iterations"))
+    for found in others:
+        assert_same(found, own, exact=("status", "warnings", "iterations"))
 
 
 # A bob and walls of several shapes. MuJoCo searches for the distance of an ellipsoid with constants
@@ -166,25 +162,21 @@ WALLED = CART.replace(
 )
 
 
-@pytest.mark.parametrize("name", SCALES)
-def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path, name: str) -> None:
-    original = stated(tmp_path / "original", limits={"clearance": 0.02})
-    (tmp_path / "original" / "cart.xml").write_text(WALLED)
+def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path) -> None:
     motion = np.stack([np.linspace(-0.4, 0.4, 40), np.linspace(2.9, 3.4, 40)], axis=1)
-
     found = []
-    for units in (Units(), SCALES[name]):
-        rescaled = rescale(original, units, tmp_path / "rescaled")
+    for rescaled in in_all_units(tmp_path, WALLED, limits={"clearance": 0.02}):
+        length = rescaled.units.length
         clearance = constraint_set_of(DesignTask.resolve(rescaled.experiment)).clearance
-        distances, slope = clearance.distances(motion * [units.length, 1.0], slopes=True)
-        assert slope is not None
-        lengths = [clearance.distances.reach, clearance.least, clearance.scale]
-        slopes = slope / [1.0, units.length]
-        found.append((np.array(lengths) / units.length, distances / units.length, slopes))
+        distances, slope = clearance.distances(motion * [length, 1.0], slopes=True)
+        lengths = np.array([clearance.distances.reach, clearance.least, clearance.scale])
+        found.append((lengths / length, distances / length, slope / [1.0, length]))
 
-    assert (found[0][1] < 0.0).any() and (found[0][1] == found[0][0][0]).any()
-    for value, expected in zip(found[1], found[0], strict=True):
-        assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
+    own, *others = found
+    assert (own[1] < 0.0).any() and (own[1] == own[0][0]).any()
+    for other in others:
+        for value, expected in zip(other, own, strict=True):
+            assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_clearance_of_nearly_nothing_has_finite_margins(tmp_path) -> None:
@@ -194,34 +186,31 @@ def test_a_clearance_of_nearly_nothing_has_finite_margins(tmp_path) -> None:
     assert clearance.scale > 1e-9
 
 
-@pytest.mark.parametrize("name", SCALES)
-def test_the_control_of_least_drift_is_the_same_in_all_units(tmp_path, name: str) -> None:
+def test_the_control_of_least_drift_is_the_same_in_all_units(tmp_path) -> None:
     """A tilted pendulum falls under every control."""
     control = EXPERIMENT["initial"]["control"]
-    original = stated(tmp_path, initial={"qpos": (0.0, 2.0), "control": control})
-    expected = DesignTask.resolve(original).centres
-
-    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
-    found = DesignTask.resolve(rescaled.experiment).centres
-    factor = rescaled.controls["force"]
-    assert_allclose(np.array(found) / factor, expected, rtol=1e-9, atol=1e-9)
+    own, *others = (
+        np.array(DesignTask.resolve(each.experiment).centres) / each.controls["force"]
+        for each in in_all_units(tmp_path, initial={"qpos": (0.0, 2.0), "control": control})
+    )
+    for found in others:
+        assert_allclose(found, own, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("harmonics", [15, None])
-@pytest.mark.parametrize("name", SCALES)
 def test_series_with_which_a_search_goes_on_are_the_same_in_all_units(
-    tmp_path, name: str, harmonics: int | None
+    tmp_path, harmonics: int | None
 ) -> None:
     """A stated time is filled with series; they know the horizon, and no second."""
-    original = stated(tmp_path / "original")
     found = []
-    for units in (Units(), SCALES[name]):
-        rescaled = rescale(original, units, tmp_path / "rescaled")
+    for rescaled in in_all_units(tmp_path):
         task = DesignTask.resolve(rescaled.experiment)
         series = islice(series_of(task, np.random.default_rng(0), harmonics), 8)
         found.append([each.control / rescaled.controls["force"] for each in series])
-    assert len(found[0]) == 8
-    assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-9)
+    own, *others = found
+    assert len(own) == 8
+    for other in others:
+        assert_allclose(other, own, rtol=1e-9, atol=1e-9)
 
 
 NUISANCE = {"initial": {"qpos:slide": 0.01, "qvel:slide": True}, "bias": {"qpos:hinge": True}}
@@ -245,9 +234,10 @@ def recording(tmp_path_factory) -> Recording:
     return simulate(robot, DesignTask.resolve(robot).initial, seed=1)
 
 
-def fit_in_units(rescaled: Rescaled, found: Estimate) -> dict[str, Any]:
+def fit_in_units(rescaled: Rescaled, recording: Recording) -> dict[str, Any]:
     """Numbers of an estimate in the units of the original experiment, and its verdicts."""
-    factors = [rescaled.units.factor(p["unit"]) for p in EXPERIMENT["parameters"].values()]
+    found = identify(rescaled.experiment, [rescaled.recording(recording)])
+    factors = parameter_factors(rescaled)
     count = len(factors)
     terms = found.missing_terms
     return {
@@ -264,55 +254,31 @@ def fit_in_units(rescaled: Rescaled, found: Estimate) -> dict[str, Any]:
     }
 
 
-@pytest.fixture(scope="module")
-def own_fits(tmp_path_factory, recording: Recording) -> Callable[[str], dict[str, Any]]:
-    """Numbers and verdicts of a fit of `FITS` in the units of the experiment."""
-
-    @cache
-    def fit(key: str) -> dict[str, Any]:
-        """The fit of a key, made when it is first needed."""
-        folder = tmp_path_factory.mktemp("own")
-        original = stated(folder / "original", **FITS[key])
-        own = rescale(original, Units(), folder / "own")
-        return fit_in_units(own, identify(original, [recording]))
-
-    return fit
-
-
-@pytest.mark.parametrize("name", SCALES)
-@pytest.mark.parametrize(
-    "path",
-    FITS,
-)
+@pytest.mark.parametrize("path", FITS)
 def test_estimates_and_misfits_are_the_same_in_all_units(
-    tmp_path, recording: Recording, own_fits: Callable[[str], dict[str, Any]], name: str, path: str
+    tmp_path, recording: Recording, path: str
 ) -> None:
-    expected = own_fits(path)
-    assert expected["misfit"]
-    if path == "stated start":
-        assert "dry friction of slide" in expected["terms"]
-
-    original = stated(tmp_path / "original", **FITS[path])
-    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
-    found = fit_in_units(rescaled, identify(rescaled.experiment, [rescaled.recording(recording)]))
+    own, *others = (fit_in_units(each, recording) for each in in_all_units(tmp_path, **FITS[path]))
+    assert own["misfit"]
+    assert path != "stated start" or "dry friction of slide" in own["terms"]
 
     # MuJoCo solves for dry friction to a tolerance that depends on the acceleration's unit.
     exact = ("status", "misfit", "terms", "warnings")
-    assert_same(found, expected, exact=exact, rough=("term", "sigmas"))
+    for found in others:
+        assert_same(found, own, exact=exact, rough=("term", "sigmas"))
 
 
-@pytest.mark.parametrize("name", SCALES)
-def test_a_check_says_the_same_in_all_units(tmp_path, name: str) -> None:
+def test_a_check_says_the_same_in_all_units(tmp_path) -> None:
     twin = {"cart": {"target": "body/cart:mass", "guess": 1.2, "true": 1.0, "unit": "kg"}}
-    original = stated(tmp_path / "original", parameters={**EXPERIMENT["parameters"], **twin})
-    expected = check(original)
-
-    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
-    found = check(rescaled.experiment)
-    assert without_quantities(found.findings) == without_quantities(expected.findings)
-    assert found.not_separable == expected.not_separable
-    assert_allclose(found.correlation, expected.correlation, rtol=1e-6, atol=1e-6)
-    assert found.self_test.recursion == pytest.approx(expected.self_test.recursion, abs=1e-6)
+    parameters = {**EXPERIMENT["parameters"], **twin}
+    own, *others = (
+        check(each.experiment) for each in in_all_units(tmp_path, parameters=parameters)
+    )
+    for found in others:
+        assert without_quantities(found.findings) == without_quantities(own.findings)
+        assert found.not_separable == own.not_separable
+        assert_allclose(found.correlation, own.correlation, rtol=1e-6, atol=1e-6)
+        assert found.self_test.recursion == pytest.approx(own.self_test.recursion, abs=1e-6)
 
 
 def without_quantities(sentences: tuple[str, ...]) -> list[str]:
@@ -335,32 +301,24 @@ def assert_same(
             assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
 
 
-DECIMAL = {"small, light, quick": Units(length=1e-3, mass=1e-6, time=1e-3)}
-
-
 def test_converged_designs_and_estimates_agree_in_decimal_units(
     tmp_path, recording: Recording
 ) -> None:
     """Numbers are rounded differently there, so a descent takes other steps to one optimum."""
     descent = {"max_iterations": 60, "coarse": 1}
     original = stated(tmp_path / "original", descent=descent, **FITS["segments"])
-    own = rescale(original, Units(), tmp_path / "own")
-    expected = in_units(own, design(original))
-    fitted = fit_in_units(own, identify(original, [recording]))
+    own, other = (
+        rescale(original, units, tmp_path / "rescaled" / str(units.time))
+        for units in (Units(), Units(length=1e-3, mass=1e-6, time=1e-3))
+    )
+    expected, found = (in_units(each, design(each.experiment)) for each in (own, other))
+    assert found["status"] == expected["status"]
+    assert found["cost"] == pytest.approx(expected["cost"], rel=1e-5)
+    largest = np.abs(expected["control"]).max()
+    assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
 
-    for name, units in DECIMAL.items():
-        rescaled = rescale(original, units, tmp_path / name)
-        found = in_units(rescaled, design(rescaled.experiment))
-        assert found["status"] == expected["status"]
-        assert found["cost"] == pytest.approx(expected["cost"], rel=1e-5)
-        largest = np.abs(expected["control"]).max()
-        assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
-
-        estimate = identify(rescaled.experiment, [rescaled.recording(recording)])
-        again = fit_in_units(rescaled, estimate)
-        assert_allclose(again["theta"], fitted["theta"], rtol=1e-6)
-        assert_allclose(again["std"], fitted["std"], rtol=1e-6)
-        assert again["misfit"] == fitted["misfit"]
-
-        assert again["terms"] == fitted["terms"]
-        assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)
+    fitted, again = (fit_in_units(each, recording) for each in (own, other))
+    for key in ("theta", "std"):
+        assert_allclose(again[key], fitted[key], rtol=1e-6)
+    assert (again["misfit"], again["terms"]) == (fitted["misfit"], fitted["terms"])
+    assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)

@@ -76,7 +76,6 @@ def test_signals_begin_without_a_jump(kind: str) -> None:
 
 
 def test_chirp_ends_at_five_times_its_start_by_default() -> None:
-    """The end of the sweep may be left out."""
     default = generate(Signal(kind="chirp", frequency=0.5), T, ("u",), REST[:1])
     assert np.array_equal(
         default,
@@ -95,7 +94,6 @@ def test_multisine_contains_its_harmonics_only() -> None:
 
 
 def test_multisine_seed() -> None:
-    """Equal seeds give equal signals, other seeds and other actuators do not."""
     first, again, other = (
         generate(Signal(kind="multisine", amplitude=1.0, seed=seed), T, NAMES, REST)
         for seed in (1, 1, 2)
@@ -107,17 +105,14 @@ def test_multisine_seed() -> None:
 
 @pytest.mark.parametrize("key", ["amplitude", "offset"])
 def test_unknown_actuator(key: str) -> None:
-    """The message names the key, the unknown actuator and the valid names."""
     signal = Signal(kind="sine", **{key: {"lift": 1.0}})
     with pytest.raises(ExperimentError, match=rf"initial\.control\.{key}: .*'lift'.*left, right"):
         generate(signal, T, NAMES, REST)
 
 
 def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path) -> None:
-    """The signal starts at the keyframe's control; an offset in the file replaces it."""
     model = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
     held = model.replace('name="hanging"', 'name="hanging" ctrl="1.5"')
-    assert held != model
     (tmp_path / "held.xml").write_text(held, encoding="utf-8")
     e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
         model=str(tmp_path / "held.xml"),
@@ -126,7 +121,3 @@ def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path)
     )
     control = DesignTask.resolve(e).control[:, 0]
     assert (control[0], control.max(), control.min()) == pytest.approx((1.5, 2.0, 1.5), abs=1e-2)
-    stated = DesignTask.resolve(
-        e.replace(initial={"control": {"kind": "sine", "amplitude": 0.5, "offset": -1.0}})
-    )
-    assert stated.control[:, 0] == pytest.approx(control - 2.5, abs=1e-12)

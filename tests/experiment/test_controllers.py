@@ -7,10 +7,11 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, MjfimError, RecordingError
+from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.task_parts import stated_inputs
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import Quantity
@@ -41,14 +42,6 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         {"controllers": {"shoulder": {"kp": -1.0}}},
         "controllers.shoulder.kp … greater than or equal to 0 … -1",
     ),
-    "negative latency": (
-        {"controllers": {"shoulder": PD | {"latency": "-2 ms"}}},
-        "controllers.shoulder.latency … greater than or equal to 0",
-    ),
-    "unit of the latency": (
-        {"controllers": {"shoulder": PD | {"latency": "2 m"}}},
-        "controllers.shoulder.latency … m",
-    ),
     "nothing": (
         {"controllers": {"shoulder": {"rate": 500.0}}},
         "controllers.shoulder: the law computes nothing … kp, kd, ki or feedforward",
@@ -56,10 +49,6 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "range": (
         {"controllers": {"shoulder": PD | {"saturation": (2.0, -2.0)}}},
         "controllers.shoulder: saturation [2.0, -2.0] needs lower < upper",
-    ),
-    "key": (
-        {"controllers": {"shoulder": PD | {"kv": 1.0}}},
-        "controllers.shoulder.kv: unknown key 'kv' … kd",
     ),
     "parameter without a law": (
         {"parameters": {"k": {"target": "controller/elbow:kp"}}},
@@ -126,7 +115,6 @@ def test_laws_follow_the_experiment() -> None:
     system = System.resolve(experiment)
 
     assert system.inputs == ("reference:shoulder", "feedforward:shoulder", "ctrl:elbow")
-    assert system.laws is not None
     assert system.laws.period == 2
     paths = {"kp": "V/rad", "kd": "V s/rad", "latency": "s", "slew": "V/s", "saturation[1]": "V"}
     paths |= {"acceleration": "rad/s²", "jump": "rad"}
@@ -187,7 +175,7 @@ def test_a_log_with_references_is_read(tmp_path: Path) -> None:
 
     goal, elbow = (np.sin(7.0 * T[:-1] + i) for i in (1, 2))
     expected = np.column_stack([np.deg2rad(goal), np.ones(59), elbow])
-    np.testing.assert_allclose(found.ctrl, expected)
+    assert_allclose(found.ctrl, expected)
     assert found.outputs == ("qpos:shoulder",)
 
 
@@ -261,18 +249,13 @@ def test_a_signal_states_references_and_controls() -> None:
     inputs = dict(zip(system.inputs, stated_inputs(system).T, strict=True))
 
     t = np.arange(500) * 0.002
-    np.testing.assert_allclose(inputs["reference:shoulder"], 0.2 + 0.3 * np.sin(2 * np.pi * t))
+    assert_allclose(inputs["reference:shoulder"], 0.2 + 0.3 * np.sin(2 * np.pi * t))
     velocity = 0.6 * np.pi * np.cos(2 * np.pi * t)
-    np.testing.assert_allclose(inputs["reference_velocity:shoulder"], velocity, atol=2e-2)
-    np.testing.assert_allclose(inputs["ctrl:elbow"], 2.0 * np.sin(2.34 * np.pi * t))
+    assert_allclose(inputs["reference_velocity:shoulder"], velocity, atol=2e-2)
+    assert_allclose(inputs["ctrl:elbow"], 2.0 * np.sin(2.34 * np.pi * t))
     assert (inputs["enable:shoulder"] == 1.0).all()
     assert (inputs["gain:shoulder"] == 1.0).all()
     assert (inputs["feedforward:shoulder"] == 0.0).all()
-
-
-def test_simulate_refuses_inputs_of_another_width() -> None:
-    with pytest.raises(MjfimError, match="expected a row for each sample with 2 columns"):
-        mjfim.simulate(arm_experiment({"shoulder": PD}), np.zeros((10, 3)))
 
 
 def test_an_actuator_without_a_joint_needs_one(tmp_path: Path) -> None:
@@ -285,5 +268,4 @@ def test_an_actuator_without_a_joint_needs_one(tmp_path: Path) -> None:
         System.resolve(arm_experiment({"elbow": PD}, model=str(path)))
 
     system = System.resolve(arm_experiment({"elbow": PD | {"joint": "elbow"}}, model=str(path)))
-    assert system.laws is not None
     assert system.laws.laws[0].joint == "elbow"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import ExperimentError, MjfimError
@@ -117,18 +117,6 @@ def test_what_is_wrong_is_named(tables: dict[str, Any], message: str) -> None:
 # ---- models
 
 
-def test_a_spec_in_memory_gives_what_its_file_gives() -> None:
-    """All numbers of a check and of an estimate are equal, and no file is needed."""
-    spec = mujoco.MjSpec.from_string(MODEL.read_text())
-    experiments = [Experiment(**{**STATED, "model": model}) for model in (MODEL, spec)]
-
-    found = [mjfim.check(each, progress=False) for each in experiments]
-    assert found[0].information.tolist() == found[1].information.tolist()
-
-    logs = [mjfim.simulate(each) for each in experiments]
-    assert logs[0].y.tolist() == logs[1].y.tolist()
-
-
 def test_patterns_match_in_a_model_whose_files_are_bytes() -> None:
     text = """
     <mujoco><asset><mesh name="part" file="part.obj"/></asset><worldbody>
@@ -155,13 +143,14 @@ def test_another_model_replaces_the_one_in_memory() -> None:
 # ---- recordings
 
 
-def given_kinds(recording: mjfim.Recording, folder: Path, system: System) -> list[Any]:
-    """One recording in all kinds."""
-    t, ctrl, y = recording.t, recording.ctrl, recording.y
-    table = folder / "log.csv"
+def test_a_recording_is_taken_in_all_kinds(
+    recording: mjfim.Recording, system: System, tmp_path: Path
+) -> None:
+    t, ctrl, qpos, hinge = recording.t, recording.ctrl, recording.y[:, :2], recording.y[:, 2]
+    table = tmp_path / "log.csv"
     write_recording(table, recording, system)
-    qpos, hinge = y[:, :2], y[:, 2]
-    return [
+    padded = {"force": np.append(ctrl[:, 0], np.nan)}
+    for given in (
         recording,
         [recording],
         table,
@@ -169,24 +158,12 @@ def given_kinds(recording: mjfim.Recording, folder: Path, system: System) -> lis
         (table,),
         {"t": t, "ctrl": ctrl, "qpos": qpos, "qvel": {"hinge": hinge}},
         {"t": t.tolist(), "ctrl": ctrl.tolist(), "qpos": qpos.tolist(), "qvel:hinge": hinge},
-        {
-            "t": t,
-            "ctrl": {"force": np.append(ctrl[:, 0], np.nan)},
-            "qpos": qpos.T,
-            "qvel:hinge": hinge,
-        },
-    ]
-
-
-def test_a_recording_is_taken_in_all_kinds(
-    recording: mjfim.Recording, system: System, tmp_path: Path
-) -> None:
-    for given in given_kinds(recording, tmp_path, system):
+        {"t": t, "ctrl": padded, "qpos": qpos.T, "qvel:hinge": hinge},
+    ):
         (found,) = recordings_of(system, given)
         assert found.outputs == recording.outputs
-        np.testing.assert_allclose(found.t, recording.t, rtol=0.0, atol=1e-12)
-        np.testing.assert_allclose(found.ctrl, recording.ctrl, rtol=1e-12)
-        np.testing.assert_allclose(found.y, recording.y, rtol=1e-12)
+        for name in ("t", "ctrl", "y"):
+            assert_allclose(getattr(found, name), getattr(recording, name), rtol=1e-12, atol=1e-12)
 
 
 def test_the_table_of_a_log_says_how_columns_are_read_and_not_arrays(
@@ -203,7 +180,7 @@ def test_the_table_of_a_log_says_how_columns_are_read_and_not_arrays(
     (column,) = recordings_of(stated, {"s": t, "u": ctrl, "q": np.rad2deg(hinge)})
     (array,) = recordings_of(stated, {"t": t, "ctrl": ctrl, "qpos": {"hinge": hinge}})
 
-    np.testing.assert_allclose(column.y, array.y, rtol=1e-12)
+    assert_allclose(column.y, array.y, rtol=1e-12)
     assert column.outputs == array.outputs == ("qpos:hinge",)
 
 
@@ -218,7 +195,7 @@ def test_arrays_of_sensors_are_in_the_order_of_mujoco(recording: mjfim.Recording
     )
 
     assert found.outputs == ("hinge_velocity",)
-    np.testing.assert_array_equal(found.y[:, 0], 0.1 * np.sin(data[:, address]))
+    assert_array_equal(found.y[:, 0], 0.1 * np.sin(data[:, address]))
 
 
 def test_positions_of_joints_serve_their_sensors(recording: mjfim.Recording) -> None:
@@ -232,7 +209,7 @@ def test_positions_of_joints_serve_their_sensors(recording: mjfim.Recording) -> 
     assert set(found.outputs) == {"slide_position", "hinge_angle"}
     assert found.outputs[0] in system.outputs.names
     order = [found.outputs.index(name) for name in ("slide_position", "hinge_angle")]
-    np.testing.assert_array_equal(found.y[:, order], recording.y[:, :2])
+    assert_array_equal(found.y[:, order], recording.y[:, :2])
 
 
 @pytest.mark.parametrize(
@@ -268,9 +245,8 @@ def test_a_wrong_array_is_named(
 def test_each_verb_takes_one_recording_without_a_list(
     recording: mjfim.Recording, system: System
 ) -> None:
-    """The number of each is that of the list."""
     experiment = system.experiment
-    verbs: list[Callable[[Any], Any]] = [
+    verbs = [
         lambda given: mjfim.identify(experiment, given, progress=False).theta,
         lambda given: mjfim.check(experiment, given, progress=False).information,
         lambda given: mjfim.predict(experiment, [1.0, 1.0], given)[0].rms,
@@ -292,7 +268,7 @@ def test_a_path_stands_for_the_experiment_and_a_design_for_its_motion() -> None:
         by_design, by_motion = verb(file, design), verb(str(file), design.trajectory)
         names = ("ctrl", "y") if verb is mjfim.simulate else ("information", "std")
         for name in names:
-            np.testing.assert_array_equal(getattr(by_design, name), getattr(by_motion, name))
+            assert_array_equal(getattr(by_design, name), getattr(by_motion, name))
     checked = mjfim.check(file, trajectory=design, progress=False)
     assert checked.source == "the given trajectory"
     assert list(mjfim.monte_carlo(file, design, trials=4, progress=False).sets) == ["final"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import shutil
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
@@ -20,8 +18,6 @@ from mjfim.experiment.system import System
 from mjfim.model import loading
 from mjfim.parallel.shared_value import Kept
 from tests.support.mesh_model import write_mesh_model
-from tests.support.paths import SHARED_MODELS
-from tests.support.shared_models import EXPERIMENTS
 
 # An experiment with a model of several files and with the table of a control.
 STATED: dict[str, Any] = {
@@ -90,7 +86,6 @@ def test_a_changed_copy_keeps_the_files_and_takes_new_ones(tmp_path: Path) -> No
 
     assert packed.packed() is packed
     assert changed.packed() is changed
-    assert further.files is not None
     assert further.files.content(tmp_path / "tables" / "other.csv") is not None
     assert further.files.content(tmp_path / "robot/tool.xml") is not None
 
@@ -132,33 +127,3 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         experiment.replace(initial={"control": "absent.csv"}).packed()
     with pytest.raises(ModelError, match=r"absent\.xml: no such model file"):
         experiment.replace(model="absent.xml").packed()
-
-
-@pytest.mark.slow
-def test_a_design_runs_in_a_process_without_any_file_of_the_caller(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "caller").mkdir()
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "caller")
-
-    # The paths are relative, so that a process in another folder does not find the files.
-    tables = {"limits": {"position": {"turn": [-2.0, 2.0]}}, "descent": {"max_iterations": 3}}
-    experiment = stated(Path("study")).replace(**tables)
-    alone = mjfim.design(experiment, threads=1)
-    with mjfim.Pool(1) as pool:
-        pool.submit(os.chdir, tmp_path / "elsewhere").result()
-        elsewhere = mjfim.design(experiment, threads=1, executor=pool)
-
-    assert elsewhere.final.cost == alone.final.cost
-    assert np.array_equal(elsewhere.trajectory.ctrl, alone.trajectory.ctrl)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(EXPERIMENTS))
-def test_shared_experiments_have_the_same_cost(name: str) -> None:
-    experiment = Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name)
-    if not (SHARED_MODELS / experiment.model).is_file():
-        pytest.skip(f"no shared model {experiment.model}")
-
-    assert cost_of(sent(experiment)) == cost_of(experiment)

@@ -5,101 +5,55 @@ of an MjSpec.
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError
-from mjfim.excitation.task import DesignTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
-from mjfim.model.parameters import Parameter
 from tests.support.numerics import (
-    CART_PARAMETERS,
     CART_PENDULUM,
+    FREE_BODY,
     body_task,
     cart_task,
     filtered_task,
     make_task,
+    sensitivity_of,
 )
 
 ARM = {"inertial": "arm"}
 MASS = {"m": {"target": "body/arm:mass"}}
 
 
-def named(task: DesignTask) -> dict[str, Parameter]:
-    """Parameters by name."""
-    return {p.name: p for p in task.parameters.parameters}
-
-
 @pytest.mark.parametrize("coordinates", [None, "logcholesky", "barycentric"])
 def test_the_inertia_of_a_body_is_ten_parameters(coordinates: str | None, tmp_path: Path) -> None:
-    """Guess, size, unit of each from the body itself; at the guess the model is unchanged."""
-    task = body_task(
-        tmp_path,
-        parameters={
-            "arm": {**ARM, "coordinates": coordinates},
-            "d": {"target": "joint/ball:damping"},
-        },
-    )
+    """Guess, size, unit and prior of each come from the body itself."""
+    arm = {**ARM, "coordinates": coordinates, "prior": 0.1, "nuisance": True}
+    task = body_task(tmp_path, parameters={"arm": arm, "d": {"target": "joint/ball:damping"}})
     chart = INERTIA_PARAMETRISATIONS[coordinates or "logcholesky"]
-    body = task.system.model.body("arm").id
+    model = task.system.model
+    number = model.body("arm").id
+    inertia = body_inertia(model, number)
     assert task.parameters.names == (*(f"arm.{n}" for n in chart.names), "d")
-    ten = task.parameters.parameters[:10]
-    np.testing.assert_allclose(
-        [p.guess for p in ten],
-        chart.coordinates(body_inertia(task.system.model, body)),
-        rtol=1e-12,
-        atol=1e-15,
-    )
-    np.testing.assert_array_equal(
-        [p.scale for p in ten], chart.magnitudes(body_inertia(task.system.model, body))
-    )
-    np.testing.assert_array_equal(
-        task.parameters.magnitude[:10], chart.magnitudes(body_inertia(task.system.model, body))
-    )
+    *ten, damping = task.parameters.parameters
+    guesses = [p.guess for p in ten]
+    assert_allclose(guesses, chart.coordinates(inertia), rtol=1e-12, atol=1e-15)
+    magnitudes = chart.magnitudes(inertia)
+    assert_array_equal([p.scale for p in ten], magnitudes)
+    assert_array_equal(task.parameters.magnitude[:10], magnitudes)
+    assert_allclose([p.prior for p in ten], 0.1 * magnitudes)
     assert tuple(p.unit for p in ten) == chart.units
-    assert {p.group for p in ten} == {"arm"} and task.parameters.parameters[10].group == ""
-    own = task.system.model_at(task.parameters.guess)
-    for field in ("body_mass", "body_ipos", "dof_M0"):
-        np.testing.assert_allclose(
-            getattr(own, field), getattr(task.system.model, field), rtol=1e-9, atol=1e-12
-        )
-    np.testing.assert_allclose(
-        body_inertia(own, body).inertia,
-        body_inertia(task.system.model, body).inertia,
-        rtol=1e-9,
-        atol=1e-12,
-    )
+    assert {(p.group, p.nuisance) for p in ten} == {("arm", True)}
+    assert (damping.group, damping.nuisance) == ("", False)
 
-
-def test_priors_of_an_inertia_are_relative_to_the_magnitude_of_each(tmp_path: Path) -> None:
-    """One number stands for ten units."""
-    table = {
-        "arm": {**ARM, "prior": 0.1, "coordinates": "barycentric", "nuisance": True},
-        "d": {"target": "joint/ball:damping"},
-    }
-    parameters = named(body_task(tmp_path, parameters=table))
-    for name in INERTIA_PARAMETRISATIONS["barycentric"].names:
-        p = parameters[f"arm.{name}"]
-        assert p.prior == pytest.approx(0.1 * p.scale)
-        assert p.nuisance
-    assert not parameters["d"].nuisance
-
-
-def test_scale_guess_of_an_inertia_is_the_value_of_each_coordinate(tmp_path: Path) -> None:
-    """A coordinate that is zero is refused."""
-    hull = {"hull": {"inertial": "hull", "scale": "guess", "coordinates": "barycentric"}}
-    task = body_task(tmp_path, parameters=hull)
-    np.testing.assert_allclose(task.parameters.scale, np.abs(task.parameters.guess), rtol=1e-15)
-    with pytest.raises(
-        ExperimentError, match=r"parameters\.arm\.scale: my is 0; leave out scale = \"guess\""
-    ):
-        body_task(
-            tmp_path, parameters={"arm": {**ARM, "scale": "guess", "coordinates": "barycentric"}}
-        )
+    stated = {"hull": {"inertial": "hull", "scale": "guess", "coordinates": "barycentric"}}
+    scaled = body_task(tmp_path, parameters=stated).parameters
+    assert_allclose(scaled.scale, np.abs(scaled.guess), rtol=1e-15)
 
 
 PLATE = CART_PENDULUM.format(integrator="RK4").replace(
@@ -107,33 +61,29 @@ PLATE = CART_PENDULUM.format(integrator="RK4").replace(
 )
 
 
-@pytest.mark.parametrize("moments", ["2e-3 1e-3 1e-3", "1e-9 1e-3 1e-3"])
-def test_the_message_about_rods_and_plates_names_the_right_coordinates(
-    moments: str, tmp_path: Path
+BOB: dict[str, Any] = {"inertial": "bob"}
+
+
+@pytest.mark.parametrize(
+    ("moments", "table", "said"),
+    [
+        ("2e-3 1e-3 1e-3", BOB, r"bob\.inertial: body 'bob': .*a rod or a plate.*\"barycentric\""),
+        (
+            "2e-3 1e-3 1e-3",
+            {"target": "body/bob:logcholesky[4]"},
+            r"parameters\.bob: body 'bob' has no logcholesky coordinates",
+        ),
+        ("2e-3 1e-3 1e-3", {**BOB, "coordinates": "barycentric"}, ""),
+        ("1e-9 1e-3 1e-3", BOB, ""),  # thin, but a body
+    ],
+)
+def test_rods_and_plates_have_barycentric_coordinates_only(
+    moments: str, table: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
-    """Log-Cholesky is the default and cannot express them."""
-    xml = PLATE.format(moments)
-    if moments.startswith("2"):
-        with pytest.raises(
-            ExperimentError, match=r"bob\.inertial: body 'bob': .*a rod or a plate.*\"barycentric\""
-        ):
-            make_task(xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1})
-        table = {"s": {"target": "body/bob:logcholesky[4]"}}
-        with pytest.raises(
-            ExperimentError, match=r"parameters\.s: body 'bob' has no logcholesky coordinates"
-        ):
-            make_task(xml, tmp_path, parameters=table, noise={"state": 0.1})
-    else:  # thin, but a body
-        assert (
-            len(
-                make_task(
-                    xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1}
-                ).theta
-            )
-            == 10
-        )
-    table = {"bob": {"inertial": "bob", "coordinates": "barycentric"}}
-    assert len(make_task(xml, tmp_path, parameters=table, noise={"state": 0.1}).theta) == 10
+    tables = {"parameters": {"bob": table}, "noise": {"state": 0.1}}
+    refused = pytest.raises(ExperimentError, match=said) if said else nullcontext()
+    with refused:
+        assert len(make_task(PLATE.format(moments), tmp_path, **tables).theta) == 10
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
@@ -214,6 +164,14 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"g": {"target": "output/acc:bias"}},
         r"parameters\.g: .*unknown output 'acc'.*valid: .*acc\[0\]",
     ),
+    "inertia with a coordinate that is 0": (
+        {"arm": {**ARM, "scale": "guess", "coordinates": "barycentric"}},
+        r"parameters\.arm\.scale: my is 0; leave out scale = \"guess\"",
+    ),
+    "function whose guess is 0": (
+        {"f": {"function": print, "guess": 0.0}},
+        r"parameters\.f\.scale",
+    ),
     "wanted zero": (
         {"m": {"target": "body/arm:mass", "wanted": 0.0}},
         r"parameters\.m\.wanted: .*greater than 0",
@@ -223,7 +181,6 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_messages_about_wrong_parameters(name: str, tmp_path: Path) -> None:
-    """They name the key, the fault and the valid values."""
     table, message = WRONG[name]
     with pytest.raises(ExperimentError, match=rf"experiment: .*{message}"):
         body_task(tmp_path, parameters=table)
@@ -253,67 +210,56 @@ BODY_LENGTH = 0.15 + np.hypot(0.05, 0.25) + np.sqrt(0.012 / 0.4)
 def test_guess_unit_and_scale_come_from_the_first_target(
     path: str, guess: float, unit: str, scale: float, tmp_path: Path
 ) -> None:
-    parameters = named(body_task(tmp_path, parameters={"p": {"target": path}}))
-    p = parameters["p"]
+    (p,) = body_task(tmp_path, parameters={"p": {"target": path}}).parameters.parameters
     assert (p.guess, p.unit, p.scale) == pytest.approx((guess, unit, scale))
-
-
-def test_integers_are_valid_scales(tmp_path: Path) -> None:
-    """TOML's 2 means 2.0."""
-    assert body_task(
-        tmp_path, parameters={"m": {"target": "body/arm:mass", "scale": 2}}
-    ).parameters.scale.tolist() == [2.0]
+    stated = body_task(tmp_path, parameters={"p": {"target": path, "scale": 2}})
+    assert stated.parameters.scale.tolist() == [2.0]
 
 
 # ---- nuisance table
 
 
 def test_deviations_of_all_components_of_the_initial_state(tmp_path: Path) -> None:
-    """One deviation for each degree of freedom in position and velocity, with the prior, as
-    nuisance.
-    """
     task = body_task(tmp_path, parameters=MASS, nuisance={"initial": 0.02})
-    found = task.parameters.parameters
-    assert len(found) == 1 + 9 + 9
-    names = [f"initial qpos:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [
-        f"initial qpos:ball.{part}" for part in ("rx", "ry", "rz")
-    ]
-    assert list(task.parameters.names[1:10]) == names
-    assert list(task.parameters.names[10:]) == [n.replace("qpos", "qvel") for n in names]
-    assert all(p.nuisance and p.prior == 0.02 and p.guess == 0.0 for p in found[1:])
-    assert [p.unit for p in found[1:8]] == ["m", "m", "m", "rad", "rad", "rad", "rad"]
+    parts = [*(f"float.{part}" for part in POSE), *(f"ball.{part}" for part in POSE[3:])]
+    names = [f"initial {kind}:{part}" for kind in ("qpos", "qvel") for part in parts]
+    assert task.parameters.names == ("m", *names)
+    deviations = task.parameters.parameters[1:]
+    assert {(p.nuisance, p.prior, p.guess) for p in deviations} == {(True, 0.02, 0.0)}
+    assert [p.unit for p in deviations[:9]] == ["m"] * 3 + ["rad"] * 6
     assert task.parameters.interest.tolist() == [0]
-    np.testing.assert_array_equal(task.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
-    np.testing.assert_allclose(np.diag(task.parameters.prior_information)[1:], 2500.0)
+    assert_array_equal(task.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
+    assert_allclose(np.diag(task.parameters.prior_information)[1:], 2500.0)
+
+
+POSE = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @pytest.mark.parametrize(
-    ("joint", "written", "right"),
+    ("quantity", "part", "written", "right"),
     [
-        ("float", "qpos[3]", "qpos.rx"),
-        ("float", "qvel[0]", "qvel.x"),
-        ("ball", "qpos[2]", "qpos.rz"),
+        ("qpos", "float", "[3]", ".rx"),
+        ("qvel", "float", "[0]", ".x"),
+        ("qpos", "ball", "[2]", ".rz"),
     ],
 )
 def test_an_index_of_a_joint_is_refused_with_its_present_name(
-    joint: str, written: str, right: str, tmp_path: Path
+    quantity: str, part: str, written: str, right: str, tmp_path: Path
 ) -> None:
     """In the nuisance table, and in the paths of parameters."""
-    quantity, right_quantity = (f"{w[:4]}:{joint}{w[4:]}" for w in (written, right))
-    message = f"nuisance.initial: '{quantity}' is now written '{right_quantity}'"
-    with pytest.raises(ExperimentError, match=re.escape(message)):
-        body_task(tmp_path, parameters=MASS, nuisance={"initial": {quantity: 0.1}})
-
-    path = f"initial/{joint}:{written}"
-    message = f"parameter path '{path}': '{path}' is now written 'initial/{joint}:{right}'"
-    with pytest.raises(ExperimentError, match=re.escape(f"parameters.p: in {message}")):
-        body_task(tmp_path, parameters={"p": {"target": path}})
-
-
-def test_a_deviation_of_an_orientation_is_a_rotation_vector(tmp_path: Path) -> None:
-    """A quaternion's component is refused with the names of the rotation vector."""
-    with pytest.raises(ExperimentError, match=r"rotation vector here; valid: qpos:ball\.rx, .*rz"):
-        body_task(tmp_path, parameters=MASS, nuisance={"initial": {"qpos:ball.qw": 0.1}})
+    name, path = f"{quantity}:{part}", f"initial/{part}:{quantity}"
+    for tables, said in (
+        (
+            {"parameters": MASS, "nuisance": {"initial": {f"{name}{written}": 0.1}}},
+            f"nuisance.initial: '{name}{written}' is now written '{name}{right}'",
+        ),
+        (
+            {"parameters": {"p": {"target": f"{path}{written}"}}},
+            f"'{path}{written}' is now written '{path}{right}'",
+        ),
+    ):
+        with pytest.raises(ExperimentError, match=re.escape(said)):
+            body_task(tmp_path, **tables)
 
 
 def test_deviations_and_biases_by_name(tmp_path: Path) -> None:
@@ -323,21 +269,17 @@ def test_deviations_and_biases_by_name(tmp_path: Path) -> None:
         "bias": {"qpos:slide": 0.3},
         "delay": 0.005,
     }
-    parameters = named(cart_task(tmp_path, nuisance=nuisance))
-    assert list(parameters) == [
-        "m",
-        "l",
-        "c",
-        "initial qpos:hinge",
-        "initial qvel:slide",
-        "bias qpos:slide",
-        "delay",
+    found = cart_task(tmp_path, nuisance=nuisance).parameters.parameters[3:]
+    assert [(p.name, p.prior, p.unit) for p in found] == [
+        ("initial qpos:hinge", None, "rad"),
+        ("initial qvel:slide", 0.1, "m/s"),
+        ("bias qpos:slide", 0.3, "m"),
+        ("delay", 0.005, "s"),
     ]
-    assert [p.prior for p in parameters.values()] == [None, None, None, None, 0.1, 0.3, 0.005]
-    assert [p.unit for p in parameters.values()][3:] == ["rad", "m/s", "m", "s"]
-    assert parameters["delay"].scale == 0.01
+    assert found[-1].scale == 0.01
 
 
+# Wrong tables for the cart-pendulum, and the message.
 NUISANCE: dict[str, tuple[dict[str, Any], str]] = {
     "joint": (
         {"initial": {"qpos:hing": True}},
@@ -356,48 +298,50 @@ NUISANCE: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", NUISANCE)
 def test_messages_about_a_wrong_nuisance_table(name: str, tmp_path: Path) -> None:
-    """They name the key, the fault and the valid values."""
     nuisance, message = NUISANCE[name]
     with pytest.raises(ExperimentError, match=rf"experiment: {message}"):
         cart_task(tmp_path, nuisance=nuisance)
 
 
-def test_a_nuisance_cannot_be_a_parameter_as_well(tmp_path: Path) -> None:
-    """Neither its number nor its name may be used twice."""
-    own = {**CART_PARAMETERS, "q": {"target": "initial/hinge:qpos"}}
-    with pytest.raises(
-        ExperimentError, match=r"initial qpos:hinge: target .* already belongs to parameters\.q"
-    ):
-        cart_task(tmp_path, parameters=own, nuisance={"initial": True})
-    clash = {**CART_PARAMETERS, "delay": {"target": "joint/slide:damping"}}
-    with pytest.raises(
-        ExperimentError, match=r"parameters\.delay: duplicate parameter name; rename one"
-    ):
-        cart_task(tmp_path, parameters=clash, nuisance={"delay": True})
-    with pytest.raises(ExperimentError, match=r"parameters: all are nuisance"):
-        cart_task(
-            tmp_path,
-            parameters={"q": {"target": "body/bob:mass", "nuisance": True}},
-            nuisance={"delay": True},
-        )
+@pytest.mark.parametrize(
+    ("parameters", "nuisance", "said"),
+    [
+        (
+            {"q": {"target": "initial/hinge:qpos"}},
+            {"initial": True},
+            r"initial qpos:hinge: target .* already belongs to parameters\.q",
+        ),
+        (
+            {"delay": {"target": "joint/slide:damping"}},
+            {"delay": True},
+            r"parameters\.delay: duplicate parameter name; rename one",
+        ),
+        (
+            {"q": {"target": "body/bob:mass", "nuisance": True}},
+            {"delay": True},
+            "parameters: all are nuisance",
+        ),
+    ],
+)
+def test_a_nuisance_cannot_be_a_parameter_as_well(
+    parameters: dict[str, Any], nuisance: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ExperimentError, match=said):
+        cart_task(tmp_path, parameters=parameters, nuisance=nuisance)
+
+
+def test_a_deviation_of_an_orientation_is_a_rotation_vector(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match=r"rotation vector here; valid: qpos:ball\.rx, .*rz"):
+        body_task(tmp_path, parameters=MASS, nuisance={"initial": {"qpos:ball.qw": 0.1}})
 
 
 def test_joints_without_a_name_are_refused_where_all_deviate(tmp_path: Path) -> None:
     """An initial state that is stated to be unknown must not be known in part."""
-    xml = CART_PENDULUM.format(integrator="RK4").replace('joint name="hinge"', "joint").replace(
-        '<jointpos name="angle" joint="hinge" noise="0.01"/>', ""
-    ).replace('<jointvel name="rate" joint="hinge" noise="0.05"/>', "")  # fmt: skip
-    table = {"m": {"target": "body/bob:mass"}}
+    xml = FREE_BODY.format(integrator="RK4").replace('name="float"', "")
     with pytest.raises(ExperimentError, match=r"nuisance\.initial: 1 joints have no name"):
-        make_task(xml, tmp_path, parameters=table, noise={"state": 0.1}, nuisance={"initial": 0.1})
-    task = make_task(
-        xml,
-        tmp_path,
-        parameters=table,
-        noise={"state": 0.1},
-        nuisance={"initial": {"qpos:slide": 0.1}},
-    )
-    assert task.parameters.names == ("m", "initial qpos:slide")
+        make_task(xml, tmp_path, parameters=MASS, nuisance={"initial": 0.1})
+    task = make_task(xml, tmp_path, parameters=MASS, nuisance={"initial": {"qpos:ball.rx": 0.1}})
+    assert task.parameters.names == ("m", "initial qpos:ball.rx")
 
 
 def test_activations_of_the_initial_state_have_paths(tmp_path: Path) -> None:
@@ -417,94 +361,66 @@ def lengthen(spec: Any, value: float) -> None:
 
 
 def test_a_function_edits_the_spec(tmp_path: Path) -> None:
-    """Against two equivalent targets, with the derivative."""
+    """Against two equivalent targets, beside a parameter that is written in place."""
     targets = [{"path": "body/bob:pos[2]"}, {"path": "body/cart:mass", "scale": 2.0}]
-    first = cart_task(tmp_path, parameters={"l": {"function": lengthen, "guess": 0.7, "unit": "m"}})
-    second = cart_task(tmp_path, parameters={"l": {"targets": targets, "guess": 0.7}})
-    assert first.parameters.needs_compile.tolist() == [
-        True
-    ] and second.parameters.needs_compile.tolist() == [False]
-    np.testing.assert_allclose(first.initial.state, second.initial.state, rtol=0, atol=1e-12)
-    found = [s.plant.derivatives.sensitivity(s.theta, s.initial).G for s in (first, second)]
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-7)
-    assert np.abs(found[0]).max() > 0.1
+    first, second = (
+        cart_task(
+            tmp_path,
+            parameters={
+                "l": {"guess": 0.7, **table},
+                "m": {"target": "body/bob:mass", "guess": 2.5},
+            },
+        )
+        for table in ({"function": lengthen, "unit": "m"}, {"targets": targets})
+    )
+    assert [t.parameters.needs_compile.any() for t in (first, second)] == [True, False]
+    assert_allclose(first.initial.state, second.initial.state, rtol=0, atol=1e-12)
+    found, wanted = (sensitivity_of(task).G for task in (first, second))
+    assert_allclose(found, wanted, rtol=1e-7, atol=1e-7)
+    assert np.abs(wanted).max() > 0.1
     p = first.parameters.parameters[0]
     assert (p.unit, p.scale, p.targets) == ("m", 0.7, ())
-    assert first.system.source.spec.body("bob").pos[2] == 0.8, (
-        "the user's own spec must stay as it is"
-    )
-
-
-def test_functions_and_paths_work_together(tmp_path: Path) -> None:
-    """Values that are written in place are written into the model that the function gave."""
-    table = {"l": {"function": lengthen, "guess": 0.7}, "m": {"target": "body/bob:mass"}}
-    task = cart_task(tmp_path, parameters=table)
-    own = task.system.model_at(np.array([0.6, 2.5]))
-    assert (
-        own.body("bob").pos[2],
-        own.body("cart").mass[0],
-        own.body("bob").mass[0],
-    ) == pytest.approx((0.6, 1.2, 2.5))
-    assert task.system.model.body("bob").mass[0] == 1.5
-
-
-def failing(spec: Any, value: float) -> None:
-    """Edit a body that does not exist."""
-    spec.body("bobb").mass = value
-
-
-def negative(spec: Any, value: float) -> None:
-    """Make a body unphysical."""
-    spec.body("bob").mass = -value
-
-
-def another_joint(spec: Any, value: float) -> None:
-    """Add a degree of freedom."""
-    spec.body("cart").add_joint()
-
-
-def another_sensor(spec: Any, value: float) -> None:
-    """Add a number to sensordata."""
-    sensor = spec.add_sensor()
-    sensor.type, sensor.objtype, sensor.objname = (
-        mujoco.mjtSensor.mjSENS_JOINTPOS,
-        mujoco.mjtObj.mjOBJ_JOINT,
-        "hinge",
-    )
-
-
-def another_site(spec: Any, value: float) -> None:
-    """Add an element that does not move but takes a place in MuJoCo's data."""
-    spec.body("bob").add_site()
+    # The user's own spec stays as it is.
+    assert first.system.source.spec.body("bob").pos[2] == 0.8
 
 
 @pytest.mark.parametrize(
     ("function", "error", "message"),
     [
-        (failing, ExperimentError, r"parameters\.f: its function failed: "),
-        (negative, ModelError, r"MuJoCo cannot compile the model: .*mass"),
         (
-            another_joint,
+            lambda spec, value: setattr(spec.body("bobb"), "mass", value),
+            ExperimentError,
+            r"parameters\.f: its function failed: ",
+        ),
+        (
+            lambda spec, value: setattr(spec.body("bob"), "mass", -value),
+            ModelError,
+            r"MuJoCo cannot compile the model: .*mass",
+        ),
+        (
+            lambda spec, value: spec.body("cart").add_joint(),
             ModelError,
             r"changes nq of the model from 2 to 3; it may change numbers only",
         ),
         (
-            another_sensor,
+            lambda spec, value: spec.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                objname="hinge",
+            ),
             ModelError,
             r"changes nsensordata of the model from 6 to 7; it may change numbers only",
         ),
-        (another_site, ModelError, r"changes nsite of the model.*; it may change numbers only"),
+        # An element that does not move but takes a place in MuJoCo's data.
+        (
+            lambda spec, value: spec.body("bob").add_site(),
+            ModelError,
+            r"changes nsite of the model.*; it may change numbers only",
+        ),
     ],
 )
 def test_messages_about_functions_that_fail(
     function: Any, error: type[MjfimError], message: str, tmp_path: Path
 ) -> None:
-    """They name the parameter and the fault of its function."""
     with pytest.raises(error, match=message):
         cart_task(tmp_path, parameters={"f": {"function": function, "guess": 1.0}})
-
-
-def test_a_function_whose_guess_is_zero_needs_a_scale(tmp_path: Path) -> None:
-    """The model gives no magnitude for it."""
-    with pytest.raises(ExperimentError, match=r"parameters\.f\.scale"):
-        cart_task(tmp_path, parameters={"f": {"function": lengthen, "guess": 0.0}})

@@ -16,8 +16,9 @@ import pytest
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment, json_schema
-from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Signal
+from mjfim.experiment.system_tables import Signal
 from mjfim.experiment.task_tables import LimitKind, Robust
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.limited_elements import KINDS
 from mjfim.recordings.section import Section
 from tests.support.messages import unsaid
@@ -107,6 +108,9 @@ BAD_TABLES = {
 }
 
 
+Resolve = Callable[[str], DesignTask]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The cart-pendulum's files beside faulty models and tables."""
@@ -122,7 +126,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def resolve(folder: Path) -> Callable[[str], DesignTask]:
+def resolve(folder: Path) -> Resolve:
     """Read a text as the file bad.toml and resolve it."""
 
     def run(text: str) -> DesignTask:
@@ -208,65 +212,41 @@ seed = 5
 """
 
 
-def test_extended_contract_parses_and_resolves(resolve: Callable[[str], DesignTask]) -> None:
-    """Each table keeps the values of the file, and the system uses them."""
+def test_extended_contract_parses_and_resolves(resolve: Resolve) -> None:
     task = resolve(EXTENDED)
-    e = task.experiment
-    assert e.noise["hinge_angle"] == NoiseSpec(sigma=(0.01,)) and e.noise["slide_position"] == 0.02
-    assert e.correlated == (
-        Correlated(
-            outputs=("hinge_angle", "slide_position"), covariance=((1e-4, 1e-5), (1e-5, 4e-4))
-        ),
-    )
-    assert e.nuisance == Nuisance(
-        initial={"qpos:slide": 0.01, "qvel:hinge": True}, bias=True, delay=0.005
-    )
+    e, outputs, noise = task.experiment, task.system.outputs.names, task.system.noise
     assert e.robust == Robust(over="worst", samples=3, seed=4)
-    assert (e.parameters["c"].wanted, e.parameters["bob"].coordinates) == (0.01, "barycentric")
     assert (e.descent.starts, e.descent.coarse, e.descent.seed) == (3, 2, 5)
-    assert task.system.noise.strides.tolist() == [2] * 4 + [1] * 2
-    assert task.system.noise.covariance[0, 1] == 1.0 and task.system.noise.covariance[4, 5] == 1e-5
-    names = task.parameters.names
-    assert names[:2] == ("bob.mass", "bob.mx") and names[10] == "c"
-    assert names[11:13] == ("initial qpos:slide", "initial qvel:hinge")
-    assert (
-        names[13:-1] == tuple(f"bias {n}" for n in task.system.outputs.names)
-        and names[-1] == "delay"
-    )
+    assert noise.strides.tolist() == [2] * 4 + [1] * 2
+    np.testing.assert_allclose(noise.sigma, [2.0, 2.0, 1.0, 1.0, 0.02, 0.01])
+    assert (noise.covariance[0, 1], noise.covariance[4, 5]) == (1.0, 1e-5)
+    deviations = ("initial qpos:slide", "initial qvel:hinge", *(f"bias {n}" for n in outputs))
+    bob = [f"bob.{name}" for name in INERTIA_PARAMETRISATIONS["barycentric"].names]
+    assert task.parameters.names == (*bob, "c", *deviations, "delay")
+    assert [p.prior for p in task.parameters.parameters[11:13]] == [0.01, None]
+    assert (task.parameters.wanted[10], task.parameters.parameters[-1].prior) == (0.01, 0.005)
     assert task.parameters.interest.tolist() == [10]
     assert task.control[0] == pytest.approx(0.5)
     assert Experiment(**e.model_dump(), directory=e.directory, source=e.source) == e
     assert e.replace(noise={"hinge_angle": 0.3}).noise == {**e.noise, "hinge_angle": 0.3}
 
 
-def test_contract_resolves(resolve: Callable[[str], DesignTask]) -> None:
-    """The numbers arrive where they act."""
+def test_contract_resolves(resolve: Resolve) -> None:
     task = resolve(CONTRACT)
-    assert task.parameters.names == ("m", "l", "c")
-    assert task.parameters.guess.tolist() == [2.5, -0.75, 1.0]  # c: the model's own damping
-    assert task.parameters.true.tolist() == [2.0, -0.75, 1.0]
-    assert task.parameters.scale.tolist() == [1.0, 0.75, 1.0]
-    assert task.parameters.lower.tolist() == [0.1, -np.inf, 0.0]
-    assert task.parameters.prior_information.tolist() == np.diag([4.0, 0.0, 0.0]).tolist()
-    assert (
-        task.system.grid.substeps,
-        task.system.grid.stride,
-        task.samples,
-        task.system.measure_rate,
-    ) == (1, 2, 100, 50.0)
-    sigma = dict(zip(task.system.outputs.names, task.system.noise.sigma, strict=True))
-    assert sigma == {
-        "qpos:slide": 0.05,
-        "qpos:hinge": 0.05,
-        "qvel:slide": 0.05,
-        "qvel:hinge": 0.05,
-        "hinge_angle": 0.01,
-    }
+    parameters, grid = task.parameters, task.system.grid
+    assert parameters.names == ("m", "l", "c")
+    assert parameters.guess.tolist() == [2.5, -0.75, 1.0]  # c: the model's own damping
+    assert parameters.true.tolist() == task.theta.tolist() == [2.0, -0.75, 1.0]
+    assert parameters.scale.tolist() == [1.0, 0.75, 1.0]
+    assert parameters.lower.tolist() == [0.1, -np.inf, 0.0]
+    assert parameters.prior_information.tolist() == np.diag([4.0, 0.0, 0.0]).tolist()
+    assert (grid.substeps, grid.stride, task.control.shape) == (1, 2, (100, 1))
+    assert task.system.measure_rate == 50.0
+    assert task.system.outputs.names[-2:] == ("qvel:hinge", "hinge_angle")
+    assert task.system.noise.sigma.tolist() == [0.05] * 4 + [0.01]
     assert task.tracking.tolist() == [0.05, 0.0, 0.0, 0.1]
     assert task.control_weight.tolist() == [1e-2]
-    assert task.theta.tolist() == task.parameters.true.tolist()
     assert task.plant.nominal_initial_state.tolist() == [0.0, np.pi, 0.0, 0.0]
-    assert task.control.shape == (100, 1)
     assert {(x.kind, x.name, x.lower, x.upper) for x in task.limits} == {
         ("position", "slide", -1.0, 1.0),
         ("velocity", "hinge", -8.0, 8.0),
@@ -274,57 +254,19 @@ def test_contract_resolves(resolve: Callable[[str], DesignTask]) -> None:
     }
 
 
-def test_defaults(resolve: Callable[[str], DesignTask]) -> None:
-    """Keys that a file leaves out have the defaults of DESIGN.md."""
-    task = resolve(SHORT)
-    e = task.experiment
-    assert (e.cost.criterion, e.cost.information, e.cost.control, e.cost.linearize_at) == (
-        "E",
-        1.0,
-        1e-3,
-        "guess",
-    )
-    assert (e.descent.method, e.descent.tolerance, e.descent.max_iterations) == ("lbfgs", 1e-7, 200)
-    assert task.system.measure_rate == e.rate
-    assert (
-        task.parameters.guess.tolist()
-        == task.parameters.true.tolist()
-        == task.parameters.scale.tolist()
-        == [2.0]
-    )
-    assert not task.tracking.any()
-    assert task.limits == ()
-
-
-def test_mjcf_noise_is_the_default(resolve: Callable[[str], DesignTask]) -> None:
+def test_mjcf_noise_is_the_default(resolve: Resolve) -> None:
     """Without a noise table the sensors that state their noise are measured."""
-    task = resolve(edited("state = 0.05", ""))
-    assert task.system.outputs.names == (
-        "slide_position",
-        "hinge_angle",
-        "slide_velocity",
-        "hinge_velocity",
-    )
-    assert task.system.noise.sigma.tolist() == [0.05] * 4
+    system = resolve(edited("state = 0.05", "")).system
+    sensors = ("slide_position", "hinge_angle", "slide_velocity", "hinge_velocity")
+    assert system.outputs.names == sensors
+    assert system.noise.sigma.tolist() == [0.05] * 4
 
 
-def test_start_from_qpos(resolve: Callable[[str], DesignTask]) -> None:
-    """Stated positions and velocities are used; the others are those of the model."""
+def test_start_from_qpos(resolve: Resolve) -> None:
     task = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
     assert task.plant.nominal_initial_state.tolist() == [0.5, 3.0, 0.0, -1.0]
-    assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_initial_state.tolist() == [
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    ]
-
-
-def test_rate_below_the_timestep(resolve: Callable[[str], DesignTask]) -> None:
-    """A sample has several engine steps."""
-    task = resolve(edited("rate = 100.0", "rate = 20.0"))
-    assert (task.system.grid.substeps, task.samples) == (5, 20)
-    assert task.dt == pytest.approx(0.05)
+    task = resolve(edited('keyframe = "hanging"', ""))
+    assert task.plant.nominal_initial_state.tolist() == [0.0] * 4
 
 
 def test_replace_merges_and_checks(folder: Path) -> None:
@@ -335,23 +277,9 @@ def test_replace_merges_and_checks(folder: Path) -> None:
     assert (new.cost.tracking, new.initial.keyframe) == (e.cost.tracking, "hanging")
     assert (new.parameters, new.directory, new.source) == (e.parameters, e.directory, e.source)
     assert (e.horizon, e.cost.control) == (4.0, 1e-3)
-    with pytest.raises(
-        ExperimentError, match=r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"
-    ):
+    said = r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"
+    with pytest.raises(ExperimentError, match=said):
         e.replace(cost={"contrl": 1.0})
-    with pytest.raises(ExperimentError, match=r"horizon: .*greater than 0"):
-        e.replace(horizon=-1.0)
-
-
-@pytest.mark.parametrize("name", ["cart_pendulum.toml", "cart_pendulum_guess.toml"])
-def test_shipped_experiments_resolve(name: str) -> None:
-    """They are the study of the paper, designed at the true values and at a guess."""
-    task = DesignTask.resolve(Experiment.from_file(MODELS / name))
-    assert task.samples == 400
-    assert task.parameters.true.tolist() == [2.0, 1.0, 1.0]
-    assert task.theta.tolist() == ([2.5, 1.4, 1.4] if "guess" in name else [2.0, 1.0, 1.0])
-    t = np.arange(400) * 0.01
-    assert np.allclose(task.control[:, 0], (1 + t / 4) * np.sin(2 * t), rtol=0, atol=1e-12)
 
 
 HOME = "bad.toml"
@@ -360,8 +288,6 @@ HOME = "bad.toml"
 FAULTS: dict[str, tuple[str, str]] = {
     "top-level key": ("modle = 1\n" + SHORT, "modle … unknown key … 'model' … valid: … horizon"),
     "nested key": (edited("[cost]", "[cost]\ncontrl = 1"), "cost.contrl … 'control' … tracking"),
-    "initial key": (edited("keyframe =", "keyfrme ="), "initial.keyfrme … 'keyframe' … qpos"),
-    "signal key": (control('{ kind = "sine", amp = 1 }'), "initial.control.amp … amplitude, "),
     "signal without kind": (
         control("{ amplitude = 1 }"),
         "initial.control.kind: this key is required",
@@ -410,7 +336,6 @@ FAULTS: dict[str, tuple[str, str]] = {
         edited("rate = 100.0", "rate = 30.0"),
         "rate: at 30 Hz … 0.01 s … 25, 50, 33.3333333 Hz … A log keeps its own rate",
     ),
-    "rate negative": (edited("rate = 100.0", "rate = -1.0"), "rate … greater than 0 … -1.0"),
     "measure rate": ("measure_rate = 30.0" + SHORT, "measure_rate: 30 Hz … 100 Hz … 50, 25"),
     "horizon": (
         edited("horizon = 1.0", "horizon = 1.005"),
@@ -453,10 +378,6 @@ FAULTS: dict[str, tuple[str, str]] = {
         parameter('targets = [{ path = "body/bob:mass", scale = 0 }]'),
         "parameters.m … scale is 0",
     ),
-    "sigma negative": (
-        edited("state = 0.05", "state = -0.1"),
-        "noise.state … greater than 0 … -0.1",
-    ),
     "sigma text": (edited("state = 0.05", 'state = "loud"'), "noise.state … number … 'loud'"),
     "control weight": (
         edited("[cost]", "[cost]\ncontrol = -1"),
@@ -465,10 +386,6 @@ FAULTS: dict[str, tuple[str, str]] = {
     "no control weight": (
         edited("[cost]", "[cost]\ncontrol = {}"),
         "cost.control … actuator 'force' has neither a weight nor a range … limits.control.force",
-    ),
-    "criterion": (
-        edited("[cost]", '[cost]\ncriterion = "F"'),
-        "cost.criterion … 'E', 'A', 'D' … or 'c' … 'F'",
     ),
     "criterion c alone": (
         edited("[cost]", '[cost]\ncriterion = "c"'),
@@ -482,7 +399,6 @@ FAULTS: dict[str, tuple[str, str]] = {
         SHORT + "[descent]\npsi_weight = 1\n",
         "descent … psi_weight can only be given together with method",
     ),
-    "coarse word": (SHORT + '[descent]\ncoarse = "no"\n', "descent.coarse … integer … 'no'"),
     "nuisance false": (SHORT + "[nuisance]\ndelay = false\n", "nuisance.delay … True"),
     "robust over": (
         SHORT + '[robust]\nover = "best"\n',
@@ -494,17 +410,9 @@ FAULTS: dict[str, tuple[str, str]] = {
         'earlier = ["cart_pendulum.csv"]\n' + SHORT,
         "earlier … cart_pendulum.csv … not a JSON file",
     ),
-    "position limits inverted": (
-        SHORT + "[limits]\nposition = { slide = [1, -1] }\n",
-        "limits.position.slide … [1, -1] … lower < upper",
-    ),
     "qpos length": (
         edited('keyframe = "hanging"', "qpos = [0, 0, 0]"),
         "initial.qpos … 3 numbers … this model needs 2",
-    ),
-    "act of a model without": (
-        edited('keyframe = "hanging"', "act = [0]"),
-        "initial.act … 1 numbers … this model needs 0",
     ),
     "keyframe and qpos": (
         edited('keyframe = "hanging"', 'keyframe = "hanging"\nqpos = [0, 0]'),
@@ -565,7 +473,6 @@ OTHER_FAULTS: dict[str, tuple[str, type[MjfimError], str]] = {
         MjfimError,
         "initial.control.seed … -1",
     ),
-    "negative descent seed": (SHORT + "[descent]\nseed = -1\n", MjfimError, "descent.seed … -1"),
     "column twice": (control('"twice.csv"'), MjfimError, "twice.csv … force"),
     "table not UTF-8": (control('"latin.csv"'), MjfimError, "latin.csv"),
 }
@@ -579,25 +486,23 @@ OTHER_FAULTS: dict[str, tuple[str, type[MjfimError], str]] = {
     ],
     ids=[*FAULTS, *OTHER_FAULTS],
 )
-def test_faults_are_named(
-    text: str, kind: type[MjfimError], parts: str, resolve: Callable[[str], DesignTask]
-) -> None:
-    """The message names the file, the key, the fault and the valid choices."""
+def test_faults_are_named(text: str, kind: type[MjfimError], parts: str, resolve: Resolve) -> None:
     with pytest.raises(kind) as caught:
         resolve(text)
     message = str(caught.value)
+    if kind is ExperimentError:
+        assert "\n" not in message
     if kind is not MjfimError:
         assert parts.split(" … ")[0] in message.splitlines()[0].split(": ")[0]
     assert unsaid(parts, message) == []
 
 
-def test_a_free_control_is_named_by_its_actuator(resolve: Callable[[str], DesignTask]) -> None:
-    """An unknown actuator in cost.control_about is refused when the cost is built."""
+def test_a_free_control_is_named_by_its_actuator(resolve: Resolve) -> None:
     with pytest.raises(ExperimentError, match=r"cost\.control_about: .*actuator 'motor'.*force"):
         _ = resolve(edited("[cost]", "[cost]\ncontrol_about = { motor = 1 }")).problem
 
 
-def test_the_short_experiment_has_no_fault(resolve: Callable[[str], DesignTask]) -> None:
+def test_the_short_experiment_has_no_fault(resolve: Resolve) -> None:
     """Every fault above is the only one in its file."""
     assert resolve(SHORT).samples == 100
 
@@ -611,7 +516,6 @@ def test_the_short_experiment_has_no_fault(resolve: Callable[[str], DesignTask])
     ],
 )
 def test_not_toml(data: bytes, fragment: str, tmp_path: Path) -> None:
-    """Wrong syntax and wrong encoding name the file and the place."""
     path = tmp_path / "broken.toml"
     path.write_bytes(data)
     with pytest.raises(ExperimentError) as caught:
@@ -629,7 +533,6 @@ def test_a_log_in_place_of_an_experiment_is_named_as_one(name: str, tmp_path: Pa
 
 
 def test_no_file(tmp_path: Path) -> None:
-    """A missing file and a folder are refused."""
     with pytest.raises(
         ExperimentError, match=r"gone\.toml: cannot read the experiment file: No such file"
     ):
@@ -638,8 +541,7 @@ def test_no_file(tmp_path: Path) -> None:
         Experiment.from_file(tmp_path)
 
 
-def test_all_faults_at_once(resolve: Callable[[str], DesignTask]) -> None:
-    """Every fault is reported on a line with the file and the key."""
+def test_all_faults_at_once(resolve: Resolve) -> None:
     with pytest.raises(ExperimentError) as caught:
         resolve(
             edited("rate = 100.0", "rate = -1.0")
@@ -665,7 +567,7 @@ def test_all_faults_at_once(resolve: Callable[[str], DesignTask]) -> None:
     ],
 )
 def test_integers_and_truth_values_are_not_converted(
-    key: str, value: str, fragment: str, resolve: Callable[[str], DesignTask]
+    key: str, value: str, fragment: str, resolve: Resolve
 ) -> None:
     """A number of starts is no truth value and no text, and a truth value is neither 1 nor "no"."""
     table, _, name = key.partition(".")
@@ -688,30 +590,13 @@ def test_integers_and_truth_values_are_not_converted(
     ],
     ids=["many faults", "long key", "long value"],
 )
-def test_messages_stay_short(text: str, parts: str, resolve: Callable[[str], DesignTask]) -> None:
+def test_messages_stay_short(text: str, parts: str, resolve: Resolve) -> None:
     """Long texts of the user are shortened, and of many faults the first ones are described."""
     with pytest.raises(ExperimentError) as caught:
         resolve(text)
     message = str(caught.value)
     assert len(message.replace(HOME, "")) < 1000
     assert unsaid(parts, message) == []
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        control('{ kind = "noise" }'),
-        control('{ kind = "sine", amp = 1 }'),
-        edited("[cost]", "[cost]\ncontrol = -1"),
-        SHORT + "[limits]\nvelocity = { hinge = -8 }\n",
-        parameter('target = "body/bob:mass"\nscale = 0.0'),
-    ],
-)
-def test_one_fault_one_line(text: str, resolve: Callable[[str], DesignTask]) -> None:
-    """A key that may have several types is reported once, not once per type."""
-    with pytest.raises(ExperimentError) as caught:
-        resolve(text)
-    assert len(str(caught.value).splitlines()) == 1
 
 
 def described_tables(annotation: Any) -> set[type[Section]]:
@@ -735,17 +620,11 @@ def test_every_key_has_a_description() -> None:
 
 
 def test_json_schema_states_the_keys_of_a_file() -> None:
-    """The schema is JSON, describes the tables and leaves out what only Python can state."""
+    """The schema is JSON, and leaves out what only Python can state."""
     schema = json.loads(json.dumps(json_schema()))
-
-    keys = set(schema["properties"])
-    assert keys == {key for key, field in Experiment.model_fields.items() if not field.exclude}
-    assert schema["required"] == ["model", "rate", "parameters"]
-
-    parameter_keys = schema["$defs"]["ParameterSpec"]["properties"]
-    assert "target" in parameter_keys
-    assert "function" not in parameter_keys
-    assert schema["additionalProperties"] is False
+    keys = {key for key, field in Experiment.model_fields.items() if not field.exclude}
+    assert set(schema["properties"]) == keys
+    assert "function" not in schema["$defs"]["ParameterSpec"]["properties"]
 
 
 @pytest.mark.parametrize("values", [{}, {"parameters": {}}, {"model": 3}])

@@ -103,57 +103,51 @@ WITH_UNITS: dict[str, Any] = {
     },
     "descent": {"seconds": "2 min"},
 }
-DEG = math.pi / 180.0
-PLAIN: dict[str, Any] = {
-    "rate": 50.0,
-    "horizon": 1.0,
-    "initial": {
-        "qpos": [0.05, 30 * DEG, 1.0, 0.0, 0.0, 0.0],
-        "qvel": [0.1, 30 * DEG, math.pi / 30, 0.0, 0.0],
-        "control": {
-            "kind": "sine",
-            "amplitude": {"push": 0.5, "servo": 5 * DEG},
-            "frequency": 2.0,
-        },
-    },
-    "parameters": {
-        "m": {"target": "body/arm:mass", "guess": 0.9, "true": 1.0, "bounds": [0.001, 5.0]},
-        "c": {"target": "joint/hinge:damping", "guess": 0.1, "prior": 1.0},
-        "z": {
-            "targets": [{"path": "body/arm:ipos[2]", "scale": -1.0, "offset": 0.01}],
-            "guess": -0.3,
-            "wanted": 0.001,
-            "published": -0.31,
-        },
-    },
-    "noise": {
-        "qpos:rail": 0.001,
-        "qpos:hinge": {"sigma": 0.1 * DEG, "rate": 25.0},
-        "qpos:wrist": DEG,
-        "gyro": {"sigma": [DEG, 0.01, math.pi / 30]},
-    },
-    "nuisance": {"initial": {"qpos:hinge": DEG, "qvel:hinge": True}, "delay": 0.003},
-    "limits": {
-        "position": {"rail": [-0.5, 0.5], "hinge": [-80 * DEG, 1.2]},
-        "velocity": {"hinge": 2 * math.pi, "rail": [-1.0, math.inf]},
-        "acceleration": {"hinge": 100.0},
-        "control": {"servo": [-45 * DEG, 45 * DEG]},
-        "control_rate": {"servo": 90 * DEG},
-        "force": {"servo": 10.0},
-        "bandwidth": 5.0,
-    },
-    "descent": {"seconds": 120.0},
-}
 
 
 def test_units_and_plain_numbers_state_the_same(tmp_path: Path) -> None:
-    stated = experiment(tmp_path, **WITH_UNITS)
-    plain = experiment(tmp_path, **PLAIN)
+    stated, plain = (
+        experiment(tmp_path, **tables) for tables in (WITH_UNITS, converted(WITH_UNITS))
+    )
     System.resolve(stated)
     System.resolve(plain)
 
     found, expected = (e.model_dump(mode="json", exclude_unset=True) for e in (stated, plain))
     assert rounded(found) == rounded(expected)
+
+
+# Units of `WITH_UNITS` in those of the model.
+FACTORS = {
+    "deg": math.pi / 180.0,
+    "deg/s": math.pi / 180.0,
+    "rpm": math.pi / 30.0,
+    "rev/s": 2.0 * math.pi,
+    "rad/s^2": 1.0,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "cm/s": 1e-2,
+    "m/s": 1.0,
+    "g": 1e-3,
+    "kg": 1.0,
+    "mN": 1e-3,
+    "Nm": 1.0,
+    "mN m s/rad": 1e-3,
+    "N m s": 1.0,
+    "ms": 1e-3,
+    "min": 60.0,
+    "Hz": 1.0,
+    "kHz": 1e3,
+}
+
+
+def converted(value: Any) -> Any:
+    """The tables with plain numbers."""
+    if isinstance(value, dict):
+        return {key: converted(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [converted(each) for each in value]
+    number, _, unit = str(value).partition(" ")
+    return float(number) * FACTORS[unit] if unit in FACTORS else value
 
 
 def rounded(values: Any) -> Any:

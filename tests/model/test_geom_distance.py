@@ -4,15 +4,15 @@ differences.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import combinations_with_replacement
 
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.model.clearance import BOX, CAPSULE, GeomDistances, SignedDistances, find_geom_pairs
+from mjfim.model.clearance import BOX, CAPSULE, GeomDistances, find_geom_pairs
 from tests.support.numerics import Array, directional_check
 
 ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))
@@ -51,25 +51,22 @@ ARMS = f"""
 
 
 def two(first: str, second: str) -> mujoco.MjModel:
-    """Two geoms, a and b: a on a hinge and a ball joint, b free."""
-    return mujoco.MjModel.from_xml_string(
-        f"""
-        <mujoco>{ASSETS}<worldbody>
+    """Two geoms: a on a hinge and a ball joint, b free; or the tilted floor and b.
+
+    MuJoCo finds the contacts of b within 10 m.
+    """
+    arm = f"""
           <body name="up" pos="0 0 0.5"><joint type="hinge" axis="1 1 0"/>
             <geom size="0.01" contype="0" conaffinity="0"/>
             <body name="A" pos="0.1 0 0.1"><joint type="ball"/>
-              <geom name="a" {first} pos="0.05 0 0.1"/></body></body>
-          <body name="B" pos="0.1 0 0.6"><freejoint/><geom name="b" {second} pos="0 0.02 0"/></body>
+              <geom name="a" {KINDS.get(first)} pos="0.05 0 0.1"/></body></body>"""
+    return mujoco.MjModel.from_xml_string(
+        f"""
+        <mujoco>{ASSETS}<worldbody>{FLOOR if first == "floor" else arm}
+          <body name="B" pos="0.1 0 0.6"><freejoint/>
+            <geom name="b" {KINDS[second]} pos="0 0.02 0" margin="10"/></body>
         </worldbody></mujoco>
         """
-    )
-
-
-def on_floor(kind: str) -> mujoco.MjModel:
-    """One free geom over a tilted floor. Contacts are found within 10 m."""
-    body = f'<body name="B"><freejoint/><geom name="b" {kind} margin="10"/></body>'
-    return mujoco.MjModel.from_xml_string(
-        f"<mujoco>{ASSETS}<worldbody>{FLOOR}{body}</worldbody></mujoco>"
     )
 
 
@@ -83,15 +80,13 @@ def moved(model: mujoco.MjModel, qpos: Array, dq: Array) -> Array:
 def scattered(model: mujoco.MjModel, count: int, spread: float, seed: int = 0) -> Array:
     """Random configurations about qpos0: (count, nq)."""
     rng = np.random.default_rng(seed)
-    size = np.full(model.nv, 2.0)
-    for j in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
-        size[model.jnt_dofadr[j] : model.jnt_dofadr[j] + 3] = spread
-    size[
-        model.dof_jntid[np.isin(model.jnt_type[model.dof_jntid], int(mujoco.mjtJoint.mjJNT_SLIDE))]
-    ] = spread
-    return np.array(
-        [moved(model, model.qpos0, size * rng.normal(size=model.nv)) for _ in range(count)]
+    kind, first = model.jnt_type[model.dof_jntid], model.jnt_dofadr[model.dof_jntid]
+    place = np.where(
+        kind == int(mujoco.mjtJoint.mjJNT_FREE), np.arange(model.nv) - first < 3, False
     )
+    size = np.where(place | (kind == int(mujoco.mjtJoint.mjJNT_SLIDE)), spread, 2.0)
+    moves = size * rng.normal(size=(count, model.nv))
+    return np.array([moved(model, model.qpos0, move) for move in moves])
 
 
 def asked(model: mujoco.MjModel, chosen: GeomDistances, qpos: Array, limit: float) -> Array:
@@ -114,25 +109,23 @@ def between(model: mujoco.MjModel, reach: float, grouped: bool = False) -> GeomD
     return GeomDistances(model, find_geom_pairs(model, ()), reach, grouped)
 
 
-def slope_errors(
-    model: mujoco.MjModel,
-    measured: Callable[[Array], SignedDistances],
-    qpos: Array,
-    h: float = 2e-4,
-) -> Array:
-    """Largest error of slopes of the first column against differences along every dof, of each
-    configuration: (n,).
-    """
-    _, slope = measured(qpos)
-    assert slope is not None
-    worst = []
-    for now, claimed in zip(qpos, slope[:, 0], strict=True):
-        curves = [
-            lambda t, now=now, e=e: float(measured(moved(model, now, t * e)[None])[0][0, 0])
-            for e in np.eye(model.nv)
-        ]
-        worst.append(directional_check(claimed, curves, h))
-    return np.array(worst)
+def slope_error(model: mujoco.MjModel, chosen: GeomDistances, qpos: Array) -> float:
+    """Largest error of the slopes of the first column against differences along every dof."""
+    slope = chosen(qpos[None], True)[1]
+    curves = [
+        lambda t, e=e: float(chosen(moved(model, qpos, t * e)[None], True)[0][0, 0])
+        for e in np.eye(model.nv)
+    ]
+    return directional_check(slope[0, 0], curves, 2e-4)
+
+
+def slope_errors(model: mujoco.MjModel, spread: float, low: float, high: float) -> Array:
+    """Largest errors of slopes at up to six distances in a range, by differences along each dof."""
+    chosen, qpos = between(model, 2.0), scattered(model, 60, spread, seed=3)
+    distances = chosen(qpos, False)[0][:, 0]
+    qpos = qpos[(distances > low) & (distances < high)][:6]
+    assert len(qpos) > 2
+    return np.array([slope_error(model, chosen, now) for now in qpos])
 
 
 # Everything overlaps, so that MuJoCo's contacts show which pairs it selects.
@@ -219,7 +212,6 @@ def test_height_fields_are_refused_unless_ignored() -> None:
 
 
 def test_no_pairs_are_refused() -> None:
-    """The message says that a moving geom is needed."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     with pytest.raises(ExperimentError, match="no two geoms can come near each other"):
         GeomDistances(model, (), 0.1)
@@ -239,7 +231,7 @@ def test_all_distances_within_reach_are_found(reach: float) -> None:
     shapes = [{int(model.geom_type[g]) for g in (p.first, p.second)} for p in chosen.pairs]
     trusted = (d > -0.05) | np.array([s != {CAPSULE, BOX} for s in shapes])  # see below
     assert trusted.mean() > 0.99
-    np.testing.assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
+    assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
     assert (d[expected == reach] == reach).all()
     assert d.max() <= reach
     assert (
@@ -247,45 +239,9 @@ def test_all_distances_within_reach_are_found(reach: float) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "place", "expected"),
-    [
-        ("sphere", "sphere", (0.3, 0.4, 0.0), 0.5 - 0.2),
-        ("sphere", "sphere", (0.09, 0.12, 0.0), 0.15 - 0.2),
-        ("sphere", "capsule", (0.0, 0.3, 0.15), 0.3 - 0.15),
-        ("sphere", "capsule", (0.3, 0.0, 0.6), 0.5 - 0.15),
-        ("capsule", "capsule", (0.12, 0.0, 0.35), 0.12 - 0.1),
-        ("capsule", "capsule", (0.3, 0.0, 0.8), 0.5 - 0.1),
-        ("sphere", "box", (0.2, 0.0, 0.1), 0.1 - 0.1),
-        ("box", "box", (0.0, 0.35, 0.1), 0.25),
-        ("cylinder", "sphere", (0.5, 0.0, 0.55), 0.4 * 2**0.5 - 0.1),
-        ("ellipsoid", "ellipsoid", (0.0, 0.0, 0.45), 0.05),
-        ("capsule", "box", (0.0, 0.12, 0.0), 0.12 - 0.05 - 0.05),
-        ("capsule", "box", (0.0, 0.02, 0.0), -0.05 - 0.05 + 0.02),
-    ],
-)
-def test_distances_by_hand(
-    first: str, second: str, place: tuple[float, float, float], expected: float
-) -> None:
-    """Upright geoms at a displacement, in either order."""
-    for a, b, shift in ((first, second, np.array(place)), (second, first, -np.array(place))):
-        model = mujoco.MjModel.from_xml_string(
-            f"""
-            <mujoco>{ASSETS}<worldbody><body><freejoint/><geom {KINDS[a]}/></body>
-            <body><freejoint/><geom {KINDS[b]}/></body></worldbody></mujoco>
-            """
-        )
-        qpos = model.qpos0.copy()
-        qpos[7:10] += shift
-        assert between(model, 2.0)(qpos[None], False)[0][0, 0] == pytest.approx(expected, abs=1e-8)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_planes_agree_with_contacts(kind: str) -> None:
-    """The deepest of the contacts that MuJoCo's collision detection makes with a margin of ten
-    metres.
-    """
-    model = on_floor(KINDS[kind])
+    model = two("floor", kind)
     chosen, qpos, data = between(model, 9.0), scattered(model, 200, 1.0), mujoco.MjData(model)
     d, deepest = chosen(qpos, False)[0][:, 0], []
     for now in qpos:
@@ -293,7 +249,7 @@ def test_planes_agree_with_contacts(kind: str) -> None:
         mujoco.mj_fwdPosition(model, data)
         deepest.append(data.contact.dist.min())
     assert d.min() < -0.3 and d.max() > 0.3
-    np.testing.assert_allclose(d, deepest, rtol=0, atol=1e-12)
+    assert_allclose(d, deepest, rtol=0, atol=1e-12)
 
 
 def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
@@ -312,12 +268,9 @@ def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
     chosen, qpos = between(model, 1.0), scattered(model, 500, 0.06)
     d = chosen(qpos, False)[0]
     assert (d[:, 0] < -0.06).mean() > 0.5
-    np.testing.assert_allclose(d[:, 0], d[:, 1], rtol=0, atol=2e-8)
+    assert_allclose(d[:, 0], d[:, 1], rtol=0, atol=2e-8)
     worst = asked(model, chosen, qpos, 1.0)[:, 0] - d[:, 0]
     assert worst.max() > 0.05  # what is avoided
-
-
-SMOOTH = [(a, b) for a, b in combinations_with_replacement(KINDS, 2)]
 
 
 # Every kind of geom is in two of the fast cases.
@@ -328,47 +281,29 @@ FAST_PAIRS = list(zip(KINDS, [*list(KINDS)[1:], next(iter(KINDS))], strict=True)
     ("first", "second"),
     [
         pytest.param(*pair, marks=[] if {pair, pair[::-1]} & {*FAST_PAIRS} else pytest.mark.slow)
-        for pair in SMOOTH
+        for pair in combinations_with_replacement(KINDS, 2)
     ],
 )
 def test_slopes_agree_with_differences(first: str, second: str) -> None:
     """Geoms are near or far and are moved by hinge, ball and free joints."""
-    model = two(KINDS[first], KINDS[second])
-    chosen, qpos = between(model, 2.0), scattered(model, 16, 0.4)
-    qpos = qpos[chosen(qpos, False)[0][:, 0] > 0.02]
-    assert len(qpos) > 5
-    errors = slope_errors(model, lambda q: chosen(q, True), qpos)
+    errors = slope_errors(two(first, second), 0.4, 0.02, np.inf)
     assert np.quantile(errors, 0.75) < 1e-6
     assert errors.max() < 1e-4  # the surface bends where another edge or face becomes the nearest
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_slopes_to_the_floor_agree_with_differences(kind: str) -> None:
-    """The geom is above or below a tilted plane."""
-    model = on_floor(KINDS[kind])
-    chosen, qpos = between(model, 9.0), scattered(model, 8, 1.0)
-    d = chosen(qpos, False)[0]
-    assert d.min() < -0.1 and d.max() > 0.1
-    assert slope_errors(model, lambda q: chosen(q, True), qpos).max() < 1e-6
-
-
-# Depths of boxes and meshes have many edges, at which no slope is the right one.
+# Depths of boxes and meshes in each other have many edges, at which no slope is the right one.
 @pytest.mark.parametrize(
     ("first", "second"),
-    [("sphere", k) for k in KINDS]
-    + [("capsule", k) for k in KINDS]
-    + [("cylinder", "cylinder"), ("ellipsoid", "box")],
+    [
+        *((first, second) for first in ("floor", "sphere", "capsule") for second in KINDS),
+        ("cylinder", "cylinder"),
+        ("ellipsoid", "box"),
+    ],
 )
 def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -> None:
-    """Distances are negative, slopes still point outwards; curved surfaces are found to fewer
-    digits inside.
-    """
-    model = two(KINDS[first], KINDS[second])
-    chosen, qpos = between(model, 2.0), scattered(model, 60, 0.1, seed=3)
-    d = chosen(qpos, False)[0][:, 0]
-    qpos = qpos[(d < -0.01) & (d > -0.04)][:6]
-    assert len(qpos) > 2
-    assert slope_errors(model, lambda q: chosen(q, True), qpos).max() < 1e-4
+    """Slopes point outwards; curved surfaces are found to fewer digits inside."""
+    spread, least = (1.0, -1.0) if first == "floor" else (0.1, -0.04)
+    assert slope_errors(two(first, second), spread, least, -0.01).max() < 1e-4
 
 
 @pytest.mark.parametrize("offset", [1e-6, 1e-10, 0.0, -1e-10, -1e-6])
@@ -377,7 +312,7 @@ def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
     """A sphere is brought to an offset along the slope of the distance; nearest points no longer
     tell the normal.
     """
-    model = two(KINDS["sphere"], KINDS[second])
+    model = two("sphere", second)
     chosen, qpos = between(model, 2.0), scattered(model, 1, 0.4)[0]
     start = model.joint(2).qposadr[0]
     for _ in range(40):
@@ -386,30 +321,26 @@ def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
         assert np.linalg.norm(out) == pytest.approx(1.0, abs=1e-9)
         qpos[start : start + 3] -= (d[0, 0] - offset) * out
     assert chosen(qpos[None], False)[0][0, 0] == pytest.approx(offset, abs=2e-11)
-    assert slope_errors(model, lambda q: chosen(q, True), qpos[None]).max() < 2e-4
+    assert slope_error(model, chosen, qpos) < 2e-4
 
 
 def test_columns_are_pairs_of_bodies() -> None:
-    """Their smallest distance, with the slope that belongs to it."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, single = between(model, 0.5, grouped=True), between(model, 0.5)
     qpos = scattered(model, 50, 0.4)
     (bodies, by_bodies), (geoms, by_geoms) = chosen(qpos, True), single(qpos, True)
-    names = [
-        " - ".join(model.body(model.geom_bodyid[g]).name for g in (p.first, p.second))
-        for p in single.pairs
-    ]
-    assert set(names) == set(chosen.columns) and len(set(chosen.columns)) == len(
-        chosen.columns
-    ) < len(names)
-    assert single.columns == tuple(p.name for p in single.pairs)
+    names = np.array(
+        [
+            " - ".join(model.body(model.geom_bodyid[g]).name for g in (p.first, p.second))
+            for p in single.pairs
+        ]
+    )
+    assert sorted(chosen.columns) == sorted({*names})
     for i, column in enumerate(chosen.columns):
-        own = [j for j, name in enumerate(names) if name == column]
-        least = geoms[:, own].argmin(axis=1)
-        np.testing.assert_array_equal(bodies[:, i], geoms[:, own].min(axis=1))
-        np.testing.assert_array_equal(
-            by_bodies[:, i], by_geoms[np.arange(50), np.array(own)[least]]
-        )
+        own = np.flatnonzero(names == column)
+        least = own[geoms[:, own].argmin(axis=1)]
+        assert_array_equal(bodies[:, i], geoms[range(50), least])
+        assert_array_equal(by_bodies[:, i], by_geoms[range(50), least])
 
 
 @pytest.mark.parametrize("spread", [0.4, 4.0])

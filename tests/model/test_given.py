@@ -8,8 +8,8 @@ from types import ModuleType
 from typing import Any
 
 import mujoco
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.model.comparison import differences, same_dynamics
@@ -52,7 +52,6 @@ PART = """
 def model_of(given: Any, folder: Path = Path()) -> Any:
     """The compiled model of what is given, from the files that hold it."""
     name, files = packed(given, folder)
-    assert files is not None
     return packed_model(files, folder / name).model
 
 
@@ -71,7 +70,7 @@ def test_no_digit_of_a_number_is_lost() -> None:
 
     assert found.opt.timestep == 0.0012345678901
     assert found.dof_damping[0] == 0.123456789012345
-    np.testing.assert_allclose(found.body_quat, wanted.body_quat, rtol=0.0, atol=1e-15)
+    assert_allclose(found.body_quat, wanted.body_quat, rtol=0.0, atol=1e-15)
     # Other programs print as before.
     assert 'damping="0.123457"' in spec.to_xml()
 
@@ -128,7 +127,7 @@ def test_a_mesh_is_not_taken_for_another_one_of_its_name(tmp_path: Path) -> None
     found, wanted = model_of(spec), spec.copy().compile()
 
     assert wanted.body_mass[2] > 2.0 * wanted.body_mass[1]
-    np.testing.assert_allclose(found.body_mass, wanted.body_mass, rtol=1e-5)
+    assert_allclose(found.body_mass, wanted.body_mass, rtol=1e-5)
 
 
 def test_a_name_of_robot_descriptions_is_its_model_file(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy
+from numpy.testing import assert_allclose
 
 from mjfim.model.inertia import (
     BARYCENTRIC_DERIVATIVES,
@@ -35,13 +36,13 @@ def test_derivatives_are_those_of_differences() -> None:
         ends = [values + sign * step * np.eye(10)[i] for sign in (1, -1)]
         matrices = [pseudo_inertia(end) for end in ends]
         slope = (matrices[0] - matrices[1]) / (2 * step)
-        np.testing.assert_allclose(derivatives[i], slope, atol=1e-8)
+        assert_allclose(derivatives[i], slope, atol=1e-8)
 
         residuals = [
             inertia_difference(matrix, derivatives, reference).residual for matrix in matrices
         ]
         slope = (residuals[0] - residuals[1]) / (2 * step)
-        np.testing.assert_allclose(difference.jacobian[:, i], slope, atol=1e-7)
+        assert_allclose(difference.jacobian[:, i], slope, atol=1e-7)
 
 
 def test_derivative_where_eigenvalues_meet() -> None:
@@ -49,29 +50,21 @@ def test_derivative_where_eigenvalues_meet() -> None:
     found = inertia_difference(
         pseudo_inertia(reference), logcholesky_derivatives(reference), reference
     )
-    np.testing.assert_allclose(found.residual, 0.0, atol=1e-12)
+    assert_allclose(found.residual, 0.0, atol=1e-12)
     step = 1e-5
     for i in range(10):
         moved = pseudo_inertia(reference + step * np.eye(10)[i])
         residual = inertia_difference(moved, BARYCENTRIC_DERIVATIVES, reference).residual
-        np.testing.assert_allclose(found.jacobian[:, i], residual / step, atol=1e-3)
+        assert_allclose(found.jacobian[:, i], residual / step, atol=1e-3)
 
 
-def test_distance_is_that_of_the_metric_in_any_frame_and_unit() -> None:
+def test_distance_is_that_of_the_metric() -> None:
     values, reference = coordinates(5), coordinates(6)
     P, C = pseudo_inertia(values), pseudo_inertia(reference)
     ratio = scipy.linalg.eigh(P, C, eigvals_only=True)
     squares = float(np.sum(np.log(ratio) ** 2))
     found = inertia_difference(P, BARYCENTRIC_DERIVATIVES, reference).residual
     assert found @ found == pytest.approx(squares, rel=1e-10)
-
-    # Another frame, and other units of length and mass.
-    R = scipy.spatial.transform.Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
-    change = np.eye(4)
-    change[:3, :3], change[:3, 3] = 1000.0 * R, [0.3, 0.1, -2.0]
-    change *= np.sqrt(1e-3)
-    moved = scipy.linalg.eigh(change @ P @ change.T, change @ C @ change.T, eigvals_only=True)
-    assert np.sum(np.log(moved) ** 2) == pytest.approx(squares, rel=1e-9)
 
 
 def test_bodies_without_volume_are_not_positive_definite() -> None:

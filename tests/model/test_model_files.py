@@ -18,15 +18,10 @@ from tests.support.mesh_model import FILES, write_mesh_model
 def test_includes_meshes_images_and_attached_models_are_listed(tmp_path: Path) -> None:
     model = write_mesh_model(tmp_path)
 
-    found = {file.relative_to(tmp_path).as_posix() for file in files_of_model(model)}
+    files = files_of_model(model)
 
-    assert found == set(FILES)
-
-
-def test_the_model_itself_is_the_first_file(tmp_path: Path) -> None:
-    model = write_mesh_model(tmp_path)
-
-    assert files_of_model(model)[0] == model
+    assert files[0] == model
+    assert {file.relative_to(tmp_path).as_posix() for file in files} == set(FILES)
 
 
 def test_a_mesh_of_a_urdf_is_found_without_its_package(tmp_path: Path) -> None:

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
-from mjfim.excitation.evaluation import simulate
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.identify import identify
 from mjfim.model.parameters import ParameterSet
 from tests.support.paths import MODELS
 
@@ -60,31 +57,3 @@ def test_a_value_outside_is_an_error_unless_bounds_contain_it(key: str) -> None:
     with pytest.raises(ExperimentError, match=rf"parameters\.c\.{key}: -0\.5 makes .* negative"):
         parameters(c=spec)
     assert parameters(c={**spec, "bounds": [-1.0, 5.0]}).lower[0] == -1.0
-
-
-def pushed(**damping: Any) -> Experiment:
-    """The cart-pendulum for half a second; its slide has a damping of -0.2 N s/m."""
-    control = {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}
-    return Experiment(
-        model="cart_pendulum.xml",
-        rate=50.0,
-        horizon=0.5,
-        initial={"keyframe": "hanging", "control": control},
-        parameters={"d": {"target": "joint/slide:damping", "guess": 0.1, **damping}},
-        noise={"state": 1e-3},
-        fit={"bootstrap": 0},
-        directory=MODELS,
-    )
-
-
-@pytest.mark.slow
-def test_a_fit_keeps_the_bound_of_physics_unless_the_file_states_a_wider_one() -> None:
-    """A drive that pushes along makes the damping of its slide look negative."""
-    robot = pushed(true=-0.2, bounds=[-1.0, 1.0])
-    recording = simulate(robot, DesignTask.resolve(robot).initial, seed=0)
-    wide = identify(robot, [recording])
-    assert wide.theta[0] == pytest.approx(-0.2, abs=0.05)
-
-    kept = identify(pushed(), [recording])
-    assert 0.0 <= kept.theta[0] < 1e-6
-    assert any("d" in text and "bound" in text for text in kept.warnings)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.experiment.system import System
 from mjfim.model.loading import silence_mujoco_log
@@ -86,18 +87,19 @@ def signals(system: System, seed: int = 0) -> np.ndarray:
     """(SAMPLES, w) inputs that change all the time: references with steps, factors, controls."""
     rng = np.random.default_rng(seed)
     t = np.arange(SAMPLES) * system.dt
-    inputs = np.zeros((SAMPLES, len(system.inputs)))
-    for i, name in enumerate(system.inputs):
-        quantity = name.partition(":")[0]
-        wave = 0.3 * np.sin(2 * np.pi * rng.uniform(2.0, 5.0) * t) + 0.4 * (
-            t > rng.uniform(0.05, 0.15)
-        )
-        inputs[:, i] = wave
-        if quantity == "gain":
-            inputs[:, i] = 1.0 + 0.5 * (t > 0.1)
-        if quantity == "enable":
-            inputs[:, i] = (t < 0.08) | (t > 0.14)
-    return inputs
+    others = {"gain": 1.0 + 0.5 * (t > 0.1), "enable": 1.0 * ((t < 0.08) | (t > 0.14))}
+    inputs = []
+    for name in system.inputs:
+        frequency, begin = rng.uniform([2.0, 0.05], [5.0, 0.15])
+        wave = 0.3 * np.sin(2 * np.pi * frequency * t) + 0.4 * (t > begin)
+        inputs.append(others.get(name.partition(":")[0], wave))
+    return np.stack(inputs, axis=1)
+
+
+def prepared(controllers: dict[str, Any], **tables: Any) -> tuple[System, Any, np.ndarray]:
+    """The arm with some laws, its model, and inputs."""
+    system = System.resolve(arm_experiment(controllers, **tables))
+    return system, system.plant.model(system.parameters.guess), signals(system)
 
 
 def oracle(system: System, law: dict[str, Any], inputs: np.ndarray) -> np.ndarray:
@@ -115,40 +117,34 @@ def oracle(system: System, law: dict[str, Any], inputs: np.ndarray) -> np.ndarra
 
 @pytest.mark.parametrize("name", LAWS)
 def test_a_law_equals_a_plain_loop(name: str) -> None:
-    system = System.resolve(arm_experiment({"shoulder": LAWS[name]}))
-    inputs = signals(system)
-    model = system.plant.model(system.parameters.guess)
-
+    system, model, inputs = prepared({"shoulder": LAWS[name]})
     found = system.plant.simulator.rollout([model], START[None], inputs[None])
 
     assert found.finite.all()
     expected = oracle(system, LAWS[name], inputs)
-    np.testing.assert_allclose(found.states[0], expected, atol=1e-11)
+    assert_allclose(found.states[0], expected, atol=1e-11)
 
     # The law has an effect, so that a wrong law would be seen.
     assert np.abs(expected - oracle(system, {"kp": 0.0}, inputs)).max() > 0.05
 
 
 def test_simulations_of_one_batch_have_their_own_numbers() -> None:
-    """Gains, latencies and start states of one batch differ, and so do the results."""
     law = LAWS["late feedback"] | {"latency": 0.003, "time_constant": 0.01, "ki": 20.0}
     system = System.resolve(arm_experiment({"shoulder": law, "elbow": LAWS["slow"]}))
     numbers = [{}, {"kp": 55.0}, {"latency": 0.0081}, {"feedback_latency": 0.0139, "ki": 40.0}]
     models, expected = [], []
     inputs = np.stack([signals(system, seed) for seed in range(4)])
-    for i, changed in enumerate(numbers):
-        other = System.resolve(arm_experiment({"shoulder": law | changed, "elbow": LAWS["slow"]}))
-        models.append(other.plant.model(other.parameters.guess))
-        columns = {0: {"reference": inputs[i, :, 0]}, 1: {"reference": inputs[i, :, 1]}}
+    starts = np.outer([1.0, 1.1, 1.2, 1.3], START)
+    for changed, start, own in zip(numbers, starts, inputs, strict=True):
+        _, model, _ = prepared({"shoulder": law | changed, "elbow": LAWS["slow"]})
+        columns = {a: {"reference": own[:, a]} for a in (0, 1)}
         laws = {0: plain(law | changed, "shoulder"), 1: plain(LAWS["slow"], "elbow")}
-        start = START * (1.0 + 0.1 * i)
-        states, _ = simulate(models[i], laws, columns, system.dt, SAMPLES, start)
-        expected.append(states)
+        models.append(model)
+        expected.append(simulate(model, laws, columns, system.dt, SAMPLES, start)[0])
 
-    starts = np.stack([START * (1.0 + 0.1 * i) for i in range(4)])
     found = system.plant.simulator.rollout(models, starts, inputs)
 
-    np.testing.assert_allclose(found.states, expected, atol=1e-11)
+    assert_allclose(found.states, expected, atol=1e-11)
     assert np.abs(np.diff(found.states, axis=0)).max(axis=(1, 2)).min() > 1e-3
 
 
@@ -162,9 +158,7 @@ def test_a_law_on_the_voltage_of_a_motor_with_a_current(tmp_path: Path) -> None:
     path.write_text(ARM.read_text().replace('<motor name="shoulder" joint="shoulder"/>', motor))
     law = {"kp": 80.0, "kd": 2.0, "rate": 250.0}
     stated = {"shoulder": {**law, "kind": "voltage"}}
-    system = System.resolve(arm_experiment(stated, model=str(path)))
-    inputs = signals(system)
-    model = system.plant.model(system.parameters.guess)
+    system, model, inputs = prepared(stated, model=str(path))
     assert model.na == 1
     start = np.append(START, 0.4)
 
@@ -173,33 +167,28 @@ def test_a_law_on_the_voltage_of_a_motor_with_a_current(tmp_path: Path) -> None:
     made = plain({**law, "saturation": (-24.0, 24.0)}, "shoulder")
     columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
     states, _ = simulate(model, {0: made}, columns, system.dt, SAMPLES, start)
-    np.testing.assert_allclose(found.states[0], states, atol=1e-11)
+    assert_allclose(found.states[0], states, atol=1e-11)
 
 
 def test_measured_forces_are_those_of_the_law(tmp_path: Path) -> None:
     """A force sensor shows the control that the law has computed at the same instant."""
     path = tmp_path / "sensed.xml"
     path.write_text(SENSED_ARM)
-    experiment = arm_experiment({"shoulder": LAWS["pd"]}, noise={"state": 1e-4, "torque": 0.1})
-    system = System.resolve(experiment.replace(model=str(path)))
-    inputs = signals(system)
-    found = system.plant.simulator.rollout(
-        [system.plant.model(system.parameters.guess)], START[None], inputs[None]
-    )
-    assert found.sensors is not None
+    noise = {"state": 1e-4, "torque": 0.1}
+    system, model, inputs = prepared({"shoulder": LAWS["pd"]}, model=str(path), noise=noise)
+    found = system.plant.simulator.rollout([model], START[None], inputs[None])
     q, v = found.states[0, :-1, 0], found.states[0, :-1, 2]
     expected = np.clip(60.0 * (inputs[:, 0] - q) - 4.0 * v, -20.0, 20.0)
-    np.testing.assert_allclose(found.sensors[0, :-1, 0], expected, atol=1e-11)
+    assert_allclose(found.sensors[0, :-1, 0], expected, atol=1e-11)
     assert np.ptp(expected) > 10.0
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_intervals_equal_one_rollout(name: str) -> None:
     """Long curves are simulated in intervals, between which laws remember everything."""
-    system = System.resolve(arm_experiment({"shoulder": LAWS[name], "elbow": LAWS["slow"]}))
+    system, model, inputs = prepared({"shoulder": LAWS[name], "elbow": LAWS["slow"]})
     plant, theta = system.plant, system.parameters.guess
-    inputs = signals(system)
-    whole = plant.simulator.rollout([plant.model(theta)], START[None], inputs[None])
+    whole = plant.simulator.rollout([model], START[None], inputs[None])
 
     # Memory for 7 samples, of which an interval takes whole ticks of both laws.
     numbers = 7 * system.grid.substeps * (1 + len(START))
@@ -218,42 +207,35 @@ def test_intervals_equal_one_rollout(name: str) -> None:
     ticks = plant.tick_samples
     assert len(parts) == -(-SAMPLES // (max(7 // ticks, 1) * ticks))
     for part in parts:
-        assert part is not None
         expected = whole.states[0, part.first : part.first + part.y.shape[1]]
-        np.testing.assert_allclose(part.y[0], expected, atol=1e-11)
+        assert_allclose(part.y[0], expected, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", ["pd", "slow", "late", "linear", "shaped", "profiled", "columns"])
 def test_a_curve_may_begin_inside_a_recording(name: str) -> None:
     """A curve that begins at a tick continues the motion; laws here remember commands only."""
-    law = {**LAWS[name], "ki": 0.0}
-    system = System.resolve(arm_experiment({"shoulder": law}))
-    plant, theta = system.plant, system.parameters.guess
-    inputs = signals(system)
-    model = plant.model(theta)
+    system, model, inputs = prepared({"shoulder": {**LAWS[name], "ki": 0.0}})
+    plant, begin = system.plant, 60
     whole = plant.simulator.rollout([model], START[None], inputs[None]).states[0]
 
-    begin, lead = 60, plant.lead(theta)
-    before = max(begin - lead, 0)
+    before = max(begin - plant.lead(system.parameters.guess), 0)
     context = InputContext(
         before=inputs[None, before:begin], after=inputs[None, :0], samples=np.array([begin])
     )
     found = plant.simulator.rollout(
         [model], whole[None, begin], inputs[None, begin:], context=context
     )
-    np.testing.assert_allclose(found.states[0], whole[begin:], atol=1e-9)
+    assert_allclose(found.states[0], whole[begin:], atol=1e-9)
 
 
 def test_a_diverging_loop_is_found() -> None:
     """A gain that is too large for the period of the law makes one of two loops unstable."""
     law = {"kp": 1.0, "kd": 1e4, "saturation": (-1e9, 1e9)}
-    system = System.resolve(arm_experiment({"shoulder": law}))
-    stable = System.resolve(arm_experiment({"shoulder": LAWS["pd"]}))
-    models = [each.plant.model(each.parameters.guess) for each in (system, stable)]
-    for model in models:
+    _, wild, _ = prepared({"shoulder": law})
+    system, stable, inputs = prepared({"shoulder": LAWS["pd"]})
+    for model in (wild, stable):
         model.actuator_ctrllimited[:] = 0
-    inputs = np.stack([signals(system)] * 2)
-    starts = np.stack([START] * 2)
+    pair = (np.stack([each] * 2) for each in (START, inputs))
     with silence_mujoco_log():
-        found = stable.plant.simulator.rollout(models, starts, inputs)
+        found = system.plant.simulator.rollout([wild, stable], *pair)
     assert found.finite.tolist() == [False, True]

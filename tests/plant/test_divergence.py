@@ -48,7 +48,6 @@ def stiff(
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
 def test_a_timestep_that_is_too_long_is_named(integrator: str, tmp_path: Path) -> None:
-    """The message names the warning, the joint, the time, the timestep, and one that works."""
     with pytest.raises(SimulationDivergedError) as refused:
         mjfim.check(stiff(tmp_path, 0.05, integrator), threads=1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.plant.plant import LumpedParameters
@@ -28,19 +29,17 @@ def test_columns_of_lumped_parameters_follow_from_those_of_the_others(
     task = cart_task(tmp_path, parameters=PRODUCT)
     derivatives = task.plant.derivatives
     lumped = LumpedParameters.of(WITHOUT_EFFECT, task.parameters.magnitude)
-    assert lumped is not None and len(lumped.base) == 2
+    assert len(lumped.base) == 2
 
     full = derivatives.sensitivity(task.theta, task.initial, central=central)
     found = derivatives.sensitivity(task.theta, task.initial, central=central, lumped=lumped)
-    assert full is not None and found is not None and found.is_lumped
+    assert found.is_lumped
 
     # One-sided differences are accurate to their step only.
     accuracy = 1e-8 if central else 1e-4
-    np.testing.assert_array_equal(found.G[..., lumped.base], full.G[..., lumped.base])
+    assert_array_equal(found.G[..., lumped.base], full.G[..., lumped.base])
     for few, all_moved in ((found.G, full.G), (found.psi, full.psi)):
-        np.testing.assert_allclose(
-            few, all_moved, rtol=accuracy, atol=accuracy * np.abs(all_moved).max()
-        )
+        assert_allclose(few, all_moved, rtol=accuracy, atol=accuracy * np.abs(all_moved).max())
 
 
 def test_a_combination_that_has_an_effect_is_found_out_and_all_parameters_are_moved(
@@ -49,13 +48,12 @@ def test_a_combination_that_has_an_effect_is_found_out_and_all_parameters_are_mo
     task = cart_task(tmp_path, parameters=PRODUCT)
     derivatives = task.plant.derivatives
     lumped = LumpedParameters.of(WITH_EFFECT, task.parameters.magnitude)
-    assert lumped is not None
 
     full = derivatives.sensitivity(task.theta, task.initial)
     found = derivatives.sensitivity(task.theta, task.initial, lumped=lumped)
-    assert full is not None and found is not None and not found.is_lumped
-    np.testing.assert_array_equal(found.G, full.G)
-    np.testing.assert_array_equal(found.psi, full.psi)
+    assert not found.is_lumped
+    assert_array_equal(found.G, full.G)
+    assert_array_equal(found.psi, full.psi)
 
 
 def test_a_level_moves_only_the_parameters_that_are_not_lumped(tmp_path) -> None:
@@ -72,7 +70,7 @@ def test_a_level_moves_only_the_parameters_that_are_not_lumped(tmp_path) -> None
     # Two parameters and the probe, by one-sided or two-sided differences.
     assert rollouts in (3, 6)
     assert np.isfinite(point.cost)
-    assert level.problem.lumped is not None and point.lumps
+    assert point.lumps
 
 
 def test_nearly_dependent_directions_are_not_lumped() -> None:

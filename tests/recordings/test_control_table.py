@@ -10,6 +10,7 @@ import pytest
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
+from mjfim.output.archive import write_table
 from mjfim.recordings.control_table import read_control
 
 Read = Callable[..., Array]
@@ -23,12 +24,7 @@ def read(tmp_path: Path) -> Read:
         columns: Mapping[str, object], N: int, dt: float, names: tuple[str, ...] = ("u",)
     ) -> Array:
         path = tmp_path / "table.csv"
-        rows = zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True)
-        lines = [
-            ",".join(columns),
-            *(",".join("" if v != v else repr(v) for v in row) for row in rows),
-        ]
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_table(path, {name: np.asarray(values) for name, values in columns.items()})
         return read_control(path, np.arange(N) * dt, dt, names)
 
     return run

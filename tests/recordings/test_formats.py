@@ -6,9 +6,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
-import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,21 +43,23 @@ def columns() -> Columns:
 
 def as_csv(path: Path, columns: Columns) -> None:
     """Write a CSV file with empty fields for NaN."""
-    pyarrow.csv.write_csv(
-        pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()}), path
-    )
+    pyarrow.csv.write_csv(arrow_table(columns), path)
 
 
 def as_gzip(path: Path, columns: Columns) -> None:
     """Write a CSV file that is packed by gzip."""
-    as_csv(path.with_suffix(""), columns)
-    path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
+    as_csv(path, columns)
+    path.write_bytes(gzip.compress(path.read_bytes()))
+
+
+def arrow_table(columns: Columns) -> Any:
+    """A table with nulls for NaN."""
+    return pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()})
 
 
 def as_parquet(path: Path, columns: Columns) -> None:
-    """Write a Parquet file with nulls for NaN."""
-    table = pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()})
-    pyarrow.parquet.write_table(table, path)
+    """Write a Parquet file."""
+    pyarrow.parquet.write_table(arrow_table(columns), path)
 
 
 def as_npz(path: Path, columns: Columns) -> None:
@@ -68,22 +67,20 @@ def as_npz(path: Path, columns: Columns) -> None:
     np.savez_compressed(path, **columns)
 
 
-def as_json(path: Path, columns: Columns) -> None:
-    """Write a JSON list of records with null for NaN."""
+def records_of(columns: Columns) -> list[dict[str, Any]]:
+    """One object for each row, with null for NaN."""
     rows = zip(*(c.tolist() for c in columns.values()), strict=True)
-    path.write_text(
-        json.dumps(
-            [dict(zip(columns, (None if v != v else v for v in row), strict=True)) for row in rows]
-        ),
-        encoding="utf-8",
-    )
+    return [{n: None if v != v else v for n, v in zip(columns, row, strict=True)} for row in rows]
+
+
+def as_json(path: Path, columns: Columns) -> None:
+    """Write a JSON list of records."""
+    path.write_text(json.dumps(records_of(columns)), encoding="utf-8")
 
 
 def as_json_lines(path: Path, columns: Columns) -> None:
     """Write one JSON object a line."""
-    as_json(path, columns)
-    records = json.loads(path.read_text(encoding="utf-8"))
-    path.write_text("\n".join(map(json.dumps, records)), encoding="utf-8")
+    path.write_text("\n".join(map(json.dumps, records_of(columns))), encoding="utf-8")
 
 
 def as_npy(path: Path, columns: Columns) -> None:
@@ -127,17 +124,11 @@ def test_formats_agree(ending: str, columns: Columns, tmp_path: Path) -> None:
 
 @formats
 def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """A truncated file is refused; a CSV file that ends inside a row is recognised by its number of
-    fields.
-    """
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     whole = path.read_bytes()
-    cuts = (
-        [len(whole) // 2, len(whole) - 8]
-        if ending != ".csv"
-        else [whole.index(b",", len(whole) // 2)]
-    )
+    middle = len(whole) // 2
+    cuts = [whole.index(b",", middle)] if ending == ".csv" else [middle, len(whole) - 8]
     for cut in cuts:
         path.write_bytes(whole[:cut])
         with pytest.raises(
@@ -175,7 +166,6 @@ def test_empty_files(ending: str, tmp_path: Path) -> None:
 
 
 def test_unknown_endings(tmp_path: Path) -> None:
-    """The message lists the known endings."""
     (tmp_path / "log.xlsx").write_text("x", encoding="utf-8")
     with pytest.raises(
         RecordingError,
@@ -192,10 +182,9 @@ def test_unknown_endings(tmp_path: Path) -> None:
 
 
 def test_text_is_a_fault_only_if_it_is_used(tmp_path: Path) -> None:
-    """A column of text does not affect the numbers beside it; using it is an error."""
     path = tmp_path / "log.csv"
     path.write_text(
-        "t,mode,q,big\n0,idle,1.5,1700000000000000123\n0.1,run,,1700000000000000124\n",
+        "t,mode,q,big,odd\n0,idle,1.5,1700000000000000123,1\n0.1,run,,1700000000000000124,abc\n",
         encoding="utf-8",
     )
     table = read_columns(path, ALL)
@@ -203,19 +192,8 @@ def test_text_is_a_fault_only_if_it_is_used(tmp_path: Path) -> None:
     assert table.column("big")[0] == 1.7e18
     with pytest.raises(RecordingError, match=r"log\.csv: column 'mode' is not numeric"):
         table.column("mode")
-    mistyped = tmp_path / "mistyped.csv"
-    mistyped.write_text("t,q\n0,1.5\n0.1,abc\n0.2,\n", encoding="utf-8")
-    table = read_columns(mistyped, ALL)
-    with pytest.raises(RecordingError, match=r"'q' is not numeric: row 2 holds 'abc'$"):
-        table.column("q")
-    pyarrow.parquet.write_table(
-        pyarrow.table({"t": [0.0, 1.0], "mode": ["1", "2"], "on": [True, False]}),
-        tmp_path / "a.parquet",
-    )
-    table = read_columns(tmp_path / "a.parquet", ALL)
-    assert table.column("on").tolist() == [1.0, 0.0]
-    with pytest.raises(RecordingError, match=r"'mode' is not numeric$"):
-        table.column("mode")
+    with pytest.raises(RecordingError, match=r"'odd' is not numeric: row 2 holds 'abc'$"):
+        table.column("odd")
 
 
 def test_parquet_columns_of_one_name(tmp_path: Path) -> None:
@@ -248,26 +226,12 @@ def test_parquet_dictionaries(tmp_path: Path) -> None:
             table.column(name)
 
 
-def as_csv_text(path: Path, columns: dict[str, list[Any]]) -> None:
-    """Write a CSV file with the values as JSON spells them."""
-    rows = zip(*columns.values(), strict=True)
-    lines = (",".join(json.dumps(value) for value in row) for row in rows)
-    path.write_text("\n".join((",".join(columns), *lines)), encoding="utf-8")
-
-
-TRUTH_WRITERS: dict[str, Callable[[Path, dict[str, list[Any]]], None]] = {
-    ".csv": as_csv_text,
-    ".parquet": lambda path, columns: pyarrow.parquet.write_table(pyarrow.table(columns), path),
-    ".npz": lambda path, columns: np.savez(path, **{n: np.array(c) for n, c in columns.items()}),
-    ".json": lambda path, columns: path.write_text(json.dumps(columns), encoding="utf-8") and None,
-}
-
-
-@pytest.mark.parametrize("ending", TRUTH_WRITERS)
+@pytest.mark.parametrize("ending", [".csv", ".parquet", ".npz", ".json"])
 def test_truth_values_are_no_measurement(ending: str, tmp_path: Path) -> None:
     """They are 1 and 0 for a control or a factor, but neither a time nor a measured column."""
     path = tmp_path / f"log{ending}"
-    TRUTH_WRITERS[ending](path, {"t": [0.0, 0.1, 0.2], "q": [True, False, True]})
+    columns = {"t": np.array([0.0, 0.1, 0.2]), "q": np.array([True, False, True])}
+    WRITERS[ending](path, columns)
     table = read_columns(path, ALL)
 
     assert table.measurement("t").tolist() == [0.0, 0.1, 0.2]
@@ -312,29 +276,12 @@ def test_single_array_instead_of_an_archive(tmp_path: Path) -> None:
         read_columns(tmp_path / "log.npz", ALL)
 
 
-class Trap:
-    """Object that makes a folder when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.mkdir, (str(self.path),)
-
-
 def test_pickles_are_not_loaded(tmp_path: Path) -> None:
-    """An array of pickled objects is refused whether it is needed or not; the trap itself works."""
-    np.savez(
-        tmp_path / "log.npz",
-        t=np.arange(3.0),
-        q=np.array([Trap(tmp_path / "sprung")], dtype=object),
-    )
+    """An array of pickled objects is refused whether it is needed or not."""
+    np.savez(tmp_path / "log.npz", t=np.arange(3.0), q=np.array([{}], dtype=object))
     for spec in (ALL, RecordingSpec(columns={"qpos:j": "t", "ctrl:m": "t"})):
         with pytest.raises(RecordingError, match=r"log\.npz: not a log archive .*without pickles"):
             read_columns(tmp_path / "log.npz", spec)
-    assert not (tmp_path / "sprung").exists()
-    pickle.loads(pickle.dumps(Trap(tmp_path / "sprung")))
-    assert (tmp_path / "sprung").exists()
 
 
 def test_matrices_become_columns(tmp_path: Path) -> None:
@@ -414,25 +361,19 @@ def test_json_records(tmp_path: Path) -> None:
 def test_json_with_several_lists_of_records(tmp_path: Path) -> None:
     """The experiment file must select one of several lists of records, by a path that exists."""
     content = {"k": 1, "a": {"gain": 2, "left": [{"t": 0}], "right": [{"t": 1}, {"t": 2}]}}
-    with pytest.raises(
-        RecordingError, match=r"several lists of records: a\.left, a\.right; .*recording\.records"
-    ):
+    said = r"several lists of records: a\.left, a\.right; .*recording\.records"
+    with pytest.raises(RecordingError, match=said):
         read_json(content, tmp_path)
     table = read_json(content, tmp_path, RecordingSpec(records="a.right"))
-    assert {name: table.column(name).tolist() for name in table.names} == {
-        "t": [1, 2],
-        "k": [1, 1],
-        "a.gain": [2, 2],
-    }
+    found = {name: table.column(name).tolist() for name in table.names}
+    assert found == {"t": [1, 2], "k": [1, 1], "a.gain": [2, 2]}
     for wrong in ("a.rigth", "k.right", "k"):
-        with pytest.raises(
-            RecordingError, match=rf"recording\.records: .*'{wrong}'.*a\.left, a\.right"
-        ):
+        said = rf"recording\.records: .*'{wrong}'.*a\.left, a\.right"
+        with pytest.raises(RecordingError, match=said):
             read_json(content, tmp_path, RecordingSpec(records=wrong))
 
 
 def test_json_lists(tmp_path: Path) -> None:
-    """Lists are columns; one of another length is refused when it is used."""
     table = read_json(
         {"t": [0, 1, 2], "q": [1, None, 3], "short": [1, 2], "k": 4, "s": ["a", 1, 2]}, tmp_path
     )

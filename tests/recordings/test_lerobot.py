@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment import System
 from mjfim.recordings import RecordingSpec, read_recording, recording_paths
 from mjfim.recordings.formats import read_columns
+from mjfim.records.trajectory import Recording
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.cli import misused, run
+from tests.support.cli import run
 from tests.support.lerobot import write_dataset
 from tests.support.paths import MODELS
 
@@ -46,25 +48,24 @@ def test_each_episode_is_a_recording(version: str, tmp_path: Path) -> None:
     """Episodes of a folder, chosen ones, and one by its name; times have no rounding."""
     data = episodes(3)
     folder = write_dataset(tmp_path / "set", data, NAMES, version=version)
+    names = [f"episode_{i:06d}" for i in range(3)]
     paths = recording_paths([folder, tmp_path / "other.csv"], cart().channels)
-    assert [path.name for path in paths] == [*(f"episode_{i:06d}" for i in range(3)), "other.csv"]
+    assert [path.name for path in paths] == [*names, "other.csv"]
     chosen = recording_paths([folder], cart(episodes=[2, 0]).channels)
-    assert [path.name for path in chosen] == ["episode_000002", "episode_000000"]
+    assert [path.name for path in chosen] == [names[2], names[0]]
 
-    for number, path in enumerate(paths[:3]):
+    for features, path in zip(data, paths[:3], strict=True):
         recording = read_recording(path, cart().channels)
         assert recording.outputs == ("qpos:slide", "qpos:hinge")
-        np.testing.assert_array_equal(recording.t, np.arange(40) / 100.0)
-        single = data[number]["observation.state"].astype(np.float32)
-        np.testing.assert_array_equal(recording.y, single)
-        np.testing.assert_array_equal(
-            recording.ctrl[:, 0], data[number]["action"].astype(np.float32)[:-1]
-        )
+        assert_array_equal(recording.t, np.arange(40) / 100.0)
+        action, state = (values.astype(np.float32) for values in features.values())
+        assert_array_equal(recording.y, state)
+        assert_array_equal(recording.ctrl[:, 0], action[:-1])
+    table = read_columns(folder, RecordingSpec(episodes=(1,)))
+    assert table.column("observation.state:slide.pos")[0] == 1.0
 
     with pytest.raises(RecordingError, match=r"set: has 3 episodes; name one, as in episode_0000"):
         read_columns(folder, ALL)
-    table = read_columns(folder, RecordingSpec(episodes=(1,)))
-    assert table.column("observation.state:slide.pos")[0] == 1.0
     with pytest.raises(RecordingError, match="no episode 3; the dataset has the episodes 0 to 2"):
         recording_paths([folder], cart(episodes=[3]).channels)
     with pytest.raises(RecordingError, match="has no "):
@@ -90,45 +91,37 @@ def test_names_have_many_forms(stated: Any, columns: list[str], tmp_path: Path) 
 
 def test_degrees_are_refused_with_the_way_to_state_units(tmp_path: Path) -> None:
     """A joint with a range whose positions are in degrees; then commands without a unit."""
-    model = System.resolve(mjfim.Experiment.from_file(MODELS / "servo_arm.toml")).model
+    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
+    model = System.resolve(stated).model
     joints = [model.joint(i).name for i in range(model.njnt)]
-    k = np.arange(100)[:, None]
-    angles = np.rad2deg(0.8 + 0.3 * np.sin(0.05 * k + np.arange(4)))
-    names = [f"{joint}.pos" for joint in joints]
+    angles = np.rad2deg(0.8 + 0.3 * np.sin(0.05 * np.arange(100)[:, None] + np.arange(4)))
     features = {"action": angles, "observation.state": angles}
+    names = [f"{joint}.pos" for joint in joints]
     folder = write_dataset(tmp_path / "set", [features], dict.fromkeys(features, names))
 
-    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
-    noise = {f"qpos:{joint}": 0.01 for joint in joints}
-    arm = stated.replace(noise=noise)
+    def read(*stated_kinds: str) -> Recording:
+        feature = {"qpos": "observation.state", "ctrl": "action"}
+        columns = {
+            f"{kind}:{joint}": {"column": f"{feature[kind]}:{joint}.pos", "unit": "deg"}
+            for kind in stated_kinds
+            for joint in joints
+        }
+        noise = {f"qpos:{joint}": 0.01 for joint in joints}
+        arm = stated.replace(noise=noise, recording={"columns": columns})
+        return read_recording(folder, System.resolve(arm).channels)
+
     with pytest.raises(RecordingError, match=r"probably in deg.*LeRobot robots store degrees.*sca"):
-        read_recording(folder, System.resolve(arm).channels)
-
-    columns: dict[str, Any] = {
-        f"qpos:{joint}": {"column": f"observation.state:{joint}.pos", "unit": "deg"}
-        for joint in joints
-    }
-    half = System.resolve(arm.replace(recording={"columns": columns}))
-    with pytest.raises(
-        RecordingError, match=r"but the command 'ctrl:yaw' has none; state the same"
-    ):
-        read_recording(folder, half.channels)
-
-    columns |= {
-        f"ctrl:{joint}": {"column": f"action:{joint}.pos", "unit": "deg"} for joint in joints
-    }
-    whole = System.resolve(arm.replace(recording={"columns": columns}))
-    recording = read_recording(folder, whole.channels)
-    np.testing.assert_allclose(recording.y, np.deg2rad(angles), rtol=1e-5)
-    np.testing.assert_allclose(recording.ctrl, np.deg2rad(angles[:-1]), rtol=1e-5)
+        read()
+    with pytest.raises(RecordingError, match="the command 'ctrl:yaw' has none; state the same"):
+        read("qpos")
+    recording = read("qpos", "ctrl")
+    assert_allclose(recording.y, np.deg2rad(angles), rtol=1e-5)
+    assert_allclose(recording.ctrl, np.deg2rad(angles[:-1]), rtol=1e-5)
 
 
 def test_stamps_of_a_clock_are_kept(tmp_path: Path) -> None:
-    """Time stamps that are not those of the frame numbers are the times."""
     folder = write_dataset(tmp_path / "set", episodes(1), NAMES, info={"fps": 90.0})
-    np.testing.assert_allclose(
-        read_columns(folder, ALL).column("t"), np.arange(40) / 100, rtol=1e-6
-    )
+    assert_allclose(read_columns(folder, ALL).column("t"), np.arange(40) / 100, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +141,6 @@ def test_wrong_descriptions(info: dict[str, Any], said: str, tmp_path: Path) -> 
 
 
 def test_damage_is_one_sentence(tmp_path: Path) -> None:
-    """Overwritten or missing data, and an info.json that is none."""
     folder = write_dataset(tmp_path / "set", episodes(1), NAMES)
     file = next(folder.rglob("*.parquet"))
     whole = file.read_bytes()
@@ -173,14 +165,12 @@ def test_keys_that_do_not_fit(tmp_path: Path) -> None:
 
 
 def test_the_verbs_read_all_episodes(tmp_path: Path) -> None:
-    """Each episode of a folder is a recording of the check; a wrong folder is one sentence."""
+    """Each episode of a folder is a recording of the check."""
     stated = cart_pendulum()
     folder = write_dataset(tmp_path / "set", episodes(2), NAMES)
     done = run("check", stated.source, folder, "--json")
     assert done.exit_code in (0, 1), done.stderr
-    assert "confounded" in done.stdout or "verdict" in done.stdout
+    assert "verdict" in done.stdout
     (tmp_path / "empty").mkdir()
-    misused(
-        run("identify", stated.source, tmp_path / "empty", "-o", tmp_path / "out"),
-        "without meta/info.json is not a LeRobot dataset",
-    )
+    with pytest.raises(RecordingError, match=r"without meta/info\.json is not a LeRobot dataset"):
+        read_recording(tmp_path / "empty", cart().channels)

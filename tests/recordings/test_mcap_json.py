@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.errors import RecordingError
 from mjfim.recordings.formats import read_columns
 from mjfim.recordings.section import RecordingSpec
-from tests.support.paths import MODELS
 
 writer = pytest.importorskip("mcap.writer", reason="the extra `ros` is not installed")
 
@@ -54,22 +52,6 @@ def test_lists_of_joints_become_columns_by_their_names(tmp_path: Path) -> None:
         assert column[np.isfinite(column)].tolist() == wanted
     assert np.unique(table.column("t")).tolist() == [0.0, 0.01, 0.02]
     assert not [name for name in table.names if "frame_id" in name or name.endswith(".on")]
-
-
-def test_a_log_of_two_topics_is_identified(tmp_path: Path) -> None:
-    """Controls and angles have topics of their own; rows of one time become one."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=1.0)
-    log = mjfim.simulate(experiment, seed=0)
-    command = [{"data": [float(u[0])]} for u in log.ctrl]
-    state = [{"name": list(log.outputs), "position": row.tolist()} for row in log.y]
-    path = write(tmp_path / "x.mcap", {"/command": command, "/state": state})
-    columns = {name: f"/state.position.{name}" for name in log.outputs}
-    stated = experiment.replace(
-        recording={"time": "t", "columns": {"ctrl:force": "/command.data.0", **columns}}
-    )
-    found = mjfim.identify(stated, path, progress=False)
-    wanted = mjfim.identify(experiment, log, progress=False)
-    np.testing.assert_allclose(found.theta, wanted.theta, rtol=1e-6)
 
 
 def test_stamps_of_messages_have_no_other_unit(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from mjfim.errors import ExperimentError, RecordingError
@@ -20,7 +21,6 @@ from mjfim.experiment.system import System
 from mjfim.output.archive import write_table
 from mjfim.recordings.read import Log, RowReader, read_log, read_recording
 from tests.support.closed_loop import arm_experiment
-from tests.support.paths import SHARED_DATA
 
 Array = NDArray[np.float64]
 Read = Callable[..., Log]
@@ -94,7 +94,9 @@ def read(tmp_path: Path) -> Read:
 
 
 def column(logged: Log, name: str) -> Array:
-    """Values of a measured column, by its name."""
+    """Values of a measured column or of a control, by its name."""
+    if name in CTRL:
+        return logged.recording.ctrl[:, [*CTRL].index(name)]
     return logged.recording.y[:, logged.recording.outputs.index(name)]
 
 
@@ -104,16 +106,6 @@ def wave(amplitude: float = 1.0, frequency: float = 2.0) -> Array:
 
 
 # ---- the formula
-
-
-def test_default_column_names(read: Read) -> None:
-    """Without a [recording] table, columns have mjfim's names, and other columns are ignored."""
-    logged = read({"qpos:pin": wave(), "encoder": wave(0.9), "note": np.array(["x"] * M)})
-    recording = logged.recording
-    assert recording.outputs == ("qpos:pin", "encoder")
-    assert np.array_equal(recording.ctrl, np.column_stack(list(CTRL.values()))[:-1])
-    assert np.array_equal(recording.t, T)
-    assert np.array_equal(column(logged, "encoder"), wave(0.9))
 
 
 def test_formula(read: Read) -> None:
@@ -131,36 +123,21 @@ def test_formula(read: Read) -> None:
     ("name", "unit", "factor"),
     [
         ("qpos:pin", "deg", np.pi / 180),
-        ("qpos:pin", "rev", 2 * np.pi),
         ("qvel:pin", "deg/s", np.pi / 180),
         ("qvel:pin", "rpm", 2 * np.pi / 60),
-        ("qvel:pin", "rev/s", 2 * np.pi),
-        ("qvel:pin", "rad/s", 1),
         ("qpos:rail", "mm", 1e-3),
-        ("qpos:rail", "cm", 1e-2),
-        ("qpos:rail", "m", 1),
         ("qvel:rail", "mm/s", 1e-3),
-        ("qvel:rail", "m/s", 1),
         ("encoder", "deg", np.pi / 180),
         ("ruler", "mm/s", 1e-3),
         ("gyro[1]", "rpm", 2 * np.pi / 60),
         ("motor", "deg", np.pi / 180),
+        ("ctrl:turn", "deg", np.pi / 180),
     ],
 )
 def test_units(name: str, unit: str, factor: float, read: Read) -> None:
-    """Each unit is converted to the model's unit."""
-    logged = read({"raw": wave(7.0)}, columns={name: {"column": "raw", "unit": unit}})
-    assert np.allclose(column(logged, name), factor * wave(7.0), rtol=1e-14, atol=0)
-
-
-def test_unit_of_a_control(read: Read) -> None:
-    """The target of a servo may be in degrees."""
-    source = {"column": "goal", "unit": "deg"}
-    logged = read({"goal": wave(90.0), "qpos:pin": wave()}, columns={"ctrl:turn": source})
-    assert np.allclose(
-        logged.recording.ctrl[:, 1], np.pi / 180 * wave(90.0)[:-1], rtol=1e-14, atol=0
-    )
-    assert np.array_equal(logged.recording.ctrl[:, 0], CTRL["ctrl:push"][:-1])
+    columns = {"qvel:stop": "raw", name: {"column": "raw", "unit": unit}}
+    found = column(read({"raw": wave(7.0)}, columns=columns), name)
+    assert np.allclose(found, factor * wave(7.0)[: len(found)], rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -195,32 +172,23 @@ def test_signed(read: Read) -> None:
     """Unsigned numbers are read as two's complement; negative numbers stay."""
     truth = np.rint(300.0 * np.sin(5.0 * T))
     raw = np.where(truth < 0, truth + 65536, truth)
-    raw[3] = truth[3] = -7.0
-    raw[4], truth[4] = 32768.0, -32768.0
-    logged = read({"raw": raw}, columns={"motor": {"column": "raw", "signed": 16, "scale": 0.1}})
+    raw[3:5], truth[3:5] = (-7.0, 32768.0), (-7.0, -32768.0)
+    columns = {"motor": {"column": "raw", "signed": 16, "scale": 0.1}}
+    logged = read({"raw": raw}, columns=columns)
     assert np.allclose(column(logged, "motor"), 0.1 * truth, rtol=1e-14, atol=0)
     for wrong in (65536.0, -32769.0, 1.5):
         raw[9] = wrong
-        with pytest.raises(
-            RecordingError,
-            match=rf"column 'raw' holds {wrong:g} in data row 10, which is not an integer",
-        ):
-            read({"raw": raw}, columns={"motor": {"column": "raw", "signed": 16}})
+        said = rf"column 'raw' holds {wrong:g} in data row 10, which is not an integer"
+        with pytest.raises(RecordingError, match=said):
+            read({"raw": raw}, columns=columns)
 
 
 def test_counters_wrap_around(read: Read) -> None:
-    """Raw numbers of a 12-bit encoder are unwrapped across empty rows, before they are scaled."""
-    truth = np.rint(9000.0 * np.sin(2.0 * T))
-    raw = np.mod(truth, 4096)
-    raw[50:53] = np.nan
+    truth = hole(np.rint(9000.0 * np.sin(2.0 * T)), 50, 53)
     scale = 2 * np.pi / 4096
-    logged = read(
-        {"raw": raw}, columns={"encoder": {"column": "raw", "period": 4096.0, "scale": scale}}
-    )
-    found = column(logged, "encoder")
-    assert np.isnan(found[50:53]).all()
-    there = np.isfinite(raw)
-    assert np.allclose(found[there], scale * truth[there], rtol=0, atol=1e-9)
+    source = {"column": "raw", "period": 4096.0, "scale": scale}
+    found = column(read({"raw": np.mod(truth, 4096)}, columns={"encoder": source}), "encoder")
+    assert np.allclose(found, scale * truth, rtol=0, atol=1e-9, equal_nan=True)
 
 
 # ---- time
@@ -250,10 +218,6 @@ def test_window(read: Read) -> None:
     assert np.allclose(r.t, T[:97], rtol=0, atol=1e-12)
     assert np.array_equal(column(logged, "qpos:pin"), wave()[104:201])
     assert r.ctrl[:4, 0].tolist() == [102.0, 105.0, 105.0, 105.0]
-    with pytest.raises(
-        RecordingError, match=r"recording\.window: no row between 7 and 8 s; the log lasts 1\.995 s"
-    ):
-        read(columns, window=(7.0, 8.0))
 
 
 @pytest.mark.parametrize(
@@ -286,99 +250,32 @@ def test_window(read: Read) -> None:
     ],
 )
 def test_clocks_that_are_wrong(change: Callable[[Array], Array], said: str, read: Read) -> None:
-    """The message names the row and the kind of fault."""
     t = change(T)
     columns = {"t": t, **{n: c[: len(t)] for n, c in CTRL.items()}, "qpos:pin": wave()[: len(t)]}
     with pytest.raises(RecordingError, match=rf"lab\.csv: column 't'.*{said}"):
         read(columns, bare=True)
 
 
-def test_gaps_in_time_can_be_allowed(read: Read) -> None:
-    """A larger `gap` bridges them; five steps of a slow log are always bridged."""
-    hole = T + 0.2 * (np.arange(M) > 99)
-    assert len(read({"t": hole, "qpos:pin": wave()}, gap=0.3).recording.t) == M
-    slow = np.arange(M) * 0.05
-    slow[200:] += 0.15
-    assert len(read({"t": slow, "qpos:rail": wave()}).recording.t) == M
-
-
 # ---- columns
 
 
-def test_measured_at_several_rates(read: Read) -> None:
-    """Regularly empty fields are no gaps, however slow the column is."""
-    slow = np.where(np.arange(M) % 50 == 3, wave(), np.nan)
-    logged = read({"qpos:pin": wave(), "encoder": slow}, gap=0.02)
-    assert np.isfinite(column(logged, "encoder")).sum() == 8
-
-
-def test_gaps_in_columns(read: Read) -> None:
-    """Empty rows for longer than the gap are refused, inside and at the ends; shorter ones stay
-    empty.
-    """
-    for begin, end, said in (
-        (100, 160, r"from 0\.495 to 0\.8 s"),
-        (0, 30, "from 0 to 0.15 s"),
-        (360, M, "to 1.995 s"),
-    ):
-        q = wave()
-        q[begin:end] = np.nan
-        with pytest.raises(
-            RecordingError,
-            match=rf"column 'qpos:pin' is empty .*{said}; gaps longer than 0\.1 s are not bridged",
-        ):
-            read({"qpos:pin": q})
-        assert np.isnan(column(read({"qpos:pin": q}, gap=0.5), "qpos:pin")).sum() == end - begin
-    q = wave()
-    q[100:115] = np.nan
-    assert np.isnan(column(read({"qpos:pin": q}), "qpos:pin")).sum() == 15
-
-
 def test_controls_are_held(read: Read) -> None:
-    """A control is held for less than the gap, never before its first value; the last row needs
-    none.
-    """
-    u = np.arange(M, dtype=float)
-    u[10:20] = u[-5:] = np.nan
-    logged = read({"qpos:pin": wave(), "ctrl:push": u})
-    assert logged.recording.ctrl[9:21, 0].tolist() == [9.0] * 11 + [20.0]
-    assert logged.recording.ctrl[-3:, 0].tolist() == [394.0] * 3
-    late = np.where(np.arange(M) < M - 21, u, np.nan)
-    assert read({"qpos:pin": wave(), "ctrl:push": late}, gap=0.1025).recording.ctrl[-1, 0] == M - 22
-    u[10:40] = np.nan
-    with pytest.raises(
-        RecordingError,
-        match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; "
-        r"a control is not held longer than 0\.1 s",
-    ):
-        read({"qpos:pin": wave(), "ctrl:push": u})
-    assert read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2).recording.ctrl[39, 0] == 9.0
-    u[:4] = np.nan
-    with pytest.raises(
-        RecordingError, match=r"'ctrl:push'.*no value in the first row; it begins 0\.02 s later"
-    ):
-        read({"qpos:pin": wave(), "ctrl:push": u})
-    assert (
-        read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2, window=(0.02, 1.0)).recording.ctrl[0, 0]
-        == 4.0
-    )
-    with pytest.raises(RecordingError, match="it holds no number"):
-        read({"qpos:pin": wave(), "ctrl:push": np.full(M, np.nan)})
+    """A control is held for less than the gap; the last row needs none."""
+    u = hole(hole(COUNT, 10, 40), M - 5, M)
+    found = column(read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2), "ctrl:push")
+    assert found[9:41].tolist() == [9.0] * 31 + [40.0]
+    assert found[-3:].tolist() == [394.0] * 3
+    late = read({"qpos:pin": wave(), "ctrl:push": hole(COUNT, M - 21, M)}, gap=0.1025)
+    assert column(late, "ctrl:push")[-1] == M - 22
+    begun = read({"qpos:pin": wave(), "ctrl:push": hole(COUNT, 0, 4)}, window=(0.02, 1.0))
+    assert column(begun, "ctrl:push")[0] == 4.0
 
 
-def test_dead_channels(read: Read) -> None:
-    """A measured column that never moves is refused, a constant control is not."""
-    with pytest.raises(
-        RecordingError,
-        match=r"column 'enc' is 1\.5 in all of its 400 rows, which suggests a dead channel; remove",
-    ):
-        read({"enc": np.full(M, 1.5), "q": wave()}, columns={"encoder": "enc", "qpos:pin": "q"})
-    with pytest.raises(RecordingError, match=r"column 'encoder' holds no number; remove it"):
-        read({"encoder": np.full(M, np.nan), "qpos:pin": wave()})
-    few = np.where(np.arange(M) % 50 == 0, 1.5, np.nan)
-    assert (
-        len(read({"encoder": few, "qpos:pin": wave(), "ctrl:push": np.zeros(M)}).recording.t) == M
-    )
+def hole(values: Array, begin: int, end: int) -> Array:
+    """Values of which some are empty."""
+    found = np.array(values)
+    found[begin:end] = np.nan
+    return found
 
 
 def test_a_joint_may_rest_where_its_reference_rests(tmp_path: Path) -> None:
@@ -400,34 +297,109 @@ def test_a_joint_may_rest_where_its_reference_rests(tmp_path: Path) -> None:
         written()
 
 
-@pytest.mark.parametrize("value", [np.inf, -1e300])
-@pytest.mark.parametrize("name", ["qpos:pin", "ctrl:push", "kp"])
-def test_values_that_are_infinite_or_too_large(name: str, value: float, read: Read) -> None:
-    """They are refused in the columns that are used, also in a factor: their squares are
-    infinite.
-    """
-    columns = {"qpos:pin": wave(), **CTRL, "kp": np.full(M, 2.0)}
-    columns[name] = np.where(np.arange(M) == 11, value, columns[name])
-    source = {"column": "ctrl:turn", "multiply_by": ["kp"]}
-    with pytest.raises(
-        RecordingError,
-        match=rf"lab\.csv: column '{name}' is {re.escape(f'{value:g}')} in data row 12",
-    ):
-        read(columns, columns={"ctrl:turn": source})
+COUNT = np.arange(M, dtype=float)
+EMPTY = np.full(M, np.nan)
+
+# Position and velocity of one motion, with a coarse resolution and with noise.
+COARSE = np.round((1.0 - np.cos(2.0 * T)) / 1e-3) * 1e-3
+ROUGH = 2.0 * np.sin(2.0 * T) + 0.1 * np.random.default_rng(4).standard_normal(M)
+REST = np.random.default_rng(5).standard_normal((2, M)) * [[2e-3], [0.5]]
+DEAD = {"enc": np.full(M, 1.5), "q": wave()}
+BOTH = {"encoder": "enc", "qpos:pin": "q"}
+LATE = T + 0.2 * (COUNT > 99)
+RADIANS = {"column": "qpos:stop", "unit": "rad"}
+BY_KP = {"column": "ctrl:turn", "multiply_by": ["kp"]}
+
+# Columns and the table [recording] of logs that are read as they are.
+SOUND: list[tuple[dict[str, Array], dict[str, Any]]] = [
+    ({"t": LATE}, {"gap": 0.3}),
+    # Five steps of a slow log are always bridged.
+    ({"t": 0.05 * COUNT + 0.15 * (COUNT > 199)}, {}),
+    # Regularly empty fields are no gaps, however slow the column is.
+    ({"encoder": np.where(COUNT % 50 == 3, wave(), np.nan)}, {"gap": 0.02}),
+    ({"qpos:pin": hole(wave(), 100, 115)}, {}),
+    ({"qpos:pin": hole(wave(), 100, 160)}, {"gap": 0.5}),
+    ({"qpos:pin": hole(wave(), 0, 30)}, {"gap": 0.5}),
+    ({"encoder": np.where(COUNT % 50 == 0, 1.5, np.nan), "ctrl:push": 0.0 * T}, {}),
+    ({"qpos:pin": COARSE, "qvel:pin": ROUGH}, {}),
+    # At rest the ratio of position and velocity is random.
+    ({"qpos:pin": REST[0], "qvel:pin": REST[1]}, {}),
+    ({"qpos:rail": 57.3 * COARSE, "qvel:rail": ROUGH}, {}),
+    *(({"qpos:stop": q, "qvel:stop": wave()}, {}) for q in (wave(4.0, 6.0), wave(700.0, 0.25))),
+    # A stated unit is right.
+    ({"qpos:stop": wave(50.0, 6.0)}, {"columns": {"qpos:stop": RADIANS}}),
+    (
+        {"qpos:pin": np.degrees(COARSE), "qvel:pin": ROUGH},
+        {"columns": {"qpos:pin": {"column": "qpos:pin", "unit": "rad"}, "qvel:pin": "qvel:pin"}},
+    ),
+]
+
+# Columns and the table [recording] of logs that are refused, and the message.
+REFUSED: list[tuple[dict[str, Array], dict[str, Any], str]] = [
+    ({}, {"window": (7.0, 8.0)}, r"recording\.window: no row between 7 and 8 s; .* 1\.995 s"),
+    (
+        {"qpos:pin": hole(wave(), 100, 160)},
+        {},
+        r"'qpos:pin' is empty .*from 0\.495 to 0\.8 s; gaps longer than 0\.1 s are not bridged",
+    ),
+    ({"qpos:pin": hole(wave(), 0, 30)}, {}, "from 0 to 0.15 s"),
+    ({"qpos:pin": hole(wave(), 360, M)}, {}, "to 1.995 s"),
+    (
+        {"ctrl:push": hole(COUNT, 10, 40)},
+        {},
+        r"'ctrl:push'.* empty for 0\.15 s until 0\.195 s; a control is not held longer than 0\.1 s",
+    ),
+    ({"ctrl:push": hole(COUNT, 0, 4)}, {}, r"'ctrl:push'.*first row; it begins 0\.02 s later"),
+    ({"ctrl:push": EMPTY}, {}, "it holds no number"),
+    (DEAD, {"columns": BOTH}, "column 'enc' is 1.5 in all of its 400 rows, which suggests a dead"),
+    ({"encoder": EMPTY}, {}, "column 'encoder' holds no number; remove it"),
+    *(
+        ({name: np.where(COUNT == 11, value, 2.0)}, {"columns": {"ctrl:turn": BY_KP}}, said)
+        for name in ("qpos:pin", "ctrl:push", "kp")
+        for value, said in (
+            (np.inf, f"column '{name}' is inf in data row 12"),
+            (-1e300, rf"column '{name}' is -1e\+300 in data row 12"),
+        )
+    ),
+    *(
+        ({}, {"columns": {"qpos:pin": source}}, said)
+        for name, said in (("lost", "'lost' is missing; found: .*note"), ("note", "is not numeric"))
+        for source in (name, {"column": "qpos:pin", "multiply_by": [name]})
+    ),
+    (
+        {"qpos:pin": np.degrees(COARSE), "qvel:pin": ROUGH},
+        {},
+        r"5\d\.\d times .* 'qpos:pin' is probably in deg: state unit = \"deg\"",
+    ),
+    (
+        {"qpos:pin": COARSE, "qvel:pin": np.degrees(ROUGH)},
+        {},
+        r"0\.017.* 'qvel:pin' is probably in deg/s: state unit = \"deg/s\"",
+    ),
+    (
+        {"qpos:stop": wave(50.0, 6.0)},
+        {},
+        r"'qpos:stop' ranges from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg",
+    ),
+]
 
 
-def test_columns_that_are_missing(read: Read) -> None:
-    """A column that is used must exist and must be numeric."""
-    for name, said in (
-        ("lost", "column 'lost' is missing; found: .*note"),
-        ("note", "column 'note' is not numeric"),
-    ):
-        for source in (name, {"column": "q", "multiply_by": [name]}):
-            with pytest.raises(RecordingError, match=said):
-                read({"q": wave(), "note": np.array(["x"] * M)}, columns={"qpos:pin": source})
-    said = r"column 'ctrl:push' is missing.*constant, state the value: \"ctrl:push\" = 0\.0\. "
+@pytest.mark.parametrize(("columns", "recording"), SOUND)
+def test_sound_logs(columns: dict[str, Array], recording: dict[str, Any], read: Read) -> None:
+    """Every row is read, and what is empty stays empty."""
+    logged = read({"qpos:pin": wave(), **columns}, **recording)
+    assert len(logged.recording.t) == M
+    for name in {*columns} & {*logged.recording.outputs}:
+        assert_array_equal(column(logged, name), columns[name])
+
+
+@pytest.mark.parametrize(("columns", "recording", "said"), REFUSED)
+def test_refused_logs(
+    columns: dict[str, Array], recording: dict[str, Any], said: str, read: Read
+) -> None:
+    given = {"qpos:pin": wave(), "kp": COUNT, "note": np.array(["x"] * M), **columns}
     with pytest.raises(RecordingError, match=said):
-        read({"t": T, "q": wave(), "ctrl:turn": T}, bare=True, columns={"qpos:pin": "q"})
+        read(given, **recording)
 
 
 def test_a_control_may_be_a_constant_that_no_column_holds(read: Read) -> None:
@@ -438,79 +410,24 @@ def test_a_control_may_be_a_constant_that_no_column_holds(read: Read) -> None:
     for logged in (alone, beside):
         assert np.array_equal(logged.recording.ctrl, np.tile([0.0, 0.25], (M - 1, 1)))
         assert [each.name for each in logged.summary.columns] == ["qpos:pin"]
-
-
-# ---- degrees
-
-
-def test_degrees_are_found_by_the_slope(read: Read) -> None:
-    """Position or velocity in degrees is found from their ratio, despite noise and a coarse
-    resolution.
-    """
-    rng = np.random.default_rng(4)
-    q = np.round((1 - np.cos(2 * T)) / 1e-3) * 1e-3
-    v = 2.0 * np.sin(2 * T) + 0.1 * rng.standard_normal(M)
-    assert len(read({"qpos:pin": q, "qvel:pin": v}).recording.t) == M
-    with pytest.raises(
-        RecordingError,
-        match=r"5\d\.\d times .* 'qpos:pin' is probably in deg: state unit = \"deg\"",
-    ):
-        read({"qpos:pin": np.degrees(q), "qvel:pin": v})
-    with pytest.raises(
-        RecordingError, match=r"0\.017.* 'qvel:pin' is probably in deg/s: state unit = \"deg/s\""
-    ):
-        read({"qpos:pin": q, "qvel:pin": np.degrees(v)})
-    both = {"q": np.degrees(q), "v": np.degrees(v)}
-    fine = {
-        "qpos:pin": {"column": "q", "unit": "deg"},
-        "qvel:pin": {"column": "v", "unit": "deg/s"},
-    }
-    assert np.allclose(column(read(both, columns=fine), "qpos:pin"), q, rtol=0, atol=1e-12)
-    silent = {"qpos:pin": {"column": "q", "unit": "rad"}, "qvel:pin": "v"}
-    assert column(read({"q": np.degrees(q), "v": v}, columns=silent), "qpos:pin").max() > 100
-
-
-@pytest.mark.slow
-def test_slopes_of_noise_are_ignored(read: Read) -> None:
-    """At rest the ratio of position and velocity is random, and no reason to refuse."""
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        q, v = 2e-3 * rng.standard_normal(M), 0.5 * rng.standard_normal(M)
-        assert len(read({"qpos:pin": q, "qvel:pin": v}).recording.t) == M
-    rail = {"qpos:rail": 57.3 * (1 - np.cos(2 * T)), "qvel:rail": 2.0 * np.sin(2 * T)}
-    assert len(read(rail).recording.t) == M
-
-
-def test_degrees_are_found_by_the_range_of_the_joint(read: Read) -> None:
-    """Angles far beyond the joint's range are refused if they are inside it as degrees."""
-    with pytest.raises(
-        RecordingError,
-        match=r"'qpos:stop' ranges from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg",
-    ):
-        read({"qpos:stop": wave(50.0, 6.0)})
-    for fine in (wave(1.5, 6.0), wave(4.0, 6.0), wave(700.0, 0.25)):
-        assert len(read({"qpos:stop": fine, "qvel:stop": wave()}).recording.t) == M
-    stated = {"qpos:stop": {"column": "s", "unit": "rad"}}
-    assert len(read({"s": wave(50.0, 6.0)}, columns=stated).recording.t) == M
+    said = r"column 'ctrl:push' is missing.*constant, state the value: \"ctrl:push\" = 0\.0\. "
+    with pytest.raises(RecordingError, match=said):
+        read({"t": T, "qpos:pin": wave(), "ctrl:turn": T}, bare=True)
 
 
 # ---- the summary
 
 
 def test_summary(read: Read) -> None:
-    """The summary has numbers that can be counted by hand."""
-    t = np.array(T)
-    t[100:] += 0.02
+    t = T + 0.02 * (COUNT > 99)
     q = np.round(wave(1.0, 3.0) / 0.01) * 0.01
     q[:40:4] = np.nan
     summary = read({"t": t, "q": q}, columns={"qpos:pin": "q"}, window=(0.0, 1.5)).summary
     assert (summary.rows, summary.dropped) == (297, M - 297)
-    assert summary.rate == pytest.approx(200.0)
-    assert summary.duration == pytest.approx(1.5)
-    assert summary.longest_step == pytest.approx(0.025)
-    assert summary.jitter_std == pytest.approx(0.02 * np.sqrt(1 / 296 - 1 / 296**2))
-    assert [c.name for c in summary.columns] == ["ctrl:push", "ctrl:turn", "qpos:pin"]
-    pin = summary.columns[2]
+    found = (summary.rate, summary.duration, summary.longest_step, summary.jitter_std)
+    assert found == pytest.approx((200.0, 1.5, 0.025, 0.02 * np.sqrt(1 / 296 - 1 / 296**2)))
+    push, turn, pin = summary.columns
+    assert (push.name, turn.name, pin.name) == ("ctrl:push", "ctrl:turn", "qpos:pin")
     assert (pin.source, pin.resolution) == ("q", pytest.approx(0.01))
     assert (pin.minimum, pin.maximum) == (np.nanmin(q[:297]), np.nanmax(q[:297]))
     assert pin.empty_share == pytest.approx(10 / 297)
@@ -523,26 +440,15 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     """Matrices are in the order of the model's joints and actuators, with one control less than
     states.
     """
-    task = task_of(tmp_path, {})
-    rng = np.random.default_rng(0)
-    qpos, qvel, ctrl = (rng.standard_normal((n, k)) for n, k in ((M, 3), (M, 3), (M - 1, 2)))
-    np.savez(tmp_path / "d.npz", t=T, qpos=qpos, qvel=qvel, ctrl=ctrl, gain=np.zeros((M - 1, 2, 6)))
-    r = read_recording(tmp_path / "d.npz", task.system.channels)
-    assert np.array_equal(r.ctrl, ctrl)
-    order = [f"{kind}:{joint}" for kind in ("qpos", "qvel") for joint in ("rail", "pin", "stop")]
-    assert np.array_equal(
-        r.y[:, [r.outputs.index(name) for name in order]], np.hstack([qpos, qvel])
-    )
-    np.savez(tmp_path / "d.npz", t=T, qpos=qpos[:, :2], ctrl=ctrl)
-    with pytest.raises(
-        RecordingError,
-        match=r"'qpos' has 2 columns; the model needs 3: qpos:rail, qpos:pin, qpos:stop",
-    ):
-        read_recording(tmp_path / "d.npz", task.system.channels)
+    path = tmp_path / "d.npz"
+    qpos, ctrl = np.split(np.random.default_rng(0).standard_normal((M, 5)), [3], axis=1)
+    np.savez(path, t=T, qpos=qpos, ctrl=ctrl[1:], gain=np.zeros((M - 1, 2, 6)))
+    logged = read_log(path, task_of(tmp_path, {}).system.channels)
+    assert np.array_equal(logged.recording.ctrl, ctrl[1:])
+    for i, joint in enumerate(("rail", "pin", "stop")):
+        assert np.array_equal(column(logged, f"qpos:{joint}"), qpos[:, i])
     stated = task_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})
-    assert np.array_equal(
-        read_recording(tmp_path / "d.npz", stated.system.channels).y[:, 0], qpos[:, 1]
-    )
+    assert np.array_equal(read_log(path, stated.system.channels).recording.y[:, 0], qpos[:, 1])
 
 
 def test_bags_are_recordings(tmp_path: Path) -> None:
@@ -552,117 +458,21 @@ def test_bags_are_recordings(tmp_path: Path) -> None:
 
     from tests.support.ros2_bag import EPOCH, State, write
 
+    q, v, u = wave(), 2 * np.cos(2 * T), T
     states = [
-        State(
-            EPOCH + 5_000_000 * i,
-            ["pin", "grip"],
-            [wave()[i], 0.0],
-            [2 * np.cos(2 * T[i]), 0.0],
-            [T[i], 1.0],
-        )
+        State(EPOCH + 5_000_000 * i, ["pin", "grip"], [q[i], 0.0], [v[i], 0.0], [u[i], 1.0])
         for i in range(M)
     ]
     path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states})
-    with pytest.raises(
-        RecordingError, match="column 'ctrl:push' is missing; found: t, position:pin"
-    ):
-        read_recording(path, task_of(tmp_path, {}).system.channels)
-    spec = {
-        "columns": {"ctrl:turn": "effort:pin", "ctrl:push": {"column": "effort:grip", "scale": 0.0}}
-    }
-    r = read_recording(path, task_of(tmp_path, spec).system.channels)
+    said = "column 'ctrl:push' is missing; found: t, position:pin"
+    with pytest.raises(RecordingError, match=said):
+        read_log(path, task_of(tmp_path, {}).system.channels)
+    columns = {"ctrl:turn": "effort:pin", "ctrl:push": 0.0}
+    r = read_log(path, task_of(tmp_path, {"columns": columns}).system.channels).recording
     assert r.outputs == ("qpos:pin", "qvel:pin")
-    assert np.array_equal(r.y[:, 0], wave())
+    assert np.array_equal(r.y, np.column_stack([q, v]))
     assert np.allclose(r.t, T, rtol=0, atol=1e-12)
-    assert np.array_equal(r.ctrl, np.column_stack([np.zeros(M), T])[:-1])
-
-
-# ---- robots
-
-ONE = """
-<mujoco>
-  <worldbody>
-    <body name="arm">
-      <joint name="one" axis="0 1 0"/>
-      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
-      {inner}
-    </body>
-  </worldbody>
-  <actuator><motor name="one" joint="one"/>{motor}</actuator>
-</mujoco>
-"""
-INNER = '<body pos="0 0 -0.3"><joint name="two" axis="0 1 0"/><geom size="0.05" mass="0.5"/></body>'
-ROBOTS: dict[str, dict[str, Any]] = {
-    "bam_xl330/raw/*.json": {
-        "time": "timestamp",
-        "records": "entries",
-        "columns": {
-            "qpos:one": "position",
-            "qvel:one": "speed",
-            "ctrl:one": {
-                "column": "load",
-                "signed": 16,
-                "scale": 1e-3,
-                "multiply_by": ["torque_enable", "kp"],
-            },
-        },
-    },
-    "dfki_simple_pendulum/*_measured.csv": {
-        "time": "time",
-        "columns": {"qpos:one": "position", "qvel:one": "velocity", "ctrl:one": "torque"},
-    },
-    "dfki_double_pendulum/*.csv.gz": {
-        "time": "time",
-        "columns": {
-            f"{kind}:{joint}": f"{name}_meas{i + 1}"
-            for i, joint in enumerate(("one", "two"))
-            for kind, name in (("qpos", "pos"), ("qvel", "vel"), ("ctrl", "tau"))
-        },
-    },
-}
-
-
-def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], DesignTask]:
-    """Logs of one robot, and the experiment that reads them; skips where they are absent."""
-    files = sorted(SHARED_DATA.glob(pattern))
-    if not files:
-        pytest.skip(f"no logs of robots at {SHARED_DATA}")
-    double = "double" in pattern
-    model = ONE.format(
-        inner=INNER if double else "", motor='<motor name="two" joint="two"/>' if double else ""
-    )
-    return files, task_of(folder, {**ROBOTS[pattern], **changes}, model)
-
-
-@pytest.mark.parametrize("pattern", ROBOTS)
-def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
-    """All rows are read, and velocities are the slopes of positions."""
-    files, task = robot(pattern, tmp_path)
-    for file in files:
-        logged = read_log(file, task.system.channels)
-        r, summary = logged.recording, logged.summary
-        assert summary.rows == len(r.t) > 1000 and summary.dropped == 0
-        assert 150.0 < summary.rate < 600.0 and 3.0 < summary.duration < 21.0
-        assert np.isfinite(r.y).all() and np.isfinite(r.ctrl).all()
-        q, v = (r.y[:, r.outputs.index(f"{kind}:one")] for kind in ("qpos", "qvel"))
-        way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(r.t))])
-        assert np.corrcoef(q, way)[0, 1] > 0.9
-
-
-def test_loads_of_a_servo(tmp_path: Path) -> None:
-    """A number near 65 thousand in the log is a small negative load."""
-    files, task = robot("bam_xl330/raw/*.json", tmp_path)
-    loads = np.concatenate(
-        [read_recording(file, task.system.channels).ctrl[:, 0] for file in files]
-    )
-    assert loads.min() < -10.0 and loads.max() > 10.0
-    assert np.abs(loads).max() < 500.0
-    _, naive = robot(
-        "bam_xl330/raw/*.json",
-        tmp_path,
-        columns={**ROBOTS["bam_xl330/raw/*.json"]["columns"], "ctrl:one": "load"},
-    )
-    assert read_recording(files[0], naive.system.channels).ctrl.max() > 65_000
+    assert np.array_equal(r.ctrl[:, 1], T[:-1])
 
 
 # ---- logs of other programs
@@ -701,83 +511,77 @@ def test_columns_of_other_programs_are_proposed(
 # ---- rows of a stream
 
 
-class TestRowReader:
-    def test_rows_are_read_as_files_are(self, read: Read, tmp_path: Path) -> None:
-        """Units, counters, turns, factors, empty cells and the window, a few rows at a time."""
-        counts = np.mod(np.rint(9000.0 * np.sin(2.0 * T)), 4096)
-        counts[50:53] = np.nan
-        push = np.where(np.arange(M) % 3 == 0, np.arange(M, dtype=float), np.nan)
-        columns = {
-            "stamp": 1e6 * (T + 1000.0),
-            "counts": counts,
-            "angle": np.rad2deg(np.mod(wave(9.0), 2.0 * np.pi)),
-            "speed": wave(3.0),
-            "on": (T < 1.0).astype(float),
-            "raw": np.mod(np.rint(wave(300.0)), 2**16),
-            "push": push,
-        }
-        recording = {
-            "time": "stamp",
-            "time_unit": "us",
-            "window": (0.1, 1.5),
-            "columns": {
-                "ctrl:push": "push",
-                "ctrl:turn": 0.5,
-                "encoder": {"column": "counts", "period": 4096.0, "scale": 1e-3},
-                "qpos:pin": {"column": "angle", "unit": "deg", "unwrap": True},
-                "qvel:rail": {"column": "speed", "multiply_by": ["on"]},
-                "motor": {"column": "raw", "signed": 16, "scale": 0.01},
-            },
-        }
-        logged = read(columns, bare=True, **recording).recording
-        channels = task_of(tmp_path, recording).system.channels
-        header, *lines = (tmp_path / "lab.csv").read_text(encoding="utf-8").splitlines()
-        reader = RowReader(header, channels, "stdin")
-        rows = [row for row in map(reader.row, lines) if row is not None]
-        t, ctrl, y = map(np.array, zip(*rows, strict=True))
-        np.testing.assert_allclose(t - t[0], logged.t, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(ctrl[:-1], logged.ctrl)
-        for name in logged.outputs:
-            found = y[:, channels.outputs.index(name)]
-            expected = logged.y[:, logged.outputs.index(name)]
-            # A window in the middle of a turn may begin at another turn.
-            turn = {"encoder": 4.096, "qpos:pin": 2.0 * np.pi}.get(name, np.inf)
-            shift = np.rint((found - expected)[0] / turn) * turn if np.isfinite(turn) else 0.0
-            np.testing.assert_allclose(found, expected + shift, rtol=0, atol=1e-9)
-        assert np.isnan(y[:, channels.outputs.index("ruler")]).all()
+def test_rows_are_read_as_files_are(read: Read, tmp_path: Path) -> None:
+    """Units, counters, turns, factors, empty cells and the window, a few rows at a time."""
+    columns = {
+        "stamp": 1e6 * (T + 1000.0),
+        "counts": hole(np.mod(np.rint(wave(9000.0)), 4096), 50, 53),
+        "angle": np.rad2deg(np.mod(wave(9.0), 2.0 * np.pi)),
+        "speed": wave(3.0),
+        "on": (T < 1.0).astype(float),
+        "raw": np.mod(np.rint(wave(300.0)), 2**16),
+        "push": np.where(COUNT % 3 == 0, COUNT, np.nan),
+    }
+    recording = {
+        "time": "stamp",
+        "time_unit": "us",
+        "window": (0.0, 1.5),
+        "columns": {
+            "ctrl:push": "push",
+            "ctrl:turn": 0.5,
+            "encoder": {"column": "counts", "period": 4096.0, "scale": 1e-3},
+            "qpos:pin": {"column": "angle", "unit": "deg", "unwrap": True},
+            "qvel:rail": {"column": "speed", "multiply_by": ["on"]},
+            "motor": {"column": "raw", "signed": 16, "scale": 0.01},
+        },
+    }
+    logged = read(columns, bare=True, **recording).recording
+    channels = task_of(tmp_path, recording).system.channels
+    header, *lines = (tmp_path / "lab.csv").read_text(encoding="utf-8").splitlines()
+    reader = RowReader(header, channels, "stdin")
+    rows = [row for row in map(reader.row, lines) if row is not None]
+    t, ctrl, y = map(np.array, zip(*rows, strict=True))
+    assert_allclose(t - t[0], logged.t, rtol=0, atol=1e-9)
+    assert_allclose(ctrl[:-1], logged.ctrl)
+    for name in logged.outputs:
+        found = y[:, channels.outputs.index(name)]
+        expected = logged.y[:, logged.outputs.index(name)]
+        assert_allclose(found, expected, rtol=0, atol=1e-9)
+    assert np.isnan(y[:, channels.outputs.index("ruler")]).all()
 
-    def reader(
-        self, folder: Path, header: str = "t,ctrl:push,ctrl:turn,qpos:pin,note"
-    ) -> RowReader:
-        """A reader of rows with a column of text."""
-        return RowReader(header, task_of(folder, {}).system.channels, "stdin")
 
-    @pytest.mark.parametrize(
-        ("line", "said"),
-        [
-            ("0.1,1,2,3", "4 cells, but line 1 has 5"),
-            ("0.1,1,2,three,", "column 'qpos:pin': 'three' is no measured number"),
-            ("0.1,1,2,1e300,", "column 'qpos:pin': '1e300' is no measured number"),
-        ],
-    )
-    def test_a_faulty_row(self, line: str, said: str, tmp_path: Path) -> None:
-        reader = self.reader(tmp_path)
-        assert reader.row("0,1,2,3,begin") is not None
-        with pytest.raises(RecordingError, match=re.escape(said)):
-            reader.row(line)
-        # A control is held, and what was not measured is unknown.
-        t, ctrl, outputs = reader.row("0.2,,,,end") or (0.0, [], [])
-        assert (t, ctrl) == (0.2, [1.0, 2.0]) and np.isnan(outputs).all()
+def reader_of(folder: Path, header: str = "t,ctrl:push,ctrl:turn,qpos:pin,note") -> RowReader:
+    """A reader of rows with a column of text."""
+    return RowReader(header, task_of(folder, {}).system.channels, "stdin")
 
-    @pytest.mark.parametrize(
-        ("header", "said"),
-        [
-            ("t,ctrl:push,ctrl:turn,qpos:pni", "did you mean 'qpos:pin'"),
-            ("t,ctrl:push,qpos:pin", "column 'ctrl:turn' is missing"),
-            ("time,ctrl:push,ctrl:turn,qpos:pin", "column 't' is missing"),
-            ("t,ctrl:push,ctrl:turn,qpos:pin,t", "line 1: two columns have the same name"),
-        ],
-    )
-    def test_a_wrong_header(self, header: str, said: str, tmp_path: Path) -> None:
-        with pytest.raises(RecordingError, match=re.escape(said)):
-            self.reader(tmp_path, header)
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("0.1,1,2,3", "4 cells, but line 1 has 5"),
+        ("0.1,1,2,three,", "column 'qpos:pin': 'three' is no measured number"),
+        ("0.1,1,2,1e300,", "column 'qpos:pin': '1e300' is no measured number"),
+    ],
+)
+def test_a_faulty_row(line: str, said: str, tmp_path: Path) -> None:
+    reader = reader_of(tmp_path)
+    assert reader.row("0,1,2,3,begin") is not None
+    with pytest.raises(RecordingError, match=re.escape(said)):
+        reader.row(line)
+    # A control is held, and what was not measured is unknown.
+    t, ctrl, outputs = reader.row("0.2,,,,end") or (0.0, [], [])
+    assert (t, ctrl) == (0.2, [1.0, 2.0]) and np.isnan(outputs).all()
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("t,ctrl:push,ctrl:turn,qpos:pni", "did you mean 'qpos:pin'"),
+        ("t,ctrl:push,qpos:pin", "column 'ctrl:turn' is missing"),
+        ("time,ctrl:push,ctrl:turn,qpos:pin", "column 't' is missing"),
+        ("t,ctrl:push,ctrl:turn,qpos:pin,t", "line 1: two columns have the same name"),
+    ],
+)
+def test_a_wrong_header(header: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=re.escape(said)):
+        reader_of(tmp_path, header)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from tests.support import limits
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
 
@@ -43,18 +43,8 @@ def played(experiment: Experiment, control: Array) -> tuple[Array, Array, Array]
         Positions (n+1, nq), velocities (n+1, nv) and controls (n, nu) at all n engine steps.
     """
     task = DesignTask.resolve(experiment)
-    model = task.system.model_at(task.theta)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key(experiment.initial.keyframe).id)
-
-    qpos = [data.qpos.copy()]
-    qvel = [data.qvel.copy()]
-    ctrl = []
-    for u in np.repeat(control, task.system.grid.substeps, axis=0):
-        data.ctrl[:] = u
-        mujoco.mj_step(model, data)
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-        ctrl.append(u)
-
-    return np.array(qpos), np.array(qvel), np.array(ctrl)
+    model, substeps = task.system.model_at(task.theta), task.system.grid.substeps
+    start = model.key(experiment.initial.keyframe)
+    found = limits.played(model, (start.qpos, start.qvel), control, substeps)
+    qpos, qvel = np.vstack([start.qpos, found["q"]]), np.vstack([start.qvel, found["v"]])
+    return qpos, qvel, np.repeat(control, substeps, axis=0)

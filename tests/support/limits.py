@@ -112,22 +112,15 @@ ARM = """
 
 def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -> dict[str, Array]:
     """Positions, velocities, accelerations and actuator forces at every step of a plain loop."""
-    data, rows = mujoco.MjData(model), {key: [] for key in ("q", "v", "a", "f")}
+    data, rows = mujoco.MjData(model), []
     data.qpos[:], data.qvel[:] = start
-    for held in ctrl:
+    for held in np.repeat(ctrl, substeps, axis=0):
         data.ctrl[:] = held
-        for _ in range(substeps):
-            before = data.qvel.copy()
-            mujoco.mj_step(model, data)
-            now = (
-                data.qpos,
-                data.qvel,
-                (data.qvel - before) / model.opt.timestep,
-                data.actuator_force,
-            )
-            for key, value in zip(rows, now, strict=True):
-                rows[key].append(np.array(value))
-    return {key: np.array(value) for key, value in rows.items()}
+        before = data.qvel.copy()
+        mujoco.mj_step(model, data)
+        change = (data.qvel - before) / model.opt.timestep
+        rows.append([np.array(x) for x in (data.qpos, data.qvel, change, data.actuator_force)])
+    return {key: np.array(column) for key, *column in zip("qvaf", *rows, strict=True)}
 
 
 def distances_of_arm(model: Any, positions: Array) -> float:

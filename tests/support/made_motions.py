@@ -74,14 +74,14 @@ def simulated(model: mujoco.MjModel, amplitude: float, samples: int = 40) -> Tra
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
     t = np.arange(samples + 1) * model.opt.timestep
-    ctrl = data.ctrl + amplitude * np.sin(2.0 * t[:-1, None] * np.ones(model.nu))
-    rows = [(data.qpos.copy(), data.qvel.copy(), data.act.copy())]
+    ctrl = data.ctrl + amplitude * np.sin(2.0 * t[:, None] * np.ones(model.nu))
+    rows = []
     for u in ctrl:
+        rows.append(np.concatenate([data.qpos, data.qvel, data.act]))
         data.ctrl[:] = u
         mujoco.mj_step(model, data)
-        rows.append((data.qpos.copy(), data.qvel.copy(), data.act.copy()))
-    qpos, qvel, act = (np.array(column) for column in zip(*rows, strict=True))
-    return Trajectory(t=t, qpos=qpos, qvel=qvel, act=act, ctrl=ctrl)
+    qpos, qvel, act = np.split(np.array(rows), [model.nq, model.nq + model.nv], axis=1)
+    return Trajectory(t=t, qpos=qpos, qvel=qvel, act=act, ctrl=ctrl[:-1])
 
 
 def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Evaluation:

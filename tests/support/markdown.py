@@ -6,11 +6,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-# A fence that opens a block, with its language; the block ends at the next equal fence.
-FENCE = re.compile(r"^(?P<fence>```+|~~~+)(?P<language>\w*)\s*$")
-
-# A comment above a block that is not run, with the reason, e.g. `<!-- not run: needs a robot -->`.
-SKIP = re.compile(r"^<!--\s*not run:\s*(?P<reason>\S.*?)\s*-->\s*$")
+# A fenced block with its language; the block ends at the next equal fence. A comment above it says
+# why it is not run, e.g. `<!-- not run: needs a robot -->`.
+BLOCK = re.compile(
+    r"(?:^<!--\s*not run:\s*(?P<reason>\S.*?)\s*-->\s*?\n\s*)?"
+    r"^(?P<fence>```+|~~~+)(?P<language>\w*)[ \t]*\n(?P<text>.*?)^(?P=fence)$",
+    re.MULTILINE | re.DOTALL,
+)
 
 # Targets of links and pictures that are neither an address nor a place in the same file.
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)#\s]+)")
@@ -47,42 +49,19 @@ def code_blocks(path: Path) -> list[CodeBlock]:
     Raises:
         ValueError: A block is not closed.
     """
-    lines = path.read_text(encoding="utf-8").splitlines()
-    blocks = []
-    reason = ""
-    index = 0
-
-    while index < len(lines):
-        skip = SKIP.match(lines[index])
-        opening = FENCE.match(lines[index])
-
-        if opening is None:
-            # Only blank lines may stand between the comment and its block.
-            if skip is not None:
-                reason = skip["reason"]
-            elif lines[index].strip():
-                reason = ""
-            index += 1
-            continue
-
-        first = index + 1
-        try:
-            last = lines.index(opening["fence"], first)
-        except ValueError:
-            raise ValueError(f"{path}: the block of line {first} is not closed") from None
-
-        block = CodeBlock(
+    text = path.read_text(encoding="utf-8")
+    if len(re.findall(r"^(?:```|~~~)", text, re.MULTILINE)) % 2:
+        raise ValueError(f"{path}: a block is not closed")
+    return [
+        CodeBlock(
             path=path,
-            line=first,
-            language=opening["language"],
-            text="\n".join(lines[first:last]) + "\n",
-            skip_reason=reason,
+            line=text.count("\n", 0, found.start("fence")) + 1,
+            language=found["language"],
+            text=found["text"],
+            skip_reason=found["reason"] or "",
         )
-        blocks.append(block)
-        reason = ""
-        index = last + 1
-
-    return blocks
+        for found in BLOCK.finditer(text)
+    ]
 
 
 def linked_files(path: Path) -> list[Path]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from mjfim.model.parameter_writer import write_element
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import resolve
@@ -23,3 +25,14 @@ def write_spec(
                 if target.term is not None:
                     written = resolve(wanted, path).read(wanted)
                 write_element(spec, compiled, wanted, path, written)
+
+
+def arrays_of(model: Any) -> dict[str, Array]:
+    """Copies of all arrays of a model and of its options."""
+    found = {
+        f"{holder}.{name}": getattr(value, name)
+        for holder, value in (("model", model), ("opt", model.opt))
+        for name in dir(value)
+        if not name.startswith("_")
+    }
+    return {name: np.array(v) for name, v in found.items() if isinstance(v, np.ndarray)}
