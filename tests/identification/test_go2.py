@@ -67,7 +67,7 @@ def test_a_leg_alone_moves_as_in_the_whole_robot(tmp_path: Path) -> None:
 def test_fits_to_a_second_predict_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two seconds of the log, each predicted from the other better than by the model as it comes."""
+    """Each of two seconds predicts the other better than the model as it comes."""
     monkeypatch.setattr(go2, "PARTS", {"first": slice(4200, 4400), "second": slice(4400, 4600)})
     monkeypatch.setattr("sys.argv", ["go2", str(DATA), str(MODEL), str(tmp_path)])
 
