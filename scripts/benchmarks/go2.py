@@ -32,8 +32,12 @@ KINDS = ("hip", "thigh", "calf")
 # Mean period of the rows [s].
 PERIOD = 0.005001064
 
-# Rows of the parts of the log. The references are triangles whose frequency grows.
-PARTS = {"0 to 12 s": slice(0, 2349), "12 to 23 s": slice(2349, 4698)}
+# Rows of the halves of the log. The references are triangles whose frequency grows to 1 Hz,
+# so that each half has slow and fast rows.
+HALVES = {
+    "0 to 6, 12 to 18 s": (slice(0, 1175), slice(2349, 3524)),
+    "6 to 12, 18 to 23 s": (slice(1175, 2349), slice(3524, 4698)),
+}
 
 # Gains of the law that the authors' repository states [N m/rad, N m s/rad].
 STATED_KP, STATED_KD = 20.0, 1.5
@@ -59,8 +63,8 @@ JOINT = f"""
 [controllers.JOINT]
 kp = {STATED_KP}
 kd = {STATED_KD}
-latency = 0.015
-feedback_latency = 0.005
+latency = 0.01
+feedback_latency = 0.008
 [parameters."kp JOINT"]
 target = "controller/JOINT:kp"
 bounds = [2.0, 100.0]
@@ -70,15 +74,21 @@ bounds = [0.0, 10.0]
 [parameters."latency JOINT"]
 target = "controller/JOINT:latency"
 bounds = [0.0, 0.06]
-[parameters."feedback JOINT"]
-target = "controller/JOINT:feedback_latency"
-bounds = [0.0, 0.03]
 [parameters."armature JOINT"]
 target = "joint/JOINT:armature"
 bounds = [1e-5, 0.3]
 [parameters."friction JOINT"]
 target = "joint/JOINT:frictionloss"
 bounds = [0.0, 5.0]
+"""
+# The drives of a leg measure equally late.
+FEEDBACK = """[parameters.feedback]
+targets = [
+  { path = "controller/LEG_hip:feedback_latency" },
+  { path = "controller/LEG_thigh:feedback_latency" },
+  { path = "controller/LEG_calf:feedback_latency" },
+]
+bounds = [0.0, 0.03]
 """
 KNOT = """[parameters."friction_KNOT JOINT"]
 target = "tendon/JOINT_KNOT:frictionloss"
@@ -125,6 +135,17 @@ def leg_alone(path: Path, leg: str) -> str:
     return str(spec.to_xml()).replace("_joint", "")
 
 
+def write_leg(path: Path, leg: str, output: Path) -> None:
+    """Write the model and the experiment file of a leg into a folder."""
+    (output / f"{leg}.xml").write_text(leg_alone(path, leg), encoding="utf-8")
+    joints = [f"{leg}_{kind}" for kind in KINDS]
+    tables = [text.replace("JOINT", each) for text in (OUTPUT, JOINT) for each in joints]
+    knots = [KNOT.replace("KNOT", str(i)) for i in range(len(KNOTS))]
+    text = "".join([LEG, *tables, FEEDBACK, *knots]).replace("LEG", leg)
+    text = text.replace("JOINT", f"{leg}_calf")
+    (output / f"{leg}.toml").write_text(text, encoding="utf-8")
+
+
 def as_it_comes(path: Path, references: Array, angles: Array) -> Array:
     """Return the angles of the model with the stated gains, in a plain loop: (M, 12)."""
     model = hanging(path).compile()
@@ -153,43 +174,68 @@ def rms(errors: Array, axis: int | None = None) -> Array:
     return np.asarray(1e3 * np.sqrt(np.mean(errors**2, axis=axis)))
 
 
-def draw(path: Path, part: str, joints: list[str], curves: dict[str, Array]) -> None:
-    """Draw angles of some joints, and the errors of their predictions."""
-    figure, axes = plt.subplots(len(joints), 2, figsize=(13, 8), sharex=True, layout="constrained")
+def draw(path: Path, half: str, joints: list[str], curves: dict[str, Array]) -> None:
+    """Draw angles of some joints in seconds that are not fitted, and errors of all seconds."""
+    figure, axes = plt.subplots(len(joints), 2, figsize=(13, 8), sharex="col", layout="constrained")
     colours = {"reference": "0.7", "measured": "black", "as it comes": "C1", "identified": "C0"}
+    shown = next(rows[-1] for other, rows in HALVES.items() if other != half)
     for row, joint in enumerate(joints):
         for name, angles in curves.items():
-            seconds = PERIOD * np.arange(len(angles)) + PERIOD * PARTS[part].start
-            axes[row, 0].plot(seconds, angles[:, row], color=colours[name], label=name, lw=1.2)
+            seconds = PERIOD * np.arange(len(angles))
+            axes[row, 0].plot(seconds[shown], angles[shown, row], color=colours[name], label=name)
             if name in ("as it comes", "identified"):
                 error = 1e3 * (angles - curves["measured"])[:, row]
-                label = f"{name}: {rms(error) / 1e3:.1f} mrad rms"
-                axes[row, 1].plot(seconds, error, color=colours[name], label=label, lw=1.0)
+                axes[row, 1].plot(seconds, error, color=colours[name], label=name, lw=1.0)
+        for rows in HALVES[half]:
+            axes[row, 1].axvspan(*seconds[rows][[0, -1]], color="0.92")
         axes[row, 0].set_ylabel(f"{joint} [rad]")
-        axes[row, 1].set_ylabel("prediction minus measured [mrad]")
-        axes[row, 1].legend(loc="upper right", fontsize=8)
+        axes[row, 1].set_ylabel("predicted minus measured [mrad]")
     axes[0, 0].legend(loc="upper right", fontsize=8)
-    axes[0, 0].set_title(f"{part}, predicted open loop from the references")
+    axes[0, 1].legend(loc="upper right", fontsize=8)
+    axes[0, 0].set_title("seconds that are not fitted, open loop from the references")
+    axes[0, 1].set_title("all seconds; the grey ones are fitted")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def table_of_parameters(found: dict[tuple[str, str], mjfim.Estimate], part: str) -> Table:
+def table_of_parameters(found: dict[tuple[str, str], mjfim.Estimate], half: str) -> Table:
     """Return the parameters of all joints with the half widths of their 95 % intervals."""
-    names = found["RL", part].parameters
+    names = found[LEGS[0], half].parameters
     quantities = list(dict.fromkeys(name.split()[0] for name in names if "bias" not in name))
-    table = new_table(f"Fitted to {part}, with half widths of 95 %", "joint", *quantities)
+    table = new_table(f"Fitted to {half}, with half widths of 95 %", "joint", *quantities)
     for kind, leg in itertools.product(KINDS, LEGS):
-        estimate, joint = found[leg, part], f"{leg}_{kind}"
+        estimate, joint = found[leg, half], f"{leg}_{kind}"
         cells = dict.fromkeys(quantities, "")
         for name, value, interval in zip(
             estimate.parameters, estimate.theta, estimate.interval, strict=True
         ):
-            if name.endswith(f" {joint}"):
-                cells[name.split()[0]] = f"{value:.4g} ± {0.5 * np.ptp(interval):.2g}"
+            quantity, _, of_joint = name.partition(" ")
+            if of_joint in ("", joint):
+                cells[quantity] = f"{value:.4g} ± {0.5 * np.ptp(interval):.2g}"
         table.add_row(joint, *cells.values())
+    return table
+
+
+def table_of_errors(half: str, joints: list[str], errors: Array, angles: Array) -> Table:
+    """Return where errors of predictions lie: angle and direction, speed, frequency.
+
+    A mean over bins of 20 mrad for each direction is what depends on the angle and the direction.
+    """
+    headings = ("all", "of angle and direction", "below 0.1 rad/s", "above 1 rad/s", "90 % below")
+    table = new_table(f"What is left in {half}, rms [mrad]", "joint", *headings)
+    speeds = np.gradient(angles, PERIOD, axis=0)
+    frequencies = np.fft.rfftfreq(len(errors), PERIOD)
+    for joint, error, angle, speed in zip(joints, errors.T, angles.T, speeds.T, strict=True):
+        bins = 2 * np.floor((angle - angle.min()) / 0.02).astype(int) + (speed > 0.0)
+        means = np.bincount(bins, error) / np.maximum(np.bincount(bins), 1)
+        power = np.cumsum(np.abs(np.fft.rfft(error)) ** 2)
+        highest = frequencies[np.searchsorted(power, 0.9 * power[-1])]
+        by_speed = (error[each] for each in (np.abs(speed) < 0.1, np.abs(speed) > 1.0))
+        found = (rms(each) if len(each) else np.nan for each in by_speed)
+        numbers = [rms(error), rms(means[bins]), *found]
+        table.add_row(joint, *(f"{number:.1f}" for number in numbers), f"{highest:.1f} Hz")
     return table
 
 
@@ -198,8 +244,8 @@ def relative_widths(estimate: mjfim.Estimate, joint: str) -> list[float]:
 
     A measured angle lags behind a ramp by kd / kp + latency - feedback latency.
     """
-    quantities = ("kp", "kd", "friction", "latency", "feedback")
-    places = [estimate.parameters.index(f"{name} {joint}") for name in quantities]
+    names = (*(f"{name} {joint}" for name in ("kp", "kd", "friction", "latency")), "feedback")
+    places = [estimate.parameters.index(name) for name in names]
     kp, kd, friction, latency, feedback = np.maximum(estimate.theta[places], 1e-9)
     lag = kd / kp + latency - feedback
     weights = np.array(
@@ -243,71 +289,67 @@ def main() -> int:
     angles, references = (
         np.column_stack([log[f"{what}_{joint}"] for joint in every]) for what in ("q", "ref")
     )
-    stated = {part: as_it_comes(model, references[r], angles[r]) for part, r in PARTS.items()}
+    stated = as_it_comes(model, references, angles)
 
     console = Console(width=200)
     found: dict[tuple[str, str], mjfim.Estimate] = {}
-    predicted = {part: np.empty_like(angles[rows]) for part, rows in PARTS.items()}
+    predicted = {half: np.empty_like(angles) for half in HALVES}
     for number, leg in enumerate(LEGS):
         begun = time.process_time()
         joints, columns = every[3 * number :][:3], slice(3 * number, 3 * number + 3)
-        (output / f"{leg}.xml").write_text(leg_alone(model, leg), encoding="utf-8")
-        knots = [KNOT.replace("KNOT", str(i)).replace("JOINT", joints[2]) for i in (0, 1)]
-        tables = [text.replace("JOINT", each) for text in (OUTPUT, JOINT) for each in joints]
-        text = "".join([LEG.replace("LEG", leg), *tables, *knots])
-        (output / f"{leg}.toml").write_text(text, encoding="utf-8")
+        write_leg(model, leg, output)
         experiment = mjfim.Experiment.from_file(output / f"{leg}.toml")
         system = System.resolve(experiment)
 
         header = ["time", *(f"{what}:{each}" for what in ("reference", "qpos") for each in joints)]
-        logs = {}
-        for part, rows in PARTS.items():
-            path = output / f"{leg} {part}.csv"
-            both = np.hstack([references[rows, columns], angles[rows, columns]])
+        logs: dict[str, list[mjfim.Recording]] = {half: [] for half in HALVES}
+        for half, part in ((half, part) for half, parts in HALVES.items() for part in parts):
+            path = output / f"{leg}_from_row_{part.start}.csv"
+            both = np.hstack([references[part, columns], angles[part, columns]])
             timed = np.column_stack([PERIOD * np.arange(len(both)), both])
             np.savetxt(path, timed, "%.7f", ",", header=",".join(header), comments="")
-            logs[part] = read_recording(path, system.channels)
-        for part in PARTS:
-            held_out = [logs[other] for other in PARTS if other != part]
-            fitted = mjfim.identify(experiment, [logs[part]], held_out=held_out)
-            found[leg, part] = fitted
-            console.print(f"{leg}, {part}: {'; '.join(fitted.reasons) or 'no misfit'}")
-            for other, there in PARTS.items():
-                if other != part:
-                    predicted[other][:, columns] = open_loop(
-                        system, fitted.theta, references[there, columns], angles[there, columns]
-                    )
+            logs[half].append(read_recording(path, system.channels))
+        for half, others in zip(HALVES, reversed(HALVES), strict=True):
+            fitted = mjfim.identify(experiment, logs[half], held_out=logs[others])
+            found[leg, half] = fitted
+            console.print(f"{leg}, {half}: {'; '.join(fitted.reasons) or 'no misfit'}")
+            predicted[half][:, columns] = open_loop(
+                system, fitted.theta, references[:, columns], angles[:, columns]
+            )
         console.print(f"{leg}: {(time.process_time() - begun) / 60.0:.1f} minutes of a processor")
 
-    for part in PARTS:
-        console.print(table_of_parameters(found, part))
+    for half in HALVES:
+        console.print(table_of_parameters(found, half))
         names = ("kp", "kd", "friction", "kd / kp", "friction / kp", "lag behind a ramp")
         table = new_table("Half widths of 95 % [%], median of four legs", "joints", *names)
         for kind in KINDS:
-            widths = [relative_widths(found[leg, part], f"{leg}_{kind}") for leg in LEGS]
+            widths = [relative_widths(found[leg, half], f"{leg}_{kind}") for leg in LEGS]
             table.add_row(kind, *(f"{each:.1f}" for each in np.median(widths, axis=0)))
         console.print(table)
         for joint in (f"{end}_{kind}" for kind in KINDS for end in ("F", "R")):
             sides = [joint[0] + side + joint[1:] for side in "LR"]
-            both_sides = [ranges_of(found[side[:2], part], side) for side in sides]
+            both_sides = [ranges_of(found[side[:2], half], side) for side in sides]
             console.print(f"{' and '.join(sides)} differ in: {apart(*both_sides) or 'nothing'}")
     for joint in every:
-        both_parts = [ranges_of(found[joint[:2], part], joint) for part in PARTS]
-        console.print(f"halves of {joint} differ in: {apart(*both_parts) or 'nothing'}")
+        both_halves = [ranges_of(found[joint[:2], half], joint) for half in HALVES]
+        console.print(f"halves of {joint} differ in: {apart(*both_halves) or 'nothing'}")
 
-    table = new_table("rms error [mrad] of the half that is not fitted", "", "all", *every)
-    for part, rows in PARTS.items():
-        errors = [each - angles[rows] for each in (predicted[part], stated[part])]
+    table = new_table("rms error [mrad] of seconds that are not fitted", "fitted", "all", *every)
+    for half, others in zip(HALVES, reversed(HALVES), strict=True):
+        rows = np.concatenate([np.arange(len(angles))[part] for part in HALVES[others]])
+        errors = [(each - angles)[rows] for each in (predicted[half], stated)]
         ours, theirs = (np.array([rms(each), *rms(each, 0)]) for each in errors)
         for name, numbers in (("", ours), (" as it comes", theirs), (" factor", theirs / ours)):
-            table.add_row(f"{part}{name}", *(f"{number:.1f}" for number in numbers))
-        shown = [every.index(joint) for joint in ("FL_hip", "RR_thigh", "RL_calf")]
+            table.add_row(f"{half}{name}", *(f"{number:.1f}" for number in numbers))
+        console.print(table_of_errors(others, every, errors[0], angles[rows]))
+
+        shown = [every.index(f"{LEGS[0]}_{kind}") for kind in KINDS]
         curves = {
-            "reference": references[rows][:, shown],
-            "measured": angles[rows][:, shown],
-            "as it comes": stated[part][:, shown],
-            "identified": predicted[part][:, shown],
+            "reference": references[:, shown],
+            "measured": angles[:, shown],
+            "as it comes": stated[:, shown],
+            "identified": predicted[half][:, shown],
         }
-        draw(output / f"{part}.png", part, [every[i] for i in shown], curves)
+        draw(output / f"{half}.png", half, [every[i] for i in shown], curves)
     console.print(table)
     return 0

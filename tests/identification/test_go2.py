@@ -35,12 +35,7 @@ def test_dry_friction_of_the_knee_grows_with_the_sine_of_the_angle() -> None:
 
 def test_a_leg_alone_moves_as_in_the_whole_robot(tmp_path: Path) -> None:
     """The closed loop of one leg agrees with a plain loop of all legs."""
-    (tmp_path / "RL.xml").write_text(go2.leg_alone(MODEL, "RL"), encoding="utf-8")
-    joints = ["RL_hip", "RL_thigh", "RL_calf"]
-    knots = [go2.KNOT.replace("KNOT", str(i)).replace("JOINT", joints[2]) for i in (0, 1)]
-    tables = [text.replace("JOINT", each) for text in (go2.OUTPUT, go2.JOINT) for each in joints]
-    text = "".join([go2.LEG.replace("LEG", "RL"), *tables, *knots])
-    (tmp_path / "RL.toml").write_text(text, encoding="utf-8")
+    go2.write_leg(MODEL, "RL", tmp_path)
     system = System.resolve(mjfim.Experiment.from_file(tmp_path / "RL.toml"))
     names = system.parameters.names
     theta = np.array(system.parameters.guess)
@@ -68,7 +63,8 @@ def test_fits_to_a_second_predict_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each of two seconds predicts the other better than the model as it comes."""
-    monkeypatch.setattr(go2, "PARTS", {"first": slice(4200, 4400), "second": slice(4400, 4600)})
+    halves = {"first": (slice(4200, 4400),), "second": (slice(4400, 4600),)}
+    monkeypatch.setattr(go2, "HALVES", halves)
     monkeypatch.setattr("sys.argv", ["go2", str(DATA), str(MODEL), str(tmp_path)])
 
     assert go2.main() == 0
