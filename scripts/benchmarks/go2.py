@@ -178,21 +178,20 @@ def rms(errors: Array, axis: int | None = None) -> Array:
 def draw(path: Path, half: str, joints: list[str], curves: dict[str, Array]) -> None:
     """Draw angles of some joints in seconds that are not fitted, and errors of all seconds."""
     figure, axes = plt.subplots(len(joints), 2, figsize=(13, 8), sharex="col", layout="constrained")
-    colours = {"reference": "0.7", "measured": "black", "as it comes": "C1", "identified": "C0"}
+    styles = {"reference": "C7", "as it comes": "C1", "identified": "C0", "measured": "k:"}
     shown = next(rows[-1] for other, rows in HALVES.items() if other != half)
     for row, joint in enumerate(joints):
         for name, angles in curves.items():
             seconds = PERIOD * np.arange(len(angles))
-            axes[row, 0].plot(seconds[shown], angles[shown, row], color=colours[name], label=name)
+            axes[row, 0].plot(seconds[shown], angles[shown, row], styles[name], label=name)
             if name in ("as it comes", "identified"):
                 error = 1e3 * (angles - curves["measured"])[:, row]
-                axes[row, 1].plot(seconds, error, color=colours[name], label=name, lw=1.0)
+                axes[row, 1].plot(seconds, error, styles[name], lw=1.0)
         for rows in HALVES[half]:
             axes[row, 1].axvspan(*seconds[rows][[0, -1]], color="0.92")
         axes[row, 0].set_ylabel(f"{joint} [rad]")
         axes[row, 1].set_ylabel("predicted minus measured [mrad]")
-    axes[0, 0].legend(loc="upper right", fontsize=8)
-    axes[0, 1].legend(loc="upper right", fontsize=8)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     axes[0, 0].set_title("seconds that are not fitted, open loop from the references")
     axes[0, 1].set_title("all seconds; the grey ones are fitted")
     for axis in axes[-1]:
@@ -225,7 +224,7 @@ def table_of_errors(half: str, joints: list[str], errors: Array, angles: Array) 
     A mean over bins of 20 mrad for each direction is what depends on the angle and the direction.
     """
     headings = ("all", "of angle and direction", "below 0.1 rad/s", "above 1 rad/s", "90 % below")
-    table = new_table(f"What is left in {half}, rms [mrad]", "joint", *headings)
+    table = new_table(f"What is left in {half}, rms in mrad", "joint", *headings)
     speeds = np.gradient(angles, PERIOD, axis=0)
     frequencies = np.fft.rfftfreq(len(errors), PERIOD)
     for joint, error, angle, speed in zip(joints, errors.T, angles.T, speeds.T, strict=True):
@@ -335,7 +334,7 @@ def main() -> int:
         both_halves = [ranges_of(found[joint[:2], half], joint) for half in HALVES]
         console.print(f"halves of {joint} differ in: {apart(*both_halves) or 'nothing'}")
 
-    table = new_table("rms error [mrad] of seconds that are not fitted", "fitted", "all", *every)
+    table = new_table("rms error in mrad of seconds that are not fitted", "fitted", "all", *every)
     for half, others in zip(HALVES, reversed(HALVES), strict=True):
         rows = np.concatenate([np.arange(len(angles))[part] for part in HALVES[others]])
         errors = [(each - angles)[rows] for each in (predicted[half], stated)]
@@ -347,10 +346,11 @@ def main() -> int:
         shown = [every.index(f"{LEGS[0]}_{kind}") for kind in KINDS]
         curves = {
             "reference": references[:, shown],
-            "measured": angles[:, shown],
             "as it comes": stated[:, shown],
             "identified": predicted[half][:, shown],
+            "measured": angles[:, shown],
         }
-        draw(output / f"{half}.png", half, [every[i] for i in shown], curves)
+        picture = output / f"predicted_from_row_{HALVES[others][0].start}.png"
+        draw(picture, half, [every[i] for i in shown], curves)
     console.print(table)
     return 0
