@@ -190,10 +190,10 @@ def draw(path: Path, half: str, joints: list[str], curves: dict[str, Array]) -> 
         for rows in HALVES[half]:
             axes[row, 1].axvspan(*seconds[rows][[0, -1]], color="0.92")
         axes[row, 0].set_ylabel(f"{joint} [rad]")
-        axes[row, 1].set_ylabel("predicted minus measured [mrad]")
+        axes[row, 1].set_ylabel("error [mrad]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     axes[0, 0].set_title("seconds that are not fitted, open loop from the references")
-    axes[0, 1].set_title("all seconds; the grey ones are fitted")
+    axes[0, 1].set_title("predicted minus measured; grey seconds are fitted")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     figure.savefig(path, dpi=110)
