@@ -21,6 +21,7 @@ BENCHMARKS = {
     "selection": "does `identify --select` find the term that a model lacks, and no other?",
     "arm_logs": "do closed-loop logs of arms give base parameters and torques within intervals?",
     "so101": "how well does a fit predict a real arm of six servos, beside published sets?",
+    "go2": "how well does each half of a log of a real Go2 predict the other half?",
     "measured_data": "how well are measured data of other groups predicted, with added terms?",
 }
 
