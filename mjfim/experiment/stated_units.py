@@ -21,7 +21,7 @@ from mjfim.model.elements import identifier
 from mjfim.model.limited_elements import LimitedElement, limited_elements
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import unit_of
-from mjfim.model.units import ANGLE, control_units, per_second, sensor_unit
+from mjfim.model.units import ANGLE, FORCE_UNITS, control_units, per_second, sensor_unit
 from mjfim.recordings.quantities import Quantity, Unit, wrong_unit
 
 # Angles beyond TURNS turns look like degrees if they are multiples of ROUND_DEGREES.
@@ -198,6 +198,9 @@ class _Units:
             ("initial", "free"): deviations,
             ("nuisance", "initial"): deviations,
             ("nuisance", "bias"): self.outputs,
+            ("nuisance", "friction"): {
+                joint.name: FORCE_UNITS[joint.unit] for joint in coordinates.scalar_joints
+            },
         }
         for kind, limited in self.elements.items():
             units = {name: element.unit for name, element in limited.items()}

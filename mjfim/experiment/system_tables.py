@@ -594,6 +594,14 @@ class Nuisance(Section):
     delay: Seconds | Literal[True] | None = Field(
         default=None, description="Delay of all outputs [s]. Default: none."
     )
+    friction: PriorsByName | None = Field(
+        default=None,
+        description=(
+            "Dry friction of the joints, beside that of the model [N or N m]: one value for all "
+            "slide and hinge joints or a table by joint. A design then reveals the parameters by "
+            "motions whose effect dry friction cannot imitate. Default: none."
+        ),
+    )
     per_recording: Boolean = Field(
         default=False,
         description=(
