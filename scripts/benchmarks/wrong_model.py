@@ -1,6 +1,6 @@
 """Is a design still good on robots that have what the model lacks?
 
-    python -m scripts.benchmarks wrong_model [--runs 10] [--seconds 10] [--robots NAME ...]
+    python -m scripts.benchmarks wrong_model [--runs 10] [--seconds 20] [--robots NAME ...]
         [--processes 2] [-o FILE.json]
 
 The simulated robots have dry friction with a Stribeck peak and a part that grows with the torque
@@ -421,7 +421,9 @@ def main() -> int:
     """Print the medians; return 1 where a design is worse than a baseline."""
     parser = options_of(__doc__)
     parser.add_argument("--runs", type=int, default=10, help="robots of each kind")
-    parser.add_argument("--seconds", type=float, default=10.0, help="time of each search")
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="processor seconds of each search"
+    )
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--processes", type=int, default=cores())
     parser.add_argument("-o", "--output", type=Path, help="JSON file with all runs")
