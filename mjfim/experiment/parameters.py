@@ -11,7 +11,13 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import ParameterSpec, TargetSpec
 from mjfim.model.coordinates import output_label, split_unit, unknown_coordinate
-from mjfim.model.elements import LEAST_MOVE_PER_SAMPLE, force_sizes, identifier, names_of
+from mjfim.model.elements import (
+    LEAST_MOVE_PER_SAMPLE,
+    force_sizes,
+    identifier,
+    names_of,
+    position_sizes,
+)
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import Parameter, ParameterSet, Target, physical_bounds
@@ -27,9 +33,10 @@ INITIAL_STATE_PREFIX = "initial "
 # is stated. It is weak: mass and second moments within a factor of e or so.
 CAD_PRIOR = 1.0
 
-# Guess of the dry friction that the model lacks, over the natural force of the joint. It is small,
-# so that the motion hardly changes, and above 0, so that differences see both sides of it.
-SMALL_FRICTION = 0.01
+# Guess of a dry friction or an armature that the model lacks, over the natural force and inertia of
+# the joint. It is small, so that the motion hardly changes, and above 0, so that differences see
+# both sides of it.
+SMALL_SHARE = 0.01
 
 # Fields of a body that hold the ten barycentric coordinates of its inertia, in their order.
 BARYCENTRIC_FIELDS = (
@@ -261,21 +268,29 @@ def _nuisance(
             "delay",
             _deviation("output:delay", stated.delay, "s", per_recording=stated.per_recording),
         )
-    # Friction that a parameter sets is no nuisance.
+    # What a parameter sets is no nuisance.
     known = {each.path for spec in experiment.parameters.values() for each in spec.all_targets}
-    joints = {f"joint/{joint.name}:frictionloss": joint for joint in coordinates.scalar_joints}
-    dofs = {joint.name: joint.v for path, joint in joints.items() if path not in known}
-    smallest = SMALL_FRICTION * force_sizes(source.model, period / LEAST_MOVE_PER_SAMPLE)
-    for name, prior in _priors_by_name("nuisance.friction", stated.friction, list(dofs)):
-        yield (
-            f"dry friction {name}",
-            ParameterSpec(
-                target=f"joint/{name}:frictionloss",
-                guess=float(source.model.dof_frictionloss[dofs[name]] or smallest[dofs[name]]),
-                prior=None if prior is True else float(prior),
-                nuisance=True,
-            ),
-        )
+    time = period / LEAST_MOVE_PER_SAMPLE
+    forces = force_sizes(source.model, time)
+    inertias = forces * time**2 / position_sizes(source.model)
+    for key, words, field, sizes in (
+        ("friction", "dry friction", "frictionloss", forces),
+        ("armature", "armature", "armature", inertias),
+    ):
+        values = getattr(source.model, f"dof_{field}")
+        paths = {joint.name: f"joint/{joint.name}:{field}" for joint in coordinates.scalar_joints}
+        places = {j.name: j.v for j in coordinates.scalar_joints if paths[j.name] not in known}
+        for name, prior in _priors_by_name(f"nuisance.{key}", getattr(stated, key), list(places)):
+            place = places[name]
+            yield (
+                f"{words} {name}",
+                ParameterSpec(
+                    target=paths[name],
+                    guess=float(values[place] or SMALL_SHARE * sizes[place]),
+                    prior=None if prior is True else float(prior),
+                    nuisance=True,
+                ),
+            )
 
 
 def _deviation(path: str, prior: Any, unit: str, *, per_recording: bool) -> ParameterSpec:

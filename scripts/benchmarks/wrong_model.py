@@ -10,9 +10,9 @@ model lacks, and other noise.
 
 It plays motions of equal length, which `mjfim.compare` has searched in equal processor time within
 the same limits: a multisine, a Fourier series of five harmonics, and a design. One more design has
-dry friction of all joints and a delay as nuisance parameters. Each recording is fitted with the
-model as it is, and with these nuisance parameters. The estimate then predicts random steps within
-the limits, the same for all motions.
+dry friction, armature and delay as nuisance parameters. Each recording is fitted with the model as
+it is, and with these nuisance parameters. The estimate then predicts random steps within the
+limits, the same for all motions.
 
 Errors of parameters are relative to their true values, in the root mean square over the wanted
 parameters. Predictions are compared with the robot without noise, in units of the noise, in the
@@ -50,7 +50,6 @@ HELD_OUT = "steps"
 
 # Names of the fits: with the model as it is, and with nuisance parameters.
 PLAIN, CURED = "as it is", "with nuisances"
-NUISANCE = {"friction": True, "delay": True}
 
 # Largest relative deviation of the true parameters from the guess.
 WRONG = 0.2
@@ -308,7 +307,10 @@ def experiments_of(robot: Robot) -> dict[str, Experiment]:
     """The experiment of a robot as its model is, and with nuisance parameters, by name."""
     file = ROOT / "models" / f"{robot.experiment}.toml"
     plain = Experiment.from_file(file).replace(**robot.changes)
-    return {PLAIN: plain, CURED: plain.replace(nuisance=NUISANCE)}
+    # Joints with a gap are those that a motor drives.
+    armature = dict.fromkeys(robot.gap, True)
+    nuisance = {"friction": True, "delay": True, "armature": armature}
+    return {PLAIN: plain, CURED: plain.replace(nuisance=nuisance)}
 
 
 def search(order: Search) -> dict[str, Array]:

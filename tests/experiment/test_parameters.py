@@ -352,7 +352,7 @@ NUISANCE: dict[str, tuple[dict[str, Any], str]] = {
     "negative": ({"bias": {"qpos:slide": -1.0}}, r"nuisance\.bias\.qpos:slide: .*greater than 0"),
     "key": (
         {"delays": 0.1},
-        r"nuisance\.delays: unknown key .*'delay'.*bias, delay, friction, initial",
+        r"nuisance\.delays: unknown key .*'delay'.*armature, bias, delay, friction, initial",
     ),
     "friction": ({"friction": {"rail": 0.1}}, r"nuisance\.friction: unknown name 'rail'.*slide"),
 }

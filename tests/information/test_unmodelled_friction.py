@@ -84,6 +84,11 @@ def test_friction_of_all_joints_beside_that_of_parameters(tmp_path: Path) -> Non
     assert found.bounds[0] == 0.0
     assert 0.0 < found.guess < 0.1
 
+    rotor = cart.replace(nuisance={"armature": {"slide": "100 g"}})
+    armature = System.resolve(rotor).parameters.parameters[-1]
+    assert (armature.name, armature.nuisance, armature.unit) == ("armature slide", True, "kg")
+    assert armature.prior == pytest.approx(0.1)
+
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_sigma_beside_unknown_friction_is_that_of_the_whole_inverse(
