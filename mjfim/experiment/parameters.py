@@ -9,9 +9,15 @@ import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system_tables import Nuisance, ParameterSpec, TargetSpec
+from mjfim.experiment.system_tables import ParameterSpec, TargetSpec
 from mjfim.model.coordinates import output_label, split_unit, unknown_coordinate
-from mjfim.model.elements import identifier, names_of
+from mjfim.model.elements import (
+    LEAST_MOVE_PER_SAMPLE,
+    force_sizes,
+    identifier,
+    names_of,
+    position_sizes,
+)
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import Parameter, ParameterSet, Target, physical_bounds
@@ -26,6 +32,11 @@ INITIAL_STATE_PREFIX = "initial "
 # Standard deviation of the logarithm of a pseudo-inertia relative to that of the model, where none
 # is stated. It is weak: mass and second moments within a factor of e or so.
 CAD_PRIOR = 1.0
+
+# Guess of a dry friction or an armature that the model lacks, over the natural force and inertia of
+# the joint. It is small, so that the motion hardly changes, and above 0, so that differences see
+# both sides of it.
+SMALL_SHARE = 0.01
 
 # Fields of a body that hold the ten barycentric coordinates of its inertia, in their order.
 BARYCENTRIC_FIELDS = (
@@ -57,11 +68,11 @@ def resolve_parameters(
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
-    nuisance = dict(_nuisance(experiment.nuisance, source, outputs.names))
+    period = 1.0 / experiment.rate
+    nuisance = dict(_nuisance(experiment, source, outputs.names, period))
     resolved: list[Parameter] = []
     for name, spec in (*experiment.parameters.items(), *nuisance.items()):
         if spec.inertial is None:
-            period = 1.0 / experiment.rate
             resolved.append(_single_parameter(name, spec, source, outputs, period))
         else:
             resolved += _inertia_parameters(name, spec, source.model)
@@ -226,10 +237,13 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
 
 
 def _nuisance(
-    stated: Nuisance, source: ModelSource, outputs: Sequence[str]
+    experiment: Experiment, source: ModelSource, outputs: Sequence[str], period: float
 ) -> Iterator[tuple[str, ParameterSpec]]:
-    """Names and tables of the parameters that the table `nuisance` stands for."""
-    coordinates = source.coordinates
+    """Names and tables of the parameters that the table `nuisance` stands for.
+
+    period: Sample period of the experiment [s].
+    """
+    stated, coordinates = experiment.nuisance, source.coordinates
     paths = {c.name: c.path for c in coordinates.deviations if c.path}
     units = {c.name: c.unit for c in coordinates.deviations}
     unnamed = coordinates.unnamed_joints
@@ -254,6 +268,29 @@ def _nuisance(
             "delay",
             _deviation("output:delay", stated.delay, "s", per_recording=stated.per_recording),
         )
+    # What a parameter sets is no nuisance.
+    known = {each.path for spec in experiment.parameters.values() for each in spec.all_targets}
+    time = period / LEAST_MOVE_PER_SAMPLE
+    forces = force_sizes(source.model, time)
+    inertias = forces * time**2 / position_sizes(source.model)
+    for key, words, field, sizes in (
+        ("friction", "dry friction", "frictionloss", forces),
+        ("armature", "armature", "armature", inertias),
+    ):
+        values = getattr(source.model, f"dof_{field}")
+        paths = {joint.name: f"joint/{joint.name}:{field}" for joint in coordinates.scalar_joints}
+        places = {j.name: j.v for j in coordinates.scalar_joints if paths[j.name] not in known}
+        for name, prior in _priors_by_name(f"nuisance.{key}", getattr(stated, key), list(places)):
+            place = places[name]
+            yield (
+                f"{words} {name}",
+                ParameterSpec(
+                    target=paths[name],
+                    guess=float(values[place] or SMALL_SHARE * sizes[place]),
+                    prior=None if prior is True else float(prior),
+                    nuisance=True,
+                ),
+            )
 
 
 def _deviation(path: str, prior: Any, unit: str, *, per_recording: bool) -> ParameterSpec:

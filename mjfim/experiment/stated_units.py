@@ -21,7 +21,7 @@ from mjfim.model.elements import identifier
 from mjfim.model.limited_elements import LimitedElement, limited_elements
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import unit_of
-from mjfim.model.units import ANGLE, control_units, per_second, sensor_unit
+from mjfim.model.units import ANGLE, JOINT_FIELD_UNITS, control_units, per_second, sensor_unit
 from mjfim.recordings.quantities import Quantity, Unit, wrong_unit
 
 # Angles beyond TURNS turns look like degrees if they are multiples of ROUND_DEGREES.
@@ -199,6 +199,10 @@ class _Units:
             ("nuisance", "initial"): deviations,
             ("nuisance", "bias"): self.outputs,
         }
+        for key, field in (("friction", "frictionloss"), ("armature", "armature")):
+            units = JOINT_FIELD_UNITS[field]
+            joints = {joint.name: units[joint.unit] for joint in coordinates.scalar_joints}
+            tables["nuisance", key] = joints
         for kind, limited in self.elements.items():
             units = {name: element.unit for name, element in limited.items()}
             # A free joint is stated by its name, with the ranges of its coordinates.

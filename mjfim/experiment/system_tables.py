@@ -608,6 +608,22 @@ class Nuisance(Section):
     delay: Seconds | Literal[True] | None = Field(
         default=None, description="Delay of all outputs [s]. Default: none."
     )
+    friction: PriorsByName | None = Field(
+        default=None,
+        description=(
+            "Dry friction of the joints that no parameter sets [N or N m]: one value for all slide "
+            "and hinge joints or a table by joint. A design then reveals the parameters by motions "
+            "whose effect dry friction cannot imitate. Default: none."
+        ),
+    )
+    armature: PriorsByName | None = Field(
+        default=None,
+        description=(
+            "Armature of the joints that no parameter sets [kg or kg m²], likewise. Where a gear "
+            "has backlash, the motor does not feel the inertia of the link at each reversal. "
+            "Default: none."
+        ),
+    )
     per_recording: Boolean = Field(
         default=False,
         description=(

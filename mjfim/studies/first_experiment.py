@@ -795,6 +795,8 @@ ABOVE = {
     "parameters": [
         f"Unknown parameters: at most {MOST_PARAMETERS} that the first motion identifies together,",
         "one for equal joints of a large robot. `mjfim list MODEL` lists every path.",
+        "For friction, rotors and a delay that the model lacks, add a table [nuisance] with",
+        "friction = true, armature = true and delay = true.",
     ],
     "boundary": [
         'end = "rest" lets the motion end at a standstill; "free" gives more information.'

@@ -292,7 +292,11 @@ NUISANCE: dict[str, tuple[dict[str, Any], str]] = {
     "false": ({"delay": False}, r"nuisance\.delay: "),
     "zero": ({"initial": 0.0}, r"nuisance\.initial: .*greater than 0"),
     "negative": ({"bias": {"qpos:slide": -1.0}}, r"nuisance\.bias\.qpos:slide: .*greater than 0"),
-    "key": ({"delays": 0.1}, r"nuisance\.delays: unknown key .*'delay'.*bias, delay, initial"),
+    "key": (
+        {"delays": 0.1},
+        r"nuisance\.delays: unknown key .*'delay'.*armature, bias, delay, friction, initial",
+    ),
+    "friction": ({"friction": {"rail": 0.1}}, r"nuisance\.friction: unknown name 'rail'.*slide"),
 }
 
 
