@@ -169,15 +169,18 @@ def steps_along(
     task: DesignTask, trajectory: Trajectory, information: Array, predicted: Array
 ) -> FiniteSteps:
     """Standard deviations along a trajectory of a task by finite steps. See `finite_steps`."""
-    return finite_steps(
+    known, inflation = task.information, task.information.inflation
+    found = finite_steps(
         task.plant,
         task.system.noise,
         task.theta,
         trajectory,
-        information=information,
-        prior=task.information.prior,
-        predicted=predicted,
+        information=known.under_white_noise(information),
+        prior=known.under_white_noise(known.prior),
+        predicted=predicted / inflation,
     )
+    # Finite steps show what white noise would leave.
+    return replace(found, predicted=predicted, std=found.std * inflation)
 
 
 @one_blas_thread()

@@ -140,6 +140,8 @@ class FisherInformation:
             of the largest weight are left out of the gradient.
         stated_prior: (p,) information of the stated priors, which may determine a combination that
             no measurement determines; None for the diagonal of `prior`.
+        inflation: (p,) factors by which residuals that are no white noise widen the standard
+            deviations, but not those of stated priors. They do not change the criterion.
     """
 
     noise: Noise
@@ -154,6 +156,7 @@ class FisherInformation:
     power: float = np.inf
     negligible_weight: float = NEGLIGIBLE_WEIGHT
     stated_prior: Array | None = None
+    inflation: Array | float = 1.0
 
     @property
     def wanted(self) -> np.ndarray:
@@ -367,8 +370,23 @@ class FisherInformation:
 
     # Standard deviations
 
+    def under_white_noise(self, information: Array) -> Array:
+        """Information of which white noise leaves standard deviations too small by the inflation.
+
+        It lets stated priors count by more, because they are not inflated.
+
+        Args:
+            information: (..., p, p) information, stated priors included [1/theta-unit²].
+
+        Returns:
+            (..., p, p) information [1 / (theta_i theta_j unit)].
+        """
+        if self.stated_prior is None:
+            return information
+        return information + np.diag((self.inflation**2 - 1.0) * self.stated_prior)
+
     def std(self, information: Array) -> Array:
-        """Cramer-Rao standard deviations of the parameters.
+        """Standard deviations of the parameters: those of Cramer and Rao, times the inflation.
 
         Args:
             information: (..., p, p) information [1 / (theta_i theta_j unit)].
@@ -378,7 +396,7 @@ class FisherInformation:
             identifiable combination by itself.
         """
         if self.basis is None:
-            return standard_deviations(information)
+            return self.inflation * standard_deviations(self.under_white_noise(information))
 
         std = np.full(information.shape[:-1], np.inf)
         variances = np.diagonal(self.covariance(information), axis1=-2, axis2=-1)
@@ -386,7 +404,7 @@ class FisherInformation:
         return std
 
     def covariance(self, information: Array) -> Array:
-        """Cramer-Rao covariance of the wanted parameters.
+        """Covariance of the wanted parameters, with the standard deviations of `std`.
 
         Args:
             information: (..., p, p) information [1 / (theta_i theta_j unit)].
@@ -400,7 +418,7 @@ class FisherInformation:
         return np.where(np.outer(alone, alone), covariance, np.nan)
 
     def combination_std(self, information: Array, combinations: Array) -> Array:
-        """Cramer-Rao standard deviations of identifiable combinations.
+        """Standard deviations of identifiable combinations, by the same covariance.
 
         Args:
             information: (p, p) information [1 / (theta_i theta_j unit)].
@@ -424,11 +442,12 @@ class FisherInformation:
         if not basis.shape[1]:
             return np.full((*information.shape[:-2], len(t), len(t)), np.nan), basis
 
-        R, _ = replace(self, basis=basis).reduced(information)
+        R, _ = replace(self, basis=basis).reduced(self.under_white_noise(information))
         unit, size = scaled_to_unit_diagonal(R)
         axes = basis @ (inverse_root(unit) / size[..., None])
         scaled = axes @ np.swapaxes(axes, -1, -2)
-        return scaled * np.outer(self.scale[t], self.scale[t]) / self.measure_rate, basis
+        widened = (self.scale * self.inflation)[t]
+        return scaled * np.outer(widened, widened) / self.measure_rate, basis
 
     # Identifiable combinations
 

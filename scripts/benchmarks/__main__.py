@@ -21,6 +21,7 @@ BENCHMARKS = {
     "selection": "does `identify --select` find the term that a model lacks, and no other?",
     "arm_logs": "do closed-loop logs of arms give base parameters and torques within intervals?",
     "so101": "how well does a fit predict a real arm of six servos, beside published sets?",
+    "promise": "does the promised accuracy come true, and do two logs give one answer?",
     "measured_data": "how well are measured data of other groups predicted, with added terms?",
 }
 
