@@ -169,7 +169,7 @@ def steps_along(
     task: DesignTask, trajectory: Trajectory, information: Array, predicted: Array
 ) -> FiniteSteps:
     """Standard deviations along a trajectory of a task by finite steps. See `finite_steps`."""
-    known, inflation = task.information, task.information.inflation
+    known = task.information
     found = finite_steps(
         task.plant,
         task.system.noise,
@@ -177,10 +177,10 @@ def steps_along(
         trajectory,
         information=known.under_white_noise(information),
         prior=known.under_white_noise(known.prior),
-        predicted=predicted / inflation,
+        predicted=predicted,
     )
     # Finite steps show what white noise would leave.
-    return replace(found, predicted=predicted, std=found.std * inflation)
+    return replace(found, std=found.std * known.widening(found.std))
 
 
 @one_blas_thread()

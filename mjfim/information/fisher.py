@@ -47,6 +47,9 @@ from mjfim.records.trajectory import Sensitivity
 ROUND_OFF_SHARE = 1e-6
 
 
+# All parameters.
+ALL = slice(None)
+
 # Largest number of samples at which accumulated standard deviations are computed.
 MAX_TIMES = 400
 
@@ -141,7 +144,8 @@ class FisherInformation:
         stated_prior: (p,) information of the stated priors, which may determine a combination that
             no measurement determines; None for the diagonal of `prior`.
         inflation: (p,) factors by which residuals that are no white noise widen the standard
-            deviations, but not those of stated priors. They do not change the criterion.
+            deviations of an experiment, but not those of stated priors. They do not change the
+            criterion.
     """
 
     noise: Noise
@@ -385,8 +389,38 @@ class FisherInformation:
             return information
         return information + np.diag((self.inflation**2 - 1.0) * self.stated_prior)
 
+    @cached_property
+    def _earlier_precision(self) -> Array:
+        """(p,) inverse variances by earlier experiments alone; 0 where they tell nothing."""
+        stated = 0.0 if self.stated_prior is None else np.diag(self.stated_prior)
+        earlier = self.prior - stated
+        precision = np.zeros(len(earlier))
+        known = np.diag(earlier) > ROUND_OFF_SHARE * np.diag(self.prior)
+        if known.any():
+            precision[known] = standard_deviations(earlier[np.ix_(known, known)]) ** -2.0
+        return precision
+
+    def widening(self, std: Array, among: np.ndarray | slice = ALL) -> Array:
+        """Factors by which residuals that are no white noise widen standard deviations.
+
+        What a model lacks does not average out over experiments. So errors of this one and of
+        earlier ones beyond white noise add as they are, and not as squares.
+
+        Args:
+            std: (..., k) standard deviations that white noise would leave [theta-unit].
+            among: Indices of the k parameters.
+
+        Returns:
+            (..., k) factors.
+        """
+        inflation = np.broadcast_to(self.inflation, len(self.scale))[among]
+        with np.errstate(invalid="ignore"):
+            share = np.clip(np.nan_to_num(std**2 * self._earlier_precision[among]), 0.0, 1.0)
+        together = np.sqrt(share) + np.sqrt(1.0 - share)
+        return np.asarray(np.sqrt(1.0 + (inflation**2 - 1.0) * together**2))
+
     def std(self, information: Array) -> Array:
-        """Standard deviations of the parameters: those of Cramer and Rao, times the inflation.
+        """Standard deviations of the parameters: those of Cramer and Rao, widened.
 
         Args:
             information: (..., p, p) information [1 / (theta_i theta_j unit)].
@@ -396,7 +430,8 @@ class FisherInformation:
             identifiable combination by itself.
         """
         if self.basis is None:
-            return self.inflation * standard_deviations(self.under_white_noise(information))
+            white = standard_deviations(self.under_white_noise(information))
+            return self.widening(white) * white
 
         std = np.full(information.shape[:-1], np.inf)
         variances = np.diagonal(self.covariance(information), axis1=-2, axis2=-1)
@@ -446,8 +481,10 @@ class FisherInformation:
         unit, size = scaled_to_unit_diagonal(R)
         axes = basis @ (inverse_root(unit) / size[..., None])
         scaled = axes @ np.swapaxes(axes, -1, -2)
-        widened = (self.scale * self.inflation)[t]
-        return scaled * np.outer(widened, widened) / self.measure_rate, basis
+        covariance = scaled * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
+        white = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        factor = self.widening(white, t)
+        return covariance * factor[..., None] * factor[..., None, :], basis
 
     # Identifiable combinations
 

@@ -125,6 +125,19 @@ def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -
     assert "1 (c) to 5 (l) times" in sigma_remark(found.inflation, names)
 
 
+def test_what_a_model_lacks_does_not_average_out(tmp_path: Path) -> None:
+    """A repetition of an earlier experiment halves the variance of white noise, and no other."""
+    data = check_task(cart_task(tmp_path)).information
+    ratio = np.array([2.0, 5.0, 1.0])
+    path = estimate_file(
+        tmp_path / "e.json", ["m", "l", "c"], (0.1 * ratio).tolist(), data=data.tolist()
+    )
+    found = check_task(cart_task(tmp_path, earlier=[str(path)]))
+    white = np.diag(np.linalg.inv(data))
+    wanted = np.sqrt(white / 2.0 + (ratio**2 - 1.0) * white)
+    assert_allclose([row.std for row in found.rows], wanted, rtol=1e-6)
+
+
 FAULTS = {
     "not JSON": ("{", "not a JSON file"),
     "a list": ("[1, 2]", "not a JSON object"),
