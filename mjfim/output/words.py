@@ -181,7 +181,7 @@ def sigma_remark(inflation: Array, names: Sequence[str]) -> str:
         return f"{BEST_CASE} Logs show more: state their `earlier` estimate in the experiment file."
     low, high = int(np.argmin(inflation)), int(np.argmax(inflation))
     return (
-        "σ allows for residuals like those of the earlier estimates: it is "
+        "σ allows for residuals like those of the earlier estimates: it is about "
         f"{number(inflation[low], 2)} ({names[low]}) to {number(inflation[high], 2)} "
         f"({names[high]}) times that under white noise."
     )
