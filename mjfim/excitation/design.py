@@ -368,6 +368,7 @@ def _record(
         rehearsal=rehearsal,
         worth=worth,
         valley=robots,
+        inflation=task.inflation,
     )
 
 

@@ -157,15 +157,18 @@ def steps_along(
     task: DesignTask, trajectory: Trajectory, information: Array, predicted: Array
 ) -> FiniteSteps:
     """Standard deviations along a trajectory of a task by finite steps. See `finite_steps`."""
-    return finite_steps(
+    known = task.information
+    found = finite_steps(
         task.plant,
         task.system.noise,
         task.theta,
         trajectory,
-        information=information,
-        prior=task.information.prior,
+        information=known.under_white_noise(information),
+        prior=known.under_white_noise(known.prior),
         predicted=predicted,
     )
+    # Finite steps show what white noise would leave.
+    return replace(found, std=found.std * known.widening(found.std))
 
 
 @one_blas_thread()

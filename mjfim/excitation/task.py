@@ -19,7 +19,7 @@ from mjfim.excitation.task_parts import (
     ParameterSamples,
     contrast_of,
     holding_control,
-    information_of,
+    known_from,
     least_drift_control,
     named_file,
     parameter_samples_of,
@@ -75,6 +75,8 @@ class DesignTask:
             parameters.
         added_information: (p, p) part of the prior information that the caller added to that of the
             experiment's `earlier` files, or None.
+        inflation: (p,) factors by which residuals like those of earlier estimates widen standard
+            deviations; empty where there is no earlier estimate.
         samples_of_parameters: Parameter values over which a robust design pools its criterion, or
             None.
         release: Ranges of the initial state within which the release is designed, or None where
@@ -91,6 +93,7 @@ class DesignTask:
     contrast: Array | None
     prior_information: Array
     added_information: Array | None
+    inflation: Array
     samples_of_parameters: ParameterSamples | None
     release: ReleaseSpace | None
 
@@ -170,11 +173,19 @@ class DesignTask:
 
         with ExitStack() as stack:
             files = [stack.enter_context(opened(experiment, path)) for path in experiment.earlier]
-            prior = information_of(files, system.parameters.names)
+            prior, inflation, sigma = known_from(files, system.parameters.names)
         if added is not None:
             prior = prior + added
 
-        system, reference = _calibrated(system, control)
+        # The noise with which the inflation was found; a fit may have estimated it.
+        stated = system.stated_noise
+        found = [
+            sigma.get(output.name, own)
+            for output, own in zip(system.outputs.outputs, stated.sigma, strict=True)
+        ]
+        factor = np.array(found) / stated.sigma
+        noise = replace(stated, covariance=stated.covariance * np.outer(factor, factor))
+        system, reference = _calibrated(replace(system, stated_noise=noise), control)
         return cls(
             system=system,
             control=control,
@@ -186,6 +197,7 @@ class DesignTask:
             contrast=contrast_of(system),
             prior_information=prior,
             added_information=added,
+            inflation=inflation,
             samples_of_parameters=parameter_samples_of(system),
             release=ReleaseSpace.of(system, limits),
         )
@@ -289,6 +301,7 @@ class DesignTask:
             interest=parameters.interest,
             contrast=self.contrast,
             stated_prior=np.diag(parameters.prior_information),
+            inflation=self.inflation if len(self.inflation) else 1.0,
         )
 
     @property

@@ -365,26 +365,38 @@ def parameter_samples_of(system: System) -> ParameterSamples | None:
     return ParameterSamples(thetas=thetas, over=robust.over, logarithmic=logarithmic)
 
 
-def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
-    """Sum the information of earlier experiments about the named parameters, without their priors.
+def known_from(
+    paths: Sequence[Path], names: Sequence[str]
+) -> tuple[Array, Array, dict[str, float]]:
+    """What earlier experiments tell about the named parameters, and how well.
 
-    Further parameters of a file are marginalised, with the priors that the file states for them.
-    So are deviations of the initial state, which are parameters of one experiment only.
+    The information is their sum, without their priors. Further parameters of a file are
+    marginalised, with the priors that the file states for them. So are deviations of the initial
+    state, which are parameters of one experiment only.
+
+    The inflation is the honest standard deviation of an estimate over its formal one, which white
+    noise would leave: residuals of the same model are expected to widen the next estimate as much.
+    Of several estimates it is the root mean square. A parameter of which none is known has the
+    geometric mean of the others.
 
     Args:
         paths: Files design.json and estimate.json.
         names: Names of the p parameters.
 
     Returns:
-        (p, p) information [1 / (unit of theta_i times unit of theta_j)].
+        (p, p) information [1 / (unit of theta_i times unit of theta_j)]; (p,) inflation of the
+        standard deviations, at least 1, and empty without an estimate; standard deviations of the
+        noise for which it holds, by output [output unit].
 
     Raises:
         ExperimentError: A file cannot be used; the message names it.
     """
     total = np.zeros((len(names), len(names)))
+    ratios: list[Array] = []
+    sigma: dict[str, float] = {}
     for path in paths:
         try:
-            known, data, prior = _information_in(path)
+            known, data, prior, ratio, noise = _information_in(path)
         except RecordingError as error:
             raise ExperimentError(f"earlier: {error}") from None
 
@@ -401,11 +413,37 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
         here = [list(names).index(name) for name in common]
         there = np.array([known.index(name) for name in common])
         total[np.ix_(here, here)] += marginal(data, prior, there)
-    return total
+        if ratio is not None:
+            ratios.append(np.full(len(names), np.nan))
+            ratios[-1][here] = ratio[there]
+        sigma |= noise
+    return total, expected_inflation(ratios), sigma
 
 
-def _information_in(path: Path) -> tuple[list[str], Array, Array]:
+def expected_inflation(ratios: Sequence[Array]) -> Array:
+    """(p,) root mean squares of the inflations of estimates, as `known_from` returns them.
+
+    Args:
+        ratios: (p,) inflation of each estimate; NaN where it is not known.
+    """
+    known = np.array(ratios)
+    known[~np.isfinite(known) | (known <= 0.0)] = np.nan
+    if not np.isfinite(known).any():
+        return np.zeros(0)
+    squares = np.maximum(known, 1.0) ** 2
+    counts = np.isfinite(squares).sum(axis=0)
+    found = np.sqrt(np.nansum(squares, axis=0) / np.maximum(counts, 1))
+    usual = np.exp(np.mean(np.log(found[counts > 0])))
+    return np.asarray(np.where(counts > 0, found, usual))
+
+
+def _information_in(
+    path: Path,
+) -> tuple[list[str], Array, Array, Array | None, dict[str, float]]:
     """Names of the p parameters of a design or an estimate, information and prior: (p, p).
+
+    Of an estimate there are (p,) honest over formal standard deviations as well, and the noise of
+    its outputs.
 
     Raises:
         RecordingError: The file has another content, or numbers that are not finite.
@@ -414,7 +452,12 @@ def _information_in(path: Path) -> tuple[list[str], Array, Array]:
     try:
         names = [str(name) for name in values["parameters"]]
         data, prior = (np.array(values[key], dtype=np.float64) for key in ("data", "prior"))
-    except (ValueError, KeyError, TypeError):
+        ratio, noise = None, {}
+        if "honest_std" in values:
+            honest, formal = (np.array(values[k], dtype=np.float64) for k in ("honest_std", "std"))
+            ratio = honest / np.where(formal > 0.0, formal, np.nan)
+            noise = {str(name): float(sigma) for name, sigma in values["sigma"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise RecordingError(f"{path}: neither a design.json nor an estimate.json") from None
 
     for matrix in (data, prior):
@@ -422,7 +465,7 @@ def _information_in(path: Path) -> tuple[list[str], Array, Array]:
             raise RecordingError(
                 f"{path}: its information is not {len(names)} x {len(names)} finite numbers"
             )
-    return names, data, prior
+    return names, data, prior, ratio, noise
 
 
 def stated_motion(system: System) -> Trajectory:

@@ -141,7 +141,8 @@ class Experiment(Section):
         default=(),
         description=(
             "Files design.json or estimate.json of other experiments. Their information is added "
-            "to the information of this experiment."
+            "to the information of this experiment. Of estimates, `check` and `design` take the "
+            "noise as well, and widen σ by honest over formal σ."
         ),
     )
     cost: Cost = Field(default=Cost(), description="The cost that a design minimises.")

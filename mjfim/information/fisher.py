@@ -47,6 +47,9 @@ from mjfim.records.trajectory import Sensitivity
 ROUND_OFF_SHARE = 1e-6
 
 
+# All parameters.
+ALL = slice(None)
+
 # Largest number of samples at which accumulated standard deviations are computed.
 MAX_TIMES = 400
 
@@ -140,6 +143,9 @@ class FisherInformation:
             of the largest weight are left out of the gradient.
         stated_prior: (p,) information of the stated priors, which may determine a combination that
             no measurement determines; None for the diagonal of `prior`.
+        inflation: (p,) factors by which residuals that are no white noise widen the standard
+            deviations of an experiment, but not those of stated priors. They do not change the
+            criterion.
     """
 
     noise: Noise
@@ -154,6 +160,7 @@ class FisherInformation:
     power: float = np.inf
     negligible_weight: float = NEGLIGIBLE_WEIGHT
     stated_prior: Array | None = None
+    inflation: Array | float = 1.0
 
     @property
     def wanted(self) -> np.ndarray:
@@ -367,8 +374,53 @@ class FisherInformation:
 
     # Standard deviations
 
+    def under_white_noise(self, information: Array) -> Array:
+        """Information of which white noise leaves standard deviations too small by the inflation.
+
+        It lets stated priors count by more, because they are not inflated.
+
+        Args:
+            information: (..., p, p) information, stated priors included [1/theta-unit²].
+
+        Returns:
+            (..., p, p) information [1 / (theta_i theta_j unit)].
+        """
+        if self.stated_prior is None:
+            return information
+        return information + np.diag((self.inflation**2 - 1.0) * self.stated_prior)
+
+    @cached_property
+    def _earlier_precision(self) -> Array:
+        """(p,) inverse variances by earlier experiments alone; 0 where they tell nothing."""
+        stated = 0.0 if self.stated_prior is None else np.diag(self.stated_prior)
+        earlier = self.prior - stated
+        precision = np.zeros(len(earlier))
+        known = np.diag(earlier) > ROUND_OFF_SHARE * np.diag(self.prior)
+        if known.any():
+            precision[known] = standard_deviations(earlier[np.ix_(known, known)]) ** -2.0
+        return precision
+
+    def widening(self, std: Array, among: np.ndarray | slice = ALL) -> Array:
+        """Factors by which residuals that are no white noise widen standard deviations.
+
+        What a model lacks does not average out over experiments. So errors of this one and of
+        earlier ones beyond white noise add as they are, and not as squares.
+
+        Args:
+            std: (..., k) standard deviations that white noise would leave [theta-unit].
+            among: Indices of the k parameters.
+
+        Returns:
+            (..., k) factors.
+        """
+        inflation = np.broadcast_to(self.inflation, len(self.scale))[among]
+        with np.errstate(invalid="ignore"):
+            share = np.clip(np.nan_to_num(std**2 * self._earlier_precision[among]), 0.0, 1.0)
+        together = np.sqrt(share) + np.sqrt(1.0 - share)
+        return np.asarray(np.sqrt(1.0 + (inflation**2 - 1.0) * together**2))
+
     def std(self, information: Array) -> Array:
-        """Cramer-Rao standard deviations of the parameters.
+        """Standard deviations of the parameters: those of Cramer and Rao, widened.
 
         Args:
             information: (..., p, p) information [1 / (theta_i theta_j unit)].
@@ -378,7 +430,8 @@ class FisherInformation:
             identifiable combination by itself.
         """
         if self.basis is None:
-            return standard_deviations(information)
+            white = standard_deviations(self.under_white_noise(information))
+            return self.widening(white) * white
 
         std = np.full(information.shape[:-1], np.inf)
         variances = np.diagonal(self.covariance(information), axis1=-2, axis2=-1)
@@ -386,7 +439,7 @@ class FisherInformation:
         return std
 
     def covariance(self, information: Array) -> Array:
-        """Cramer-Rao covariance of the wanted parameters.
+        """Covariance of the wanted parameters, with the standard deviations of `std`.
 
         Args:
             information: (..., p, p) information [1 / (theta_i theta_j unit)].
@@ -400,7 +453,7 @@ class FisherInformation:
         return np.where(np.outer(alone, alone), covariance, np.nan)
 
     def combination_std(self, information: Array, combinations: Array) -> Array:
-        """Cramer-Rao standard deviations of identifiable combinations.
+        """Standard deviations of identifiable combinations, by the same covariance.
 
         Args:
             information: (p, p) information [1 / (theta_i theta_j unit)].
@@ -424,11 +477,14 @@ class FisherInformation:
         if not basis.shape[1]:
             return np.full((*information.shape[:-2], len(t), len(t)), np.nan), basis
 
-        R, _ = replace(self, basis=basis).reduced(information)
+        R, _ = replace(self, basis=basis).reduced(self.under_white_noise(information))
         unit, size = scaled_to_unit_diagonal(R)
         axes = basis @ (inverse_root(unit) / size[..., None])
         scaled = axes @ np.swapaxes(axes, -1, -2)
-        return scaled * np.outer(self.scale[t], self.scale[t]) / self.measure_rate, basis
+        covariance = scaled * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
+        white = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        factor = self.widening(white, t)
+        return covariance * factor[..., None] * factor[..., None, :], basis
 
     # Identifiable combinations
 

@@ -168,6 +168,25 @@ BEST_CASE = (
     "σ is the Cramér-Rao bound: the best case, reached if the model and the stated noise are right."
 )
 
+
+def sigma_remark(inflation: Array, names: Sequence[str]) -> str:
+    """Say for which residuals standard deviations are predicted.
+
+    Args:
+        inflation: (p,) factors by which the residuals of earlier estimates widen them; empty where
+            they assume white noise.
+        names: Names of the p parameters.
+    """
+    if not len(inflation):
+        return f"{BEST_CASE} Logs show more: state their `earlier` estimate in the experiment file."
+    low, high = int(np.argmin(inflation)), int(np.argmax(inflation))
+    return (
+        "σ allows for residuals like those of the earlier estimates: it is about "
+        f"{number(inflation[low], 2)} ({names[low]}) to {number(inflation[high], 2)} "
+        f"({names[high]}) times that under white noise."
+    )
+
+
 # Cell of a standard deviation that is infinite, because others absorb the parameter's effect.
 NOT_ALONE = "not alone"
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.errors import first_ones, shortened
-from mjfim.records.base import Record
+from mjfim.records.base import Record, no_array
 from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal, Valley
 from mjfim.records.values import ParameterResult, ParameterValue
@@ -307,6 +307,8 @@ class Check(ParameterResult):
             complete.
         refused: Reasons why `mjfim design` refuses the experiment, in its own words.
         violations: Limits that the motion of the initial control violates.
+        inflation: (p,) factors by which residuals like those of earlier estimates widen σ; empty
+            where σ assumes white noise.
     """
 
     source: str
@@ -330,6 +332,7 @@ class Check(ParameterResult):
     missing: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     violations: tuple[LimitViolation, ...] = ()
+    inflation: Array = no_array()
 
     file_stem = "check"
     made_by = "`mjfim check EXPERIMENT -o DIR`"
@@ -355,6 +358,7 @@ class Check(ParameterResult):
         "rehearsal",
         "worth",
         "valley",
+        "inflation",
     )
     json_names = {
         "findings": "verdict",

@@ -472,6 +472,8 @@ class Design(ParameterResult):
             None where the search was interrupted.
         valley: Two robots that the initial motion does not tell apart, in both motions; None where
             the initial motion determines well what the designed one determines.
+        inflation: (p,) factors by which residuals like those of earlier estimates widen σ; empty
+            where σ assumes white noise.
     """
 
     status: Status
@@ -502,6 +504,7 @@ class Design(ParameterResult):
     rehearsal: Rehearsal | None = None
     worth: Worth | None = None
     valley: Valley | None = None
+    inflation: Array = no_array()
 
     file_stem = "design"
     made_by = "`mjfim design EXPERIMENT -o DIR`"
@@ -531,6 +534,7 @@ class Design(ParameterResult):
         "rehearsal",
         "worth",
         "valley",
+        "inflation",
         "reserve",
     )
     json_names = {"outcome": "message"}

@@ -15,7 +15,7 @@ effort than the one before, and a round at values below the guess less than the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from mjfim.excitation.shortest_horizon import (
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import expected_inflation
 from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
@@ -347,18 +348,25 @@ class _CampaignRun:
         better of the two is returned.
         """
         base, last = self.base, self.rounds[-1]
-        known = last.estimate.data
+        estimate = last.estimate
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inflation = expected_inflation([estimate.honest_std / estimate.std])
         moved = restate_experiment(base, theta, last.estimate)
         moved = moved.replace(cost={"information": _information_weight(base, moved, self.rounds)})
 
-        task = base.restated(moved, added_information=known)
+        def task_of(stated: Experiment) -> DesignTask:
+            """The task with what the recordings so far tell, and the residuals that they show."""
+            task = base.restated(stated, added_information=estimate.data)
+            return replace(task, inflation=inflation)
+
+        task = task_of(moved)
         first = self._designed(task, executor=self.executor)
         if last.control.shape != task.control.shape or first.status is Status.INTERRUPTED:
             return first
 
         # The second design starts at the control of the last design, and nowhere else.
         only_start = {"starts": 1, "previous": (), "fourier": (), "repeats": ()}
-        task = base.restated(moved.replace(descent=only_start), added_information=known)
+        task = task_of(moved.replace(descent=only_start))
         try:
             second = self._designed(task, initial_control=last.control)
         except SimulationDivergedError:

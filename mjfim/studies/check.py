@@ -380,9 +380,14 @@ def check_recordings(
     _known(point)
 
     # Rows of G at the times of the measurements, and the error of their finite differences.
+    fit = fit.with_noise(replace(fit.noise, covariance=task.system.noise.covariance))
     recorded = sensitivity_rows(fit, fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     count = len(recordings)
+    # Segments of a recording have its parameters in common.
+    of_each = np.zeros((count, len(task.theta), len(task.theta)))
+    for segment, (rows, _) in zip(fit.segments, recorded, strict=True):
+        of_each[segment.recording] += rows.T @ rows
     # From here on, there is something to report when the check is stopped.
     with stop_on_interrupt(stop) as token:
         return _checked(
@@ -390,7 +395,7 @@ def check_recordings(
             problem,
             point,
             partial(_identifiability_test(task, executor, token).of_rows, task.initial, J, error),
-            _common_information(task, [rows.T @ rows for rows, _ in recorded]),
+            _common_information(task, of_each),
             token,
             source=f"{count} recording{'s' if count > 1 else ''}",
             duration=float(sum(recording.t[-1] for recording in fit.recordings)),
@@ -453,7 +458,7 @@ def _rows_along(test: IdentifiabilityTest, probe: Trajectory, _: StopToken) -> R
     return test.rows_along(probe)
 
 
-def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
+def _common_information(task: DesignTask, matrices: Iterable[Array]) -> Array:
     """(p, p) sum of information matrices about the parameters that all recordings share."""
     p = task.parameters
     every = [shared(each, p.prior_information, p.recording_specific) for each in matrices]
@@ -584,6 +589,7 @@ def _checked(
         valley=robots,
         is_start=is_start,
         findings=(),
+        inflation=task.inflation,
         combined=() if not_excited else found.combinations(information, values, total, total),
         missing=tuple(missing),
         refused=refused,

@@ -23,6 +23,7 @@ BENCHMARKS = {
     "so101": "how well does a fit predict a real arm of six servos, beside published sets?",
     "go2": "how well does each half of a log of a real Go2 predict the other half?",
     "wrong_model": "is a design still good on robots that have what the model lacks?",
+    "promise": "does the promised accuracy come true, and do two logs give one answer?",
     "measured_data": "how well are measured data of other groups predicted, with added terms?",
 }
 

@@ -59,7 +59,7 @@ class MeasuredSet:
 SERVO_TIMES = ("28m10", "28m17", "28m24", "28m32", "28m42", "28m49", "28m57", "29m04")
 
 
-def _servo_files(*times: str) -> tuple[str, ...]:
+def servo_files(*times: str) -> tuple[str, ...]:
     """Names of the servo's files."""
     return tuple(f"2026-01-15_10h{each}.json" for each in times)
 
@@ -89,8 +89,8 @@ SETS = (
     MeasuredSet(
         name="bam_xl330",
         folder="bam_xl330/raw",
-        fitted=_servo_files("28m10", "28m17", "28m57", "29m04"),
-        held_out=_servo_files("28m24", "28m32", "28m42", "28m49"),
+        fitted=servo_files("28m10", "28m17", "28m57", "29m04"),
+        held_out=servo_files("28m24", "28m32", "28m42", "28m49"),
         published={
             "gain": SERVO_KT / SERVO_R,
             "brake": SERVO_KT**2 / SERVO_R,
@@ -105,7 +105,7 @@ SETS = (
     MeasuredSet(
         name="bam_xl330",
         folder="bam_xl330/raw",
-        fitted=_servo_files(*SERVO_TIMES),
+        fitted=servo_files(*SERVO_TIMES),
         held_out=(),
         selects=False,
     ),

@@ -11,9 +11,11 @@ from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.task_parts import information_of
+from mjfim.excitation.task_parts import known_from
 from mjfim.output import archive
-from tests.support.numerics import Array, cart_task
+from mjfim.output.words import sigma_remark
+from mjfim.studies.check import check_task
+from tests.support.numerics import CART_PARAMETERS, Array, cart_task
 
 
 def information(seed: int, size: int) -> Array:
@@ -38,15 +40,15 @@ def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
     wanted = np.zeros((3, 3))
     wanted[np.ix_([1, 0], [1, 0])] += first
     wanted[np.ix_([2, 0], [2, 0])] += second
-    assert_allclose(information_of([design, estimate], ("a", "b", "c")), wanted, rtol=1e-12)
-    assert not information_of([], ("a", "b")).any()
+    assert_allclose(known_from([design, estimate], ("a", "b", "c"))[0], wanted, rtol=1e-12)
+    assert not known_from([], ("a", "b"))[0].any()
 
 
 def test_further_parameters_of_a_file_are_marginalised(tmp_path: Path) -> None:
     """The covariance of the shared parameters is that of the file, with unknown other ones."""
     matrix = information(2, 4)
     path = design_file(tmp_path / "design.json", ["x", "a", "y", "b"], matrix)
-    found = information_of([path], ("a", "b"))
+    found = known_from([path], ("a", "b"))[0]
     assert_allclose(np.linalg.inv(found), np.linalg.inv(matrix)[np.ix_([1, 3], [1, 3])], rtol=1e-11)
     assert np.abs(found - matrix[np.ix_([1, 3], [1, 3])]).max() > 0.1, (
         "nothing to marginalise: a weak test"
@@ -57,7 +59,7 @@ def test_nothing_is_known_about_a_parameter_that_is_confounded_with_others(tmp_p
     """Only the sum of a and x is known, so that nothing is known about a."""
     matrix = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 9.0]])
     path = design_file(tmp_path / "design.json", ["a", "x", "b"], matrix)
-    assert_allclose(information_of([path], ("a", "b")), np.diag([0.0, 9.0]), atol=1e-12)
+    assert_allclose(known_from([path], ("a", "b"))[0], np.diag([0.0, 9.0]), atol=1e-12)
 
 
 def test_the_prior_of_a_file_is_left_out(tmp_path: Path) -> None:
@@ -65,10 +67,10 @@ def test_the_prior_of_a_file_is_left_out(tmp_path: Path) -> None:
     data = information(3, 3)
     prior = np.diag([5.0, 0.0, 7.0])
     path = design_file(tmp_path / "design.json", ["a", "b", "x"], data + prior, prior)
-    assert_allclose(information_of([path], ("a", "b", "x")), data, rtol=1e-12)
+    assert_allclose(known_from([path], ("a", "b", "x"))[0], data, rtol=1e-12)
     joint = data + np.diag([0.0, 0.0, 7.0])
     wanted = np.linalg.inv(np.linalg.inv(joint)[:2, :2])
-    found = information_of([path], ("a", "b"))
+    found = known_from([path], ("a", "b"))[0]
     assert_allclose(found, wanted, rtol=1e-11)
     unknown = np.linalg.inv(np.linalg.inv(data)[:2, :2])
     assert np.abs(found - unknown).max() > 0.1, "the prior on the rest does not matter: a weak test"
@@ -79,10 +81,61 @@ def test_deviations_of_the_initial_state_belong_to_one_experiment(tmp_path: Path
     names = ["a", "initial qpos:slide", "bias acc"]
     data, prior = information(4, 3), np.diag([0.0, 100.0, 0.0])
     path = design_file(tmp_path / "design.json", names, data + prior, prior)
-    found = information_of([path], tuple(names))
+    found = known_from([path], tuple(names))[0]
     assert not found[1].any() and not found[:, 1].any()
     marginal = np.linalg.inv(np.linalg.inv(data + prior)[np.ix_([0, 2], [0, 2])])
     assert_allclose(found[np.ix_([0, 2], [0, 2])], marginal, rtol=1e-11)
+
+
+def estimate_file(path: Path, names: list[str], honest: list[float | None], **more: object) -> Path:
+    """An estimate.json with formal deviations of 0.1 and honest ones, which may be unknown."""
+    zero = np.zeros((len(names), len(names))).tolist()
+    values = {"parameters": names, "data": zero, "prior": zero, "sigma": {}, **more}
+    values |= {"std": [0.1] * len(names), "honest_std": honest}
+    path.write_text(json.dumps(values), encoding="utf-8")
+    return path
+
+
+def test_estimates_tell_how_much_wider_honest_deviations_are(tmp_path: Path) -> None:
+    """Root mean squares of several estimates, at least 1; unknown ones are as the others."""
+    first = estimate_file(tmp_path / "1.json", ["b", "a", "c"], [0.2, 0.3, None], sigma={"y": 2.0})
+    second = estimate_file(tmp_path / "2.json", ["a", "d"], [0.4, 0.05])
+    _, inflation, sigma = known_from([first, second], ("a", "b", "c", "d"))
+    known = [np.sqrt((9.0 + 16.0) / 2.0), 2.0, 1.0]
+    assert_allclose(inflation[[0, 1, 3]], known, rtol=1e-12)
+    assert inflation[2] == pytest.approx(np.prod(known) ** (1.0 / 3.0))
+    assert sigma == {"y": 2.0}
+    assert not len(known_from([design_file(tmp_path / "d.json", ["a"], np.eye(1))], ("a",))[1])
+
+
+def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -> None:
+    """Data count by the honest deviation and the noise of the estimate; stated priors do not."""
+    names, ratio = ["m", "l", "c"], np.array([2.0, 5.0, 1.0])
+    parameters = {**CART_PARAMETERS, "l": {**CART_PARAMETERS["l"], "prior": 0.02}}
+    white = cart_task(tmp_path, parameters=parameters)
+    sigma = dict(zip(white.system.outputs.names, 3.0 * white.system.noise.sigma, strict=True))
+    path = estimate_file(tmp_path / "e.json", names, (0.1 * ratio).tolist(), sigma=sigma)
+    task = cart_task(tmp_path, parameters=parameters, earlier=[str(path)])
+    data = (check_task(white).information - white.prior) / 9.0
+    prior = np.diag([0.0, 0.02**-2, 0.0])
+    wanted = np.linalg.inv(data / np.outer(ratio, ratio) + prior)
+    found = check_task(task)
+    assert_allclose([row.std for row in found.rows], np.sqrt(np.diag(wanted)), rtol=1e-6)
+    assert found.steps is not None and found.steps.confirmed.all()
+    assert "1 (c) to 5 (l) times" in sigma_remark(found.inflation, names)
+
+
+def test_what_a_model_lacks_does_not_average_out(tmp_path: Path) -> None:
+    """A repetition of an earlier experiment halves the variance of white noise, and no other."""
+    data = check_task(cart_task(tmp_path)).information
+    ratio = np.array([2.0, 5.0, 1.0])
+    path = estimate_file(
+        tmp_path / "e.json", ["m", "l", "c"], (0.1 * ratio).tolist(), data=data.tolist()
+    )
+    found = check_task(cart_task(tmp_path, earlier=[str(path)]))
+    white = np.diag(np.linalg.inv(data))
+    wanted = np.sqrt(white / 2.0 + (ratio**2 - 1.0) * white)
+    assert_allclose([row.std for row in found.rows], wanted, rtol=1e-6)
 
 
 FAULTS = {
@@ -109,15 +162,15 @@ def test_unusable_files_are_named(name: str, tmp_path: Path) -> None:
     path = tmp_path / "odd.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ExperimentError, match=rf"earlier: .*odd\.json: .*{message}"):
-        information_of([path], ("a", "b"))
+        known_from([path], ("a", "b"))[0]
 
 
 def test_missing_files_are_named(tmp_path: Path) -> None:
     """No file, a folder."""
     with pytest.raises(ExperimentError, match=r"gone\.json: cannot read: No such file"):
-        information_of([tmp_path / "gone.json"], ("a",))
+        known_from([tmp_path / "gone.json"], ("a",))[0]
     with pytest.raises(ExperimentError, match="cannot read: Is a directory"):
-        information_of([tmp_path], ("a",))
+        known_from([tmp_path], ("a",))[0]
 
 
 def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
@@ -141,7 +194,7 @@ def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
     again = design_task(second)
     archive.write_design(tmp_path / "two", again, second.system)
     late = str(tmp_path / "two" / "design.json")
-    total = information_of([Path(earlier), Path(late)], ("c", "m"))
+    total = known_from([Path(earlier), Path(late)], ("c", "m"))[0]
     assert_allclose(total, again.final.information - np.diag([0.25, 0.0]), rtol=1e-8)
     with pytest.raises(ExperimentError, match=r"experiment: earlier: .*gone\.json"):
         cart_task(tmp_path, earlier=("gone.json",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -220,6 +221,10 @@ def test_a_fit_names_the_odd_recording(recordings: list[Recording]) -> None:
     assert [parameter.name for parameter in odd.parameters] == ["c"]
     assert odd.parameters[0].value == pytest.approx(1.7, abs=0.3)
     assert any(warning.startswith("run_3.csv is odd: its c is") for warning in estimate.warnings)
+
+    # What moves is named with its values and their logs.
+    (moved,) = (each for each in estimate.warnings if each.startswith("recordings disagree"))
+    assert re.search(r"\bc \(from [\d.]+ in run_[1245]\.csv to 1\.\d+ .* in run_3\.csv\)", moved)
 
     # One step from the common estimate is nearly the fit of a recording alone.
     alone = mjfim.identify(experiment, recordings[:1])

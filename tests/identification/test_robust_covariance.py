@@ -11,8 +11,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.signal import lfilter
-from scipy.stats import binom
 
 from mjfim.identification.assessment.robust_covariance import (
     block_length,
@@ -75,7 +75,12 @@ class Linear:
 
 
 def assess(
-    condensed: Condensed, theta: Array, length: float, draws: int = 0, inflation: float = 1.0
+    condensed: Condensed,
+    theta: Array,
+    length: float,
+    draws: int = 0,
+    inflation: float = 1.0,
+    is_white: bool = True,
 ) -> Uncertainty:
     """The robust uncertainty of an estimate with blocks of at least some length."""
     blocks = condensed.segment_of_block
@@ -89,6 +94,7 @@ def assess(
         rng=np.random.default_rng(0),
         own=np.zeros((len(condensed.private_rows), 0), dtype=int),
         inflation=inflation,
+        is_white=is_white,
     )
 
 
@@ -177,7 +183,7 @@ def test_deviations_are_the_spread_of_estimates_and_intervals_cover_the_truth(
         for deviation in (s.sandwich, s.bootstrap):
             np.testing.assert_allclose(deviation.mean(axis=0), true, rtol=0.25 if phi else 0.15)
 
-    assert s.covered.sum() >= binom.ppf(0.001, s.covered.size, 0.92)
+    assert s.covered.sum() >= stats.binom.ppf(0.001, s.covered.size, 0.92)
     assert not s.covered.all(), "an interval that is never wrong is too wide"
     assert s.apart.sum() <= 3
 
@@ -295,6 +301,27 @@ def test_the_interval_is_the_hull() -> None:
     assert result.blocks == 20
     assert result.draws.shape == (400, 2)
     np.testing.assert_array_equal(result.between, 0.0)
+
+
+def test_residuals_that_are_alike_in_slow_parts_count_as_few_groups() -> None:
+    """A model that errs in its slow parts alone; four groups by strength, and Student's factor."""
+    X = np.ones((1, 64 * FINE, 1))
+    slow = np.repeat(np.arange(64) % 4 == 0, FINE)
+    X[0, slow] = 0.2
+    y = (
+        X[..., 0] * 2.0
+        + np.where(slow, 3.0, 0.0)
+        + noise(0.0, X.shape[:2], np.random.default_rng(1))
+    )
+    theta, condensed = Linear(X).fitted(y)
+    narrow, wide = (assess(condensed, theta, FINE, is_white=each) for each in (True, False))
+    r = X[0, :, 0] * theta - y[0]
+    score = X[0, :, 0] * r
+    groups = np.concatenate([score[slow], score[~slow]]).reshape(4, -1).sum(axis=1)
+    std = np.sqrt(4.0 / 3.0 * np.sum((groups - groups.mean()) ** 2)) / np.sum(X**2)
+    half = float(stats.t.ppf(0.975, 3)) * std
+    assert half > 1.5 * (narrow.interval[0, 1] - theta[0])
+    np.testing.assert_allclose(wide.interval[0], theta + np.array([-half, half]), rtol=1e-9)
 
 
 def test_blocks_are_four_autocorrelation_times_long() -> None:

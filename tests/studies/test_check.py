@@ -137,6 +137,18 @@ def test_information_of_recordings_adds_up_without_missing_values(tmp_path) -> N
     assert two.horizon == pytest.approx(2 * alone.horizon)
 
 
+def test_segments_of_a_recording_have_its_bias_in_common(tmp_path) -> None:
+    """A bias that each recording has for itself is as well known as the bias of a single one."""
+    stds = []
+    for per_recording in (False, True):
+        nuisance = {"bias": {"qpos:hinge": 0.05}, "per_recording": per_recording}
+        fit = {"segments": 0.1, "start": "measured"}
+        task = cart_task(tmp_path, nuisance=nuisance, fit=fit)
+        log = simulate_system(task.system, task.initial, seed=1)
+        stds.append([row.std for row in check_recordings(task.system, [log]).rows[:3]])
+    np.testing.assert_allclose(stds[1], stds[0], rtol=1e-6)
+
+
 def test_a_given_trajectory_is_checked_instead_of_the_initial_one(tmp_path) -> None:
     task = cart_task(tmp_path)
     other = task.plant.simulate(task.theta, 2.0 * task.control)

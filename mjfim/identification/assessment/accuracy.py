@@ -207,6 +207,7 @@ def _accuracy_of(fit: FitResult) -> Accuracy:
             rng=np.random.default_rng(settings.seed),
             own=problem.own_columns,
             inflation=fit.quality.inflation,
+            is_white=fit.quality.is_white,
         )
         covariance = _of_parameters(
             problem, solution, robust.covariance + between_covariance(robust)

@@ -500,12 +500,21 @@ def _contradictions(result: FitResult, comparison: RecordingComparison | None) -
     if robust is None or not robust.apart:
         return
 
-    names = result.task.system.parameters.names
-    index = result.problem.parameter_of_column
-    apart = [names[index[column]] for column in robust.apart]
+    system, index = result.task.system, result.problem.parameter_of_column
+    logs = [Path(recording.name).name for recording in result.task.recordings]
+    apart = []
+    for column in robust.apart:
+        values, j = robust.each[:, column], index[column]
+        low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
+        apart.append(
+            f"{system.parameters.names[j]} (from {values[low]:.3g} in {logs[low]} to "
+            f"{values[high]:.3g} {system.units[j]}".rstrip()
+            + f" in {logs[high]})"
+        )
     yield (
-        f"recordings disagree on {listed(apart)} by more than the scatter within each recording: "
-        "something differs between them that is not in the model; the intervals allow for it"
+        f"recordings disagree on {first_ones(apart)} by more than the scatter within each "
+        "recording: it moves with the excitation, or something else differs between them that is "
+        "not in the model; the intervals allow for it"
     )
 
 

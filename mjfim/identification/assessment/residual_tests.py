@@ -373,6 +373,11 @@ class FitQuality:
         longest = max((test.time for test in self.whiteness), default=1.0)
         return max(self.chi2 / self.dof, 1.0) * max(longest, 1.0)
 
+    @property
+    def is_white(self) -> bool:
+        """Whether no output has significant autocorrelation, however small its residuals are."""
+        return all(test.p >= SIGNIFICANCE / len(self.whiteness) for test in self.whiteness)
+
 
 def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
     """Assess the residuals of a solution.

@@ -213,6 +213,10 @@ MAX_CONDITION_OF_DRAW = 1e14
 # Smallest variance in a denominator.
 SMALLEST_VARIANCE = 1e-300
 
+# Number of groups of blocks where residuals are no white noise. A model that lacks a term errs
+# alike in all rows of a kind: only few groups are independent (Ibragimov & Müller 2010).
+GROUPS = 4
+
 
 def robust_uncertainty(
     condensed: Condensed,
@@ -225,6 +229,7 @@ def robust_uncertainty(
     rng: np.random.Generator,
     own: np.ndarray,
     inflation: float = 1.0,
+    is_white: bool = True,
 ) -> Uncertainty:
     """Uncertainty of the common unknowns at a minimum.
 
@@ -240,6 +245,8 @@ def robust_uncertainty(
         own: (K, e) columns of the unknowns that belong to each of K recordings; e may be 0.
         inflation: Factor of the formal variances from which the covariance of combinations begins.
             The scatter of few blocks says nothing about most combinations of many unknowns.
+        is_white: Whether residuals are white noise; otherwise, the scatter between few groups of
+            blocks counts as well.
 
     Returns:
         The uncertainty.
@@ -253,9 +260,7 @@ def robust_uncertainty(
 
     # Sandwich and formal covariance.
     root = inverse_root(of_data + prior)
-    along = (scores - scores.mean(axis=0)) @ root
-    scatter = along.T @ along * (count / max(count - 1, 1))
-    of_scatter = _in_unknowns(scatter + root.T @ prior @ root, root)
+    of_scatter = _sandwich(scores, prior, root)
     sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
     formal = np.linalg.norm(root, axis=1)
 
@@ -279,6 +284,12 @@ def robust_uncertainty(
     half_width = np.maximum(
         NORMAL_95 * np.hypot(formal, between), factor * NORMAL_95 * np.hypot(sandwich, between)
     )
+    number = min(GROUPS, count // 2)
+    for order in () if is_white or number < 2 else _orders(information):
+        groups = np.array_split(order, number)
+        of_groups = _sandwich(np.array([scores[g].sum(axis=0) for g in groups]), prior, root)
+        wide = np.hypot(np.sqrt(np.maximum(np.diag(of_groups), 0.0)), between)
+        half_width = np.maximum(half_width, t_quantile(number - 1) * wide)
     low, high = theta - half_width, theta + half_width
     if len(replicates):
         tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
@@ -293,6 +304,27 @@ def robust_uncertainty(
         draws=theta + replicates,
         covariance=covering_covariance(of_noise, factor**2 * of_scatter),
     )
+
+
+def _sandwich(scores: Array, prior: Array, root: Array) -> Array:
+    """(c, c) sandwich covariance of the unknowns.
+
+    Args:
+        scores: (n, c) scores of parts that count as independent.
+        prior: (c, c) information of the priors.
+        root: (c, k) factor of the formal covariance.
+    """
+    count = len(scores)
+    along = (scores - scores.mean(axis=0)) @ root
+    scatter = along.T @ along * (count / max(count - 1, 1))
+    return _in_unknowns(scatter + root.T @ prior @ root, root)
+
+
+def _orders(information: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Orders of (B, c, c) blocks: in time, and by the strength of their excitation."""
+    _, scale = scaled_to_unit_diagonal(information.sum(axis=0))
+    strength = np.sum(np.diagonal(information, axis1=1, axis2=2) / scale**2, axis=1)
+    return np.arange(len(information)), np.argsort(strength, kind="stable")
 
 
 def t_quantile(freedom: np.ndarray | int, level: float = LEVEL) -> Array:

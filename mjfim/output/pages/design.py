@@ -33,6 +33,7 @@ from mjfim.output.words import (
     NOT_ALONE,
     improvement,
     relative,
+    sigma_remark,
     when_learnt,
 )
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup, unknown_groups
@@ -585,7 +586,7 @@ def _accuracy_parts(design: Design) -> Iterator[Part]:
             "Some parameters are not identifiable alone; the search maximises the information of "
             "combinations of them, see design.json"
         )
-    yield Text(BEST_CASE, Emphasis.WEAK)
+    yield Text(sigma_remark(design.inflation, design.parameters), Emphasis.WEAK)
 
 
 def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
@@ -782,7 +783,8 @@ def _check_parts(check: Check) -> Iterator[Part]:
     title = "Identifiable only in combination, with this control and with random ones"
     yield from _groups(title, check.not_separable, check)
     yield from _groups("Not excited by this control, but by another one", check.not_excited, check)
-    yield Text(BEST_CASE, Emphasis.WEAK)
+    remark = sigma_remark(check.inflation, [row.name for row in check.rows])
+    yield Text(remark, Emphasis.WEAK)
     yield Text(_about_self_test(check), detail=True)
 
 

@@ -47,6 +47,7 @@ from mjfim.output.words import (
     relative,
     share_note,
     shorten,
+    sigma_remark,
     when_learnt,
 )
 from mjfim.records.design import Design, LimitUsage
@@ -309,7 +310,7 @@ def accuracy(design: Design, labels: Labels) -> Picture:
     if np.isfinite(shares).any():
         worst = int(np.nanargmax(np.where(np.isfinite(shares), shares, np.nan)))
         title += f": σ is at most {relative(after[worst], sizes[worst])} ({names[worst]})"
-    note = BEST_CASE
+    note = sigma_remark(design.inflation, design.parameters)
     if not np.array_equal(np.abs(design.theta), design.sizes):
         note += " Percent of an entry of a vector or tensor are a share of the whole."
     return Picture(
@@ -328,6 +329,7 @@ def accuracy_over_time(design: Design, labels: Labels) -> Picture:
     last_first = sorted(asked, key=lambda j: (-seconds[j], -design.stated_std[j] / design.sizes[j]))
     shown = sorted(last_first[: len(SERIES)])
     which = "parameters, those that are known last"
+    remark = sigma_remark(design.inflation, design.parameters)
     begin = design.trajectory.t[0]
     panel = accuracy_over_time_panel(
         [
@@ -344,7 +346,7 @@ def accuracy_over_time(design: Design, labels: Labels) -> Picture:
     return Picture(
         title=when_learnt(design, shorten).removesuffix(".") or "Accuracy over time",
         panels=[panel],
-        note=f"Beside the names: σ at the end. {BEST_CASE}{share_note(shown, asked, which)}",
+        note=f"Beside the names: σ at the end. {remark}{share_note(shown, asked, which)}",
         heights=[3.4],
         keys=[line([], [], "muted", label="initial motion", **INITIAL_LOOK)],
     )

@@ -63,6 +63,7 @@ from mjfim.output.words import (
     quotient_unit,
     share_note,
     shorten,
+    sigma_remark,
     squared_unit,
     without_zeros,
 )
@@ -134,7 +135,7 @@ def check(result: Check) -> Picture:
     goal = [f"wanted {share_text(*pair)}" for pair in zip(goals[: len(rows)], sizes, strict=False)]
     panels = [replace(panel, beside=[("", source.role, panel.beside[0][2]), ("", "text", goal)])]
 
-    note = BEST_CASE
+    note = sigma_remark(result.inflation, [row.name for row in result.rows])
     count = len(result.wanted)
     has_correlations = bool(np.isfinite(result.correlation).any()) and count > 1
     if has_correlations:
