@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,12 @@ from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, _clearanc
 from mjfim.excitation.task import DesignTask
 from mjfim.output.archive import reference_columns, simulate_playback
 from tests.support.limits import along_control, played
-from tests.support.numerics import CART_PENDULUM, make_task
+from tests.support.numerics import cart_task, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
 SPRING = """
 <mujoco model="spring">
-  <option timestep="0.001" integrator="{integrator}" gravity="0 0 0">
+  <option timestep="0.001" integrator="RK4" gravity="0 0 0">
     <flag contact="disable"/>
   </option>
   <worldbody>
@@ -43,12 +44,10 @@ def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -
         "horizon": 1.0,
         "parameters": {"m": {"target": "body/ball:mass"}},
         "noise": {"state": 0.01},
-        "initial": {
-            "qvel": (SPEED,),
-            "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0},
-        },
+        "initial": {"qvel": (SPEED,)},
+        "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0},
     }
-    text = SPRING.format(joint=joint, motor=motor, integrator="RK4")
+    text = SPRING.format(joint=joint, motor=motor)
     return make_task(text, folder, **{**defaults, **tables})
 
 
@@ -60,31 +59,22 @@ def test_limits_hold_between_the_samples_too(tmp_path: Path) -> None:
         "acceleration": 300.0,
     }
     task = spring_task(tmp_path, limits=limits)
-    samples = task.initial
-    assert task.system.grid.substeps == 100
-    assert np.abs(samples.qpos).max() < 0.01
-    assert samples.qvel.min() > 0.98 * SPEED
-    found = verify(task, samples)
+    assert np.abs(task.initial.qpos).max() < 0.01
+    assert task.initial.qvel.min() > 0.98 * SPEED
+    found = verify(task, task.initial)
     assert not found.is_feasible
     # by hand: a harmonic motion of 10 Hz
-    assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
-    assert found.margins["velocity"] == pytest.approx(-1.9 * SPEED, rel=1e-3)
-    assert found.margins["acceleration"] == pytest.approx(
-        300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3
-    )
+    wanted = {
+        "position": 0.1 - SWING,
+        "velocity": -1.9 * SPEED,
+        "acceleration": 300.0 - 20.0 * np.pi * SPEED,
+    }
+    assert found.margins == pytest.approx(wanted, rel=3e-3)
     assert found.deviation < SAME_STATE_TOLERANCE
-    # margins at the samples only are positive
+
+    # Positions at the samples alone would not show it.
     constraints = constraint_set_of(task)
-    watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
-    trajectory, observed = watched
-    at_samples = constraints.margins(
-        constraints.evaluate(trajectory, observed[:, -1:], slopes=False)
-    )
-    assert min(at_samples.values()) > 0.0
-    assert constraints.margins(
-        constraints.evaluate(trajectory, observed, slopes=False)
-    ) == pytest.approx(found.margins)
+    assert constraints.margins(along_control(task, constraints)) == pytest.approx(found.margins)
 
 
 def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
@@ -98,6 +88,13 @@ def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
     assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).is_feasible
 
 
+PUSHED = {
+    "rate": 50.0,
+    "initial": {"qvel": (SPEED,)},
+    "control": {"kind": "sine", "amplitude": 1.0, "frequency": 1.0},
+}
+
+
 @pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
 def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path: Path) -> None:
     """A design on the plant without them deviates when it is played on the model with them."""
@@ -107,14 +104,12 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
         "joint force": {"joint": 'actuatorfrcrange="-0.05 0.05"'},
         "control": {"motor": 'ctrlrange="-0.05 0.05"'},
     }[clamp]
-    control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
-    tables = {"rate": 50.0, "initial": {"qvel": (SPEED,), "control": control}}
-    task = spring_task(tmp_path, **words, **tables)
+    task = spring_task(tmp_path, **words, **PUSHED)
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
     found = verify(task, designed)
     assert found.deviation > 10 * SAME_STATE_TOLERANCE
-    free = verify(spring_task(tmp_path, **tables), designed)
+    free = verify(spring_task(tmp_path, **PUSHED), designed)
     assert free.deviation < SAME_STATE_TOLERANCE
     if clamp in ("stop", "control"):
         assert not found.is_feasible
@@ -128,15 +123,8 @@ def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
 ) -> None:
     """Where limits are not enforced, the plant of the design has to clamp forces."""
     motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
-    control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
-    tables = {
-        "rate": 50.0,
-        "initial": {"qvel": (SPEED,), "control": control},
-        "cost": {"control": 1.0},
-    }
-    task = spring_task(
-        tmp_path, motor=motor, boundary={"end": "periodic"}, limits={"enforce": enforce}, **tables
-    )
+    tables = {"boundary": {"end": "periodic"}, "cost": {"control": 1.0}}
+    task = spring_task(tmp_path, motor=motor, limits={"enforce": enforce}, **PUSHED, **tables)
     assert task.is_limited
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
@@ -163,10 +151,7 @@ def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
     rows: int, tmp_path: Path
 ) -> None:
     """The table holds each sample for all its rows, so that the control jumps within one row."""
-    control = {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0}
-    tables = {"initial": {"qvel": (SPEED,), "control": control}}
-    tables["playback_rate"] = 10.0 * rows
-    task = spring_task(tmp_path, **tables)
+    task = spring_task(tmp_path, playback_rate=10.0 * rows)
 
     # The largest rate of the rows, from the table itself.
     gain = np.zeros((len(task.control), 1, 2))
@@ -174,7 +159,8 @@ def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
     fastest = np.abs(np.diff(played.ctrl, axis=0)).max() / (played.t[1] - played.t[0])
 
     for share, kept in ((1.01, True), (0.99, False)):
-        limited = spring_task(tmp_path, limits={"control_rate": share * fastest}, **tables)
+        limits = {"control_rate": share * fastest}
+        limited = spring_task(tmp_path, limits=limits, playback_rate=10.0 * rows)
         found = verify(limited, limited.initial)
         assert found.margins["control_rate"] == pytest.approx((share - 1.0) * fastest)
         assert found.is_feasible is kept
@@ -326,9 +312,8 @@ def test_limits_hold_with_the_solver_settings_of_the_model_too(
     solver: dict[str, Any], tmp_path: Path
 ) -> None:
     """The limit is between the speeds with the exact solver and with that of the model."""
-    tables = {"parameters": {"m": {"target": "body/lower:mass"}}}
-    tables["noise"] = {"state": 0.01}
     text = COARSE_SOLVER.format(**solver)
+    tables = {"parameters": {"m": {"target": "body/lower:mass"}}, "noise": {"state": 0.01}}
     task = make_task(text, tmp_path, **tables)
 
     # A plain loop over the user's file, and one with the solver settings of the design.
@@ -339,29 +324,22 @@ def test_limits_hold_with_the_solver_settings_of_the_model_too(
     assert abs(stated - exact) > 1e-3 * exact
 
     # The limit holds with one of both only.
-    between = {"velocity": {"elbow": 0.5 * (stated + exact)}}
-    found = verify(make_task(text, tmp_path, limits=between, **tables), task.initial)
+    limit = 0.5 * (stated + exact)
+    limits = {"velocity": {"elbow": limit}}
+    found = verify(make_task(text, tmp_path, limits=limits, **tables), task.initial)
     assert not found.is_feasible
     assert found.margins["velocity"] == pytest.approx(-0.5 * abs(stated - exact), rel=1e-6)
     assert found.by_stated_solver == ({"velocity"} if stated > exact else set())
 
     (usage,) = found.usage
-    limit = 0.5 * (stated + exact)
     assert np.abs(usage.share).max() == pytest.approx(max(stated, exact) / limit)
     assert found.deviation < SAME_STATE_TOLERANCE
 
 
 def test_a_control_that_makes_the_model_diverge_violates_every_limit(tmp_path: Path) -> None:
     limits = {"position": {"slide": (-3.0, 3.0)}, "control": {"force": (-1e13, 1e13)}}
-    task = make_task(
-        CART_PENDULUM.format(integrator="RK4"),
-        tmp_path,
-        parameters={"m": {"target": "body/bob:mass"}},
-        noise={"state": 0.01},
-        limits=limits,
-    )
-    wild = task.plant.trajectory(task.initial.state, np.full_like(task.control, 1e12))
-    found = verify(task, wild)
+    task = cart_task(tmp_path, limits=limits)
+    found = verify(task, replace(task.initial, ctrl=np.full_like(task.control, 1e12)))
     assert not found.is_feasible
     assert found.deviation == np.inf
     assert set(found.margins.values()) == {-np.inf}
