@@ -51,6 +51,10 @@ def test_many_tangent_curves_at_once_are_those_one_by_one(steps: bool, feedback:
     forces = weights.half_gradient(curves)
     gradients, back = coordinates.gradient(a, b), coordinates.coordinate(curves)
     assert_allclose(back, b, rtol=0, atol=1e-9)
+    moved = np.einsum("kij,nkj->nki", A, curves.z[:, :-1]) + np.einsum("kij,nkj->nki", B, curves.v)
+    assert_allclose(curves.z[:, 1:], moved, rtol=0, atol=1e-9)
+    slope = np.sum(a[0] * curves.z[1]) + np.sum(b[0] * curves.v[1])
+    assert np.sum(gradients[0] * b[1]) == pytest.approx(slope, rel=1e-9)
 
     alone = [(coordinates.lift(b[i]), solution.descent(a[i], b[i])) for i in range(4)]
     pairs = [
