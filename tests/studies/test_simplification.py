@@ -122,7 +122,6 @@ def test_a_selection_holds_what_the_recordings_hardly_determine(tmp_path: Path) 
     assert "slide" in plain.sloppy
     found = mjfim.select_terms(experiment, logs)
     selection = found.selection
-    assert selection is not None
     assert not selection.terms
     assert selection.held == ("slide",)
     assert selection.steps[-1].decision is Decision.HELD
@@ -146,9 +145,7 @@ def test_the_selected_model_is_fitted_to_held_out_recordings() -> None:
     robot = stated.replace(parameters=friction)
     *logs, kept = recorded(robot, 3)
     found = mjfim.select_terms(stated, logs, held_out=[kept])
-    assert found.selection is not None
     refit = found.selection.refit
-    assert refit is not None
     assert refit.differs == ()
     assert refit.theta.shape == found.theta.shape
     assert (refit.interval[:, 0] < refit.interval[:, 1]).all()
@@ -158,7 +155,6 @@ def test_the_selected_model_is_fitted_to_held_out_recordings() -> None:
     task = DesignTask.resolve(heavier.replace(cost={"linearize_at": "true"}), threads=1)
     other = simulate_system(task.system, task.initial, 9)
     odd = mjfim.select_terms(stated, logs, held_out=[other])
-    assert odd.selection is not None and odd.selection.refit is not None
     assert "m" in odd.selection.refit.differs
     j = odd.parameters.index("m")
     assert odd.interval[j, 1] > found.interval[j, 1] + 0.1
