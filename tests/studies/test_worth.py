@@ -94,6 +94,7 @@ def test_added_sensors_are_those_of_a_model_that_has_them(tmp_path: Path) -> Non
         with_it = cart(model=str(tmp_path / "with.xml"), noise={**NOISE, key: sigma})
         assert_tells(found[name].present, with_it)
         assert found[name].is_added
+    assert_tells(found["gyro of bob"].without, cart())
 
     # The motor's force is its control, which tells nothing.
     assert_tells(found["torque of slide"].present, cart())
