@@ -146,11 +146,6 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
         found = np.sum(model.a * zeta.z, axis=(1, 2)) + np.sum(model.b * zeta.v, axis=(1, 2))
         slope = (logarithm(task.control + 1e-3 * way) - logarithm(task.control - 1e-3 * way)) / 2e-3
         assert relative_error(found, slope) < 5e-3
-        # what the gradient of the cost holds besides is the running cost's
-        running = problem.running.gradient(task.initial)
-        rest = float(np.sum(running[0] * zeta.z) + np.sum(running[1] * zeta.v)) / point.cost
-        whole = float(model.gradient(np.zeros(6)) @ found) + rest
-        assert whole == pytest.approx(expansion.slope(zeta) / point.cost, rel=1e-6, abs=1e-9)
 
 
 def test_other_criteria_and_expansions_without_limits_have_no_model(tmp_path: Path) -> None:

@@ -24,15 +24,11 @@ from tests.support.lq import positive, random_system, random_weights
 
 
 def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
-    """The quadratic form, computed sample by sample."""
-    total, before = float(z[-1] @ weights.Q[-1] @ z[-1]), np.zeros(v.shape[1])
-    for k, now in enumerate(v):
-        total += (
-            z[k] @ weights.Q[k] @ z[k] + 2 * now @ weights.S[k] @ z[k] + now @ weights.R[k] @ now
-        )
-        total += weights.W[k] @ (now - before) ** 2
-        before = now
-    return total + weights.W[-1] @ before**2
+    """The quadratic form of one tangent curve."""
+    changes = np.diff(v, axis=0, prepend=0.0, append=0.0)
+    of_states = np.einsum("ki,kij,kj->", z, weights.Q, z)
+    of_controls = np.einsum("ku,kuw,kw->", v, weights.R, v) + np.sum(weights.W * changes**2)
+    return float(of_states + of_controls + 2.0 * np.einsum("ku,kui,ki->", v, weights.S, z[:-1]))
 
 
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
@@ -45,29 +41,23 @@ def test_many_tangent_curves_at_once_are_those_one_by_one(steps: bool, feedback:
     K = feedback * rng.normal(size=(N, nu, nx))
     a, b = rng.normal(size=(4, N + 1, nx)), rng.normal(size=(4, N, nu))
 
+    # The curves follow the dynamics, their coordinates are those stated, and gradients are dual.
     coordinates = CurveCoordinates(A=A, B=B, K=K)
-    solution = RiccatiSolution.solve(A, B, weights)
-    curves, minima = coordinates.lift(b), solution.descent(a, b)
-    forces = weights.half_gradient(curves)
-    gradients, back = coordinates.gradient(a, b), coordinates.coordinate(curves)
-    assert_allclose(back, b, rtol=0, atol=1e-9)
+    curves = coordinates.lift(b)
+    assert_allclose(coordinates.coordinate(curves), b, rtol=0, atol=1e-9)
     moved = np.einsum("kij,nkj->nki", A, curves.z[:, :-1]) + np.einsum("kij,nkj->nki", B, curves.v)
     assert_allclose(curves.z[:, 1:], moved, rtol=0, atol=1e-9)
-    slope = np.sum(a[0] * curves.z[1]) + np.sum(b[0] * curves.v[1])
-    assert np.sum(gradients[0] * b[1]) == pytest.approx(slope, rel=1e-9)
+    slopes = np.einsum("nki,mki->nm", a, curves.z) + np.einsum("nki,mki->nm", b, curves.v)
+    assert_allclose(np.einsum("nki,mki->nm", coordinates.gradient(a, b), b), slopes, rtol=1e-9)
 
-    alone = [(coordinates.lift(b[i]), solution.descent(a[i], b[i])) for i in range(4)]
-    pairs = [
-        (curves.z, [curve.z for curve, _ in alone]),
-        (curves.v, [curve.v for curve, _ in alone]),
-        (minima.z, [minimum.z for _, minimum in alone]),
-        (minima.v, [minimum.v for _, minimum in alone]),
-        (gradients, [coordinates.gradient(a[i], b[i]) for i in range(4)]),
-        (forces[0], [weights.half_gradient(curve)[0] for curve, _ in alone]),
-        (forces[1], [weights.half_gradient(curve)[1] for curve, _ in alone]),
-    ]
-    for many, one_by_one in pairs:
-        assert_allclose(many, one_by_one, rtol=1e-9, atol=1e-9)
+    solution = RiccatiSolution.solve(A, B, weights)
+    minima, forces = solution.descent(a, b), weights.half_gradient(curves)
+    for i in range(4):
+        minimum, curve = solution.descent(a[i], b[i]), TangentCurve(z=curves.z[i], v=curves.v[i])
+        assert_allclose(minima.z[i], minimum.z, rtol=1e-9, atol=1e-9)
+        assert_allclose(minima.v[i], minimum.v, rtol=1e-9, atol=1e-9)
+        for many, one in zip(forces, weights.half_gradient(curve), strict=True):
+            assert_allclose(many[i], one, rtol=1e-9, atol=1e-9)
 
 
 def test_recursion_overflows_to_infinity_without_a_warning() -> None:
@@ -146,16 +136,14 @@ def test_a_control_weight_that_is_not_positive_is_refused() -> None:
 def test_arrays_that_do_not_fit_together_are_refused(wrong: str) -> None:
     fits = {"A": (6, 3, 3), "B": (6, 3, 2), "a": (7, 3), "b": (6, 2), "Q": (3, 3), "R": (2, 2)}
     misfits = {"A": (6, 4, 4), "B": (6, 4, 2), "a": (6, 3), "b": (5, 2), "Q": (4, 4), "R": (3, 3)}
-    made = {name: np.ones(shape) for name, shape in {**fits, wrong: misfits[wrong]}.items()}
+    A, B, a, b, Q, R = (np.ones({**fits, wrong: misfits[wrong]}[name]) for name in fits)
 
-    def descent(
-        A: np.ndarray, B: np.ndarray, a: np.ndarray, b: np.ndarray, **QR: np.ndarray
-    ) -> None:
-        weights = Weights.constant(6, QR["Q"], QR["R"] + np.eye(len(QR["R"])), np.eye(3))
+    def descent() -> None:
+        weights = Weights.constant(6, Q, R + np.eye(len(R)), np.eye(3))
         RiccatiSolution.solve(A, B, weights).descent(a, b)
 
     with pytest.raises((ValueError, IndexError)):
-        descent(**made)
+        descent()
 
 
 @pytest.mark.parametrize(("rows", "rhs"), [(3, "c"), (5, "c"), (4, "a"), (6, "a")])
