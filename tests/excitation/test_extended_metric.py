@@ -99,22 +99,6 @@ def response(wide: Expansion, v: Array) -> Array:
     return LinearRecursion(wide.A).forward(zero, np.einsum("kij,kj->ki", wide.B, v))
 
 
-@pytest.mark.parametrize("case", ["cart E", "free body"])
-def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_trajectories(
-    case: str, tmp_path
-) -> None:
-    task = CASES[case](tmp_path)
-    wide, nx, p = expanded(task).extended, task.space.nx, len(task.theta)
-    v, h = np.cos(9.0 * task.t)[:, None] * np.ones(task.plant.nu), 1e-2
-    full = response(wide, v)
-    up, down = (task.plant.simulate(task.theta, task.control + s * h * v) for s in (1, -1))
-    psi = [task.plant.derivatives.sensitivity(task.theta, curve).psi for curve in (up, down)]
-    change = np.swapaxes(psi[0] - psi[1], 1, 2).reshape(task.samples + 1, p, nx) / (2 * h)
-    moved = full[:, nx:].reshape(task.samples + 1, p, nx)
-    for j in range(p):
-        assert relative_error(moved[:, j], change[:, j]) < 1e-3
-
-
 def test_an_expansion_without_psi_is_refused(tmp_path) -> None:
     task = cart_task(tmp_path)
     plain = task.problem.expand(task.problem.point(task.initial, CENTRAL_DIFFERENCES))
