@@ -277,20 +277,17 @@ def test_the_slope_of_all_limits_together_holds_with_every_integrator(
 def test_derivatives_of_the_barrier_of_a_norm_are_those_of_differences(is_angle: bool) -> None:
     """Also at the norm zero, near the bound and beyond it."""
     magnitude, step = Magnitude(columns=(1, 2, 3), is_angle=is_angle), 1e-5
-    way = np.array([2.0, -1.0, 2.0]) / 3.0
     share = magnitude.norm_at(0.7)
+    moves = step * share * np.eye(4)[1:]
+
+    def at(y: Array) -> BarrierDerivatives:
+        return magnitude.barrier(y, 0.7, 0.8, delta=0.01, weight=0.5)
+
     for norm in (0.0, 1e-6, 0.3, 0.995, 1.2):
-        here = np.concatenate([[9.0], norm * share * way])
-
-        def at(y: Array) -> BarrierDerivatives:
-            return magnitude.barrier(y, 0.7, 0.8, delta=0.01, weight=0.5)
-
-        moves = step * share * np.eye(4)[1:]
-        ups, downs = ([at(here + sign * move) for move in moves] for sign in (1.0, -1.0))
-        pairs = list(zip(ups, downs, strict=True))
+        here = share * norm * np.array([0.0, 2.0, -1.0, 2.0]) / 3.0
+        found, pairs = at(here), [(at(here + move), at(here - move)) for move in moves]
         slope = np.array([up.value - down.value for up, down in pairs]) / (2 * step * share)
         bend = np.array([up.slope - down.slope for up, down in pairs]) / (2 * step * share)
-        found = at(here)
         size = np.abs(found.curvature).max()
         np.testing.assert_allclose(found.slope, slope, rtol=1e-5, atol=1e-7 * size)
         np.testing.assert_allclose(found.curvature, bend, rtol=1e-4, atol=1e-4 * size)
@@ -378,17 +375,14 @@ def test_a_clamped_sum_of_forces_is_lifted_in_the_search_and_kept_as_a_limit(
         aim='forcerange="0 0.2"',
     )
     task = ship_task(tmp_path, text)
-    relaxed = task.relaxed().plant.model(task.theta)
-    assert not relaxed.tendon_actfrclimited.any()
-    assert not relaxed.tendon_limited.any()
-    assert not relaxed.jnt_limited.any()
-    assert not relaxed.actuator_forcelimited.any()
-
     free = task.relaxed()
+    relaxed = free.plant.model(task.theta)
+    for name in ("tendon_actfrclimited", "tendon_limited", "jnt_limited", "actuator_forcelimited"):
+        assert not getattr(relaxed, name).any()
+
     constraints = constraint_set_of(free)
     margins = constraints.margins(along_control(free, constraints))
-    assert margins["tendon_force"] < 0.0
-    assert margins["force"] < 0.0
+    assert margins["tendon_force"] < 0.0 and margins["force"] < 0.0
     assert verify(task, task.initial).margins["tendon_force"] == pytest.approx(0.0, abs=1e-12)
 
 
@@ -558,18 +552,11 @@ def test_a_falling_body_exceeds_a_single_number_for_velocities(tmp_path: Path) -
 
 
 def test_angles_may_be_stated_in_degrees(tmp_path: Path) -> None:
-    stated = flight(
-        tmp_path,
-        limits={
-            "tilt": "30 deg",
-            "velocity": {"float": "80 cm/s"},
-            "position": {"float": (("-40 cm", "40 cm"), (-0.4, 0.4), (0.7, 1.3))},
-        },
-    )
-    found = {(limit.kind, limit.name): limit.upper for limit in stated.limits}
-    assert found["tilt", "float"] == pytest.approx(np.pi / 6)
-    assert found["velocity", "float"] == pytest.approx(0.8)
-    assert found["position", "float.x"] == pytest.approx(0.4)
+    box = (("-40 cm", "40 cm"), (-0.4, 0.4), (0.7, 1.3))
+    limits = {"tilt": "30 deg", "velocity": {"float": "80 cm/s"}, "position": {"float": box}}
+    found = {limit.title: limit.upper for limit in flight(tmp_path, limits=limits).limits}
+    wanted = {"tilt of float": np.pi / 6, "velocity of float": 0.8, "position of float.x": 0.4}
+    assert {title: found[title] for title in wanted} == pytest.approx(wanted)
 
     for limits, key in (
         ({"tilt": "30 cm"}, "limits.tilt"),

@@ -85,29 +85,26 @@ def test_samples_fill_bounds_evenly_and_begin_with_the_guess() -> None:
     parameters = unknowns(
         {"bounds": (1.0, 3.0), "guess": 2.5}, {"bounds": (-1e6, 1e6)}, {"guess": 7.0}
     )
-    theta = np.array([2.5, 0.0, 7.0])
-    drawn = sample_parameters(parameters, theta, 21, seed=3)
-    assert drawn.shape == (21, 3)
-    assert_array_equal(drawn[0], theta)
+    drawn = sample_parameters(parameters, parameters.guess, 21, seed=3)
+    assert_array_equal(drawn[0], [2.5, 0.0, 7.0])
     assert_array_equal(drawn[:, 2], 7.0)  # neither prior nor bounds: it stays
-    for column, (low, high) in enumerate([(1.0, 3.0), (-1e6, 1e6)]):
-        strata = np.floor((drawn[1:, column] - low) / (high - low) * 20).astype(int)
-        assert sorted(strata) == list(range(20))  # one in each twentieth: a Latin hypercube
-    assert abs(np.corrcoef(drawn[1:, 0], drawn[1:, 1])[0, 1]) < 0.7
+    shares = (drawn[1:, :2] - [1.0, -1e6]) / [2.0, 2e6]
+    strata = np.sort(np.floor(20 * shares), axis=0)
+    assert_array_equal(strata, np.arange(20)[:, None] * [1, 1])  # a Latin hypercube
+    assert abs(np.corrcoef(shares.T)[0, 1]) < 0.7
 
 
 def test_samples_of_a_prior_are_normal_and_within_bounds() -> None:
     parameters = unknowns(
         {"prior": 0.5, "guess": 2.0}, {"prior": 1.0, "bounds": (-0.2, np.inf)}, {"prior": 1e3}
     )
-    theta = np.array([2.0, 0.0, 0.0])
-    drawn = sample_parameters(parameters, theta, 2001, seed=0)[1:]
-    z = (drawn - theta) / [0.5, 1.0, 1e3]
+    drawn = sample_parameters(parameters, parameters.guess, 2001, seed=0)[1:]
+    z = (drawn - parameters.guess) / [0.5, 1.0, 1e3]
     assert np.abs(z).max() == 2.5
     assert drawn[:, 1].min() == -0.2
-    inside = np.abs(z[:, 0]) < 2.5
-    strata = np.floor(norm.cdf(z[inside, 0]) * 2000).astype(int)
-    assert len(set(strata)) == inside.sum()
+    inside = z[np.abs(z[:, 0]) < 2.5, 0]
+    strata = np.floor(norm.cdf(inside) * 2000)
+    assert len(np.unique(strata)) == len(inside)
     assert z[:, 0].std() == pytest.approx(1.0, rel=0.03)
 
 
@@ -238,14 +235,8 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
 def test_workers_evaluate_the_samples_as_one_process_does(
     limits: dict[str, Any], tmp_path: Path
 ) -> None:
-    bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.5, 3.5)}}
-    task = cart_task(
-        tmp_path,
-        parameters={**CART_PARAMETERS, **bounded},
-        robust={"samples": 3},
-        limits=limits,
-        descent={"max_iterations": 3},
-    )
+    robust = {"robust": {"samples": 3}, "parameters": VAGUE, "descent": {"max_iterations": 3}}
+    task = cart_task(tmp_path, limits=limits, **robust)
     alone = design_task(task)
     with mjfim.Pool(2) as executor:
         found = design_task(DesignTask.resolve(task.experiment, threads=1), executor=executor)

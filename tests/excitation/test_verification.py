@@ -15,7 +15,7 @@ from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, _clearanc
 from mjfim.excitation.task import DesignTask
 from mjfim.output.archive import reference_columns, simulate_playback
 from tests.support.limits import along_control, played
-from tests.support.numerics import cart_task, make_task
+from tests.support.numerics import Array, cart_task, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
 SPRING = """
@@ -194,37 +194,32 @@ def light_link(
     folder: Path, integrator: str, drive: str, joint: str = "", **tables: Any
 ) -> DesignTask:
     """The light link under a sine for 0.4 s, with two engine steps in each sample."""
-    control = {"kind": "sine", "amplitude": 0.4, "frequency": 2.5}
     defaults = {
-        "rate": 100.0,
         "horizon": 0.4,
         "parameters": {"m": {"target": "body/link:mass"}},
         "noise": {"state": 0.01},
-        "initial": {"control": control},
+        "control": {"kind": "sine", "amplitude": 0.4, "frequency": 2.5},
     }
     text = LIGHT_LINK.format(integrator=integrator, drive=DRIVES[drive], joint=joint)
     return make_task(text, folder, **{**defaults, **tables})
 
 
-def largest_forces(task: DesignTask) -> tuple[float, float]:
+def largest_forces(task: DesignTask) -> Array:
     """Largest force of the actuator and on the joint that MuJoCo shows in a plain loop.
 
     They are read from the sensors and the fields after every step, and from the sensors after
     `mj_forward` at the state after the step.
     """
     model = task.system.model
-    data, after = mujoco.MjData(model), mujoco.MjData(model)
-    found = []
-    for control in task.control:
-        data.ctrl[:] = after.ctrl[:] = control
-        for _ in range(task.system.grid.substeps):
-            mujoco.mj_step(model, data)
-            after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
-            mujoco.mj_forward(model, after)
-            fields = np.array([data.actuator_force[0], data.qfrc_actuator[0]])
-            found += [data.sensordata.copy(), after.sensordata.copy(), fields]
-    actuator, joint = np.abs(found).max(axis=0)
-    return float(actuator), float(joint)
+    data, after, found = mujoco.MjData(model), mujoco.MjData(model), []
+    for held in np.repeat(task.control, task.system.grid.substeps, axis=0):
+        data.ctrl[:] = after.ctrl[:] = held
+        mujoco.mj_step(model, data)
+        after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
+        mujoco.mj_forward(model, after)
+        fields = [data.actuator_force[0], data.qfrc_actuator[0]]
+        found += [data.sensordata.tolist(), after.sensordata.tolist(), fields]
+    return np.abs(found).max(axis=0)
 
 
 @pytest.mark.parametrize("drive", DRIVES)
@@ -262,15 +257,13 @@ def test_reference_csv_has_no_acceleration_above_a_limit_that_holds(
     playback = {"playback_rate": 200.0}  # one row per engine step
     task = light_link(tmp_path, integrator, drive, **playback)
     gain = np.zeros((task.samples, 1, task.space.nx))
-    played = simulate_playback(task.system, task.initial, gain)
-    columns = reference_columns(played, task.system)
-    largest = float(np.abs(columns["qacc:hinge"]).max())
-    speed = columns["qvel:hinge"]
-    np.testing.assert_allclose(columns["qacc:hinge"][:-1], np.diff(speed) / 0.005, atol=1e-9)
+    columns = reference_columns(simulate_playback(task.system, task.initial, gain), task.system)
+    acceleration, speed = columns["qacc:hinge"], columns["qvel:hinge"]
+    largest = float(np.abs(acceleration).max())
+    np.testing.assert_allclose(acceleration[:-1], np.diff(speed) / 0.005, atol=1e-9)
 
-    limited = light_link(
-        tmp_path, integrator, drive, limits={"acceleration": 1.001 * largest}, **playback
-    )
+    limits = {"acceleration": 1.001 * largest}
+    limited = light_link(tmp_path, integrator, drive, limits=limits, **playback)
     found = verify(limited, limited.initial)
     assert found.margins["acceleration"] == pytest.approx(0.001 * largest, rel=1e-6)
 

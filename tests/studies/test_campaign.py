@@ -411,20 +411,21 @@ def test_a_campaign_is_continued_with_its_own_settings_only(tmp_path: Path) -> N
     """The seed, every key of the experiment, and the contents of its files are compared."""
     study, folder = write_study(tmp_path), tmp_path / "out"
     (folder / "round_1").mkdir(parents=True)
-    words = ("campaign", study, "-o", folder, "--resume")
-    misused(run(*words, "--wanted", 0.1), "settings.json: no such file", "another folder")
 
-    experiment = with_target_accuracies(mjfim.Experiment.from_file(study), 0.1)
-    write_json(folder / SETTINGS_FILE, campaign_settings(experiment, seed=5))
-    require_same_settings(folder, campaign_settings(experiment, seed=5))
-    other = run(*words, "--wanted", 0.2, "--seed", 6)
+    def refused(*words: object, said: Sequence[str]) -> None:
+        """The campaign is not continued."""
+        misused(run("campaign", study, "-o", folder, "--resume", *words), *said)
+
+    refused("--wanted", 0.1, said=("settings.json: no such file", "another folder"))
+    stated = with_target_accuracies(mjfim.Experiment.from_file(study), 0.1)
+    write_json(folder / SETTINGS_FILE, campaign_settings(stated, seed=5))
     told = ("--seed was 5, is 6", "parameters.c.wanted was 0.13", "is 0.27")
-    misused(other, f"{folder}: --resume needs the settings", *told)
+    message = f"{folder}: --resume needs the settings"
+    refused("--wanted", 0.2, "--seed", 6, said=(message, *told))
 
     # A comment in the experiment file changes nothing, a comment in the model may.
     study.write_text(study.read_text(encoding="utf-8") + "# end\n", encoding="utf-8")
-    require_same_settings(folder, campaign_settings(experiment, seed=5))
+    require_same_settings(folder, campaign_settings(stated, seed=5))
     model = tmp_path / "cart_pendulum.xml"
     model.write_text(model.read_text(encoding="utf-8") + "<!-- end -->\n", encoding="utf-8")
-    changed = run(*words, "--wanted", 0.1, "--seed", 5)
-    misused(changed, "the file cart_pendulum.xml was changed")
+    refused("--wanted", 0.1, "--seed", 5, said=["the file cart_pendulum.xml was changed"])

@@ -168,12 +168,11 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     parameters = system.parameters
     cad = CadPrior.of(parameters)
     assert len(cad.bodies) == 2
-    guess = parameters.guess
-    row = np.random.default_rng(1).standard_normal(len(parameters)) / parameters.magnitude
     others = np.setdiff1d(np.arange(len(parameters)), cad.columns)
+    row = np.random.default_rng(1).standard_normal(len(parameters)) / parameters.magnitude
     data = np.outer(row, row)
     data[others, others] += 1e4 / parameters.magnitude[others] ** 2
-    covariance = np.asarray(np.linalg.inv(data + cad.information(guess)), dtype=np.float64)
+    covariance = np.linalg.inv(data + cad.information(parameters.guess))
     estimate = estimated(system, covariance, data=data, honest_covariance=covariance)
 
     task = PayloadTask.of(whole, body="hand", robot=estimate)
@@ -181,8 +180,7 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     index = [found.names.index(name) for name in parameters.names]
     prior = found.prior_information + CadPrior.of(found).information(found.guess)
     inverse = np.linalg.inv(covariance)
-    scale = np.sqrt(np.diag(inverse))
-    size = np.outer(scale, scale)
+    size = np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     np.testing.assert_allclose(prior[np.ix_(index, index)] / size, inverse / size, atol=1e-5)
     assert not CadPrior.of(found).bodies
 
