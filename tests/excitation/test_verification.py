@@ -14,8 +14,8 @@ from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, _clearance_usage, verify
 from mjfim.excitation.task import DesignTask
 from mjfim.output.archive import reference_columns, simulate_playback
-from tests.support.limits import along_control, played
-from tests.support.numerics import Array, cart_task, make_task
+from tests.support.limits import along_control, excess_of, played
+from tests.support.numerics import cart_task, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
 SPRING = """
@@ -166,7 +166,7 @@ def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
         assert found.is_feasible is kept
 
 
-# A link whose drive is a servo or a filtered motor, with force sensors. It is so light against its
+# A link whose drive is a servo or a filtered motor. It is so light against its
 # damping that implicit integrators do not follow its qacc.
 LIGHT_LINK = """
 <mujoco model="link">
@@ -178,10 +178,6 @@ LIGHT_LINK = """
     </body>
   </worldbody>
   <actuator>{drive}</actuator>
-  <sensor>
-    <actuatorfrc actuator="drive"/>
-    <jointactuatorfrc joint="hinge"/>
-  </sensor>
 </mujoco>
 """
 DRIVES = {
@@ -204,31 +200,15 @@ def light_link(
     return make_task(text, folder, **{**defaults, **tables})
 
 
-def largest_forces(task: DesignTask) -> Array:
-    """Largest force of the actuator and on the joint that MuJoCo shows in a plain loop.
-
-    They are read from the sensors and the fields after every step, and from the sensors after
-    `mj_forward` at the state after the step.
-    """
-    model = task.system.model
-    data, after, found = mujoco.MjData(model), mujoco.MjData(model), []
-    for held in np.repeat(task.control, task.system.grid.substeps, axis=0):
-        data.ctrl[:] = after.ctrl[:] = held
-        mujoco.mj_step(model, data)
-        after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
-        mujoco.mj_forward(model, after)
-        fields = [data.actuator_force[0], data.qfrc_actuator[0]]
-        found += [data.sensordata.tolist(), after.sensordata.tolist(), fields]
-    return np.abs(found).max(axis=0)
-
-
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
 def test_a_force_within_its_limit_is_never_shown_above_it_by_mujoco(
     integrator: str, drive: str, tmp_path: Path
 ) -> None:
     """The margin is that to the largest force of all sensors and fields."""
-    force, on_joint = largest_forces(light_link(tmp_path, integrator, drive))
+    limits = {"force": {"drive": 1.0}, "joint_force": {"hinge": 1.0}}
+    task = light_link(tmp_path, integrator, drive, limits=limits)
+    force, on_joint = (1.0 + excess for excess in excess_of(task, task.control).values())
     for share in (1.001, 0.999):
         task = light_link(tmp_path, integrator, drive, limits={"force": {"drive": share * force}})
         found = verify(task, task.initial)
@@ -236,7 +216,7 @@ def test_a_force_within_its_limit_is_never_shown_above_it_by_mujoco(
         assert found.is_feasible is (share > 1.0)
 
         # The usage over time has one value for each engine step, and the same largest force.
-        (usage,) = (used for used in found.usage if used.kind == "force")
+        (usage,) = found.usage
         assert len(usage.t) == len(usage.share) == task.samples * task.system.grid.substeps
         assert np.abs(usage.share).max() == pytest.approx(1.0 / share, rel=1e-6)
 

@@ -167,6 +167,11 @@ def along_control(
     return constraints.evaluate(*observed, slopes=slopes)
 
 
+def of_kind(excess: dict[tuple[str, str], float], kind: str) -> float:
+    """Largest excess beyond the limits of one kind."""
+    return max(value for (other, _), value in excess.items() if other == kind)
+
+
 def barrier_problem(task: DesignTask, delta: float, **changes: Any) -> InteriorProblem:
     """The barrier of the limits of a task alone."""
     stated = {"constraints": constraint_set_of(task), "mu": 1.0, "with_cost": False, **changes}
@@ -188,10 +193,16 @@ def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
 def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
     """Excess of a control beyond each limit on the model of the user, as a share of half the range.
 
-    The player shares no code with the package. A speed or an angle is between 0 and its bound.
+    The player shares no code with the package. A speed or an angle is between 0 and its bound. An
+    end that is not free is the initial state. What a clearance lacks is relative to it.
     """
-    model = model_with_force_sensors(mujoco.MjSpec.from_file(str(task.experiment.model)))
-    columns = itertools.chain.from_iterable(Layout.of(model).columns)
+    stated = task.experiment
+    spec = mujoco.MjSpec.from_file(str(stated.directory / stated.model))
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    model = model_with_force_sensors(spec)
+    layout = Layout.of(model)
+    columns = itertools.chain.from_iterable(layout.columns)
     start = dict(zip(columns, task.plant.nominal_initial_state.tolist(), strict=True))
     rows = [
         {
@@ -205,9 +216,13 @@ def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
         (limit.kind, limit.name): (-limit.upper if limit.is_magnitude else limit.lower, limit.upper)
         for limit in task.limits
     }
-    least = task.experiment.limits.clearance
+    least, boundary = stated.limits.clearance, stated.boundary
     if least is not None:
-        ranges["clearance", NEAREST] = (least, 2.0 * least)
+        ranges["clearance", NEAREST] = (least, 3.0 * least)
+    if boundary.end != "free":
+        for name in layout.freedoms:
+            ranges["end_position", name] = (-boundary.position, boundary.position)
+            ranges["end_velocity", name] = (-boundary.velocity, boundary.velocity)
     return play(model, rows, ranges, task.dt).found
 
 
