@@ -271,15 +271,6 @@ def test_the_derivative_by_a_range_is_that_of_a_narrower_range(
         assert sum(of_kind) == pytest.approx((narrow - wide) / (2.0 * h), rel=1e-5)
 
 
-def test_without_enforcement_only_the_boundary_constrains(tmp_path: Path) -> None:
-    """All limits are still checked and reported."""
-    task = arm_task(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
-    for every, kinds in ((False, set()), (True, KINDS)):
-        constraints = constraint_set_of(task, every=every)
-        values = along_control(task, constraints)
-        assert set(constraints.margins(values)) == kinds | {"end_position", "end_velocity"}
-
-
 ROD = """
 <mujoco>
   <option timestep="0.005"/>

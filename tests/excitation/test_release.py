@@ -21,7 +21,6 @@ from mjfim.experiment.system import System
 from mjfim.model.coordinates import tangent_components
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status, is_playable, keeps_limits
-from mjfim.studies.monte_carlo import monte_carlo
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import run
 from tests.support.limits import played
@@ -221,19 +220,6 @@ def test_recordings_from_several_releases_are_identified_together(
     assert (error < 4.0 * estimate.std[:2]).all()
     assert not estimate.misfit
     assert mjfim.check(experiment, recordings).verdict.ok
-
-
-@pytest.mark.slow
-def test_estimates_of_a_designed_release_reach_the_cramer_rao_bound(designed: Designed) -> None:
-    experiment, design, _ = designed
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = monte_carlo(experiment, curves, trials=100, seed=3)
-    for name, evaluation in (("initial", design.initial), ("final", design.final)):
-        found = study.sets[name]
-        assert found.failed == 0
-        assert_allclose(np.sqrt(np.diag(found.crlb)), evaluation.std, rtol=1e-2)
-        assert (found.efficiency_interval[:, 0] < 1.05).all()
-        assert (found.efficiency_interval[:, 1] > 0.95).all()
 
 
 FILE = """

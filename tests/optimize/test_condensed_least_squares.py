@@ -339,15 +339,6 @@ def test_without_some_blocks_and_segments_the_rows_of_the_others_count() -> None
     assert_allclose(np.abs(part.triangles[0]), of_third, rtol=1e-9, atol=1e-9)
 
 
-def test_private_unknowns_follow_a_given_step_of_the_common_ones() -> None:
-    dense = problem(6)
-    norms = dense.condensed.column_norms
-    common = np.random.default_rng(0).standard_normal(3) / norms[2:]
-    private = dense.condensed.step_to(common, 0.0, norms).private
-    exact = lstsq(dense.starts, -(dense.r + dense.shared @ common))[0]
-    assert_allclose(private.ravel(), exact, rtol=1e-6)
-
-
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
 def test_the_true_deviation_is_that_of_autocorrelated_residuals(correlation: float) -> None:
     """Residuals of a first-order autoregressive process, and two smooth regressors."""

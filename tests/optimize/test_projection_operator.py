@@ -357,14 +357,6 @@ def test_a_constant_in_the_cost_does_not_change_the_optimum(
     assert iterates[-1].value + shift == pytest.approx(optimum, rel=1e-6)
 
 
-@pytest.mark.slow
-def test_lbfgs_needs_fewer_iterations_than_metric_descent_for_the_same_digits() -> None:
-    # The same metric as the L-BFGS here starts from.
-    metric = MetricDescent(np.zeros((2, 2)), R * DT, np.zeros((2, 2)))
-    counts = [len(run(Pendulum(), d, max_iterations=120)) for d in (metric, LBFGS(R * DT))]
-    assert counts[1] < 0.5 * counts[0]
-
-
 def learned(memory: int, iterations: int = 9) -> tuple[LBFGS, Expansion, Array]:
     """An L-BFGS after some iterations, the next expansion, and K."""
     problem, direction = Pendulum(), LBFGS(R * DT, memory)

@@ -13,7 +13,6 @@ from mjfim.identification.identify import identify
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import StudyEvent
 from mjfim.records.trajectory import Recording, Trajectory
-from mjfim.studies import monte_carlo as monte_carlo_module
 from mjfim.studies.monte_carlo import _statistics, monte_carlo
 from tests.support.cart_pendulum import cart_pendulum
 
@@ -144,26 +143,6 @@ def test_priors_do_not_enter_the_study(short: Experiment, motion: Trajectory) ->
     (found, expected) = (study.sets["final"] for study in (prior, plain))
     np.testing.assert_allclose(found.estimates, expected.estimates, rtol=1e-9)
     np.testing.assert_allclose(np.linalg.inv(prior.information["final"]), found.crlb)
-
-
-@pytest.mark.slow
-def test_a_request_to_stop_keeps_the_finished_trials(
-    short: Experiment, motion: Trajectory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(monte_carlo_module, "MIN_CHUNK", 64)
-    curves = {"initial": motion, "final": motion}
-    token = StopToken()
-
-    def stop_in_the_third_chunk(event: StudyEvent) -> None:
-        if event.share > 0.5:
-            token.request()
-
-    # 256 trials are stepped in four chunks; the initial trajectory comes first.
-    study = monte_carlo(short, curves, trials=256, callback=stop_in_the_third_chunk, stop=token)
-    assert set(study.sets) == {"initial"}
-    assert study.sets["initial"].trials == 192
-    everything = monte_carlo(short, curves, trials=256).sets["initial"]
-    np.testing.assert_array_equal(study.sets["initial"].estimates, everything.estimates[:192])
 
 
 def test_a_request_to_stop_keeps_the_finished_sets(short: Experiment, motion: Trajectory) -> None:

@@ -186,20 +186,6 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_load_on_links_whose_inertia_the_model_tells_in_part(tmp_path: Path) -> None:
-    robot = with_whole_links(experiment(tmp_path))
-    loaded = with_whole_links(experiment(tmp_path, **LOAD, inertia=INERTIA))
-    earlier = mjfim.identify(robot, [log(robot, 1)])
-    estimate = mjfim.identify_payload(robot, [log(loaded, 2)], body="hand", robot=earlier)
-    payload = estimate.payload
-    assert estimate.converged and payload.is_seen
-    assert inside(estimate).sum() >= 3
-
-    # Single inertias of the links are hardly known, but the load is.
-    assert np.ptp(payload.mass_interval) < 0.5 * LOAD["mass"]
-
-
-@pytest.mark.slow
 def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
     robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=INERTIA)
     found = []
