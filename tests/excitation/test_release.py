@@ -40,19 +40,10 @@ def cost_of(task: DesignTask, angle: float) -> float:
     return released.problem.point(released.initial).cost
 
 
-Designed = tuple[Experiment, mjfim.Design, list[Any]]
-
-
-@pytest.fixture(scope="module")
-def designed(tmp_path_factory: pytest.TempPathFactory) -> Designed:
-    """The swing-down, its design and the events of the design."""
-    experiment, events = short(tmp_path_factory.mktemp("designed")), []
-    return experiment, mjfim.design(experiment, callback=events.append), events
-
-
 @pytest.mark.slow
-def test_the_designed_release_is_the_best_of_a_fine_grid(designed: Designed) -> None:
-    experiment, design, events = designed
+def test_the_designed_release_is_the_best_of_a_fine_grid(tmp_path: Path) -> None:
+    experiment, events = short(tmp_path), []
+    design = mjfim.design(experiment, callback=events.append)
     task = DesignTask.resolve(experiment)
     costs = {angle: cost_of(task, angle) for angle in np.linspace(0.1, 3.1, 61)}
     best = min(costs, key=costs.__getitem__)

@@ -126,7 +126,7 @@ RATE = Bounds.from_range(np.full(NU, -0.4), np.full(NU, 0.4))
 
 @dataclass(frozen=True, eq=False)
 class Toy:
-    """A linear plant with a convex cost, whose minimum lies outside the limits.
+    """A linear plant with a quadratic cost, whose minimum lies outside the limits.
 
     Attributes:
         mu: Weight of the barrier, which is relaxed less with a smaller weight.
@@ -152,10 +152,8 @@ class Toy:
         ]
 
     def value(self, point: SimpleNamespace) -> float:
-        """Sum of cost and barrier; a small term is not quadratic."""
-        x, u = point.x[1:], point.u
-        cost = 0.01 * np.sum((x - WANTED) ** 2) + 1e-4 * np.sum(u**2)
-        cost += 2e-3 * np.sum(x[:, 2] ** 2 * u[:, 1] ** 2)
+        """Sum of cost and barrier."""
+        cost = 0.01 * np.sum((point.x[1:] - WANTED) ** 2) + 1e-4 * np.sum(point.u**2)
         return float(cost + sum(barrier.value for barrier in self.barriers(point)))
 
     def size(self, point: SimpleNamespace) -> float:
@@ -164,12 +162,8 @@ class Toy:
 
     def expand(self, point: SimpleNamespace) -> Expansion:
         """Derivatives of cost and barrier, and the curvature of the barrier only."""
-        x, u = point.x, point.u
-        a, b = np.zeros((N + 1, NX)), 2e-4 * u
-        a[1:] = 0.02 * (x[1:] - WANTED)
-        a[1:, 2] += 4e-3 * x[1:, 2] * u[:, 1] ** 2
-        b[:, 1] += 4e-3 * x[1:, 2] ** 2 * u[:, 1]
-
+        a = np.zeros((N + 1, NX))
+        a[1:] = 0.02 * (point.x[1:] - WANTED)
         shown, held, rated = self.barriers(point)
         Q, R = np.zeros((N + 1, NX, NX)), np.zeros((N, NU, NU))
         Q[1:, 0, 0], R[:, range(NU), range(NU)] = shown.curvature[:, 0], held.curvature
@@ -183,7 +177,7 @@ class Toy:
             control_scale=CONTROL.scale,
             control_step_scale=RATE.scale,
         )
-        return Expansion(A=A, B=B, a=a + barrier.a, b=b + barrier.b, barrier=barrier)
+        return Expansion(A=A, B=B, a=a + barrier.a, b=2e-4 * point.u + barrier.b, barrier=barrier)
 
     def project(
         self, point: SimpleNamespace, zeta: TangentCurve, gamma: float, K: Array

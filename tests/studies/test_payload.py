@@ -100,11 +100,9 @@ def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Pa
     robot = experiment(tmp_path)
     system = System.resolve(robot)
     covariance = np.array([[4e-4, 1e-4, -4e-6], [1e-4, 9e-4, 6e-6], [-4e-6, 6e-6, 1e-6]])
-    std = np.sqrt(np.diag(covariance))
-    theta = np.array(list(ROBOT.values()))
-    estimate = bare_estimate(system.parameters.names, theta, std, covariance=covariance)
-    task = PayloadTask.of(robot, body="hand", robot=estimate)
-    parameters = task.system().parameters
+    std, theta = np.sqrt(np.diag(covariance)), np.array([*ROBOT.values()])
+    estimate = bare_estimate(ROBOT, theta, std, covariance=covariance)
+    parameters = PayloadTask.of(robot, body="hand", robot=estimate).system().parameters
     index = [parameters.names.index(name) for name in ROBOT]
     information = parameters.prior_information[np.ix_(index, index)]
     expected = np.linalg.inv(honest_covariance(system.parameters, estimate))
