@@ -110,9 +110,7 @@ SETUPS = {
     "cart E tracking": cart(cost={**TRACKING, "criterion": "E"}),
     "cart A tracking": cart(cost={**TRACKING, "criterion": "A"}),
     "cart D tracking": cart(cost={**TRACKING, "criterion": "D"}),
-    "cart Euler": cart("Euler"),
     "cart implicitfast, every fifth sample": cart("implicitfast", measure_rate=20.0),
-    "cart sensors": cart(noise={"angle": 0.01, "acc": 0.3, "drive": 0.1}),
     "cart sensors, priors": cart(
         noise={"acc": 0.3},
         parameters={
@@ -125,7 +123,6 @@ SETUPS = {
     "free body with ball joint": body_task,
     "free body D": lambda folder: body_task(folder, "Euler", cost={"criterion": "D"}),
     "activation": filtered_task,
-    "start unknown": cart(nuisance={"initial": 0.05}, cost={"criterion": "A"}),
     "ball joint, start unknown": lambda folder: body_task(
         folder, nuisance={"initial": {"qvel:ball.ry": True}}
     ),

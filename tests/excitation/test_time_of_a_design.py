@@ -133,8 +133,7 @@ def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_frict
     evaluation = clock() - begun
 
     costs = []
-    for evaluations in (6, 12.2, 16):
-        seconds = evaluations * evaluation
+    for seconds in (6 * evaluation, 12.2 * evaluation, 16 * evaluation):
         tables = {"descent": {**ENDLESS, "seconds": seconds}, "rehearsal": {"robots": 0}}
         task = DesignTask.resolve(dry_arm_experiment(tmp_path, **tables))
         begun = clock()

@@ -139,19 +139,21 @@ def test_models_with_the_curvature_along_their_minimum_lead_to_that_of_the_barri
     s: float, slope: float, bend: float, delta: float
 ) -> None:
     """The minimum of slope x + bend x^2 / 2 + beta(s + x) follows from a few quadratic models."""
-    slack = np.array([s])
+    slack, factors = np.array([s]), np.ones(1)
     _, first, second = relaxed_log_barrier(slack, delta)
-    factors = np.ones(1)
+    newton = -(slope + first) / (bend + second)
     for _ in range(20):
         x = -(slope + first) / (bend + factors * second)
         factors = curvature_factors(slack, x, factors, delta)
-    wanted = brentq(
-        lambda x: slope + bend * x + relaxed_log_barrier(np.array([s + x]), delta)[1][0], -2.0, 2.0
-    )
+
+    def rise(x: float) -> float:
+        return slope + bend * x + relaxed_log_barrier(slack + x, delta)[1][0]
+
+    wanted = brentq(rise, -2.0, 2.0)
     assert x[0] == pytest.approx(wanted, rel=1e-3)
-    # the curvature at the beginning leads elsewhere
-    newton = -(slope + first[0]) / (bend + second[0])
-    assert abs(newton - wanted) > 0.2 * abs(wanted)
+    assert abs(newton[0] - wanted) > 0.2 * abs(
+        wanted
+    )  # the curvature at the beginning leads elsewhere
 
 
 def test_the_curvature_along_a_step_is_that_at_its_beginning_without_a_step_or_a_bound() -> None:

@@ -261,18 +261,16 @@ def test_stored_pairs_do_not_contain_the_barrier() -> None:
 
 
 def test_no_step_changes_a_limited_quantity_by_more_than_the_reach() -> None:
-    toy = Toy(1e-4)
+    toy, ridge = Toy(1e-4), np.full(NU, 1e-6)
     e = toy.expand(toy.point(np.zeros((N, NU))))
-    K = OPEN_LOOP
-    long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(e, K)
-    short = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)(e, K)
+    long, short = (StructuredBFGS(ridge, reach=reach)(e, OPEN_LOOP) for reach in (1e9, 0.25))
     assert e.barrier.largest_relative_move(long) > 1.0
     assert 0.05 < e.barrier.largest_relative_move(short) <= 0.25 * (1.0 + 1e-12)
     assert e.slope(short) < 0.0
 
     # A short step stays as it is.
-    tiny = replace(e, a=1e-9 * e.a, b=1e-9 * e.b)
-    assert e.barrier.largest_relative_move(StructuredBFGS(np.ones(NU))(tiny, K)) < 1e-6
+    tiny = StructuredBFGS(np.ones(NU))(replace(e, a=1e-9 * e.a, b=1e-9 * e.b), OPEN_LOOP)
+    assert e.barrier.largest_relative_move(tiny) < 1e-6
 
 
 def test_damping_keeps_the_step_back_inside_the_limits() -> None:
@@ -283,13 +281,13 @@ def test_damping_keeps_the_step_back_inside_the_limits() -> None:
     toy, outside = Toy(1e-4), np.zeros((N, NU))
     outside[3, 0] = CONTROL.upper[0] + 0.2 * CONTROL.scale[0]
     e = toy.expand(toy.point(outside))
-    a = e.a + 50.0 * np.random.default_rng(2).normal(size=e.a.shape) * np.array([0.0, 1.0, 1.0])
-    pulled, K = replace(e, a=a), OPEN_LOOP
-    long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(pulled, K)
+    pull = 50.0 * np.random.default_rng(2).normal(size=e.a.shape) * [0.0, 1.0, 1.0]
+    pulled = replace(e, a=e.a + pull)
+    long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(pulled, OPEN_LOOP)
     far = e.barrier.largest_relative_move(long) / 0.25
     assert far > 10.0
     direction = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)
-    damped = direction(pulled, K)
+    damped = direction(pulled, OPEN_LOOP)
     assert direction.damping > 0.0
     assert e.barrier.largest_relative_move(damped) <= 0.25 + 1e-12
     assert pulled.slope(damped) < 0.0

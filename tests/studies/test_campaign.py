@@ -88,28 +88,19 @@ def test_a_campaign_ends_at_the_targets_and_at_the_true_values(
     assert not campaign.warnings and not campaign.short
 
 
-def smallest_eigenvalue(controls: Sequence[Array], truth: DesignTask) -> float:
-    """Smallest eigenvalue of what the controls tell together at the truth."""
-    motions = [truth.plant.simulate(truth.theta, control) for control in controls]
-    told = np.sum([evaluate_task(truth, motion).information for motion in motions], axis=0)
-    return float(np.linalg.eigvalsh(told)[0])
-
-
-def gained(controls: Sequence[Array], truth: DesignTask) -> float:
-    """What the controls tell over what as many repetitions of the first one tell."""
-    alone = len(controls) * smallest_eigenvalue(controls[:1], truth)
-    return smallest_eigenvalue(controls, truth) / alone
-
-
 def test_a_redesign_gains_more_information_than_repeating_the_first_design(
     campaign: Campaign, truth: DesignTask
 ) -> None:
     """For about the same effort: information that is there already makes later rounds neither
     gentler nor wilder.
     """
-    assert gained([r.control for r in campaign.rounds], truth) > 1.03
-    efforts = [float((r.control**2).sum()) for r in campaign.rounds]
-    assert 0.8 * efforts[0] < min(efforts) and max(efforts) < 1.25 * efforts[0]
+    controls = [r.control for r in campaign.rounds]
+    motions = [truth.plant.simulate(truth.theta, control) for control in controls]
+    told = [evaluate_task(truth, motion).information for motion in motions]
+    repeated = len(told) * np.linalg.eigvalsh(told[0])[0]
+    assert np.linalg.eigvalsh(np.sum(told, axis=0))[0] > 1.03 * repeated
+    efforts = [float((control**2).sum()) for control in controls]
+    assert 0.8 * efforts[0] < min(efforts) <= max(efforts) < 1.25 * efforts[0]
 
 
 def test_the_guess_of_an_inertia_moves_where_the_recordings_determine_it(tmp_path: Path) -> None:
@@ -241,25 +232,6 @@ def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_are_
     np.testing.assert_array_equal(asked, [first.estimate.theta, first.theta])
     (said,) = [text for text in found.warnings if "no design could be made at the estimate" in text]
     assert "too fast" in said
-
-
-def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: DesignTask) -> None:
-    limited = STUDY.replace(
-        limits={"control": {"force": (-12.0, 12.0)}, "position": {"slide": (-1.0, 1.0)}},
-        cost={"control": 0.0, "tracking": {}},
-        descent={"max_iterations": 15},
-        parameters={name: {"wanted": 1e-4} for name in "mlc"},
-    )
-    found = mjfim.run_campaign(limited, robot, rounds=2)
-    assert len(found.rounds) == 2 and found.status is CampaignStatus.EXHAUSTED
-    for design in found.designs:
-        assert min(design.limits.values()) >= 0.0
-
-    # Two rounds tell more than twice the first one, and together more than the 22 800 that they
-    # told when the first design, of few iterations, was worse.
-    controls = [r.control for r in found.rounds]
-    assert gained(controls, truth) > 1.1
-    assert smallest_eigenvalue(controls, truth) > 23_000
 
 
 def test_messages_about_faulty_requests_name_valid_values() -> None:
