@@ -272,7 +272,7 @@ class Upwards:
 
 
 def searched(
-    problem: Pendulum, factor: float, armijo: Armijo
+    problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0
 ) -> tuple[tuple[Curve, float] | None, float, float]:
     """Search along a multiple of the metric direction.
 
@@ -281,20 +281,20 @@ def searched(
     """
     point, expansion, K, zeta = begun(problem, METRIC)
     along, slope = TangentCurve(z=factor * zeta.z, v=factor * zeta.v), expansion.slope(zeta)
-    found = armijo.search(problem, point, along, abs(factor) * slope, K, first=0.5)
+    found = armijo.search(problem, point, along, abs(factor) * slope, K, first)
     return found, problem.value(point), slope
 
 
-@pytest.mark.parametrize("wall", [np.inf, 6.0])
+@pytest.mark.parametrize(("wall", "first"), [(np.inf, 1.0), (6.0, 1.0), (np.inf, 0.125)])
 @pytest.mark.parametrize("factor", [1.0, 10.0, 100.0, 1e4])
 @pytest.mark.parametrize("sigma", [1e-4, 0.3])
 def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction(
-    factor: float, sigma: float, wall: float
+    factor: float, sigma: float, wall: float, first: float
 ) -> None:
     """Beyond the wall, trials diverge."""
     problem = Pendulum(wall=wall)
-    (trial, gamma), value, slope = searched(problem, factor, Armijo(sigma=sigma))
-    assert 0.0 < gamma <= 0.5
+    (trial, gamma), value, slope = searched(problem, factor, Armijo(sigma=sigma), first)
+    assert 0.0 < gamma <= first
 
     # Between J at the start and the one that is asked for after the accepted one.
     accepts = [
