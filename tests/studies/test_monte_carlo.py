@@ -80,6 +80,10 @@ def test_interval_of_the_efficiency_has_the_stated_coverage() -> None:
         hits += low <= 1.0 <= high
     assert abs(hits / 400 - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 400)
 
+    # An estimator that scatters more is not efficient.
+    wasteful = _statistics(1.2 * rng.standard_normal((4000, 1)), bound, 0.0)
+    assert wasteful.efficiency_interval[0, 1] < 1.0
+
 
 def test_failed_trials_are_counted_not_averaged() -> None:
     estimates = np.random.default_rng(2).standard_normal((100, 2))
