@@ -195,8 +195,9 @@ def directions(task: DesignTask, gradient: Array) -> list[Array]:
 
 
 def expansion_of(task: DesignTask, accuracy: DifferenceAccuracy) -> tuple[DesignPoint, Expansion]:
-    """The initial trajectory and J expanded about it."""
-    point = task.problem.point(task.initial, accuracy)
+    """A trajectory near the initial one, from which tracking is measured, and J about it."""
+    nearby = task.plant.simulate(task.theta, 0.9 * task.control)
+    point = task.problem.point(nearby, accuracy)
     assert np.isfinite(point.cost)
     return point, task.problem.expand(point)
 
