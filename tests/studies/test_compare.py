@@ -35,9 +35,9 @@ LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-
 
 def row(method: str, cost: float, outcome: MethodOutcome = MethodOutcome.INSIDE) -> MethodResult:
     """A made-up result."""
-    return make_method_result(
-        method, cost, outcome=outcome, control=np.zeros((4, 1)), std=np.full(2, np.sqrt(abs(cost)))
-    )
+    std = np.full(2, np.sqrt(abs(cost)))
+    numbers = {"control": np.zeros((4, 1)), "std": std, "worst_relative_std": std[0]}
+    return make_method_result(method, cost, outcome=outcome, **numbers)
 
 
 def made(*rows: MethodResult, nats: float = 0.0) -> Comparison:
@@ -158,7 +158,7 @@ def test_budgets_must_be_positive(budget: dict[str, float]) -> None:
     [
         (row("a", 1.0),),
         (row("a", 1e-4), row("b", 1.0, MethodOutcome.OUTSIDE), row(DESIGN, 0.5)),
-        (replace(row("a", 1.0, MethodOutcome.NONE), control=None, std=np.full(2, np.nan)),),
+        (replace(row("a", np.nan, MethodOutcome.NONE), control=None),),
         (replace(row(DESIGN, 1.0), std=np.full(2, np.inf)),),
     ],
 )

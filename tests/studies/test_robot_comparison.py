@@ -98,6 +98,13 @@ def test_equal_robots_say_what_would_have_been_found() -> None:
     assert found.detectable[0] == pytest.approx(expected, rel=1e-3)
 
 
+def test_entries_of_vectors_have_no_percentage() -> None:
+    sizes = {"sizes": np.array([2.0, 1.0, 1.0])}
+    changed = estimate(1, theta=np.array([2.0, 0.3, 1.0]), **sizes)
+    found = compare_estimates(estimate(**sizes), changed)
+    assert "damping of B is 0.15 N m s/rad above that of A" in found.sentence(1)
+
+
 def test_combinations_may_differ_although_no_parameter_does() -> None:
     """Strongly correlated errors: the sum is known, and differs."""
     wide = 0.01 * np.array([[1.0, -0.99, 0.0], [-0.99, 1.0, 0.0], [0.0, 0.0, 1.0]])
