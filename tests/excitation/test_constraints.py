@@ -16,6 +16,7 @@ from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.cost_models import relaxed_log_barrier
+from mjfim.optimize.structured_bfgs import StructuredBFGS
 from tests.support.limits import (
     ARM,
     along_control,
@@ -192,6 +193,13 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     _, again, growth = barrier.curvature.along(step, once)
     ratios = [b / a for a, b in zip(once, again, strict=True)]
     assert growth == pytest.approx(max(each.max() for each in ratios))
+    # A search that follows it has another step, which is a descent as well.
+    straight, bent = (
+        StructuredBFGS(np.full(2, 1e-4), is_bent=each)(expansion, K) for each in (False, True)
+    )
+    assert expansion.slope(bent) < 0.0
+    assert np.abs(bent.v - straight.v).max() > 1e-3 * np.abs(straight.v).max()
+
     # with a smooth barrier, or where it is not asked for, the curvature is not followed
     for change in ({"mu": 0.1}, {"follows_curvature": False}):
         other = replace(problem, **change)

@@ -95,6 +95,16 @@ def test_a_fourier_series_comes_with_its_basis(begins: bool, ends: bool, tmp_pat
         assert_array_equal(series, fourier_basis(task.t, 1.0, 1.5, harmonics, begins, ends))
 
 
+@pytest.mark.parametrize(("limits", "most"), [({}, 50), ({"bandwidth": 5.0}, 5)])
+def test_a_series_without_any_harmonic_is_refused(
+    limits: dict[str, float], most: int, tmp_path: Path
+) -> None:
+    task = arm(tmp_path, limits=limits, descent={"fourier": (60.0,)})
+    message = rf"descent\.fourier: 60 Hz is above the bandwidth of {most} Hz"
+    with pytest.raises(ExperimentError, match=message):
+        list(initial_controls_of(task, None))
+
+
 def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) -> None:
     """Its rows have the rate of the earlier design; the last row has no control."""
     lines = [f"{k * 0.02},{0.01 * k},{-0.02 * k},0.0" for k in range(20)] + ["0.4,nan,nan,0.0"]

@@ -129,6 +129,7 @@ def test_steering_inside_has_no_cost(tmp_path: Path) -> None:
     expansion = inward.expand(point)
     assert_array_equal(expansion.a, expansion.barrier.a)
     assert check(task, inward, expansion) < 2e-3
+    assert inward.reevaluate(point) is point
 
 
 def test_a_diverged_trial_has_infinite_value(tmp_path: Path) -> None:

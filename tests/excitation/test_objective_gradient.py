@@ -207,6 +207,7 @@ OFF = [
     "cart E tracking",
     "free body with ball joint",
     "activation",
+    "quaternions measured",
     "sensors, all nuisances",
     "robust worst",
 ]
