@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.limits.limits import unsupported_ranges
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import holding_control
 from mjfim.experiment.schema import Experiment
@@ -219,13 +217,11 @@ def test_a_control_with_neither_weight_nor_hard_range_is_refused(
 
 def test_a_hard_range_replaces_the_weight(tmp_path: Path) -> None:
     """It may be stated in the file or in the MJCF."""
-    path = with_control_weight(tmp_path, "[limits]\ncontrol = { force = [-5.0, 5.0] }")
-    assert DesignTask.resolve(Experiment.from_file(path)).control_weight.tolist() == [0.0]
-    model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
-    (tmp_path / "cart_pendulum.xml").write_text(model.replace(*MOTOR), encoding="utf-8")
-    assert DesignTask.resolve(
-        Experiment.from_file(with_control_weight(tmp_path, ""))
-    ).control_weight.tolist() == [0.0]
+    model = tmp_path / "cart_pendulum.xml"
+    for lines in ("[limits]\ncontrol = { force = [-5.0, 5.0] }", ""):
+        path = with_control_weight(tmp_path, lines)
+        assert DesignTask.resolve(Experiment.from_file(path)).control_weight.tolist() == [0.0]
+        model.write_text(model.read_text(encoding="utf-8").replace(*MOTOR), encoding="utf-8")
 
 
 def test_a_start_that_falls_is_refused_at_a_high_rate(tmp_path: Path) -> None:
@@ -239,11 +235,8 @@ def test_a_start_that_falls_is_refused_at_a_high_rate(tmp_path: Path) -> None:
         initial={"qpos": (0.0, 2.0), "control": {"kind": "sine"}},
         boundary={"start": "rest"},
     )
-    with pytest.raises(
-        ExperimentError,
-        match=r"no control holds the initial state: "
-        r"joint 'hinge' still accelerates by \d\.\d+ per s²",
-    ):
+    message = r"no control holds the initial state: joint 'hinge' still accelerates by \d\.\d+ per"
+    with pytest.raises(ExperimentError, match=message):
         design_task(task)
 
 
@@ -266,32 +259,6 @@ def test_limits_that_no_control_can_keep_end_with_exit_code_one(
     assert found == (1, "infeasible", False)
     assert "it violates limits (velocity" in result.stderr
     assert "checked, not enforced" not in result.stderr
-
-
-LOOSE = """
-<mujoco>
-  <compiler angle="radian"/>
-  <worldbody>
-    <body name="a"><joint name="wrist" type="ball" range="0 1"/><geom size="0.1"/>
-      <body name="b" pos="0 0 1">
-        <joint name="elbow" axis="0 1 0" range="-1 1"/><geom size="0.1"/>
-      </body>
-    </body>
-  </worldbody>
-  <tendon>
-    <fixed name="rope" range="-1 1" actuatorfrcrange="-2 2"><joint joint="elbow" coef="1"/></fixed>
-  </tendon>
-  <actuator>
-    <general name="muscle" joint="elbow" dyntype="filter" dynprm="0.1"
-             actlimited="true" actrange="0 1"/>
-  </actuator>
-</mujoco>
-"""
-
-
-def test_ranges_of_the_mjcf_that_are_no_limits_are_named() -> None:
-    model = mujoco.MjModel.from_xml_string(LOOSE)
-    assert unsupported_ranges(model) == ("the activation of muscle",)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, StudyEvent
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.cli import run
+from tests.support.cli import read, run
 from tests.support.paths import MODELS
 
 STUDY = cart_pendulum(
@@ -63,11 +62,10 @@ def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
     task = DesignTask.resolve(shorter.experiment)
     assert shorter.design.trajectory.samples == task.samples
     evaluated = evaluate_task(task, shorter.design.trajectory)
-    assert largest_ratio_to_target(evaluated.std, target_accuracies(task))[0] <= 1.0
-    best = next(t for t in shorter.tried if t.horizon == shorter.horizon)
-    assert best.reached and best.ratio == pytest.approx(
-        largest_ratio_to_target(evaluated.std, target_accuracies(task))[0], rel=1e-6
-    )
+    ratio, _ = largest_ratio_to_target(evaluated.std, target_accuracies(task))
+    (best,) = [tried for tried in shorter.tried if tried.horizon == shorter.horizon]
+    assert best.reached and best.ratio <= 1.0
+    assert best.ratio == pytest.approx(ratio, rel=1e-6)
     assert shorter.summary()["horizon"] == shorter.horizon
 
     # The last parameter is known just before the end, by the numbers of the picture over time.
@@ -89,16 +87,11 @@ def test_an_experiment_shorter_by_the_tolerance_does_not(shorter: mjfim.Shortest
 @pytest.mark.slow
 def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperiment) -> None:
     """A search that begins at a horizon that is too short ends near the shortest one as well."""
-    messages = []
-
-    def callback(event: DesignEvent | StudyEvent) -> None:
-        if isinstance(event, StudyEvent):
-            messages.append(event.message)
-
-    found = mjfim.shortest_experiment(
-        wanting(SIGMA, horizon=0.8), tolerance=0.05, callback=callback
-    )
+    events = []
+    stated = wanting(SIGMA, horizon=0.8)
+    found = mjfim.shortest_experiment(stated, tolerance=0.05, callback=events.append)
     assert found.horizon > 0.8 and abs(found.horizon - shorter.horizon) < 0.11
+    messages = [event.message for event in events if isinstance(event, StudyEvent)]
     assert messages == [str(tried) for tried in found.tried]
     assert not found.tried[0].reached and found.tried[0].horizon == 0.8
 
@@ -106,10 +99,8 @@ def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperi
 @pytest.mark.slow
 def test_the_message_names_targets_out_of_reach_with_numbers() -> None:
     hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
-    with pytest.raises(
-        OutOfReachError,
-        match=r"0\.8 s is too short: the target is missed by m \(σ 0\.\d+, wanted 0\.001\)",
-    ):
+    message = r"0\.8 s is too short: the target is missed by m \(σ 0\.\d+, wanted 0\.001\)"
+    with pytest.raises(OutOfReachError, match=message):
         mjfim.shortest_experiment(hard, longest=0.8)
 
 
@@ -129,9 +120,9 @@ def test_it_is_saved_and_loaded_with_its_experiment(
 def test_an_experiment_with_a_function_cannot_be_saved(
     shorter: mjfim.ShortestExperiment, tmp_path: Path
 ) -> None:
-    tables = {**shorter.experiment.model_dump(exclude_unset=True)}
-    tables["parameters"] = {"m": {"function": lambda spec, value: None, "guess": 1.0}}
-    stated = mjfim.Experiment(**tables, directory=shorter.experiment.directory)
+    function = {"m": {"function": lambda spec, value: None, "guess": 1.0}}
+    values = shorter.experiment.model_dump(exclude_unset=True)
+    stated = shorter.experiment.restated({**values, "parameters": function})
     with pytest.raises(TypeError, match="a Python function cannot be saved"):
         replace(shorter, experiment=stated).save(tmp_path)
 
@@ -156,12 +147,13 @@ def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> Non
 
 
 def test_messages_about_faulty_requests_name_valid_values() -> None:
-    with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
-        mjfim.shortest_experiment(STUDY)
-    with pytest.raises(ExperimentError, match="tolerance"):
-        mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.0)
-    with pytest.raises(ExperimentError, match="longest"):
-        mjfim.shortest_experiment(wanting(SIGMA), longest=0.01)
+    for experiment, options, message in (
+        (STUDY, {}, r"parameters\.m\.wanted"),
+        (wanting(SIGMA), {"tolerance": 0.0}, "tolerance"),
+        (wanting(SIGMA), {"longest": 0.01}, "longest"),
+    ):
+        with pytest.raises(ExperimentError, match=message):
+            mjfim.shortest_experiment(experiment, **options)
 
 
 @pytest.mark.slow
@@ -212,13 +204,8 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
     control = np.arange(4.0)[:, None]
 
     def made(samples: int, **tables: object) -> list[float]:
-        return (
-            fit_control(
-                DesignTask.resolve(STUDY.replace(horizon=samples / 100.0, **tables)), control
-            )
-            .ravel()
-            .tolist()
-        )
+        task = DesignTask.resolve(STUDY.replace(horizon=samples / 100.0, **tables))
+        return fit_control(task, control).ravel().tolist()
 
     limited = {"limits": {"control": {"force": (-5.0, 5.0)}}}
     assert made(3) == [0.0, 1.0, 2.0] and made(4) == [0.0, 1.0, 2.0, 3.0]
@@ -240,32 +227,29 @@ def test_the_command_line(tmp_path: Path) -> None:
         ("horizon = 4.0", "horizon = 1.0"),
         ("max_iterations = 200", "max_iterations = 10"),
         ("tolerance = 1e-7", "tolerance = 1e-2"),
-        ("[parameters.m] ", "[parameters.m]\nwanted = 0.03\n#"),
+        ("[parameters.m] ", "[parameters.m]\nWANTED\n#"),
     ):
         assert old in text
         text = text.replace(old, new, 1)
-    study = tmp_path / "study.toml"
-    study.write_text(text, encoding="utf-8")
+    study, folder = tmp_path / "study.toml", tmp_path / "out"
 
     # The table of the initial control ends after one second, which is the longest horizon then.
     table = (tmp_path / "cart_pendulum.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "cart_pendulum.csv").write_text("\n".join(table[:101]) + "\n", encoding="utf-8")
-    folder = tmp_path / "out"
 
-    done = run("design", study, "-o", folder, "--shortest")
-    assert done.exit_code == 0, done.output
-    kept = json.loads((folder / "shortest.json").read_text(encoding="utf-8"))
+    for wanted, code, said in (
+        ("wanted = 1e-9", 1, "is too short"),
+        ("", 2, "wanted"),
+        ("wanted = 0.03", 0, "shortest horizon: "),
+    ):
+        study.write_text(text.replace("WANTED", wanted), encoding="utf-8")
+        done = run("design", study, "-o", folder, "--shortest")
+        assert done.exit_code == code, done.output
+        assert said in done.output
+
+    kept = read(folder / "shortest.json")
     assert kept["closed"] and kept["horizon"] < 1.0
-    told = json.loads((folder / "design.json").read_text(encoding="utf-8"))
-    assert told["shortest"]["horizon"] == kept["horizon"]
+    assert read(folder / "design.json")["shortest"]["horizon"] == kept["horizon"]
     assert f"shortest horizon: {kept['horizon']:g} s" in done.output
     with np.load(folder / "design.npz", allow_pickle=False) as arrays:
         assert arrays["t"][-1] == pytest.approx(kept["horizon"])
-    study.write_text(text.replace("wanted = 0.03", "wanted = 1e-9"), encoding="utf-8")
-    done = run("design", study, "-o", folder, "--shortest")
-    assert done.exit_code == 1
-    assert "is too short" in done.output
-    study.write_text(text.replace("wanted = 0.03", ""), encoding="utf-8")
-    done = run("design", study, "-o", folder, "--shortest")
-    assert done.exit_code == 2
-    assert "wanted" in done.output

@@ -6,8 +6,9 @@ the speed of the computer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,45 +30,23 @@ STEPS_PER_SECOND = 1e5
 ENDLESS = {"max_iterations": 100_000, "tolerance": 1e-14}
 
 
-class StepClock:
-    """A clock that engine steps move on.
-
-    Attributes:
-        steps: Engine steps of all simulators so far.
-    """
-
-    def __init__(self) -> None:
-        self.steps = 0
-
-    def __call__(self) -> float:
-        """Time [s]."""
-        return self.steps / STEPS_PER_SECOND
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[StepClock]:
-    """The clock of all budgets."""
-    clock = StepClock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], float]]:
+    """The clock of all budgets, which engine steps move on."""
+    made = []
 
-    class Counted:
-        """Engine steps of one plant, which move the clock on."""
+    def counter(**fields: int) -> SimpleNamespace:
+        """The counter of one plant."""
+        made.append(SimpleNamespace(**fields))
+        return made[-1]
 
-        def __init__(self, steps: int) -> None:
-            self._steps = steps
+    def now() -> float:
+        """Time [s]."""
+        return sum(each.steps for each in made) / STEPS_PER_SECOND
 
-        @property
-        def steps(self) -> int:
-            """Engine steps so far."""
-            return self._steps
-
-        @steps.setter
-        def steps(self, steps: int) -> None:
-            clock.steps += steps - self._steps
-            self._steps = steps
-
-    monkeypatch.setattr(batch, "SimpleNamespace", Counted)
-    with measured_by(clock):
-        yield clock
+    monkeypatch.setattr(batch, "SimpleNamespace", counter)
+    with measured_by(now):
+        yield now
 
 
 def weights(folder: Path, descent: dict[str, Any]) -> DesignTask:
@@ -100,7 +79,7 @@ def far_outside(folder: Path, descent: dict[str, Any]) -> DesignTask:
     ],
 )
 def test_a_design_uses_its_time_and_not_much_more(
-    make: Any, seconds: float, clock: StepClock, tmp_path: Path
+    make: Any, seconds: float, clock: Callable[[], float], tmp_path: Path
 ) -> None:
     """Beyond its time, it ends the iteration and verifies the result."""
     task = make(tmp_path, {**ENDLESS, "seconds": seconds})
@@ -129,7 +108,7 @@ def small_control(folder: Path, descent: dict[str, Any]) -> DesignTask:
     ("make", "evaluations", "bound"), [(resting_arm, 17, 10.0), (small_control, 8, 0.04)]
 )
 def test_the_time_of_few_evaluations_is_enough_for_a_good_control(
-    make: Any, evaluations: int, bound: float, clock: StepClock, tmp_path: Path
+    make: Any, evaluations: int, bound: float, clock: Callable[[], float], tmp_path: Path
 ) -> None:
     """The coarse level gets most of the time; without that, J of the arm is 51140."""
     task = make(tmp_path, {})
@@ -143,7 +122,7 @@ def test_the_time_of_few_evaluations_is_enough_for_a_good_control(
 
 @pytest.mark.slow
 def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_friction(
-    clock: StepClock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    clock: Callable[[], float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A descent takes as long as some evaluations before its first step."""
     # Two robots that are alike in the initial motion are sought after the time of the search.
@@ -154,8 +133,7 @@ def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_frict
     evaluation = clock() - begun
 
     costs = []
-    for evaluations in (6, 12.2, 16):
-        seconds = evaluations * evaluation
+    for seconds in (6 * evaluation, 12.2 * evaluation, 16 * evaluation):
         tables = {"descent": {**ENDLESS, "seconds": seconds}, "rehearsal": {"robots": 0}}
         task = DesignTask.resolve(dry_arm_experiment(tmp_path, **tables))
         begun = clock()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,16 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.limits.constraints import constraint_set_of
-from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, _clearance_usage, verify
+from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, verify
 from mjfim.excitation.task import DesignTask
 from mjfim.output.archive import reference_columns, simulate_playback
-from tests.support.limits import along_control, played
-from tests.support.numerics import CART_PENDULUM, make_task
+from tests.support.limits import along_control, excess_of, played
+from tests.support.numerics import cart_task, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
 SPRING = """
 <mujoco model="spring">
-  <option timestep="0.001" integrator="{integrator}" gravity="0 0 0">
+  <option timestep="0.001" integrator="RK4" gravity="0 0 0">
     <flag contact="disable"/>
   </option>
   <worldbody>
@@ -43,12 +44,10 @@ def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -
         "horizon": 1.0,
         "parameters": {"m": {"target": "body/ball:mass"}},
         "noise": {"state": 0.01},
-        "initial": {
-            "qvel": (SPEED,),
-            "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0},
-        },
+        "initial": {"qvel": (SPEED,)},
+        "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0},
     }
-    text = SPRING.format(joint=joint, motor=motor, integrator="RK4")
+    text = SPRING.format(joint=joint, motor=motor)
     return make_task(text, folder, **{**defaults, **tables})
 
 
@@ -60,31 +59,22 @@ def test_limits_hold_between_the_samples_too(tmp_path: Path) -> None:
         "acceleration": 300.0,
     }
     task = spring_task(tmp_path, limits=limits)
-    samples = task.initial
-    assert task.system.grid.substeps == 100
-    assert np.abs(samples.qpos).max() < 0.01
-    assert samples.qvel.min() > 0.98 * SPEED
-    found = verify(task, samples)
+    assert np.abs(task.initial.qpos).max() < 0.01
+    assert task.initial.qvel.min() > 0.98 * SPEED
+    found = verify(task, task.initial)
     assert not found.is_feasible
     # by hand: a harmonic motion of 10 Hz
-    assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
-    assert found.margins["velocity"] == pytest.approx(-1.9 * SPEED, rel=1e-3)
-    assert found.margins["acceleration"] == pytest.approx(
-        300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3
-    )
+    wanted = {
+        "position": 0.1 - SWING,
+        "velocity": -1.9 * SPEED,
+        "acceleration": 300.0 - 20.0 * np.pi * SPEED,
+    }
+    assert found.margins == pytest.approx(wanted, rel=3e-3)
     assert found.deviation < SAME_STATE_TOLERANCE
-    # margins at the samples only are positive
+
+    # Positions at the samples alone would not show it.
     constraints = constraint_set_of(task)
-    watched = task.plant.observe(task.theta, task.control, constraints.observations)
-    assert watched is not None
-    trajectory, observed = watched
-    at_samples = constraints.margins(
-        constraints.evaluate(trajectory, observed[:, -1:], slopes=False)
-    )
-    assert min(at_samples.values()) > 0.0
-    assert constraints.margins(
-        constraints.evaluate(trajectory, observed, slopes=False)
-    ) == pytest.approx(found.margins)
+    assert constraints.margins(along_control(task, constraints)) == pytest.approx(found.margins)
 
 
 def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
@@ -98,6 +88,21 @@ def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
     assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).is_feasible
 
 
+def test_a_clearance_beyond_the_reach_of_distances_is_measured_too(tmp_path: Path) -> None:
+    still = {"initial": {"qvel": (1e-9,)}, "control": {"kind": "constant", "amplitude": 0.0}}
+    task = spring_task(tmp_path, limits={"clearance": 1e-4}, **still)
+    assert constraint_set_of(task).clearance.distances.reach < 0.15
+    margin = verify(task, task.initial).margins["clearance"]
+    assert margin == pytest.approx(0.19 - 1e-4, abs=1e-6)
+
+
+PUSHED = {
+    "rate": 50.0,
+    "initial": {"qvel": (SPEED,)},
+    "control": {"kind": "sine", "amplitude": 1.0, "frequency": 1.0},
+}
+
+
 @pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
 def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path: Path) -> None:
     """A design on the plant without them deviates when it is played on the model with them."""
@@ -107,14 +112,12 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
         "joint force": {"joint": 'actuatorfrcrange="-0.05 0.05"'},
         "control": {"motor": 'ctrlrange="-0.05 0.05"'},
     }[clamp]
-    control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
-    tables = {"rate": 50.0, "initial": {"qvel": (SPEED,), "control": control}}
-    task = spring_task(tmp_path, **words, **tables)
+    task = spring_task(tmp_path, **words, **PUSHED)
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
     found = verify(task, designed)
     assert found.deviation > 10 * SAME_STATE_TOLERANCE
-    free = verify(spring_task(tmp_path, **tables), designed)
+    free = verify(spring_task(tmp_path, **PUSHED), designed)
     assert free.deviation < SAME_STATE_TOLERANCE
     if clamp in ("stop", "control"):
         assert not found.is_feasible
@@ -128,15 +131,8 @@ def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
 ) -> None:
     """Where limits are not enforced, the plant of the design has to clamp forces."""
     motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
-    control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
-    tables = {
-        "rate": 50.0,
-        "initial": {"qvel": (SPEED,), "control": control},
-        "cost": {"control": 1.0},
-    }
-    task = spring_task(
-        tmp_path, motor=motor, boundary={"end": "periodic"}, limits={"enforce": enforce}, **tables
-    )
+    tables = {"boundary": {"end": "periodic"}, "cost": {"control": 1.0}}
+    task = spring_task(tmp_path, motor=motor, limits={"enforce": enforce}, **PUSHED, **tables)
     assert task.is_limited
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
@@ -163,10 +159,7 @@ def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
     rows: int, tmp_path: Path
 ) -> None:
     """The table holds each sample for all its rows, so that the control jumps within one row."""
-    control = {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0}
-    tables = {"initial": {"qvel": (SPEED,), "control": control}}
-    tables["playback_rate"] = 10.0 * rows
-    task = spring_task(tmp_path, **tables)
+    task = spring_task(tmp_path, playback_rate=10.0 * rows)
 
     # The largest rate of the rows, from the table itself.
     gain = np.zeros((len(task.control), 1, 2))
@@ -174,13 +167,14 @@ def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
     fastest = np.abs(np.diff(played.ctrl, axis=0)).max() / (played.t[1] - played.t[0])
 
     for share, kept in ((1.01, True), (0.99, False)):
-        limited = spring_task(tmp_path, limits={"control_rate": share * fastest}, **tables)
+        limits = {"control_rate": share * fastest}
+        limited = spring_task(tmp_path, limits=limits, playback_rate=10.0 * rows)
         found = verify(limited, limited.initial)
         assert found.margins["control_rate"] == pytest.approx((share - 1.0) * fastest)
         assert found.is_feasible is kept
 
 
-# A link whose drive is a servo or a filtered motor, with force sensors. It is so light against its
+# A link whose drive is a servo or a filtered motor. It is so light against its
 # damping that implicit integrators do not follow its qacc.
 LIGHT_LINK = """
 <mujoco model="link">
@@ -192,10 +186,6 @@ LIGHT_LINK = """
     </body>
   </worldbody>
   <actuator>{drive}</actuator>
-  <sensor>
-    <actuatorfrc actuator="drive"/>
-    <jointactuatorfrc joint="hinge"/>
-  </sensor>
 </mujoco>
 """
 DRIVES = {
@@ -208,37 +198,14 @@ def light_link(
     folder: Path, integrator: str, drive: str, joint: str = "", **tables: Any
 ) -> DesignTask:
     """The light link under a sine for 0.4 s, with two engine steps in each sample."""
-    control = {"kind": "sine", "amplitude": 0.4, "frequency": 2.5}
     defaults = {
-        "rate": 100.0,
         "horizon": 0.4,
         "parameters": {"m": {"target": "body/link:mass"}},
         "noise": {"state": 0.01},
-        "initial": {"control": control},
+        "control": {"kind": "sine", "amplitude": 0.4, "frequency": 2.5},
     }
     text = LIGHT_LINK.format(integrator=integrator, drive=DRIVES[drive], joint=joint)
     return make_task(text, folder, **{**defaults, **tables})
-
-
-def largest_forces(task: DesignTask) -> tuple[float, float]:
-    """Largest force of the actuator and on the joint that MuJoCo shows in a plain loop.
-
-    They are read from the sensors and the fields after every step, and from the sensors after
-    `mj_forward` at the state after the step.
-    """
-    model = task.system.model
-    data, after = mujoco.MjData(model), mujoco.MjData(model)
-    found = []
-    for control in task.control:
-        data.ctrl[:] = after.ctrl[:] = control
-        for _ in range(task.system.grid.substeps):
-            mujoco.mj_step(model, data)
-            after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
-            mujoco.mj_forward(model, after)
-            fields = np.array([data.actuator_force[0], data.qfrc_actuator[0]])
-            found += [data.sensordata.copy(), after.sensordata.copy(), fields]
-    actuator, joint = np.abs(found).max(axis=0)
-    return float(actuator), float(joint)
 
 
 @pytest.mark.parametrize("drive", DRIVES)
@@ -247,7 +214,9 @@ def test_a_force_within_its_limit_is_never_shown_above_it_by_mujoco(
     integrator: str, drive: str, tmp_path: Path
 ) -> None:
     """The margin is that to the largest force of all sensors and fields."""
-    force, on_joint = largest_forces(light_link(tmp_path, integrator, drive))
+    limits = {"force": {"drive": 1.0}, "joint_force": {"hinge": 1.0}}
+    task = light_link(tmp_path, integrator, drive, limits=limits)
+    force, on_joint = (1.0 + excess for excess in excess_of(task, task.control).values())
     for share in (1.001, 0.999):
         task = light_link(tmp_path, integrator, drive, limits={"force": {"drive": share * force}})
         found = verify(task, task.initial)
@@ -255,7 +224,7 @@ def test_a_force_within_its_limit_is_never_shown_above_it_by_mujoco(
         assert found.is_feasible is (share > 1.0)
 
         # The usage over time has one value for each engine step, and the same largest force.
-        (usage,) = (used for used in found.usage if used.kind == "force")
+        (usage,) = found.usage
         assert len(usage.t) == len(usage.share) == task.samples * task.system.grid.substeps
         assert np.abs(usage.share).max() == pytest.approx(1.0 / share, rel=1e-6)
 
@@ -276,15 +245,13 @@ def test_reference_csv_has_no_acceleration_above_a_limit_that_holds(
     playback = {"playback_rate": 200.0}  # one row per engine step
     task = light_link(tmp_path, integrator, drive, **playback)
     gain = np.zeros((task.samples, 1, task.space.nx))
-    played = simulate_playback(task.system, task.initial, gain)
-    columns = reference_columns(played, task.system)
-    largest = float(np.abs(columns["qacc:hinge"]).max())
-    speed = columns["qvel:hinge"]
-    np.testing.assert_allclose(columns["qacc:hinge"][:-1], np.diff(speed) / 0.005, atol=1e-9)
+    columns = reference_columns(simulate_playback(task.system, task.initial, gain), task.system)
+    acceleration, speed = columns["qacc:hinge"], columns["qvel:hinge"]
+    largest = float(np.abs(acceleration).max())
+    np.testing.assert_allclose(acceleration[:-1], np.diff(speed) / 0.005, atol=1e-9)
 
-    limited = light_link(
-        tmp_path, integrator, drive, limits={"acceleration": 1.001 * largest}, **playback
-    )
+    limits = {"acceleration": 1.001 * largest}
+    limited = light_link(tmp_path, integrator, drive, limits=limits, **playback)
     found = verify(limited, limited.initial)
     assert found.margins["acceleration"] == pytest.approx(0.001 * largest, rel=1e-6)
 
@@ -326,9 +293,8 @@ def test_limits_hold_with_the_solver_settings_of_the_model_too(
     solver: dict[str, Any], tmp_path: Path
 ) -> None:
     """The limit is between the speeds with the exact solver and with that of the model."""
-    tables = {"parameters": {"m": {"target": "body/lower:mass"}}}
-    tables["noise"] = {"state": 0.01}
     text = COARSE_SOLVER.format(**solver)
+    tables = {"parameters": {"m": {"target": "body/lower:mass"}}, "noise": {"state": 0.01}}
     task = make_task(text, tmp_path, **tables)
 
     # A plain loop over the user's file, and one with the solver settings of the design.
@@ -339,41 +305,22 @@ def test_limits_hold_with_the_solver_settings_of_the_model_too(
     assert abs(stated - exact) > 1e-3 * exact
 
     # The limit holds with one of both only.
-    between = {"velocity": {"elbow": 0.5 * (stated + exact)}}
-    found = verify(make_task(text, tmp_path, limits=between, **tables), task.initial)
+    limit = 0.5 * (stated + exact)
+    limits = {"velocity": {"elbow": limit}}
+    found = verify(make_task(text, tmp_path, limits=limits, **tables), task.initial)
     assert not found.is_feasible
     assert found.margins["velocity"] == pytest.approx(-0.5 * abs(stated - exact), rel=1e-6)
     assert found.by_stated_solver == ({"velocity"} if stated > exact else set())
 
     (usage,) = found.usage
-    limit = 0.5 * (stated + exact)
     assert np.abs(usage.share).max() == pytest.approx(max(stated, exact) / limit)
     assert found.deviation < SAME_STATE_TOLERANCE
 
 
 def test_a_control_that_makes_the_model_diverge_violates_every_limit(tmp_path: Path) -> None:
     limits = {"position": {"slide": (-3.0, 3.0)}, "control": {"force": (-1e13, 1e13)}}
-    task = make_task(
-        CART_PENDULUM.format(integrator="RK4"),
-        tmp_path,
-        parameters={"m": {"target": "body/bob:mass"}},
-        noise={"state": 0.01},
-        limits=limits,
-    )
-    wild = task.plant.trajectory(task.initial.state, np.full_like(task.control, 1e12))
-    found = verify(task, wild)
+    task = cart_task(tmp_path, limits=limits)
+    found = verify(task, replace(task.initial, ctrl=np.full_like(task.control, 1e12)))
     assert not found.is_feasible
     assert found.deviation == np.inf
     assert set(found.margins.values()) == {-np.inf}
-
-
-def test_a_clearance_beyond_the_reach_of_distances_is_measured_too(tmp_path: Path) -> None:
-    """One position is farther from the wall than that, the other one is nearer."""
-    task = spring_task(tmp_path, limits={"clearance": 1e-4})
-    constraints = constraint_set_of(task, every=True)
-    distances = constraints.clearance.distances
-    near = task.initial.qpos[:1] + 0.19 - 0.5 * distances.reach
-    far = np.array([[-SWING]])
-    farther, nearer = (_clearance_usage(task, constraints.clearance, q)[0] for q in (far, near))
-    assert farther == pytest.approx(0.19 + SWING)
-    assert nearer == pytest.approx(0.5 * distances.reach)

@@ -392,7 +392,7 @@ class Proximity:
             ignored: Pairs of bodies whose distance does not matter.
         """
         self._model = copy.copy(model)
-        self._model.geom_margin[:] = reach
+        self._model.geom_margin[:] = self._model.body_margin[:] = reach
         self._model.geom_gap[:] = 0.0
         self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self._data = mujoco.MjData(self._model)

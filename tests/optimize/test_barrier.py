@@ -5,8 +5,6 @@ It is twice differentiable and defined outside the bounds.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -18,7 +16,8 @@ from mjfim.optimize.cost_models import (
     curvature_factors,
     relaxed_log_barrier,
 )
-from mjfim.optimize.lq import TangentCurve, Weights
+from mjfim.optimize.lq import TangentCurve
+from tests.support.lq import random_weights
 from tests.support.numerics import Array, relative_error
 
 INF = np.inf
@@ -30,17 +29,13 @@ def test_the_barrier_is_twice_continuous_where_it_relaxes(delta: float) -> None:
     """Value, slope and curvature agree from both sides; the curvature falls towards the inside and
     is constant outside.
     """
-    h = 1e-9
-    below, above = (
-        relaxed_log_barrier(np.array([delta * (1.0 + sign * h)]), delta) for sign in (-1.0, 1.0)
-    )
-    for order, (left, right) in enumerate(zip(below, above, strict=True)):
-        assert_allclose(left * delta**order, right * delta**order, rtol=0, atol=1e-7)
-    curvature = [
-        relaxed_log_barrier(np.array([delta * (1.0 + s)]), delta)[2][0] * delta**2
-        for s in (-0.1, 0.1)
-    ]
-    assert curvature == pytest.approx([1.0, 1.1**-2])
+    below, above = np.array(
+        relaxed_log_barrier(delta * np.array([1.0 - 1e-9, 1.0 + 1e-9]), delta)
+    ).T
+    powers = delta ** np.arange(3)
+    assert_allclose(below * powers, above * powers, rtol=0, atol=1e-7)
+    curvature = relaxed_log_barrier(delta * np.array([0.9, 1.1]), delta)[2]
+    assert curvature * delta**2 == pytest.approx([1.0, 1.1**-2])
 
 
 @pytest.mark.parametrize("delta", [0.05, 0.3])
@@ -92,64 +87,48 @@ def test_tightening_moves_both_bounds_inwards_and_keeps_the_scale() -> None:
 @pytest.mark.parametrize("delta", [0.1, 1e-3])
 def test_the_barrier_of_bounds_is_the_sum_over_both_bounds(delta: float) -> None:
     """Its derivatives by every number, inside and outside, agree with differences."""
-    bounds, weight = Bounds.from_range(LOWER, UPPER), 0.25
+    bounds, h = Bounds.from_range(LOWER, UPPER), 1e-5
     r = np.array([[2.4, 0.2, 2.7, 5.0, 0.3, -60.0], [3.3, 0.8, 1.1, -5.0, -0.9, -35.0]])
 
-    def value(numbers: Array) -> float:
-        total = 0.0
-        for i, (low, high, scale) in enumerate(
-            zip(bounds.lower, bounds.upper, bounds.scale, strict=True)
-        ):
-            for s in ((numbers[:, i] - low) / scale, (high - numbers[:, i]) / scale):
-                total += weight * float(np.sum(relaxed_log_barrier(s[np.isfinite(s)], delta)[0]))
-        return total
+    def values(numbers: Array) -> Array:
+        sides = np.array([numbers - LOWER, UPPER - numbers]) / bounds.scale
+        beta = relaxed_log_barrier(np.where(np.isfinite(sides), sides, 1.0), delta)[0]
+        return np.asarray(0.25 * beta.sum(axis=0))
 
-    barrier = bounds.barrier(r, delta, weight)
-    assert barrier.value == pytest.approx(value(r), rel=1e-12)
-    assert (barrier.slope[:, 3] == 0.0).all() and (barrier.curvature[:, 3] == 0.0).all()  # free
+    barrier, up, down = (bounds.barrier(r + move, delta, 0.25) for move in (0.0, h, -h))
+    assert barrier.value == pytest.approx(values(r).sum(), rel=1e-12)
+    slope = (values(r + h) - values(r - h)) / (2 * h)
+    assert_allclose(barrier.slope, slope, rtol=1e-6, atol=1e-6)
+    assert_allclose(barrier.curvature, (up.slope - down.slope) / (2 * h), rtol=1e-4)
+    assert not barrier.slope[:, 3].any() and not barrier.curvature[:, 3].any()  # no bound
     middle = Bounds.from_range(np.array([-1.0]), np.array([3.0])).barrier(np.ones((1, 1)), 0.1, 1.0)
-    assert (middle.value, float(middle.slope[0, 0])) == (0.0, 0.0)
-    h = 1e-5
-    for k, i in np.ndindex(*r.shape):
-        e = np.zeros_like(r)
-        e[k, i] = h
-        size = max(abs(barrier.slope[k, i]), 1.0)
-        assert barrier.slope[k, i] == pytest.approx(
-            (value(r + e) - value(r - e)) / (2 * h), abs=1e-6 * size
-        )
-        up, down = (
-            bounds.barrier(r + e, delta, weight).slope,
-            bounds.barrier(r - e, delta, weight).slope,
-        )
-        assert_allclose((up - down)[k, i] / (2 * h), barrier.curvature[k, i], rtol=1e-4)
+    assert (middle.value, middle.slope.item()) == (0.0, 0.0)
 
 
 def test_the_largest_relative_move_is_over_observations_and_controls() -> None:
     N, nx, nu = 4, 2, 1
     observations = np.zeros((N, 1, 2, nx + nu))
     observations[2, 0, 1] = [0.0, 3.0, 1.0]  # what is shown there moves by 3 z_1 + v over its scale
-    free = Weights.constant(N, np.zeros((nx, nx)), np.zeros((nu, nu)), np.zeros((nx, nx)))
+    z, v = np.zeros((N + 1, nx)), np.zeros((N, nu))
     barrier = BarrierExpansion(
-        a=np.zeros((N + 1, nx)),
-        b=np.zeros((N, nu)),
-        weights=free,
+        a=z + 1.0,
+        b=v + 2.0,
+        weights=random_weights(np.random.default_rng(0), N, nx, nu, steps=True),
         observations=observations,
         control_scale=np.array([8.0]),
         control_step_scale=np.array([np.inf]),
     )
-    z, v = np.zeros((N + 1, nx)), np.zeros((N, nu))
-    v[0] = -2.0
-    assert barrier.largest_relative_move(TangentCurve(z=z, v=v)) == pytest.approx(
-        0.25
-    )  # the control alone
+    v[0] = -2.0  # the control alone
+    assert barrier.largest_relative_move(TangentCurve(z=z, v=v)) == pytest.approx(0.25)
     z[2], v[2] = [9.0, -0.4], 0.1
     assert barrier.largest_relative_move(TangentCurve(z=z, v=v)) == pytest.approx(1.1)
-    weights = Weights(Q=free.Q + 1.0, S=free.S + 2.0, R=free.R + 3.0, W=free.W + 4.0)
-    other = replace(barrier, a=barrier.a + 1.0, b=barrier.b + 2.0, weights=weights)
-    double = other.scaled(2.0)
-    found = [double.a, double.b, *(getattr(double.weights, name) for name in "QSRW")]
-    assert [float(array.flat[0]) for array in found] == [2.0, 4.0, 2.0, 4.0, 6.0, 8.0]
-    assert_array_equal(double.observations, observations)  # ranges, not weights
+
+    # Another weight of the barrier changes no range.
+    double = barrier.scaled(2.0)
+    assert (double.a.flat[0], double.b.flat[0]) == (2.0, 4.0)
+    for name in "QSRW":
+        assert_array_equal(getattr(double.weights, name), 2.0 * getattr(barrier.weights, name))
+    assert_array_equal(double.observations, observations)
 
 
 @pytest.mark.parametrize(
@@ -160,19 +139,21 @@ def test_models_with_the_curvature_along_their_minimum_lead_to_that_of_the_barri
     s: float, slope: float, bend: float, delta: float
 ) -> None:
     """The minimum of slope x + bend x^2 / 2 + beta(s + x) follows from a few quadratic models."""
-    slack = np.array([s])
+    slack, factors = np.array([s]), np.ones(1)
     _, first, second = relaxed_log_barrier(slack, delta)
-    factors = np.ones(1)
+    newton = -(slope + first) / (bend + second)
     for _ in range(20):
         x = -(slope + first) / (bend + factors * second)
         factors = curvature_factors(slack, x, factors, delta)
-    wanted = brentq(
-        lambda x: slope + bend * x + relaxed_log_barrier(np.array([s + x]), delta)[1][0], -2.0, 2.0
-    )
+
+    def rise(x: float) -> float:
+        return slope + bend * x + relaxed_log_barrier(slack + x, delta)[1][0]
+
+    wanted = brentq(rise, -2.0, 2.0)
     assert x[0] == pytest.approx(wanted, rel=1e-3)
-    # the curvature at the beginning leads elsewhere
-    newton = -(slope + first[0]) / (bend + second[0])
-    assert abs(newton - wanted) > 0.2 * abs(wanted)
+    assert abs(newton[0] - wanted) > 0.2 * abs(
+        wanted
+    )  # the curvature at the beginning leads elsewhere
 
 
 def test_the_curvature_along_a_step_is_that_at_its_beginning_without_a_step_or_a_bound() -> None:

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import lstsq
-from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
 
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from tests.support.numerics import Array
+
+# Segments, private unknowns of each, and common unknowns.
+SHAPES = [(4, 2, 3), (1, 3, 2), (5, 0, 3), (3, 4, 1), (6, 1, 5), (3, 2, 0)]
+FREE = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,63 +24,53 @@ class Dense:
 
     Attributes:
         condensed: Condensed form.
-        J: (rows, P n + c) derivatives by all unknowns.
+        starts: (rows, P n) derivatives by the private unknowns.
+        shared: (rows, c) derivatives by the common unknowns.
         r: (rows,) residuals.
         blocks: Rows `[private, common, r]` of every block.
-        P: Number of segments.
-        n: Number of private unknowns of a segment.
-        c: Number of common unknowns.
     """
 
     condensed: Condensed
-    J: Array
+    starts: Array
+    shared: Array
     r: Array
     blocks: list[Array]
-    P: int
-    n: int
-    c: int
 
     @property
-    def starts(self) -> Array:
-        """Columns of the private unknowns."""
-        return self.J[:, : self.P * self.n]
+    def J(self) -> Array:
+        """Derivatives by all unknowns."""
+        return np.concatenate([self.starts, self.shared], axis=1)
 
-    @property
-    def shared(self) -> Array:
-        """Columns of the common unknowns."""
-        return self.J[:, self.P * self.n :]
-
-    def step(self, damping: float = 0.0, scale: Array | None = None) -> Step:
-        """The step without bounds; all unknowns are damped alike where no scale is given."""
-        scale = np.ones(self.n + self.c) if scale is None else scale
-        free = np.full(self.c, FREE)
-        return self.condensed.step(damping, scale, -free, free)
+    def step(self, damping: float = 0.0) -> Step:
+        """The step without bounds."""
+        free = np.full(self.shared.shape[1], FREE)
+        return self.condensed.step(damping, self.condensed.column_norms, -free, free)
 
     def halves(self, step: Step) -> float:
         """Half of the squares after a step."""
-        left = self.J @ np.concatenate([step.private.ravel(), step.common]) + self.r
-        return 0.5 * float(left @ left)
+        return 0.5 * float(np.sum((self.J @ of_all(step) + self.r) ** 2))
+
+    def left_of_shared(self) -> Array:
+        """What the private unknowns cannot explain of the columns of the common ones."""
+        basis = np.linalg.svd(self.starts, full_matrices=False)[0]
+        basis = basis[:, : np.linalg.matrix_rank(self.starts / self.norms)]
+        return self.shared - basis @ (basis.T @ self.shared)
+
+    @property
+    def norms(self) -> Array:
+        """Norms of the private columns, or 1."""
+        norms = np.linalg.norm(self.starts, axis=0)
+        return np.where(norms > 0.0, norms, 1.0)
+
+
+def of_all(step: Step) -> Array:
+    """Step of the private unknowns, then of the common ones."""
+    return np.concatenate([step.private.ravel(), step.common])
 
 
 def condense(rows: Array) -> Array:
-    """(m, m) matrix with the inner products of (k, m) rows.
-
-    It is computed by singular values; the package uses the QR decomposition.
-    """
-    m = rows.shape[1]
-    _, s, V = np.linalg.svd(rows, full_matrices=True)
-    out = np.zeros((m, m))
-    out[: len(s)] = s[:, None] * V[: len(s)]
-    out[:, ~rows.any(axis=0)] = 0.0  # exactly zero, as with QR
-    return out
-
-
-def spread(rows: Array, segment: int, P: int, n: int) -> Array:
-    """(k, P n + c) of rows `[private, common]` of one segment among the columns of all unknowns."""
-    wide = np.zeros((len(rows), P * n + rows.shape[1] - n))
-    wide[:, segment * n : (segment + 1) * n] = rows[:, :n]
-    wide[:, P * n :] = rows[:, n:]
-    return wide
+    """(m, m) matrix with the inner products of (k, m) rows."""
+    return np.linalg.qr(np.concatenate([rows, np.zeros((rows.shape[1],) * 2)]), mode="r")
 
 
 def problem(
@@ -101,140 +95,107 @@ def problem(
     """
     rng = np.random.default_rng(seed)
     m = n + c + 1
-    owner = rng.permutation(np.concatenate([np.full(rng.integers(1, 4), i) for i in range(P)]))
-    units = 10.0 ** rng.uniform(-2, 2, m)
-    units[-1] = 1.0
+    owner = rng.permutation(np.repeat(np.arange(P), rng.integers(1, 4, P)))
+    units = np.append(10.0 ** rng.uniform(-2, 2, m - 1), 1.0)
     blocks = [rng.standard_normal((rng.integers(1, 9), m)) * units for _ in owner]
-    inside, outside = (
-        rng.standard_normal((P, inner, m)) * units,
-        rng.standard_normal((outer, c + 1)) * units[n:],
-    )
-    if rank_deficient and n:
-        inside[:, :, n - 1] = 0.0
-        for block in blocks:
-            block[:, n - 1] = 0.0
-    condensed = Condensed(
-        blocks=np.stack([condense(b) for b in blocks]),
-        segment_of_block=owner,
-        private_rows=inside,
-        common_rows=outside,
-    )
-    wide_rows = [spread(b[:, :-1], i, P, n) for b, i in zip(blocks, owner, strict=True)]
-    wide_rows += [spread(rows[:, :-1], i, P, n) for i, rows in enumerate(inside)]
-    J = np.concatenate([*wide_rows, np.pad(outside[:, :-1], ((0, 0), (P * n, 0)))])
-    r = np.concatenate([*(b[:, -1] for b in blocks), inside[:, :, -1].ravel(), outside[:, -1]])
-    return Dense(condensed, J, r, blocks, P, n, c)
+    inside = rng.standard_normal((P, inner, m)) * units
+    outside = rng.standard_normal((outer, c + 1)) * units[n:]
+    if rank_deficient:
+        for rows in (inside, *blocks):
+            rows[..., n - 1 : n] = 0.0
 
-
-SHAPES = [(4, 2, 3), (1, 3, 2), (5, 0, 3), (3, 4, 1), (6, 1, 5)]
-FREE = np.inf
+    parts = [
+        (outside[:, :0], -1, outside),
+        *((b[:, :n], i, b[:, n:]) for b, i in zip(blocks, owner, strict=True)),
+    ]
+    parts += [(rows[:, :n], i, rows[:, n:]) for i, rows in enumerate(inside)]
+    starts = [np.kron(np.arange(P) == i, private) for private, i, _ in parts[1:]]
+    common = np.concatenate([rows for _, _, rows in parts])
+    return Dense(
+        condensed=Condensed(
+            blocks=np.stack([condense(b) for b in blocks]),
+            segment_of_block=owner,
+            private_rows=inside,
+            common_rows=outside,
+        ),
+        starts=np.concatenate([np.zeros((outer, P * n)), *starts]),
+        shared=common[:, :-1],
+        r=common[:, -1],
+        blocks=blocks,
+    )
 
 
 def close(value: Array, expected: Array, rtol: float = 1e-7) -> None:
     """Equal up to round-off of the largest entry."""
     assert value.shape == expected.shape
-    assert_allclose(
-        value, expected, rtol=rtol, atol=rtol * max(float(np.abs(expected).max(initial=0.0)), 1e-12)
-    )
+    size = max(float(np.abs(expected).max(initial=0.0)), 1e-12)
+    assert_allclose(value, expected, rtol=rtol, atol=rtol * size)
 
 
+def assert_least(J: Array, r: Array, x: Array, lower: Array, upper: Array) -> None:
+    """The conditions of optimality of |J x + r| within bounds."""
+    slope = J.T @ (J @ x + r) / (np.abs(J).sum(axis=0) * np.linalg.norm(r))
+    assert ((x >= lower) & (x <= upper)).all()
+    assert slope[x > lower].max(initial=0.0) < 1e-8, "could go further down"
+    assert slope[x < upper].min(initial=0.0) > -1e-8, "could go further up"
+
+
+@pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
 def test_a_step_solves_the_full_stacked_problem(
-    shape: tuple[int, int, int], damping: float
+    shape: tuple[int, int, int], damping: float, bounded: bool
 ) -> None:
     """The dense problem has one further row per unknown for the damping."""
+    P, n, c = shape
     for seed in range(6):
-        dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
-        scale = np.random.default_rng(seed).uniform(0.5, 2.0, dense.n + dense.c)
-        wide = np.concatenate([np.tile(scale[: dense.n], dense.P), scale[dense.n :]])
+        dense, rng = problem(seed, *shape, inner=n + 1, outer=c + 1), np.random.default_rng(seed)
+        scale = rng.uniform(0.5, 2.0, n + c)
+        bounds = np.full((2, c), FREE)
+        if bounded:
+            best = np.abs(dense.step(damping).common)
+            bounds = best * rng.uniform(0.0, 1.5, (2, c))
+            bounds[:, :1] *= rng.integers(0, 2, (2, 1))  # at a bound already
+        step = dense.condensed.step(damping, scale, -bounds[0], bounds[1])
+        wide = np.concatenate([np.tile(scale[:n], P), scale[n:]])
         rows = np.concatenate([dense.J, np.sqrt(damping) * np.diag(wide)])
-        expected = lstsq(rows, -np.concatenate([dense.r, np.zeros(len(wide))]))[0]
-        step = dense.step(damping, scale)
-        unit = np.linalg.norm(rows, axis=0)
-        close(np.concatenate([step.private.ravel(), step.common]) * unit, expected * unit)
-        assert step.predicted_decrease == pytest.approx(
-            0.5 * float(dense.r @ dense.r) - dense.halves(step), rel=1e-8
-        )
-        assert dense.condensed.segment_count == dense.P
-        assert (dense.condensed.private_count, dense.condensed.common_count) == (dense.n, dense.c)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int]) -> None:
-    """Compare with another method of SciPy on the full problem with bounded common unknowns."""
-    active = 0
-    for seed in range(10):
-        dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
-        best = np.abs(dense.step().common)
-        rng = np.random.default_rng(seed)
-        lower, upper = (sign * best * rng.uniform(0.0, 1.5, dense.c) for sign in (-1.0, 1.0))
-        lower[0] *= dense.c == 1  # at a bound already
-        step = dense.condensed.step(0.0, np.ones(dense.n + dense.c), lower, upper)
-        assert (step.common >= lower).all()
-        assert (step.common <= upper).all()
-        unit = np.linalg.norm(dense.J, axis=0)
-        none = np.full(dense.P * dense.n, FREE)
-        wide = (np.concatenate([-none, lower]) * unit, np.concatenate([none, upper]) * unit)
-        expected = lsq_linear(
-            dense.J / unit,
-            -dense.r,
-            wide,
-            method="trf",
-            tol=1e-15,
-            lsq_solver="exact",
-            max_iter=500,
-        )
-        assert dense.halves(step) <= expected.cost * (1 + 1e-9)
-        assert_allclose(
-            step.common * unit[-dense.c :], expected.x[-dense.c :], rtol=1e-4, atol=1e-5
-        )
-        active += int(((step.common == lower) | (step.common == upper)).sum())
-    assert active > 5, "too few bounds are active for this test"
+        lower, upper = (np.concatenate([np.full(P * n, FREE), each]) for each in bounds)
+        r = np.concatenate([dense.r, np.zeros(len(wide))])
+        assert_least(rows, r, of_all(step), -lower, upper)
+        decrease = 0.5 * float(dense.r @ dense.r) - dense.halves(step)
+        assert step.predicted_decrease == pytest.approx(decrease, rel=1e-8)
 
 
 def test_many_active_bounds_satisfy_the_optimality_conditions() -> None:
     """Unknowns are strongly correlated, and most of them end at a bound."""
-    for seed in (
-        4,
-        1188,
-        1211,
-        *range(100, 140),
-    ):  # the first three take more exchanges than there are unknowns
+    # The first three take more exchanges than there are unknowns.
+    for seed in (4, 1188, 1211, *range(100, 140)):
         rng = np.random.default_rng(seed)
         c = int(rng.integers(2, 20))
         A = np.triu(rng.standard_normal((c + 1, c)))
         rng.standard_normal((c, c))
-        A = A @ (
-            np.eye(c)
-            + rng.choice([0, 1, 5]) * np.outer(rng.standard_normal(c), rng.standard_normal(c))
-        )
+        size = rng.choice([0, 1, 5])
+        A = A + size * np.outer(A @ rng.standard_normal(c), rng.standard_normal(c))
         b = rng.standard_normal(c + 1) * 10
         lower = -rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
         upper = rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
-        condensed = Condensed(
-            blocks=np.column_stack([A, -b])[None],
-            segment_of_block=np.zeros(1, int),
-            private_rows=np.zeros((1, 0, c + 1)),
-            common_rows=np.zeros((0, c + 1)),
-        )
-        d = condensed.step(0.0, np.ones(c), lower, upper).common
-        slope = A.T @ (A @ d - b) / (np.abs(A).sum(axis=0) * np.linalg.norm(b))
-        assert ((d >= lower) & (d <= upper)).all()
-        assert slope[d > lower + 1e-12].max(initial=0.0) < 1e-8, "could go further down"
-        assert slope[d < upper - 1e-12].min(initial=0.0) > -1e-8, "could go further up"
+        step = alone(np.column_stack([A, -b])[None]).step(0.0, np.ones(c), lower, upper)
+        assert_least(A, -b, step.common, lower, upper)
 
 
-def test_a_common_unknown_with_equal_bounds_stays() -> None:
-    """Both bounds are zero; the other unknowns solve the problem without its column."""
-    dense = problem(3, inner=3, outer=4)
-    lower, upper = np.array([-FREE, 0.0, -FREE]), np.array([FREE, 0.0, FREE])
-    step = dense.condensed.step(0.0, np.ones(5), lower, upper)
-    kept = np.delete(np.arange(dense.J.shape[1]), dense.P * dense.n + 1)
-    expected = lstsq(dense.J[:, kept], -dense.r)[0]
-    assert step.common[1] == 0.0
-    close(step.common[[0, 2]], expected[-2:])
-    none = np.zeros(3)
+def alone(blocks: Array) -> Condensed:
+    """Blocks of one segment without private unknowns."""
+    m = blocks.shape[2]
+    return Condensed(
+        blocks=blocks,
+        segment_of_block=np.zeros(len(blocks), int),
+        private_rows=np.zeros((1, 0, m)),
+        common_rows=np.zeros((0, m)),
+    )
+
+
+def test_common_unknowns_with_equal_bounds_stay() -> None:
+    dense, none = problem(3, inner=3, outer=4), np.zeros(3)
     still = dense.condensed.step(0.0, np.ones(5), none, none)
     close(still.private.ravel(), lstsq(dense.starts, -dense.r)[0])
     assert not still.common.any()
@@ -247,59 +208,48 @@ def test_elimination_gives_the_schur_complement(
     shape: tuple[int, int, int], rank_deficient: bool
 ) -> None:
     """Compare response, information and reduced rows with the full normal matrix."""
+    P, n, c = shape
     for seed in range(4):
         dense = problem(seed, *shape, rank_deficient=rank_deficient)
-        C, P, n, c = dense.condensed, dense.P, dense.n, dense.c
-        inverse = np.linalg.pinv(
-            dense.starts / (unit := np.maximum(np.linalg.norm(dense.starts, axis=0), 1e-30))
-        )
-        follow = -(inverse / unit[:, None]) @ dense.shared
+        C = dense.condensed
+        inverse = np.linalg.pinv(dense.starts / dense.norms) / dense.norms[:, None]
+        follow = -inverse @ dense.shared
         left = dense.shared + dense.starts @ follow
         close(C.information(), left.T @ left)
         outer = C.common_rows[:, :-1]
         close(C.information(with_common_rows=False), left.T @ left - outer.T @ outer, rtol=1e-6)
         rows = np.concatenate([C.reduced_rows(), C.common_rows])
-        rest = dense.r - dense.starts @ (inverse / unit[:, None]) @ dense.r
-        both = np.column_stack([left, rest])
+        both = np.column_stack([left, dense.r - dense.starts @ inverse @ dense.r])
         close(rows.T @ rows, both.T @ both)
-        rank = np.linalg.matrix_rank(dense.starts / unit) if n else 0
-        if rank == P * n:
+        if n and np.linalg.matrix_rank(dense.starts / dense.norms) == P * n:
             close(C.private_response, follow.reshape(P, n, c), rtol=1e-6)
 
 
 def test_column_norms_are_root_mean_squares_over_segments_for_private_unknowns() -> None:
     dense = problem(1)
-    norms = np.linalg.norm(dense.J, axis=0)
-    private = np.sqrt(np.mean(norms[: dense.P * dense.n].reshape(dense.P, dense.n) ** 2, axis=0))
-    close(dense.condensed.column_norms, np.concatenate([private, norms[dense.P * dense.n :]]))
+    squares = np.mean(np.sum(dense.starts**2, axis=0).reshape(4, 2), axis=0)
+    shared = np.linalg.norm(dense.shared, axis=0)
+    close(dense.condensed.column_norms, np.concatenate([np.sqrt(squares), shared]))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_scores_and_information_of_blocks_sum_to_the_whole(
-    shape: tuple[int, int, int],
-) -> None:
+def test_scores_and_information_of_blocks_sum_to_the_whole(shape: tuple[int, int, int]) -> None:
     """Each block is compared with its rows, and the sum with the full problem including priors."""
+    n, c = shape[1:]
     for seed in range(4):
-        dense = problem(seed, *shape, inner=shape[1] + 1)
-        C, n = dense.condensed, dense.n
-        for b, rows in enumerate(dense.blocks):
-            J = rows[:, n:-1] + rows[:, :n] @ C.private_response[C.segment_of_block[b]]
-            for found, wanted in (
-                (C.block_scores, J.T @ rows[:, -1]),
-                (C.block_information, J.T @ J),
-            ):
-                size = np.abs(found).max()
-                assert_allclose(found[b], wanted, rtol=1e-7, atol=1e-9 * size)
-        known = np.concatenate([C.reduced_private_rows.reshape(-1, dense.c + 1), C.common_rows])
-        gradient = C.block_scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
-        basis = np.linalg.qr(dense.starts)[0]
-        expected = (dense.shared - basis @ (basis.T @ dense.shared)).T @ dense.r
-        close(gradient, expected, rtol=1e-6)
-        close(
-            C.block_information.sum(axis=0) + known[:, :-1].T @ known[:, :-1],
-            C.information(),
-            rtol=1e-6,
-        )
+        dense = problem(seed, *shape, inner=n + 1)
+        C = dense.condensed
+        J = [
+            rows[:, n:-1] + rows[:, :n] @ C.private_response[i]
+            for rows, i in zip(dense.blocks, C.segment_of_block, strict=True)
+        ]
+        pairs = list(zip(J, dense.blocks, strict=True))
+        close(C.block_scores, np.array([j.T @ rows[:, -1] for j, rows in pairs]), rtol=1e-6)
+        close(C.block_information, np.array([j.T @ j for j in J]))
+        known = np.concatenate([C.reduced_private_rows.reshape(-1, c + 1), C.common_rows])
+        A, left = known[:, :-1], dense.left_of_shared()
+        close(C.block_scores.sum(axis=0) + A.T @ known[:, -1], left.T @ dense.r, rtol=1e-6)
+        close(C.block_information.sum(axis=0) + A.T @ A, C.information(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-6])
@@ -307,91 +257,67 @@ def test_undetermined_private_unknowns_do_not_break_the_step(damping: float) -> 
     """No row depends on one private unknown, and one segment has fewer rows than unknowns."""
     for seed in range(5):
         dense = problem(seed, P=3, n=3, c=2, inner=0, outer=3, rank_deficient=True)
-        scale = np.maximum(dense.condensed.column_norms, 0.0)
-        step = dense.step(damping, scale)
-        assert np.isfinite(step.private).all()
-        assert np.abs(step.private[:, 2]).max() == 0.0
-        best = lstsq(dense.J, -dense.r)[0]
-        least = 0.5 * float(np.sum((dense.J @ best + dense.r) ** 2))
+        step = dense.step(damping)
+        assert not step.private[:, 2].any()
+        least = 0.5 * float(np.sum((dense.J @ lstsq(dense.J, -dense.r)[0] + dense.r) ** 2))
         assert dense.halves(step) == pytest.approx(least, rel=1e-4, abs=1e-4)
         assert np.isfinite(dense.condensed.information()).all()
-
-
-def test_a_problem_without_common_unknowns() -> None:
-    """Every segment is solved separately."""
-    dense = problem(2, P=3, n=2, c=0, inner=2, outer=0)
-    step = dense.step()
-    close(step.private.ravel(), lstsq(dense.J, -dense.r)[0])
-    assert step.common_length == 0.0
-    assert dense.condensed.information().shape == (0, 0)
-    assert dense.condensed.block_scores.shape == (len(dense.blocks), 0)
 
 
 def test_step_lengths_are_standard_deviations() -> None:
     """Common steps use the marginal information, private ones that at constant theta."""
     dense = problem(4, inner=3)
     step = dense.step()
-    basis = np.linalg.qr(dense.starts)[0]
-    left = dense.shared - basis @ (basis.T @ dense.shared)
-    assert step.common_length == pytest.approx(float(np.linalg.norm(left @ step.common)), rel=1e-8)
-    squares = np.linalg.norm(dense.starts @ step.private.ravel()) ** 2
-    assert step.private_length == pytest.approx(np.sqrt(squares / step.private.size), rel=1e-8)
+    length = float(np.linalg.norm(dense.left_of_shared() @ step.common))
+    assert step.common_length == pytest.approx(length, rel=1e-8)
+    private = np.linalg.norm(dense.starts @ step.private.ravel())
+    assert step.private_length == pytest.approx(private / np.sqrt(step.private.size), rel=1e-8)
 
 
 def test_units_of_the_unknowns_do_not_matter() -> None:
     """Columns ten orders of magnitude apart give equal steps in these units."""
-    dense = problem(9, inner=3, outer=4)
+    C = problem(9, inner=3, outer=4).condensed
     unit = np.array([1e6, 1e-4, 1e-5, 1.0, 1e5, 1.0])
-    C = dense.condensed
-    other = Condensed(
+    shared = unit[2:-1]
+    other = replace(
+        C,
         blocks=C.blocks * unit,
-        segment_of_block=C.segment_of_block,
         private_rows=C.private_rows * unit,
         common_rows=C.common_rows * unit[2:],
     )
     for lower in (-FREE, -0.01):
         bound = np.full(3, lower)
         one = C.step(1e-4, C.column_norms, bound, -bound)
-        two = other.step(1e-4, other.column_norms, bound / unit[2:-1], -bound / unit[2:-1])
-        close(two.common * unit[2:-1], one.common, rtol=1e-6)
+        two = other.step(1e-4, other.column_norms, bound / shared, -bound / shared)
+        close(two.common * shared, one.common, rtol=1e-6)
         close(two.private * unit[:2], one.private, rtol=1e-6)
         assert two.common_length == pytest.approx(one.common_length, rel=1e-6)
-    close(other.information(), C.information() * np.outer(unit[2:-1], unit[2:-1]), rtol=1e-6)
+    close(other.information(), C.information() * np.outer(shared, shared), rtol=1e-6)
 
 
 def gradients_after(condensed: Condensed, common: Array) -> Array:
     """(P, c) gradients of half of the squares of each segment after a step, without common rows."""
-    rows = condensed.reduced_rows()
-    J, residual = rows[:, :-1], rows[:, :-1] @ common + rows[:, -1]
-    each = (J * residual[:, None]).reshape(condensed.segment_count, -1, J.shape[1])
-    return np.asarray(each.sum(axis=1))
+    rows = condensed.reduced_rows().reshape(condensed.segment_count, -1, len(common) + 1)
+    J = rows[..., :-1]
+    return np.asarray(np.einsum("pkc,pk->pc", J, J @ common + rows[..., -1]))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_the_linearisation_after_a_step_has_its_residuals(shape: tuple[int, int, int]) -> None:
     """Residuals are those of the dense rows, and gradients those of the reduced ones."""
     dense = problem(2, *shape, inner=shape[1] + 1)
-    C, n = dense.condensed, dense.n
-    step = dense.step(1e-3, C.column_norms)
+    C = dense.condensed
+    step = dense.step(1e-3)
     moved = C.after(step)
 
     # Squares of all rows at the end of the step.
-    private = moved.triangles[..., -1]
-    squares = float(np.sum(private**2)) + float(np.sum(moved.common_rows[:, -1] ** 2))
+    squares = np.sum(moved.triangles[..., -1] ** 2) + np.sum(moved.common_rows[:, -1] ** 2)
     assert 0.5 * squares == pytest.approx(dense.halves(step), rel=1e-9)
     close(moved.information(), C.information())
 
     # The private unknowns follow, so that only the step of the common ones counts.
-    before = gradients_after(C, step.common)
-    after = gradients_after(moved, np.zeros(dense.c))
-    scale = np.abs(before).max(initial=1e-300)
-    assert_allclose(after, before, rtol=1e-6, atol=1e-7 * scale)
-    scores = np.zeros((dense.P, dense.c))
-    np.add.at(scores, moved.segment_of_block, moved.block_scores)
-    if not n:
-        of_private = moved.reduced_private_rows
-        scores += np.einsum("pkc,pk->pc", of_private[..., :-1], of_private[..., -1])
-        assert_allclose(after, scores, rtol=1e-6, atol=1e-7 * scale)
+    after = gradients_after(moved, 0.0 * step.common)
+    close(after, gradients_after(C, step.common), rtol=1e-6)
 
 
 def test_without_some_blocks_and_segments_the_rows_of_the_others_count() -> None:
@@ -400,54 +326,33 @@ def test_without_some_blocks_and_segments_the_rows_of_the_others_count() -> None
     left_out[[1, 3]] = True
     step = replace(dense, condensed=dense.condensed.without_blocks(left_out)).step()
 
-    # Zero rows in place of the blocks that are left out.
-    first = np.cumsum([0, *(len(block) for block in dense.blocks)])
-    kept = np.ones(len(dense.J), dtype=bool)
-    for block in np.flatnonzero(left_out):
-        kept[first[block] : first[block + 1]] = False
+    # Two common rows, the rows of the blocks, and the private rows.
+    sizes = [len(block) for block in dense.blocks]
+    of_blocks = np.repeat(~left_out, sizes)
+    kept = np.concatenate([[True] * 2, of_blocks, [True] * 4])
     exact = lstsq(dense.J[kept], -dense.r[kept])[0]
-    assert_allclose(step.common, exact[dense.P * dense.n :], rtol=1e-7)
+    assert_allclose(step.common, exact[-3:], rtol=1e-7)
 
-    some = np.array([2, 0])
-    part = dense.condensed.of_segments(some)
+    part = dense.condensed.of_segments(np.array([2, 0]))
     assert part.segment_count == 2
-    assert_allclose(
-        np.abs(part.triangles[0]), np.abs(dense.condensed.triangles[2]), rtol=1e-9, atol=1e-9
-    )
-
-
-def test_private_unknowns_follow_a_given_step_of_the_common_ones() -> None:
-    dense = problem(6)
-    common = np.random.default_rng(0).standard_normal(dense.c) / dense.condensed.column_norms[2:]
-    private = dense.condensed.step_to(common, 0.0, dense.condensed.column_norms).private
-    exact = lstsq(dense.starts, -(dense.r + dense.shared @ common))[0]
-    assert_allclose(private.ravel(), exact, rtol=1e-6)
+    of_third = np.abs(dense.condensed.triangles[2])
+    assert_allclose(np.abs(part.triangles[0]), of_third, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
 def test_the_true_deviation_is_that_of_autocorrelated_residuals(correlation: float) -> None:
     """Residuals of a first-order autoregressive process, and two smooth regressors."""
-    rng = np.random.default_rng(1)
     count, rows = 400, 20
-    e = rng.standard_normal(count * rows)
-    for k in range(1, len(e)):
-        e[k] = correlation * e[k - 1] + np.sqrt(1.0 - correlation**2) * e[k]
-    t = np.linspace(0.0, 1.0, len(e))
-    J = np.column_stack([np.ones_like(t), t])
+    white = np.random.default_rng(1).standard_normal(count * rows)
+    e = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white)
+    J = np.column_stack([np.ones(len(e)), np.linspace(0.0, 1.0, len(e))])
     r = e - J @ lstsq(J, e)[0]
-    blocks = np.stack(
-        [condense(np.column_stack([J, r])[i : i + rows]) for i in range(0, len(t), rows)]
-    )
-    found = Condensed(
-        blocks=blocks,
-        segment_of_block=np.zeros(count, dtype=int),
-        private_rows=np.zeros((1, 0, 3)),
-        common_rows=np.zeros((0, 3)),
-    ).true_deviation
+    blocks = np.column_stack([J, r]).reshape(count, rows, 3)
 
     # The variance of a mean is (1 + rho) / (1 - rho) times that of white noise.
     expected = np.sqrt((1.0 + correlation) / (1.0 - correlation))
-    assert found == pytest.approx(expected if correlation else 1.0, rel=0.25)
+    found = alone(np.stack([condense(block) for block in blocks])).true_deviation
+    assert found == pytest.approx(expected, rel=0.25)
 
 
 @pytest.mark.parametrize("columns", [3, 40, 200])

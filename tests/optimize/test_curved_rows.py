@@ -40,23 +40,20 @@ def test_over_straight_rows_it_is_the_linear_step() -> None:
 
 
 def test_over_a_barrier_it_is_the_minimum_inside() -> None:
-    rng = np.random.default_rng(1)
-    pull = np.array([[60.0, 0.0, 0.0, 120.0]])
+    pull = np.array([60.0, 0.0, 0.0, 120.0])
 
     def curved(step: Array) -> Array | None:
         """Logarithms of the distances from the region's end, where each step is -1."""
         if (step <= -1.0).any():
             return None
         barrier = np.column_stack([np.diag(1.0 / (1.0 + step)), np.log(1.0 + step)])
-        straight = np.append(pull[0, :-1], pull[0, :-1] @ step + pull[0, -1])
+        straight = np.append(pull[:-1], pull[:-1] @ step + pull[-1])
         return np.concatenate([barrier, straight[None]])
 
-    begin = curved(np.zeros(COUNT))
-    assert begin is not None
-    condensed = linearisation(rng, begin)
-    scale, infinite = condensed.column_norms, np.full(COUNT, np.inf)
+    zero, infinite = np.zeros(COUNT), np.full(COUNT, np.inf)
+    condensed = linearisation(np.random.default_rng(1), curved(zero))
+    scale, data = condensed.column_norms, condensed.reduced_rows()
     found = step_over_curved_rows(condensed, curved, 0.0, scale, -infinite, infinite)
-    data = condensed.reduced_rows()
 
     def cost(step: Array) -> float:
         rows = curved(step)
@@ -65,13 +62,12 @@ def test_over_a_barrier_it_is_the_minimum_inside() -> None:
         residual = data[:, :-1] @ step + data[:, -1]
         return 0.5 * float(residual @ residual + rows[:, -1] @ rows[:, -1])
 
-    best = scipy.optimize.minimize(
-        cost, np.zeros(COUNT), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}
-    )
+    sharp = {"xatol": 1e-9, "fatol": 1e-12}
+    best = scipy.optimize.minimize(cost, zero, method="Nelder-Mead", options=sharp)
     assert -1.0 < found.common[0] < -0.99
     assert cost(found.common) <= best.fun * (1.0 + 1e-5)
-    of_private = condensed.step_to(np.zeros(COUNT), 0.0, scale).predicted_decrease
-    decrease = cost(np.zeros(COUNT)) - cost(found.common) + of_private
+    of_private = condensed.step_to(zero, 0.0, scale).predicted_decrease
+    decrease = cost(zero) - cost(found.common) + of_private
     assert np.isclose(found.predicted_decrease, decrease, rtol=1e-6)
 
     # The linear step leaves the region.

@@ -32,14 +32,13 @@ def test_the_product_is_that_with_the_dense_bfgs_matrix(count: int) -> None:
     for step, change, _ in pairs:
         H = updated(H, step.reshape(-1), change.reshape(-1))
 
-    def initial(g: np.ndarray) -> np.ndarray:
-        return np.asarray((g.reshape(-1, 6) @ start).reshape(g.shape))
-
     many = rng.normal(size=(5, *SHAPE))
     expected = (many.reshape(5, -1) @ H).reshape(many.shape)
-    np.testing.assert_allclose(inverse_hessian_product(many, pairs, initial), expected, rtol=1e-9)
-    for g, product in zip(many, expected, strict=True):
-        np.testing.assert_allclose(inverse_hessian_product(g, pairs, initial), product, rtol=1e-9)
+    for g, product in ((many, expected), (many[0], expected[0])):
+        found = inverse_hessian_product(
+            g, pairs, lambda rows: (rows.reshape(-1, 6) @ start).reshape(rows.shape)
+        )
+        np.testing.assert_allclose(found, product, rtol=1e-9)
 
 
 def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:

@@ -5,6 +5,7 @@ A line through points with outliers has an equal optimum, and weights follow fro
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -32,10 +33,10 @@ def residuals(x: Array, y: Array) -> Array:
     return np.asarray(x[0] + x[1] * T - y)
 
 
-def reweighted(loss: RobustLoss, y: Array, iterations: int = 2000) -> Array:
+def reweighted(loss: RobustLoss, y: Array) -> Array:
     """The line that iteratively reweighted least squares finds."""
     A, x = np.column_stack([np.ones_like(T), T]), np.zeros(2)
-    for _ in range(iterations):
+    for _ in range(2000):
         w = loss.weight(residuals(x, y))
         x = x - np.linalg.lstsq(A * w[:, None], residuals(x, y) * w)[0]
     return np.asarray(x)
@@ -47,14 +48,11 @@ def test_the_optimum_agrees_with_scipy(kind: Kind, scale: float) -> None:
     """The value at the optimum agrees as well."""
     loss, y = RobustLoss(kind=kind, scale=scale), points(0)
     x = reweighted(loss, y)
-    wanted = least_squares(
-        residuals, x, args=(y,), loss=kind, f_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-13
-    )
+    of_scipy = partial(least_squares, residuals, args=(y,), loss=kind, f_scale=scale)
+    wanted = of_scipy(x, xtol=1e-15, ftol=1e-15, gtol=1e-13)
     np.testing.assert_allclose(x, wanted.x, rtol=1e-6)
-    assert 0.5 * loss.value(residuals(wanted.x, y)) == pytest.approx(wanted.cost, rel=1e-12)
-    far = np.array([5.0, -9.0])
-    one = least_squares(residuals, far, args=(y,), loss=kind, f_scale=scale, max_nfev=1)
-    assert 0.5 * loss.value(residuals(one.x, y)) == pytest.approx(one.cost, rel=1e-12)
+    for found in (wanted, of_scipy([5.0, -9.0], max_nfev=1)):
+        assert 0.5 * loss.value(residuals(found.x, y)) == pytest.approx(found.cost, rel=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -74,14 +72,9 @@ def test_the_weight_follows_from_the_value(kind: Kind) -> None:
     np.testing.assert_array_equal(loss.weight(np.zeros(3)), 1.0)
 
 
-def test_outliers_count_less_than_small_residuals() -> None:
-    """All losses equal the square near zero; far away, their order is that of SciPy."""
-    small, large = np.full(5, 1e-4), np.full(5, 1e3)
+def test_losses_equal_the_square_near_zero_and_huber_to_its_scale() -> None:
     for kind in KINDS:
-        assert RobustLoss(kind=kind).value(small) == pytest.approx(5e-8, rel=1e-6)
-    values = [RobustLoss(kind=kind).value(large) for kind in KINDS]
-    assert values == sorted(values, reverse=True)
-    assert values[1] == pytest.approx(5 * 9 * (2 * 1e3 / 3 - 1), rel=1e-12)
+        assert RobustLoss(kind=kind).value(np.full(5, 1e-4)) == pytest.approx(5e-8, rel=1e-6)
     huber = RobustLoss(kind="huber", scale=3.0)
     np.testing.assert_array_equal(huber.weight(np.array([-3.0, 0.0, 2.9, 3.0])), 1.0)
     assert huber.weight(np.array([3.3]))[0] < 1.0
@@ -97,21 +90,3 @@ def test_the_mean_square_of_inliers(scale: float) -> None:
         assert loss.inlier_mean_square == pytest.approx(
             float(np.mean(r[np.abs(r) <= loss.outlier_threshold] ** 2)), rel=5e-3
         )
-
-
-def test_outliers_hardly_move_a_robust_line() -> None:
-    """The ordinary fit is biased in the mean over many draws.
-
-    Robust fits stay within a few standard deviations.
-    """
-    found = {
-        kind: np.array(
-            [reweighted(RobustLoss(kind=kind, scale=1.5), points(seed), 40) for seed in range(30)]
-        )
-        for kind in KINDS
-    }
-    off = {kind: abs(float(x[:, 0].mean()) - 2.0) for kind, x in found.items()}
-    assert off["linear"] > 1.0
-    assert off["huber"] < 0.5 * off["linear"]
-    assert off["soft_l1"] < 0.5 * off["linear"]
-    assert off["cauchy"] < 0.1 * off["linear"]

@@ -14,6 +14,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -189,16 +190,13 @@ def test_a_cluster_without_workers_is_an_error_when_the_time_is_over(
     monkeypatch.setattr(dispatch, "GRACE", 0.05)
     monkeypatch.setattr(dispatch, "LONGEST_OVERTIME", 0.05)
     monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.02)
-
-    class Idle(FakeDaskExecutor):
-        """A cluster on which nothing begins."""
-
-        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-            return Future()
-
     monkeypatch.setattr(FakeClient, "nthreads", lambda self: {})
+
+    # Nothing begins on this cluster.
+    idle = FakeDaskExecutor(FakeClient())
+    idle.submit = lambda *_, **__: Future()
     with pytest.raises(ExperimentError, match="had no workers"):
-        list(carry_out(Idle(FakeClient()), square, range(2), Budget(seconds=0.0)))
+        list(carry_out(idle, square, range(2), Budget(seconds=0.0)))
 
 
 def test_without_time_the_first_order_is_carried_out_and_the_rest_is_left_out() -> None:
@@ -221,14 +219,11 @@ def test_a_function_that_cannot_be_sent_is_explained() -> None:
 
 
 def test_a_task_that_is_refused_while_it_is_submitted_is_explained_as_well() -> None:
-    class Refusing(FakeExecutor):
-        """Pickles a task while it is submitted, as Dask does."""
-
-        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-            raise TypeError("cannot pickle '_thread.lock' object")
-
+    """Dask pickles a task while it is submitted."""
+    refusing = FakeExecutor()
+    refusing.submit = Mock(side_effect=TypeError("cannot pickle '_thread.lock' object"))
     with pytest.raises(ExperimentError, match="at the top of a module"):
-        squares(Refusing())
+        squares(refusing)
 
 
 def test_the_number_of_workers_is_stated_or_found() -> None:
@@ -247,8 +242,7 @@ def test_the_number_of_workers_is_stated_or_found() -> None:
     assert math.isinf(Workers(unknown).window)
 
     workers = Workers(unknown)
-    assert Workers.of(workers) is workers
-    assert Workers.of_any(workers) is workers
+    assert Workers.of(workers) is Workers.of_any(workers) is workers
     assert Workers.of_any(None) is None
     with pytest.raises(ExperimentError, match="wrapped already"):
         Workers(workers, threads=2)

@@ -20,16 +20,10 @@ from tests.support.paths import ROOT
 
 
 @pytest.fixture
-def sentences() -> list[str]:
-    """What the user was told."""
-    return []
-
-
-@pytest.fixture
-def interruption(sentences: list[str]) -> Iterator[Interruption]:
+def interruption() -> Iterator[Interruption]:
     """A handler in force."""
     before = [signal.getsignal(number) for number in module.SIGNALS]
-    with Interruption(sentences.append) as handler:
+    with Interruption(lambda _: None) as handler:
         yield handler
     assert [signal.getsignal(number) for number in module.SIGNALS] == before
 
@@ -76,7 +70,7 @@ def test_signals_that_were_ignored_stay_so_but_for_sigterm(
     ignored: tuple[str, ...], other: Callable[..., None] | signal.Handlers
 ) -> None:
     """A shell ignores SIGINT in a background job, and `nohup` ignores SIGHUP."""
-    before = {number: signal.getsignal(number) for number in module.SIGNALS}
+    before = [signal.getsignal(number) for number in module.SIGNALS]
     try:
         for number in module.SIGNALS:
             signal.signal(number, signal.SIG_IGN if number.name in ignored else other)
@@ -86,7 +80,7 @@ def test_signals_that_were_ignored_stay_so_but_for_sigterm(
                 assert token.requested is (number.name in HEARD[ignored])
             assert handler.presses == int(token.requested)
     finally:
-        for number, handled in before.items():
+        for number, handled in zip(module.SIGNALS, before, strict=True):
             signal.signal(number, handled)
 
 
@@ -159,22 +153,21 @@ def pressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     sys.modules.pop(name, None)
 
 
-@pytest.mark.parametrize("begin", ["computing", "keep"])
+@pytest.mark.parametrize(
+    "begin",
+    [Interruption.keep, lambda interruption: interruption.computing(StopToken()).__enter__()],
+    ids=["keep", "computing"],
+)
 def test_no_work_begins_after_a_press_during_an_import(
-    interruption: Interruption, pressed: str, begin: str
+    interruption: Interruption, pressed: str, begin: Callable[[Interruption], None]
 ) -> None:
     """Short work would end before the error comes, with a result that was asked to stop."""
     importlib.import_module(pressed)
     with pytest.raises(InterruptedByUserError):
-        interruption.keep() if begin == "keep" else _compute(interruption)
+        begin(interruption)
 
     assert sys.modules[pressed].IS_COMPLETE
     assert interruption.presses == 1
-
-
-def _compute(interruption: Interruption) -> None:
-    with interruption.computing(StopToken()):
-        pytest.fail("the computation has begun")
 
 
 def test_no_figure_begins_some_seconds_after_a_press(
@@ -218,17 +211,21 @@ with interruption.Interruption(lambda text: print(text, flush=True)) as handler:
 
 
 def test_two_presses_end_work_that_does_not_return() -> None:
+    assert_ended(ROOT, DEAF, said=[module.FIRST_SENTENCE, module.LAST_SENTENCE])
+
+
+def assert_ended(folder: Path, *words: str, said: list[str]) -> None:
+    """A program in a new process is interrupted after these sentences."""
     ended = subprocess.run(
-        [sys.executable, "-c", DEAF],
+        [sys.executable, "-c", *words],
         capture_output=True,
         text=True,
-        cwd=ROOT,
-        check=False,
-        timeout=30.0,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])},
+        timeout=60.0,
     )
-    assert ended.returncode == module.INTERRUPTED_CODE, ended.stderr
-    assert ended.stdout.splitlines() == [module.FIRST_SENTENCE, module.LAST_SENTENCE]
-    assert not ended.stderr
+    assert (ended.returncode, ended.stderr) == (module.INTERRUPTED_CODE, "")
+    assert ended.stdout.splitlines() == said
 
 
 # A program whose work lets threads run, but calls no handler of Python until it ends after minutes,
@@ -278,15 +275,5 @@ def test_code_that_calls_no_handler_is_ended(
     where: str, presses: int, said: list[str], tmp_path: Path
 ) -> None:
     (tmp_path / "pressed.py").write_text(PRESSED.replace("SIGINT", "SIGTERM"))
-    ended = subprocess.run(
-        [sys.executable, "-c", IN_C, where, str(presses)],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
-        check=False,
-        timeout=60.0,
-    )
-    assert (ended.returncode, ended.stderr) == (module.INTERRUPTED_CODE, "")
-    assert ended.stdout.splitlines() == said
+    assert_ended(tmp_path, IN_C, where, str(presses), said=said)
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".csv"] == []

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError
-from mjfim.parallel import workers as stated_workers
 from mjfim.parallel.workers import StatedExecutor
 
 FACTORY = """
@@ -138,13 +137,4 @@ def test_missing_certificates_are_explained(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "distributed.comm", comm)
     place = StatedExecutor.parse("dask:tls://host:8786")
     with pytest.raises(ExperimentError, match=r"distributed\.comm\.tls"), place.started():
-        pass
-
-
-@pytest.mark.slow
-def test_an_address_at_which_nobody_answers_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(stated_workers, "CONNECTION_SECONDS", 0.5)
-    place = StatedExecutor.parse("dask://127.0.0.1:9")
-    with pytest.raises(ExperimentError, match="no scheduler answers there"), place.started():
         pass

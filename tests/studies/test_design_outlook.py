@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -69,10 +71,8 @@ def walled(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_check_refuses_what_a_design_refuses_in_the_same_words(name: str, tmp_path: Path) -> None:
     tables, fragment = REFUSED[name]
     task = stiff_arm_task(tmp_path, amplitude=1e-3, **tables)
-    with pytest.raises(MjfimError) as error:
+    with pytest.raises(MjfimError, match=re.escape(fragment)) as error:
         design_task(task)
-    assert fragment in str(error.value)
-
     found = check_task(task)
     assert str(error.value) in found.refused
     assert not found.verdict.ok
@@ -105,8 +105,7 @@ def test_parameters_that_do_the_same_are_named_by_both(tmp_path: Path) -> None:
     )
     found, design = check_task(task), design_task(task)
     assert not found.refused
-    assert not found.verdict.ok
-    assert not design.verdict.ok
+    assert not found.verdict.ok and not design.verdict.ok
     assert any("a and b" in text for text in design.combinations)
     for text in design.combinations:
         assert any(text in sentence for sentence in found.findings)
@@ -127,10 +126,7 @@ def test_a_check_says_which_limits_the_start_violates_and_when(tmp_path: Path) -
 def test_a_motion_without_a_regulator_fails_the_self_test_without_a_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def unstable(*_: object) -> float:
-        raise np.linalg.LinAlgError("the Riccati recursion lost positive definiteness")
-
-    monkeypatch.setattr(study_check, "slope_error", unstable)
+    monkeypatch.setattr(study_check, "slope_error", Mock(side_effect=np.linalg.LinAlgError))
     found = check_task(stiff_arm_task(tmp_path, amplitude=1e-3))
     assert np.isinf(found.self_test.slope)
     assert not found.self_test.passed

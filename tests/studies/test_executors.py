@@ -39,11 +39,9 @@ def started(kind: str) -> AbstractContextManager[Any]:
     return ThreadPoolExecutor(2) if kind == "threads" else processes(kind)
 
 
-def kill_one_worker(workers: Workers) -> None:
-    """End a worker process as the system does where the memory is full."""
-    for future in [workers.submit(os.getpid) for _ in range(4)]:
-        process = future.result()
-    os.kill(process, signal.SIGKILL)
+def some_process(workers: Workers) -> int:
+    """Start all workers; returns the number of one process."""
+    return [future.result() for future in [workers.submit(os.getpid) for _ in range(4)]][-1]
 
 
 def numbers(design: Design) -> list[Any]:
@@ -96,8 +94,7 @@ def test_all_executors_behave_alike(
         workers = Workers.of(executor)
         # Processes in another folder do not find the files of a relative path. Recordings are sent,
         # or found as files.
-        for future in [workers.submit(os.getpid) for _ in range(4)]:
-            future.result()
+        some_process(workers)
         monkeypatch.chdir(MODELS)
         monkeypatch.setattr(monte_carlo, "MIN_CHUNK", 2)
         monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 2000)
@@ -105,12 +102,12 @@ def test_all_executors_behave_alike(
             monkeypatch.setattr(fit_workers, "MIN_FILE_BYTES", 0)
         assert fitted(Path("cart_pendulum.toml"), executor=workers) == estimated
 
-        seen: list[DesignEvent] = []
+        seen = []
 
         def kill(event: DesignEvent) -> None:
-            """Kill a worker at the first iterate."""
+            """End a worker at the first iterate, as the system does where the memory is full."""
             if not seen and kind != "threads":
-                kill_one_worker(workers)
+                os.kill(some_process(workers), signal.SIGKILL)
             seen.append(event)
 
         # A killed worker does not change the result.
@@ -121,7 +118,7 @@ def test_all_executors_behave_alike(
         # A request to stop ends the design soon with its best result so far.
         long = limited_task(tmp_path, starts=40, max_iterations=10_000)
         stop = StopToken()
-        asked: list[float] = []
+        asked = []
 
         def ask(event: DesignEvent) -> None:
             """Ask for the end after some iterates."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
@@ -88,26 +89,20 @@ def with_whole_links(stated: mjfim.Experiment) -> mjfim.Experiment:
     return stated.restated({**values, "parameters": {**parameters, **links}})
 
 
-def inside(found: mjfim.Estimate) -> dict[str, bool]:
-    """Whether the true values of the load are inside the intervals, by field."""
-    payload = found.payload
-    assert payload is not None
-    intervals = [payload.mass_interval, *payload.centre_interval]
-    return {
-        field: bool(low <= LOAD[field] <= high)
-        for field, (low, high) in zip(LOAD, intervals, strict=True)
-    }
+def inside(found: mjfim.Estimate) -> Array:
+    """Whether the true values of the load, in the order of `LOAD`, are inside the intervals."""
+    intervals = np.array([found.payload.mass_interval, *found.payload.centre_interval])
+    true = np.array(list(LOAD.values()))
+    return (intervals[:, 0] <= true) & (true <= intervals[:, 1])
 
 
 def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Path) -> None:
     robot = experiment(tmp_path)
     system = System.resolve(robot)
     covariance = np.array([[4e-4, 1e-4, -4e-6], [1e-4, 9e-4, 6e-6], [-4e-6, 6e-6, 1e-6]])
-    std = np.sqrt(np.diag(covariance))
-    theta = np.array(list(ROBOT.values()))
-    estimate = bare_estimate(system.parameters.names, theta, std, covariance=covariance)
-    task = PayloadTask.of(robot, body="hand", robot=estimate)
-    parameters = task.system().parameters
+    std, theta = np.sqrt(np.diag(covariance)), np.array([*ROBOT.values()])
+    estimate = bare_estimate(ROBOT, theta, std, covariance=covariance)
+    parameters = PayloadTask.of(robot, body="hand", robot=estimate).system().parameters
     index = [parameters.names.index(name) for name in ROBOT]
     information = parameters.prior_information[np.ix_(index, index)]
     expected = np.linalg.inv(honest_covariance(system.parameters, estimate))
@@ -115,27 +110,23 @@ def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Pa
     np.testing.assert_array_equal(parameters.guess[index], theta)
 
     # A parameter that the estimate does not determine is held.
-    unknown = replace(
-        estimate,
-        std=np.array([np.inf, *std[1:]]),
-        std_sandwich=np.zeros(0),
-        interval=np.zeros((0, 2)),
-    )
+    unknown = replace(estimate, std=np.array([np.inf, *std[1:]]))
     held = PayloadTask.of(robot, body="hand", robot=unknown).known_robot()
     assert held.held == ("pitch_damping",)
     assert held.known == ("roll_damping", "hand_mass")
 
     # An estimate of another robot, and bodies that cannot carry a load.
     other = replace(estimate, parameters=("pitch_damping", "roll_damping", "mass"))
-    with pytest.raises(ExperimentError, match=r"lacks the robot's hand_mass of arm.toml"):
-        PayloadTask.of(robot, body="hand", robot=other)
-    for body, words in (("hnad", "did you mean 'hand'"), ("world", "move"), ("stand", "move")):
-        with pytest.raises(ExperimentError, match=f"^body: .*{words}"):
-            PayloadTask.of(robot, body=body)
-    with pytest.raises(ExperimentError, match=r"valid: upper, hand$"):
-        PayloadTask.of(robot)
-    with pytest.raises(ExperimentError, match=r"^size: -1"):
-        PayloadTask.of(robot, body="hand", size=-1.0)
+    for options, message in (
+        ({"body": "hand", "robot": other}, "lacks the robot's hand_mass of arm.toml"),
+        ({"body": "hnad"}, "^body: .*did you mean 'hand'"),
+        ({"body": "world"}, "^body: .*move"),
+        ({"body": "stand"}, "^body: .*move"),
+        ({}, "valid: upper, hand$"),
+        ({"body": "hand", "size": -1.0}, "^size: -1"),
+    ):
+        with pytest.raises(ExperimentError, match=message):
+            PayloadTask.of(robot, **options)
 
 
 def test_a_payload_that_the_experiment_states_is_left_out_of_the_robot(tmp_path: Path) -> None:
@@ -154,17 +145,15 @@ def test_a_payload_that_the_experiment_states_is_left_out_of_the_robot(tmp_path:
 
 
 def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Path) -> None:
-    stated = experiment(tmp_path)
-    values = stated.model_dump(exclude_unset=True)
+    values = experiment(tmp_path).model_dump(exclude_unset=True)
     values["parameters"] = {"hand": {"inertial": "hand"}}
-    whole = stated.restated(values)
+    whole = experiment(tmp_path).restated(values)
     system = System.resolve(whole)
     names, theta = system.parameters.names, system.parameters.guess
     tables = RobotExperiment.of(whole).known(dict(zip(names, theta, strict=True)))
     again = System.resolve(whole.restated({**values, "parameters": tables}))
     assert again.parameters.names == names
-    moved = theta + 0.1 * system.parameters.magnitude
-    for vector in (theta, moved):
+    for vector in (theta, theta + 0.1 * system.parameters.magnitude):
         expected, found = system.model_at(vector), again.model_at(vector)
         np.testing.assert_allclose(found.body_mass, expected.body_mass, rtol=1e-12)
         np.testing.assert_allclose(found.body_inertia, expected.body_inertia, rtol=1e-9)
@@ -177,12 +166,11 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     parameters = system.parameters
     cad = CadPrior.of(parameters)
     assert len(cad.bodies) == 2
-    guess = parameters.guess
-    row = np.random.default_rng(1).standard_normal(len(parameters)) / parameters.magnitude
     others = np.setdiff1d(np.arange(len(parameters)), cad.columns)
+    row = np.random.default_rng(1).standard_normal(len(parameters)) / parameters.magnitude
     data = np.outer(row, row)
     data[others, others] += 1e4 / parameters.magnitude[others] ** 2
-    covariance = np.asarray(np.linalg.inv(data + cad.information(guess)), dtype=np.float64)
+    covariance = np.linalg.inv(data + cad.information(parameters.guess))
     estimate = estimated(system, covariance, data=data, honest_covariance=covariance)
 
     task = PayloadTask.of(whole, body="hand", robot=estimate)
@@ -190,27 +178,9 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     index = [found.names.index(name) for name in parameters.names]
     prior = found.prior_information + CadPrior.of(found).information(found.guess)
     inverse = np.linalg.inv(covariance)
-    scale = np.sqrt(np.diag(inverse))
-    size = np.outer(scale, scale)
+    size = np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     np.testing.assert_allclose(prior[np.ix_(index, index)] / size, inverse / size, atol=1e-5)
     assert not CadPrior.of(found).bodies
-
-
-@pytest.mark.slow
-def test_a_load_on_links_whose_inertia_the_model_tells_in_part(tmp_path: Path) -> None:
-    robot = with_whole_links(experiment(tmp_path))
-    loaded = with_whole_links(experiment(tmp_path, **LOAD, inertia=INERTIA))
-    earlier = mjfim.identify(robot, [log(robot, 1)])
-    assert earlier.prior_directions is not None
-    estimate = mjfim.identify_payload(robot, [log(loaded, 2)], body="hand", robot=earlier)
-    payload = estimate.payload
-    assert payload is not None
-    assert estimate.converged and payload.is_seen
-    assert sum(inside(estimate).values()) >= 3
-
-    # Single inertias of the links are hardly known, but the load is.
-    width = float(np.ptp(payload.mass_interval))
-    assert width < 0.5 * LOAD["mass"]
 
 
 @pytest.mark.slow
@@ -222,10 +192,8 @@ def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
         estimate = mjfim.identify_payload(
             robot, [log(loaded, 100 + seed)], body="hand", robot=robots
         )
-        assert estimate.converged
-        assert estimate.payload is not None
-        assert estimate.payload.is_seen
-        found.append(list(inside(estimate).values()))
+        assert estimate.converged and estimate.payload.is_seen
+        found.append(inside(estimate))
     assert np.mean(found) >= 0.85
     assert (np.mean(found, axis=0) >= 0.6).all()
 
@@ -238,17 +206,15 @@ def test_recordings_without_the_payload_take_the_place_of_an_estimate(tmp_path: 
     earlier = mjfim.identify(robot, [reference])
     other = mjfim.identify_payload(robot, [recording], body="hand", robot=earlier)
     np.testing.assert_allclose(estimate.theta, other.theta, rtol=1e-9)
-    assert all(inside(estimate).values())
+    assert inside(estimate).all()
 
     # With a robot that is held at its guess, which is wrong, the load is not what it is.
     held = mjfim.identify_payload(robot, [recording], body="hand")
-    assert held.payload is not None
     assert held.payload.held == tuple(ROBOT)
     assert held.misfit
 
     # Where there is no load, none is found.
     nothing = mjfim.identify_payload(robot, [log(robot, 3)], body="hand", robot=earlier)
-    assert nothing.payload is not None
     assert not nothing.payload.is_seen
     assert "show no payload at hand" in str(nothing.payload)
 
@@ -261,7 +227,6 @@ def test_an_inertia_that_recordings_show_is_determined(tmp_path: Path) -> None:
         robot, [log(loaded, 5)], body="hand", robot=mjfim.identify(robot, [log(robot, 4)])
     )
     payload = estimate.payload
-    assert payload is not None
     assert payload.edge is None
     low, high = payload.inertia_interval
     assert low <= 0.02 <= high
@@ -282,7 +247,6 @@ def test_terms_that_a_selection_has_added_are_taken_over(tmp_path: Path) -> None
     reference, recording = with_dry_friction(robot, 1), with_dry_friction(loaded, 2)
     selected = mjfim.select_terms(robot, [reference])
     estimate = mjfim.identify_payload(robot, [recording], body="hand", robot=selected)
-    assert estimate.payload is not None
     assert "pitch_frictionloss" in estimate.payload.known
     assert not estimate.misfit
-    assert all(inside(estimate).values())
+    assert inside(estimate).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -54,17 +55,15 @@ def test_a_term_at_several_joints_is_refuted_apart_from_that_of_its_first_joint(
         tried("joint/pan:damping", Decision.REJECTED, -reduction, joints),
     )
     selection = Selection(terms=(), steps=(BEGUN, *steps[::order]), ending="No further term.")
-    pan, roll = (
-        (TermNumber(path=f"joint/{joint}:damping", value=0.1, unit="", scale=0.1),)
-        for joint in ("pan", "roll")
-    )
-    single = replace(results.missing_term(), numbers=pan)
+    number = partial(TermNumber, value=0.1, unit="", scale=0.1)
+    single = replace(results.missing_term(), numbers=(number(path="joint/pan:damping"),))
     of_joints = replace(single, description="damping at 3 joints", joints=joints)
     left = TermTests(terms=(of_joints, single)).without(selection.refuted)
     assert left.terms == ((single,) if is_joint_refuted else (of_joints,))
 
     # The same joints in another order are the same term.
-    again = replace(of_joints, numbers=roll, joints=joints[::-1])
+    numbers = (number(path="joint/roll:damping"),)
+    again = replace(of_joints, numbers=numbers, joints=joints[::-1])
     assert (again.key in selection.refuted) == is_joint_refuted
 
 

@@ -77,9 +77,8 @@ def test_a_worn_joint_is_named() -> None:
     # The distance is 4.2 standard deviations; four tests are made.
     sigmas = 0.06 / np.hypot(0.01, 0.01)
     assert found.p[1] == pytest.approx(4 * 2 * student.sf(sigmas, 1e6), rel=1e-2)
-    np.testing.assert_allclose(
-        found.interval[1], 0.06 + np.array([-1, 1]) * NORMAL_95 * 0.01 * 2**0.5, rtol=1e-3
-    )
+    half = NORMAL_95 * 0.01 * 2**0.5
+    np.testing.assert_allclose(found.interval[1], [0.06 - half, 0.06 + half], rtol=1e-3)
 
     # The other way round, the sign changes.
     back = compare_estimates(worn, estimate())
@@ -100,21 +99,18 @@ def test_equal_robots_say_what_would_have_been_found() -> None:
 
 
 def test_entries_of_vectors_have_no_percentage() -> None:
-    sizes = np.array([2.0, 1.0, 1.0])
-    found = compare_estimates(
-        estimate(sizes=sizes), estimate(1, theta=np.array([2.0, 0.3, 1.0]), sizes=sizes)
-    )
+    sizes = {"sizes": np.array([2.0, 1.0, 1.0])}
+    changed = estimate(1, theta=np.array([2.0, 0.3, 1.0]), **sizes)
+    found = compare_estimates(estimate(**sizes), changed)
     assert "damping of B is 0.15 N m s/rad above that of A" in found.sentence(1)
 
 
 def test_combinations_may_differ_although_no_parameter_does() -> None:
     """Strongly correlated errors: the sum is known, and differs."""
-    correlation = np.array([[1.0, -0.99, 0.0], [-0.99, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    std = np.array([0.1, 0.1, 0.1])
-    fields = {"std": std, "covariance": correlation * np.outer(std, std)}
-    first = estimate(theta=np.array([1.0, 1.0, 1.0]), **fields)
+    wide = 0.01 * np.array([[1.0, -0.99, 0.0], [-0.99, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    fields = {"std": np.full(3, 0.1), "covariance": wide}
     second = estimate(1, theta=np.array([1.06, 1.06, 1.0]), **fields)
-    found = compare_estimates(first, second)
+    found = compare_estimates(estimate(theta=np.ones(3), **fields), second)
     assert found.changed == ()
     assert found.joint_p < 1e-3
     assert found.differs
@@ -123,53 +119,41 @@ def test_combinations_may_differ_although_no_parameter_does() -> None:
 
 def test_wide_intervals_count_and_bounds_do_not() -> None:
     theta = np.array([2.0, 0.0, 1.0])
-    wide = estimate(
-        theta=theta,
-        interval=np.array([[1.8, 2.2], [0.0, 0.3], [0.9, 1.1]]),
-        at_bound=("damping",),
-    )
+    interval = np.array([[1.8, 2.2], [0.0, 0.3], [0.9, 1.1]])
+    wide = estimate(theta=theta, interval=interval, at_bound=("damping",))
     np.testing.assert_allclose(honest_std(wide) * NORMAL_95, [0.2, 0.3, 0.1])
 
 
+PRIOR = {"prior": np.diag([1.0, 0.0, 0.0])}
+OF_MODEL = PriorDirections(bodies=("link",), count=10, determined=7, parameters=())
+
+
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("of_both", "of_second", "said"),
     [
-        ({"misfit": True}, "does not explain the recordings of B (misfit)"),
-        ({"converged": False, "status": "stopped"}, "the estimate of B is not reliable: stopped"),
-        ({"units": ("g", "N m s/rad", "m")}, "mass is not compared: its units differ (kg and g)"),
-        ({"std": np.array([np.inf, 0.1, 0.1])}, "recordings of B do not determine it"),
-        ({"per_recording": {"mass": (1.0, 2.0)}}, "B has a value for each recording"),
-        ({"parameters": ("load", "damping", "length")}, "load: a parameter of B, but fixed for A"),
-        ({"count": 1}, "of B there is a single recording"),
-        ({"seed": 0, "count": 3}, "both estimates contain robot_0_0.csv, robot_0_1.csv"),
+        ({}, {"misfit": True}, "does not explain the recordings of B (misfit)"),
+        ({}, {"converged": False, "status": "stopped"}, "of B is not reliable: stopped"),
+        ({}, {"units": ("g", *UNITS[1:])}, "mass is not compared: its units differ (kg and g)"),
+        ({}, {"std": np.array([np.inf, 0.1, 0.1])}, "recordings of B do not determine it"),
+        ({}, {"per_recording": {"mass": (1.0, 2.0)}}, "B has a value for each recording"),
+        ({}, {"parameters": ("load", *NAMES[1:])}, "load: a parameter of B, but fixed for A"),
+        ({}, {"count": 1}, "of B there is a single recording"),
+        ({"count": 1}, {}, "single recordings say nothing"),
+        ({}, {"seed": 0, "count": 3}, "both estimates contain robot_0_0.csv, robot_0_1.csv"),
+        (PRIOR, {}, "mass: the priors"),
+        ({}, {"prior_directions": OF_MODEL}, "B: combinations of inertias"),
+        ({}, {"prior_directions": OF_MODEL}, "cad_prior = false"),
     ],
 )
-def test_remarks(changes: dict[str, Any], said: str) -> None:
-    found = compare_estimates(estimate(), estimate(**{"seed": 1, **changes}))
+def test_remarks(of_both: dict[str, Any], of_second: dict[str, Any], said: str) -> None:
+    found = compare_estimates(estimate(**of_both), estimate(**{"seed": 1, **of_both, **of_second}))
     assert any(said in remark for remark in found.remarks), found.remarks
-    is_poor = "misfit" in changes or "converged" in changes
+    is_poor = "misfit" in of_second or "converged" in of_second
     assert found.is_reliable is not is_poor
 
 
-def test_single_recordings_of_both() -> None:
-    found = compare_estimates(estimate(count=1), estimate(1, count=1))
-    assert any(remark.startswith("single recordings say nothing") for remark in found.remarks)
-
-
-def test_priors_draw_both_to_one_value() -> None:
-    prior = np.diag([1.0, 0.0, 0.0])
-    found = compare_estimates(estimate(prior=prior), estimate(1, prior=prior))
-    assert any(remark.startswith("mass: the priors") for remark in found.remarks)
-
-
-def test_inertias_of_the_model_make_robots_alike() -> None:
-    directions = PriorDirections(bodies=("link",), count=10, determined=7, parameters=())
-    found = compare_estimates(estimate(), estimate(1, prior_directions=directions))
-    assert any(remark.startswith("B: combinations of inertias") for remark in found.remarks)
-    assert any("cad_prior = false" in remark for remark in found.remarks)
-    assert not any(
-        "cad_prior" in text for text in compare_estimates(estimate(), estimate(1)).remarks
-    )
+def test_robots_without_a_remark() -> None:
+    assert compare_estimates(estimate(), estimate(1)).remarks == ()
 
 
 def test_known_combinations_are_compared_by_the_honest_covariance() -> None:
@@ -198,12 +182,13 @@ def test_known_combinations_are_compared_by_the_honest_covariance() -> None:
 
 
 def test_misuse() -> None:
-    with pytest.raises(ExperimentError, match="no parameter in common"):
-        compare_estimates(estimate(), estimate(1, parameters=("a", "b", "c")))
-    with pytest.raises(ExperimentError, match="from the same recordings"):
-        compare_estimates(estimate(), estimate())
-    with pytest.raises(ExperimentError, match="two different names"):
-        compare_estimates(estimate(), estimate(1), names=("A", "A"))
+    for second, names, message in (
+        (estimate(1, parameters=("a", "b", "c")), ("A", "B"), "no parameter in common"),
+        (estimate(), ("A", "B"), "from the same recordings"),
+        (estimate(1), ("A", "A"), "two different names"),
+    ):
+        with pytest.raises(ExperimentError, match=message):
+            compare_estimates(estimate(), second, names=names)
 
 
 def test_initial_states_are_not_compared() -> None:
@@ -242,8 +227,7 @@ class Setting:
         N = 400
         X = waves(self.K, N, self.c)
         growth = (1.0 + self.phi) / (1.0 - self.phi)
-        std = np.sqrt(2.0 / N * growth)
-        deviations = self.tau * std * rng.normal(size=(self.K, self.c))
+        deviations = self.tau * np.sqrt(2.0 / N * growth) * rng.normal(size=(self.K, self.c))
         deviations[:, 0] += shift
         y = noise(self.phi, (self.K, N), rng) + np.einsum("knc,kc->kn", X, 1.0 + deviations)
 
@@ -255,25 +239,25 @@ class Setting:
         uncertainty = robust_uncertainty(
             condensed, theta, recording, rows, min_rows=length, draws=100, rng=rng, own=own
         )
+        names, units = tuple(f"p{j}" for j in range(self.c)), ("",) * self.c
         comparison = None
         if self.K > 1:
             blocks = independent_blocks(condensed, recording, rows, length)
             comparison = compare_evidence(
                 theta,
                 recording_evidence(condensed, blocks, recording, own),
-                recordings=[str(k) for k in range(self.K)],
-                parameters=[f"p{j}" for j in range(self.c)],
-                units=[""] * self.c,
+                recordings=list("abcd"[: self.K]),
+                parameters=names,
+                units=units,
                 is_single=np.ones(self.c, dtype=bool),
             )
         covariance = np.linalg.inv(condensed.information())
         return estimate(
             seed,
             self.K,
-            parameters=tuple(f"p{j}" for j in range(self.c)),
-            units=("",) * self.c,
+            parameters=names,
+            units=units,
             theta=theta,
-            initial_theta=theta,
             covariance=covariance,
             std=np.sqrt(np.diag(covariance)),
             std_sandwich=uncertainty.sandwich,
@@ -288,15 +272,10 @@ class Setting:
 
 
 @pytest.mark.slow
-def test_equal_robots_rarely_differ() -> None:
-    rng = np.random.default_rng(0)
-    alarms = sum(Setting(K=2).compared(rng).differs for _ in range(40))
-    assert alarms <= 6
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "setting", [Setting(K=1, phi=0.9), Setting(K=3, phi=0.9, c=8), Setting(K=4, tau=3.0)], ids=str
+    "setting",
+    [Setting(K=2), Setting(K=1, phi=0.9), Setting(K=3, phi=0.9, c=8), Setting(K=4, tau=3.0)],
+    ids=str,
 )
 def test_rate_of_false_alarms(setting: Setting) -> None:
     """The stated level is 5 %; 60 comparisons give more than 7 with a probability of 1 %."""
@@ -309,8 +288,7 @@ def test_rate_of_false_alarms(setting: Setting) -> None:
 def test_rate_of_true_alarms(setting: Setting) -> None:
     """A shift as large as the difference that would be found with a probability of 80 %."""
     rng = np.random.default_rng(2)
-    found = setting.compared(rng)
-    hits = 0
+    found, hits = setting.compared(rng), 0
     # A binomial number with 60 and 0.8 is outside with a probability of 4e-4.
     for _ in range(60):
         found = setting.compared(rng, float(found.detectable[0]))

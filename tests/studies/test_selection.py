@@ -44,7 +44,6 @@ def test_the_missing_term_is_added_and_nothing_else(tmp_path: Path) -> None:
     *fitted, kept = logs
     found = mjfim.select_terms(stated(), fitted, held_out=[kept])
     selection = found.selection
-    assert selection is not None
     assert [term.path for term in selection.terms] == ["joint/slide:frictionloss"]
     assert [step.decision for step in selection.steps if step.is_kept] == [
         Decision.BEGUN,
@@ -75,7 +74,6 @@ def test_the_missing_term_is_added_and_nothing_else(tmp_path: Path) -> None:
 def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
     logs = recorded(tmp_path, "", count=2)
     found = mjfim.select_terms(stated(), logs)
-    assert found.selection is not None
     assert not found.selection.terms
     assert len(found.selection.steps) == 1
     assert found.parameters == ("m", "l", "c")
@@ -93,7 +91,6 @@ def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
 def test_terms_that_no_data_tell_apart_are_named_with_what_they_imply(tmp_path: Path) -> None:
     """Inertia of the cart or of the hinge, a weaker motor and a payload have the same effect."""
     found = mjfim.select_terms(stated(), recorded(tmp_path, 'armature="0.9"', count=2))
-    assert found.selection is not None
     (term,) = found.selection.terms
     assert term.path == "joint/slide:armature"
     (step,) = [step for step in found.selection.steps if step.decision is Decision.ADDED]
@@ -121,7 +118,6 @@ def test_a_selection_that_is_stopped_returns_what_it_has(tmp_path: Path) -> None
     assert len(found.theta) == 3
 
     # The selection says that nothing was tried.
-    assert found.selection is not None
     assert "interrupted before a term was tried" in str(found.selection)
     assert "σ" not in str(found.selection)
 
@@ -135,13 +131,11 @@ def test_a_selection_that_cannot_predict_left_out_data_says_so(
     logs = recorded(tmp_path, 'frictionloss="0.5"', count=2, horizon=1.0)
     found = mjfim.select_terms(stated(), logs)
     selection = found.selection
-    assert selection is not None
     assert "No part of the recordings could be predicted" in str(selection)
     assert not found.interrupted
 
     plain = mjfim.identify(stated(), logs)
     np.testing.assert_allclose(found.theta, plain.theta, rtol=1e-4)
-    assert found.horizons is not None
 
     # The error that is not known is shown, drawn and saved as such.
     found.save(tmp_path / "results")
@@ -160,7 +154,6 @@ def test_a_term_with_which_the_simulation_diverges_is_not_added(
     monkeypatch.setattr(selection_study, "refit_task", diverge)
     logs = recorded(tmp_path, 'frictionloss="0.5"', count=2, horizon=1.0)
     found = mjfim.select_terms(stated(segments="whole"), logs)
-    assert found.selection is not None
     assert not found.selection.terms
     assert "No further term predicts" in found.selection.ending
 
@@ -169,7 +162,6 @@ def test_a_term_with_which_the_simulation_diverges_is_not_added(
 def test_two_missing_terms_are_both_found(tmp_path: Path) -> None:
     logs = recorded(tmp_path, 'frictionloss="0.3" stiffness="2"', count=2, horizon=3.0)
     found = mjfim.select_terms(stated(), logs)
-    assert found.selection is not None
     paths = {term.path for term in found.selection.terms}
     assert paths == {"joint/slide:frictionloss", "joint/slide:stiffness"}
     assert not found.misfit

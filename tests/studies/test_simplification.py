@@ -16,26 +16,22 @@ from mjfim.records.terms import Decision, PooledParameter
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import possible_pools, selected_experiment, simplified_experiment
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.paths import ROOT
+from tests.support.paths import MODELS
+
+JOINTS = ("shoulder", "elbow")
 
 
-def arm(**damping: float) -> mjfim.Experiment:
+def arm(first: float, second: float) -> mjfim.Experiment:
     """The double pendulum, of which the damping of both joints is unknown."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "double_pendulum.toml")
+    base = mjfim.Experiment.from_file(MODELS / "double_pendulum.toml")
+    kept = base.model_dump(include={"model", "rate", "noise"}, exclude_unset=True)
     tables = {
-        name: {"target": f"joint/{name}:damping", "guess": guess} for name, guess in damping.items()
+        name: {"target": f"joint/{name}:damping", "guess": guess}
+        for name, guess in zip(JOINTS, (first, second), strict=True)
     }
-    kept = {"model", "rate", "noise"}
-    values = {k: v for k, v in base.model_dump(exclude_unset=True).items() if k in kept}
-    return base.restated(
-        {
-            **values,
-            "horizon": 2.0,
-            "initial": {"control": {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}},
-            "parameters": tables,
-            "fit": {"bootstrap": 0},
-        }
-    )
+    control = {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}
+    further = {"horizon": 2.0, "initial": {"control": control}, "fit": {"bootstrap": 0}}
+    return base.restated({**kept, **further, "parameters": tables})
 
 
 def recorded(experiment: mjfim.Experiment, count: int) -> list[Recording]:
@@ -44,19 +40,11 @@ def recorded(experiment: mjfim.Experiment, count: int) -> list[Recording]:
     return [simulate_system(task.system, task.initial, seed) for seed in range(count)]
 
 
-def names_of_joints() -> tuple[str, str]:
-    """Names of the two joints."""
-    base = mjfim.Experiment.from_file(ROOT / "models" / "double_pendulum.toml")
-    first, second = System.resolve(base).coordinates[:2]
-    return first.name, second.name
-
-
 def test_parameters_of_one_field_are_pooled_by_a_factor_on_their_guesses() -> None:
-    first, second = names_of_joints()
-    experiment = arm(**{first: 0.2, second: 0.05})
+    experiment = arm(0.2, 0.05)
     system = System.resolve(experiment)
-    (pool,) = possible_pools(system.parameters, {first, second})
-    assert pool.members == (first, second)
+    (pool,) = possible_pools(system.parameters, set(JOINTS))
+    assert pool.members == JOINTS
     assert pool.scales == (0.2, 0.05)
     assert pool.guess == 1.0
 
@@ -67,17 +55,14 @@ def test_parameters_of_one_field_are_pooled_by_a_factor_on_their_guesses() -> No
     np.testing.assert_allclose(model.dof_damping[:2], [0.6, 0.15])
 
     # Equal guesses give one value, and one name alone nothing.
-    (same,) = possible_pools(
-        System.resolve(arm(**{first: 0.1, second: 0.1})).parameters, {first, second}
-    )
+    (same,) = possible_pools(System.resolve(arm(0.1, 0.1)).parameters, set(JOINTS))
     assert same.scales == (1.0, 1.0)
     assert same.guess == pytest.approx(0.1)
-    assert possible_pools(system.parameters, {first}) == []
+    assert possible_pools(system.parameters, {JOINTS[0]}) == []
 
 
 def test_parameters_are_pooled_within_the_bounds_of_all_members() -> None:
-    names = names_of_joints()
-    resolved = System.resolve(arm(**{names[0]: 0.1, names[1]: 0.1})).parameters
+    resolved = System.resolve(arm(0.1, 0.1)).parameters
 
     def pools(*stated: tuple[float, float, float]) -> list[PooledParameter]:
         """The pools of both dampings with a guess and bounds each."""
@@ -85,7 +70,7 @@ def test_parameters_are_pooled_within_the_bounds_of_all_members() -> None:
             replace(parameter, guess=guess, bounds=(low, high))
             for parameter, (guess, low, high) in zip(resolved.parameters, stated, strict=True)
         ]
-        return possible_pools(ParameterSet(tuple(changed)), names)
+        return possible_pools(ParameterSet(tuple(changed)), JOINTS)
 
     # Guesses of one sign give a factor, which has common bounds, and others a common value.
     (factor,) = pools((0.1, 0.0, 0.2), (0.6, 0.3, 0.9))
@@ -99,34 +84,29 @@ def test_parameters_are_pooled_within_the_bounds_of_all_members() -> None:
 
 
 def test_held_parameters_are_added_to_those_that_the_user_holds() -> None:
-    first, second = names_of_joints()
-    experiment = arm(**{first: 0.2, second: 0.05}).replace(fit={"hold": (first,)})
-    held = simplified_experiment(experiment, (), (second,))
-    assert held.fit.hold == (first, second)
+    experiment = arm(0.2, 0.05).replace(fit={"hold": JOINTS[:1]})
+    held = simplified_experiment(experiment, (), JOINTS[1:])
+    assert held.fit.hold == JOINTS
     assert simplified_experiment(experiment, (), ()) is experiment
+
+
+CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+MOVED = {"horizon": 2.0, "initial": {"control": CONTROL}, "fit": {"bootstrap": 0}}
 
 
 @pytest.mark.slow
 def test_a_selection_holds_what_the_recordings_hardly_determine(tmp_path: Path) -> None:
     """The damping of the hinge is determined; that of a slow slide is not."""
-    base = cart_pendulum()
-    control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
-    experiment = base.replace(
-        horizon=2.0,
-        initial={"control": control},
-        parameters={"slide": {"target": "joint/slide:damping", "guess": 0.02, "scale": 0.1}},
-        fit={"bootstrap": 0},
-    )
+    slide = {"target": "joint/slide:damping", "guess": 0.02, "scale": 0.1}
+    experiment = cart_pendulum(**MOVED, parameters={"slide": slide})
     logs = recorded(experiment, 3)
     plain = mjfim.identify(experiment, logs)
     assert "slide" in plain.sloppy
     found = mjfim.select_terms(experiment, logs)
     selection = found.selection
-    assert selection is not None
     assert not selection.terms
     assert selection.held == ("slide",)
     assert selection.steps[-1].decision is Decision.HELD
-    assert found.held == ("slide",)
     assert found.theta[found.parameters.index("slide")] == 0.02
 
     # The selected experiment says the same, and the record is saved.
@@ -139,16 +119,12 @@ def test_a_selection_holds_what_the_recordings_hardly_determine(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_selected_model_is_fitted_to_held_out_recordings() -> None:
-    base = cart_pendulum()
-    control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
-    stated = base.replace(horizon=2.0, initial={"control": control}, fit={"bootstrap": 0})
+    stated = cart_pendulum(**MOVED)
     friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.6, "scale": 1.0}}
     robot = stated.replace(parameters=friction)
     *logs, kept = recorded(robot, 3)
     found = mjfim.select_terms(stated, logs, held_out=[kept])
-    assert found.selection is not None
     refit = found.selection.refit
-    assert refit is not None
     assert refit.differs == ()
     assert refit.theta.shape == found.theta.shape
     assert (refit.interval[:, 0] < refit.interval[:, 1]).all()
@@ -158,7 +134,6 @@ def test_the_selected_model_is_fitted_to_held_out_recordings() -> None:
     task = DesignTask.resolve(heavier.replace(cost={"linearize_at": "true"}), threads=1)
     other = simulate_system(task.system, task.initial, 9)
     odd = mjfim.select_terms(stated, logs, held_out=[other])
-    assert odd.selection is not None and odd.selection.refit is not None
     assert "m" in odd.selection.refit.differs
     j = odd.parameters.index("m")
     assert odd.interval[j, 1] > found.interval[j, 1] + 0.1

@@ -18,15 +18,21 @@ from mjfim.records.worth import PRICED_SHARE
 from tests.support.numerics import Array, sensitivity_of
 from tests.support.paths import MODELS
 
-CART = MODELS / "cart_pendulum.toml"
 NOISE = {"qpos:slide": 0.05, "qpos:hinge": 0.04, "qvel:slide": 0.03, "qvel:hinge": 0.05}
+
+
+CART = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
 
 
 def cart(**tables: Any) -> mjfim.Experiment:
     """The cart-pendulum for 1 s, whose four sensors have noise of their own."""
-    values = mjfim.Experiment.from_file(CART).model_dump(exclude_unset=True)
-    changed = {**values, "horizon": 1.0, "noise": NOISE, **tables}
-    return mjfim.Experiment.from_file(CART).restated(changed)
+    values = CART.model_dump(exclude_unset=True)
+    return CART.restated({**values, "horizon": 1.0, "noise": NOISE, **tables})
+
+
+def without(noise: dict[str, Any], name: str) -> dict[str, Any]:
+    """The noise of the other sensors."""
+    return {key: value for key, value in noise.items() if key != name}
 
 
 def checked(experiment: mjfim.Experiment) -> Array:
@@ -34,26 +40,26 @@ def checked(experiment: mjfim.Experiment) -> Array:
     return np.array([row.std for row in mjfim.check(experiment, progress=False).rows])
 
 
-def sensors(found: mjfim.Worth) -> dict[str, Any]:
+def sensors(experiment: mjfim.Experiment, **options: Any) -> dict[str, Any]:
     """What each sensor tells, by its name."""
+    found = mjfim.worth(experiment, progress=False, **options)
     return {each.name: each for each in found.sensors}
 
 
+def assert_tells(std: Array, experiment: mjfim.Experiment) -> None:
+    """σ of the wanted parameters are those of a check of an experiment."""
+    np.testing.assert_allclose(std[:3], checked(experiment)[:3], rtol=1e-6)
+
+
 def test_each_sensor_alone_left_out_and_halved_is_a_changed_file() -> None:
-    found = mjfim.worth(cart(), progress=False)
-    np.testing.assert_allclose(found.std, checked(cart()), rtol=1e-6)
+    found = sensors(cart())
+    assert_tells(found["qpos:slide"].present, cart())
     for name, sigma in NOISE.items():
-        others = {key: value for key, value in NOISE.items() if key != name}
-        row = sensors(found)[name]
-        for std, noise in (
-            (row.without, others),
-            (row.alone, {name: sigma}),
-            (row.halved, {**NOISE, name: sigma / 2.0}),
-        ):
-            np.testing.assert_allclose(std, checked(cart(noise=noise)), rtol=1e-6)
+        assert_tells(found[name].without, cart(noise=without(NOISE, name)))
+        assert_tells(found[name].alone, cart(noise={name: sigma}))
+        assert_tells(found[name].halved, cart(noise={**NOISE, name: sigma / 2.0}))
     velocities = {key: NOISE[key] for key in ("qvel:slide", "qvel:hinge")}
-    of_kind = sensors(found)["all velocities"]
-    np.testing.assert_allclose(of_kind.alone, checked(cart(noise=velocities)), rtol=1e-6)
+    assert_tells(found["all velocities"].alone, cart(noise=velocities))
 
 
 def test_correlated_outputs_are_one_sensor() -> None:
@@ -62,22 +68,17 @@ def test_correlated_outputs_are_one_sensor() -> None:
         "covariance": [[0.0025, 0.001], [0.001, 0.0025]],
     }
     others = {"qpos:hinge": 0.04, "qvel:slide": 0.03}
-    found = mjfim.worth(cart(noise=others, correlated=[joined]), progress=False)
-    row = sensors(found)["qpos:slide + qvel:hinge"]
-    np.testing.assert_allclose(row.without, checked(cart(noise=others)), rtol=1e-6)
+    found = sensors(cart(noise=others, correlated=[joined]))
+    assert_tells(found["qpos:slide + qvel:hinge"].without, cart(noise=others))
 
 
 def test_a_sensor_whose_bias_is_unknown_and_one_that_measures_seldom_may_be_left_out() -> None:
     slow = {**NOISE, "qvel:hinge": {"sigma": 0.05, "rate": 20.0}}
-    unsure = cart(noise=slow, nuisance={"bias": {"qpos:slide": True}})
-    found = sensors(mjfim.worth(unsure, progress=False))
-    others = {key: value for key, value in slow.items() if key != "qpos:slide"}
-    np.testing.assert_allclose(
-        found["qpos:slide"].without[:3], checked(cart(noise=others)), rtol=1e-6
-    )
-    rest = {key: value for key, value in slow.items() if key != "qvel:hinge"}
-    expected = checked(cart(noise=rest, nuisance={"bias": {"qpos:slide": True}}))
-    np.testing.assert_allclose(found["qvel:hinge"].without[:3], expected[:3], rtol=1e-6)
+    unsure = {"nuisance": {"bias": {"qpos:slide": True}}}
+    found = sensors(cart(noise=slow, **unsure))
+    assert_tells(found["qpos:slide"].without, cart(noise=without(slow, "qpos:slide")))
+    rest = cart(noise=without(slow, "qvel:hinge"), **unsure)
+    assert_tells(found["qvel:hinge"].without, rest)
 
 
 def test_added_sensors_are_those_of_a_model_that_has_them(tmp_path: Path) -> None:
@@ -88,55 +89,49 @@ def test_added_sensors_are_those_of_a_model_that_has_them(tmp_path: Path) -> Non
     (tmp_path / "with.xml").write_text(text, encoding="utf-8")
 
     add = {"gyro:bob": 0.01, "force:bob": 0.2, "torque": 0.1}
-    found = sensors(mjfim.worth(cart(), add=add, progress=False))
+    found = sensors(cart(), add=add)
     for name, key, sigma in (("gyro of bob", "g", 0.01), ("force of bob", "f", 0.2)):
         with_it = cart(model=str(tmp_path / "with.xml"), noise={**NOISE, key: sigma})
-        np.testing.assert_allclose(found[name].present, checked(with_it), rtol=1e-6)
+        assert_tells(found[name].present, with_it)
         assert found[name].is_added
-        np.testing.assert_allclose(found[name].without, checked(cart()), rtol=1e-6)
+    assert_tells(found["gyro of bob"].without, cart())
+
     # The motor's force is its control, which tells nothing.
-    np.testing.assert_allclose(found["torque of slide"].present, checked(cart()), rtol=1e-6)
+    assert_tells(found["torque of slide"].present, cart())
     assert np.isinf(found["torque of slide"].alone).all()
 
 
 def test_a_joint_acceleration_is_the_difference_of_two_velocities() -> None:
-    found = sensors(mjfim.worth(cart(), add={"acceleration:hinge": 0.1}, progress=False))
-    task = DesignTask.resolve(cart())
-    velocity = []
-    for j, sign in itertools.product(range(3), (1.0, -1.0)):
-        theta = task.theta + sign * 1e-4 * np.eye(3)[j]
-        velocity.append(task.plant.simulate(theta, task.control).qvel[:, 1])
-    slopes = (np.array(velocity[::2]) - np.array(velocity[1::2])) / 2e-4
+    found = sensors(cart(), add={"acceleration:hinge": 0.1})["acceleration of hinge"]
+    task, slopes = DesignTask.resolve(cart()), []
+    for step in 1e-4 * np.eye(3):
+        ends = [task.plant.simulate(task.theta + s * step, task.control).qvel for s in (1, -1)]
+        slopes.append((ends[0] - ends[1])[:, 1] / 2e-4)
     rows = np.diff(slopes, axis=1) / (task.dt * 0.1)
     expected = np.sqrt(np.diag(np.linalg.inv(rows @ rows.T)))
-    np.testing.assert_allclose(found["acceleration of hinge"].alone, expected, rtol=1e-4)
+    np.testing.assert_allclose(found.alone, expected, rtol=1e-4)
 
 
 def test_the_smallest_set_is_that_of_all_sets() -> None:
     wanted = {"m": 0.2, "l": 0.12, "c": 0.5}
     stated = {name: {"wanted": value} for name, value in wanted.items()}
     experiment = cart().replace(parameters=stated)
-    task = DesignTask.resolve(experiment)
-    fine = sensitivity_of(task)
-    rows = fine.G[1:] / np.array(list(NOISE.values()))[:, None]
-    matrices = np.einsum("kyi,kyj->yij", rows, rows)
-    names, enough = list(NOISE), []
-    for count in range(1, 5):
-        for chosen in itertools.combinations(range(4), count):
-            std = np.sqrt(np.diag(np.linalg.inv(matrices[list(chosen)].sum(axis=0))))
-            if (std <= list(wanted.values())).all():
-                enough.append([names[i] for i in chosen])
-    found = mjfim.worth(experiment, progress=False)
-    assert enough and len(enough[0]) < 4
-    assert list(found.fewest) in [each for each in enough if len(each) == len(enough[0])]
+    rows = (
+        sensitivity_of(DesignTask.resolve(experiment)).G[1:] / np.array([*NOISE.values()])[:, None]
+    )
+    matrices = dict(zip(NOISE, np.einsum("kyi,kyj->yij", rows, rows), strict=True))
+
+    def is_enough(names: tuple[str, ...]) -> bool:
+        told = np.sum([matrices[name] for name in names], axis=0)
+        return bool((np.sqrt(np.diag(np.linalg.inv(told))) <= [*wanted.values()]).all())
+
+    by_size = (itertools.combinations(NOISE, count) for count in range(1, 4))
+    enough = next(filter(None, ([*filter(is_enough, sets)] for sets in by_size)))
+    assert mjfim.worth(experiment, progress=False).fewest in enough
 
 
 def test_an_unknown_sensor_or_place_is_named() -> None:
-    for key, fault in (
-        ("lidar", "gyro, moment"),
-        ("gyro:hand", "bob"),
-        ("torque:x", "slide"),
-    ):
+    for key, fault in (("lidar", "gyro, moment"), ("gyro:hand", "bob"), ("torque:x", "slide")):
         with pytest.raises(ExperimentError, match=fault):
             mjfim.worth(cart(), add={key: 0.1}, progress=False)
 
@@ -160,7 +155,6 @@ def test_prices_are_those_of_a_design_with_a_wider_limit(
     limited: tuple[mjfim.Experiment, mjfim.Design],
 ) -> None:
     experiment, design = limited
-    assert design.worth is not None
     found = mjfim.worth(experiment, design, seconds=np.inf, progress=False)
     force, time = found.prices
     assert (force.name, time.name) == ("control of force", "time")
@@ -185,12 +179,10 @@ def test_without_time_only_multipliers_are_shown(
     limited: tuple[mjfim.Experiment, mjfim.Design],
 ) -> None:
     experiment, design = limited
-    found = mjfim.worth(experiment, design, progress=False)
-    assert design.worth is not None
-    assert [price.predicted for price in found.prices] == [
-        price.predicted for price in design.worth.prices
-    ]
-    assert all(np.isnan(price.redesigned) for price in found.prices)
+    prices = mjfim.worth(experiment, design, progress=False).prices
+    of_design = [price.predicted for price in design.worth.prices]
+    assert [price.predicted for price in prices] == of_design
+    assert all(np.isnan(price.redesigned) for price in prices)
 
 
 def test_what_no_sensor_determines_alone_does_not_count() -> None:

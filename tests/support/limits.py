@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
+from tests.fuzz.player import NEAREST, Layout, model_with_force_sensors, play
 from tests.support.numerics import Array, cart_task, directional_check, make_task
 
 # An arm of two servos on a floating hull: the addresses of positions, velocities, joints and
@@ -158,6 +160,11 @@ def along_control(
     return constraints.evaluate(*observed, slopes=slopes)
 
 
+def of_kind(excess: dict[tuple[str, str], float], kind: str) -> float:
+    """Largest excess beyond the limits of one kind."""
+    return max(value for (other, _), value in excess.items() if other == kind)
+
+
 def barrier_problem(task: DesignTask, delta: float, **changes: Any) -> InteriorProblem:
     """The barrier of the limits of a task alone."""
     stated = {"constraints": constraint_set_of(task), "mu": 1.0, "with_cost": False, **changes}
@@ -174,6 +181,42 @@ def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
     ways = directions_of(task, 6) * sizes
     curves = [lambda s, way=way: problem.point(task.control + s * way).barrier for way in ways]
     return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
+
+
+def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
+    """Excess of a control beyond each limit on the model of the user, as a share of half the range.
+
+    The player shares no code with the package. A speed or an angle is between 0 and its bound. An
+    end that is not free is the initial state. What a clearance lacks is relative to it.
+    """
+    stated = task.experiment
+    spec = mujoco.MjSpec.from_file(str(stated.directory / stated.model))
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    model = model_with_force_sensors(spec)
+    layout = Layout.of(model)
+    columns = itertools.chain.from_iterable(layout.columns)
+    start = dict(zip(columns, task.plant.nominal_initial_state.tolist(), strict=True))
+    rows = [
+        {
+            **start,
+            "t": k * task.dt,
+            **{f"ctrl:{n}": u for n, u in zip(task.controls, now, strict=True)},
+        }
+        for k, now in enumerate([*ctrl.tolist(), ctrl[-1].tolist()])
+    ]
+    ranges = {
+        (limit.kind, limit.name): (-limit.upper if limit.is_magnitude else limit.lower, limit.upper)
+        for limit in task.limits
+    }
+    least, boundary = stated.limits.clearance, stated.boundary
+    if least is not None:
+        ranges["clearance", NEAREST] = (least, 3.0 * least)
+    if boundary.end != "free":
+        for name in layout.freedoms:
+            ranges["end_position", name] = (-boundary.position, boundary.position)
+            ranges["end_velocity", name] = (-boundary.velocity, boundary.velocity)
+    return play(model, rows, ranges, task.dt).found
 
 
 # Limits that the cart-pendulum meets quickly.
