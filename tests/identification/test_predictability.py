@@ -46,9 +46,9 @@ def test_rounding_errors_are_mentioned_where_they_change_the_motion() -> None:
 @pytest.mark.slow
 def test_a_chaotic_motion_is_fitted_with_the_recommended_segments(tmp_path: Path) -> None:
     """One simulation ends in a local minimum; the warning says with which segments it works."""
-    study = PLANTS["acrobot"](Setting(horizon=6.0))
-    (tmp_path / "plant.xml").write_text(study.xml, encoding="utf-8")
-    tables = {"model": "plant.xml", "directory": tmp_path, "source": "chaos.toml", **study.tables}
+    xml, stated = PLANTS["acrobot"](Setting(horizon=6.0))
+    (tmp_path / "plant.xml").write_text(xml, encoding="utf-8")
+    tables = {"model": "plant.xml", "directory": tmp_path, "source": "chaos.toml", **stated}
     experiment = mjfim.Experiment(**tables)
     control = DesignTask.resolve(experiment, threads=1).initial
     recording = mjfim.simulate(experiment, control, seed=1, threads=1)
@@ -62,7 +62,7 @@ def test_a_chaotic_motion_is_fitted_with_the_recommended_segments(tmp_path: Path
 
     experiment = mjfim.Experiment(**tables, fit={"segments": float(advice[1])})
     good = mjfim.identify(experiment, [recording], threads=1)
-    true = [entry["true"] for entry in study.tables["parameters"].values()]
+    true = [entry["true"] for entry in stated["parameters"].values()]
     assert (np.abs(good.theta - true) < 4.0 * good.std).all()
     assert good.chi2 / good.dof == pytest.approx(1.0, abs=0.1)
     assert not good.misfit
