@@ -32,8 +32,6 @@ PENDULUM = """<mujoco>
   <sensor><jointpos name="angle" joint="hinge" noise="0.01"/></sensor>
 </mujoco>
 """
-COM = {"target": "body/arm:ipos[2]", "guess": -0.4, "true": -0.4}
-DAMPING = {"target": "joint/hinge:damping", "guess": 0.002, "true": 0.002, "bounds": [0.0, 1.0]}
 RATE = 50.0
 
 # Factors by which the start is wrong, of the centre of mass and of the damping.
@@ -43,14 +41,19 @@ START = (0.5, 0.5)
 def pendulum(folder: Path, seconds: float, **tables: object) -> System:
     """The pendulum, released at 1.5 rad."""
     (folder / "pendulum.xml").write_text(PENDULUM, encoding="utf-8")
-    stated = {"fit": {"bootstrap": 0}, "parameters": {"com": COM, "damping": DAMPING}, **tables}
+    parameters = {
+        "com": {"target": "body/arm:ipos[2]"},
+        "damping": {"target": "joint/hinge:damping", "bounds": [0.0, 1.0]},
+    }
     experiment = mjfim.Experiment(
         model="pendulum.xml",
         directory=folder,
         rate=RATE,
         horizon=seconds,
         initial={"qpos": [1.5]},
-        **stated,
+        parameters=parameters,
+        fit={"bootstrap": 0},
+        **tables,
     )
     return System.resolve(experiment, threads=1)
 
@@ -67,28 +70,30 @@ def is_found(system: System, estimate: Estimate) -> bool:
 
 
 @pytest.mark.slow
-def test_a_wrong_start_finds_the_truth_over_many_swings(tmp_path: Path) -> None:
-    system = pendulum(tmp_path, 12.0, fit={"bootstrap": 0, "max_iterations": 15})
-    recording = swings(system, 12.0)
-    phases: list[str] = []
-
-    def note(event: FitEvent) -> None:
-        """Keep the phases in their order."""
-        if event.phase not in phases:
-            phases.append(event.phase)
-
-    start = system.parameters.true * START
-    found = identify_system(system, [recording], start=start, callback=note)
+@pytest.mark.parametrize("start", [(0.5, 0.5), (1.5, 2.0), (0.4, 3.0)])
+def test_a_wrong_start_finds_the_truth_over_many_swings(
+    tmp_path: Path, start: tuple[float, float]
+) -> None:
+    """The factors are those of the centre of mass and of the damping."""
+    seconds = 12.0 if start == START else 20.0
+    system = pendulum(tmp_path, seconds)
+    phases: dict[str, None] = {}
+    found = identify_system(
+        system,
+        [swings(system, seconds)],
+        start=system.parameters.true * start,
+        callback=lambda event: phases.setdefault(event.phase),
+    )
     assert is_found(system, found)
     assert not found.missing_terms
-    assert phases[0] == "all data" and phases[-1] == "again all data"
-    assert phases[1].startswith("segments of")
+    if start == START:
+        first, then, *_, last = phases
+        assert (first, last) == ("all data", "again all data")
+        assert then.startswith("segments of")
 
-    # The result says what happened.
-    restart = found.restart
-    assert restart is not None
-    assert restart.cost < 1e-2 * restart.cost_before
-    assert "fell from" in found.summary()["restart"]["words"]
+        # The result says what happened.
+        assert found.restart.cost < 1e-2 * found.restart.cost_before
+        assert "fell from" in found.summary()["restart"]["words"]
 
 
 def test_a_right_first_fit_is_not_repeated(tmp_path: Path) -> None:
@@ -99,17 +104,6 @@ def test_a_right_first_fit_is_not_repeated(tmp_path: Path) -> None:
     )
     assert is_found(system, found)
     assert found.restart is None and phases == {"all data"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("start", [(1.5, 2.0), (0.4, 3.0)])
-def test_guesses_that_are_wrong_by_factors_find_the_truth(
-    tmp_path: Path, start: tuple[float, float]
-) -> None:
-    system = pendulum(tmp_path, 20.0)
-    recording = swings(system, 20.0)
-    found = identify_system(system, [recording], start=system.parameters.true * start)
-    assert is_found(system, found)
 
 
 @pytest.mark.slow
@@ -130,14 +124,10 @@ def test_deviations_of_the_initial_state_and_biases_are_continued_too(tmp_path: 
 def test_a_wrong_model_keeps_the_lower_cost_of_all_fits(tmp_path: Path) -> None:
     """Dry friction that the model lacks is no local minimum: the first result stands."""
     system = pendulum(tmp_path, 12.0)
-    text = PENDULUM.replace('damping="0.002"', 'damping="0.002" frictionloss="0.02"')
-    (tmp_path / "robot").mkdir()
-    robot = pendulum(tmp_path / "robot", 12.0)
-    (tmp_path / "robot" / "pendulum.xml").write_text(text, encoding="utf-8")
-    robot = System.resolve(robot.experiment, threads=1)
-
+    rub = {"target": "joint/hinge:frictionloss", "guess": 0.02}
+    robot = System.resolve(system.experiment.replace(parameters={"rub": rub}), threads=1)
     found = identify_system(system, [swings(robot, 12.0)])
-    assert found.misfit and found.restart is not None
+    assert found.misfit
     assert found.restart.cost <= found.restart.cost_before
     assert found.missing_terms[0].path == "joint/hinge:frictionloss"
 
@@ -155,7 +145,7 @@ def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Pa
     start = system.parameters.true * START
     found = identify_system(system, [swings(system, 12.0)], start=start, callback=press, stop=stop)
     assert found.interrupted
-    assert found.restart is not None and found.restart.cost <= found.restart.cost_before
+    assert found.restart.cost <= found.restart.cost_before
 
 
 def test_segments_are_shares_of_the_whole_problem_with_enough_rows(tmp_path: Path) -> None:
@@ -163,12 +153,11 @@ def test_segments_are_shares_of_the_whole_problem_with_enough_rows(tmp_path: Pat
     system = pendulum(tmp_path, 12.0)
     problem = FitProblem.of(system, [swings(system, 12.0)])
     part = problem.cut(1.0)
-    assert part is not None
     assert len(part.segments) == 12
     assert part.recordings is problem.recordings and part.system is problem.system
     assert problem.cut(0.01) is None
 
     lengths = segment_lengths(problem.recordings)
     assert lengths[0] * RATE >= MIN_ROWS
-    assert list(lengths) == sorted(set(lengths))
+    assert (np.diff(lengths) > 0.0).all()
     assert lengths[-1] <= 6.0

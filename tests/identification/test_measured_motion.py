@@ -13,6 +13,7 @@ from mjfim.identification.aligned_recording import align
 from mjfim.identification.inverse_dynamics.motion import MeasuredMotion, measured_motion
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
+from tests.support.terms import recorded
 
 MOST = 10_000
 ALL = ("qpos", "qvel")
@@ -22,24 +23,24 @@ def motion_of(
     task: DesignTask,
     kinds: tuple[str, ...] = ALL,
     hidden: tuple[str, ...] = (),
-    rows: Array | None = None,
+    rows: Array | slice = slice(None),
 ) -> tuple[MeasuredMotion, Array, Array]:
     """Motion of a recording without noise, and (N+1, nq), (N+1, nv) what was measured."""
-    trajectory = task.plant.simulate(task.parameters.guess, task.control)
-    names = task.system.outputs.names
-    measured = np.array(task.plant.outputs(trajectory.state, None))
-    columns = [i for i, name in enumerate(names) if name.startswith(kinds) and name not in hidden]
-    rows = np.arange(len(measured)) if rows is None else rows
+    guess = task.parameters.guess
+    made = recorded(task.system, task.control, theta=guess, share=0.0)
+    columns = [
+        i for i, name in enumerate(made.outputs) if name.startswith(kinds) and name not in hidden
+    ]
     recording = Recording(
-        t=trajectory.t[rows],
-        ctrl=task.control[rows[:-1]],
-        y=measured[rows][:, columns],
-        outputs=tuple(names[i] for i in columns),
+        t=made.t[rows],
+        ctrl=made.ctrl[np.arange(len(made.t))[rows][:-1]],
+        y=made.y[rows][:, columns],
+        outputs=tuple(made.outputs[i] for i in columns),
         name="x.csv",
     )
-    aligned = align(task.system, recording)
-    motion = measured_motion(task.system, aligned, task.parameters.guess, MOST)
-    return motion, trajectory.qpos, trajectory.qvel
+    motion = measured_motion(task.system, align(task.system, recording), guess, MOST)
+    nq = task.space.nq
+    return motion, made.y[:, :nq], made.y[:, nq:]
 
 
 def inner(motion: MeasuredMotion, samples: Array, dt: float) -> tuple[Array, Array]:
@@ -60,9 +61,7 @@ def test_states_of_a_simulation_are_found(
     expected, inside = inner(motion, qvel, task.dt)
 
     # Half a timestep, by which the velocities of implicit steps are earlier, is more.
-    size = np.abs(qvel).max()
-    assert np.abs(motion.qvel[inside] - expected).max() < 0.005 * size
-    assert 0.5 * np.abs(np.diff(qvel, axis=0)).max() > 0.015 * size
+    assert np.abs(motion.qvel[inside] - expected).max() < 0.005 * np.abs(qvel).max()
     # The mean acceleration of the step that begins at a sample, or with RK4, whose steps have no
     # mean that the equation of motion contains, that at the sample.
     steps = np.diff(qvel, axis=0) / task.dt
@@ -73,12 +72,9 @@ def test_states_of_a_simulation_are_found(
     assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(acceleration**2))
 
 
-@pytest.mark.parametrize("kinds", [ALL, ("qpos",)])
-def test_orientations_turn_with_the_angular_velocity_of_the_body(
-    kinds: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_orientations_turn_with_the_angular_velocity_of_the_body(tmp_path: Path) -> None:
     task = body_task(tmp_path, noise={"state": 0.01}, horizon=3.0)
-    motion, qpos, qvel = motion_of(task, kinds)
+    motion, qpos, qvel = motion_of(task, ("qpos",))
     expected, inside = inner(motion, qvel, task.dt)
     assert np.abs(motion.qvel[inside] - expected).max() < 0.02 * np.abs(qvel).max()
     change = np.gradient(expected, motion.step, axis=0)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mjfim.identification.inverse_dynamics.motion import Readings, RegressionSpline, fit_spline
 from tests.support.numerics import Array
 
-RATE, SECONDS = 200.0, 10.0
+GRID = np.arange(2000) / 200.0
+
+
+SECONDS = 10.0
 
 
 def curve(t: Array, derivative: int = 0) -> Array:
@@ -27,10 +32,6 @@ def readings(t: Array, sigma: float, derivative: int = 0, seed: int = 0) -> Read
     return Readings(t=t, values=values, sigma=sigma or 1.0, derivative=derivative)
 
 
-def grid() -> Array:
-    return np.arange(int(SECONDS * RATE)) / RATE
-
-
 def inner_error(spline: RegressionSpline, derivative: int) -> float:
     """Root mean square error of a derivative away from the ends."""
     t = np.linspace(0.5, SECONDS - 0.5, 500)
@@ -41,14 +42,12 @@ def inner_error(spline: RegressionSpline, derivative: int) -> float:
 @pytest.mark.parametrize("derivative", [0, 1, 2])
 @pytest.mark.parametrize("sigma", [1e-4, 1e-2])
 def test_noise_is_averaged_and_its_size_found(sigma: float, derivative: int) -> None:
-    t = grid()
     inner = np.linspace(0.5, SECONDS - 0.5, 300)
     squares, splines = [], []
     for seed in range(8):
-        noisy = fit_spline([readings(t, sigma, seed=seed)])
-        exact = fit_spline([readings(t, 0.0)], spacing=noisy.spacing)
-        change = noisy.at(inner, derivative) - exact.at(inner, derivative)
-        squares.append(np.mean(change**2))
+        noisy = fit_spline([readings(GRID, sigma, seed=seed)])
+        exact = fit_spline([readings(GRID, 0.0)], spacing=noisy.spacing)
+        squares.append(np.mean((noisy.at(inner, derivative) - exact.at(inner, derivative)) ** 2))
         splines.append(noisy)
     assert inner_error(splines[0], 0) < 0.5 * sigma
     assert np.mean([spline.variance for spline in splines]) == pytest.approx(1.0, abs=0.1)
@@ -59,23 +58,17 @@ def test_noise_is_averaged_and_its_size_found(sigma: float, derivative: int) -> 
 
 
 def test_velocities_improve_velocities() -> None:
-    t = grid()
-    positions = readings(t, 1e-2)
-    velocities = readings(t, 2e-2, derivative=1, seed=1)
-    alone = fit_spline([positions])
-    both = fit_spline([positions, velocities])
-    assert inner_error(both, 1) < 0.5 * inner_error(alone, 1)
+    positions = readings(GRID, 1e-2)
+    both = fit_spline([positions, readings(GRID, 2e-2, derivative=1, seed=1)])
+    assert inner_error(both, 1) < 0.5 * inner_error(fit_spline([positions]), 1)
 
 
 def test_irregular_times_gaps_and_outliers() -> None:
-    rng = np.random.default_rng(4)
-    t = np.sort(rng.uniform(0.0, SECONDS, 1500))
+    t = np.sort(np.random.default_rng(4).uniform(0.0, SECONDS, 1500))
     t = t[(t < 3.0) | (t > 3.4)]
     given = readings(t, 1e-3)
-    values = np.array(given.values)
-    values[::200] += 5.0
-    spoiled = Readings(t=t, values=values, sigma=given.sigma, derivative=0)
-    spline = fit_spline([spoiled])
+    outliers = 5.0 * (np.arange(len(t)) % 200 == 0)
+    spline = fit_spline([replace(given, values=given.values + outliers)])
     inner = np.concatenate([np.linspace(0.5, 2.5, 100), np.linspace(4.0, 9.5, 100)])
     assert np.abs(spline.at(inner) - curve(inner)).max() < 3e-3
     assert np.isfinite(spline.at(np.linspace(3.0, 3.4, 50))).all()
