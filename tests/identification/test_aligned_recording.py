@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
@@ -60,17 +61,17 @@ def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
         assert edges[-1] >= t[-1] - 0.01 * DT
         assert len(found) == 1 or edges[-2] < t[-1]
         integral = np.cumsum(found, axis=0) * DT
-        np.testing.assert_allclose(integral, reference(t, ctrl, edges[1:]), rtol=1e-10)
+        assert_allclose(integral, reference(t, ctrl, edges[1:]), rtol=1e-10)
 
 
 def test_control_on_the_grid_is_unchanged() -> None:
     """It is exactly equal, also after many samples; a row holds until the next one."""
     rng = np.random.default_rng(0)
     ctrl = rng.standard_normal((200_000, 3))
-    np.testing.assert_array_equal(resample_control(np.arange(200_001) * DT, ctrl, DT), ctrl)
+    assert_array_equal(resample_control(np.arange(200_001) * DT, ctrl, DT), ctrl)
     rows = rng.standard_normal((40, 1))
     coarse = resample_control(np.arange(41) * 5 * DT, rows, DT)
-    np.testing.assert_array_equal(coarse, np.repeat(rows, 5, axis=0))
+    assert_array_equal(coarse, np.repeat(rows, 5, axis=0))
 
 
 def log(task: DesignTask, **changes: Any) -> Recording:
@@ -98,14 +99,14 @@ def test_a_recording_on_the_grid_is_unchanged(task: DesignTask) -> None:
     for t, ctrl in ((plain.t, more), (plain.t + 1.7e9, plain.ctrl), (plain.t + jitter, plain.ctrl)):
         aligned = align(task.system, log(task, t=t, ctrl=ctrl))
         assert aligned.on_grid
-        np.testing.assert_allclose(aligned.t, plain.t, rtol=0, atol=1e-15)
-        np.testing.assert_array_equal(aligned.ctrl, plain.ctrl)
-        np.testing.assert_array_equal(aligned.y, plain.y)
+        assert_allclose(aligned.t, plain.t, rtol=0, atol=1e-15)
+        assert_array_equal(aligned.ctrl, plain.ctrl)
+        assert_array_equal(aligned.y, plain.y)
     with pytest.raises(ValueError, match="read-only"):
         aligned.y[0, 0] = 1.0
     swapped = log(task, y=plain.y[:, [3, 0]], outputs=("qvel:hinge", "qpos:slide"))
     aligned = align(task.system, swapped)
-    np.testing.assert_array_equal(aligned.y[:, [3, 0]], swapped.y)
+    assert_array_equal(aligned.y[:, [3, 0]], swapped.y)
     assert aligned.measured.sum() == 2 * len(plain.t)
 
 
@@ -118,16 +119,16 @@ def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> No
     t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
     aligned = align(task.system, log(task, t=t + 5.0))
     assert not aligned.on_grid
-    np.testing.assert_allclose(aligned.t, t - t[0], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(aligned.y, plain.y)
+    assert_allclose(aligned.t, t - t[0], rtol=0, atol=1e-12)
+    assert_array_equal(aligned.y, plain.y)
     averaged = resample_control(t - t[0], plain.ctrl, task.dt)
-    np.testing.assert_allclose(aligned.ctrl, averaged, rtol=0, atol=1e-9)
+    assert_allclose(aligned.ctrl, averaged, rtol=0, atol=1e-9)
     kept = np.delete(np.arange(31), [4, 5, 20])
     changes = {"t": plain.t[kept], "ctrl": plain.ctrl[kept[:-1]], "y": plain.y[kept]}
     sparse = align(task.system, log(task, **changes))
     assert sparse.on_grid
     held = np.concatenate([np.arange(4), [3, 3], np.arange(6, 20), [19], np.arange(21, 30)])
-    np.testing.assert_array_equal(sparse.ctrl, plain.ctrl[held])
+    assert_array_equal(sparse.ctrl, plain.ctrl[held])
 
 
 def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> None:
@@ -139,8 +140,8 @@ def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> No
     t = np.array(plain.t)
     t[8] = t[7] + 0.005 * task.dt
     aligned = align(task.system, log(task, t=t))
-    np.testing.assert_allclose(aligned.ctrl[8], plain.ctrl[8], rtol=0, atol=0.05)
-    np.testing.assert_allclose(aligned.ctrl[7], plain.ctrl[8], rtol=0, atol=0.05)
+    assert_allclose(aligned.ctrl[8], plain.ctrl[8], rtol=0, atol=0.05)
+    assert_allclose(aligned.ctrl[7], plain.ctrl[8], rtol=0, atol=0.05)
 
 
 GRID = np.arange(31) * DT
@@ -184,7 +185,7 @@ def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
         signs[:, columns] *= rng.choice([-1.0, 1.0], (len(signs), 1))
         signs[10:20, columns] = np.nan
     y, aligned = aligned_prediction(body, signs)
-    np.testing.assert_array_equal(aligned, y * np.abs(signs))
+    assert_array_equal(aligned, y * np.abs(signs))
 
 
 def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
@@ -192,7 +193,7 @@ def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
     some = body_task(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
     y, aligned = aligned_prediction(some)
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
-    np.testing.assert_array_equal(aligned, y)
+    assert_array_equal(aligned, y)
 
 
 def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) -> None:
@@ -200,19 +201,19 @@ def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) ->
     y = np.array(log(task).y)
     y[10:13, 1] = np.nan
     shown = measured_trajectory(task.system, log(task, y=y))
-    np.testing.assert_array_equal(shown.qpos[:, 0], y[:, 0])
-    np.testing.assert_allclose(shown.qpos[11, 1], 0.5 * (y[9, 1] + y[13, 1]))
+    assert_array_equal(shown.qpos[:, 0], y[:, 0])
+    assert_allclose(shown.qpos[11, 1], 0.5 * (y[9, 1] + y[13, 1]))
     y[:, 1] = np.nan
     assert measured_trajectory(task.system, log(task, y=y)) is None
     assert measured_trajectory(task.system, log(task, y=y[:, :1], outputs=("qpos:slide",))) is None
     turned = measured_trajectory(body.system, log(body))
-    np.testing.assert_allclose(np.linalg.norm(turned.qpos[:, 3:7], axis=1), 1.0)
+    assert_allclose(np.linalg.norm(turned.qpos[:, 3:7], axis=1), 1.0)
 
     # The rows of a part are the same, also those of a clock that does not begin at zero.
     late = log(body, t=GRID + 100.0)
     part = measured_trajectory(body.system, late, GRID[19])
     assert len(part.t) == 20 and len(part.ctrl) == 19
-    np.testing.assert_array_equal(part.qpos, turned.qpos[:20])
+    assert_array_equal(part.qpos, turned.qpos[:20])
 
 
 def test_the_measured_trajectory_has_measured_velocities_or_none(task: DesignTask) -> None:
@@ -221,7 +222,7 @@ def test_the_measured_trajectory_has_measured_velocities_or_none(task: DesignTas
     names = tuple(task.system.outputs.names[i] for i in measured)
     y = log(task).y[:, measured]
     shown = measured_trajectory(task.system, log(task, y=y, outputs=names))
-    np.testing.assert_array_equal(shown.qvel[:, 1], y[:, 2])
+    assert_array_equal(shown.qvel[:, 1], y[:, 2])
     assert np.isnan(shown.qvel[:, 0]).all()
 
 
@@ -237,4 +238,4 @@ def test_measured_rows_near_a_place(share: float) -> None:
     for row, count in product((0, 1, 57, 398, 400), (1, 12)):
         middle = int(np.searchsorted(rows, row))
         expected = rows[max(middle - count, 0) : middle + count]
-        np.testing.assert_array_equal(recording.measured_rows_near(0, row, count), expected)
+        assert_array_equal(recording.measured_rows_near(0, row, count), expected)

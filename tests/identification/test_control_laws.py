@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError, SimulationDivergedError
@@ -146,7 +147,7 @@ def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:
     batch = next(problem.batches(derivatives=True))
     (rows,) = problem.rows_of_batch(problem.begin(guess), batch)
     for found in (system.plant.derivatives.predict(guess, inputs)[1], rows.jacobians[0]):
-        np.testing.assert_allclose(found / size, expected / size, atol=2e-4)
+        assert_allclose(found / size, expected / size, atol=2e-4)
 
 
 @pytest.mark.parametrize(("off", "tolerance"), [(0, 4e-4), (50, 2e-3)])
@@ -279,7 +280,7 @@ def test_a_duty_law_equals_the_same_law_as_three_controls(tmp_path: Path, enable
         log = read_recording(servo_log(tmp_path, enabled), system.channels)
         problem = FitProblem.of(system, [log])
         outputs.append(problem.predict(problem.begin(system.parameters.guess))[0][:, 0])
-    np.testing.assert_allclose(*outputs, atol=1e-12)
+    assert_allclose(*outputs, atol=1e-12)
     assert np.ptp(outputs[0]) > 0.1
 
 
@@ -328,7 +329,7 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
     found = mjfim.inverse_dynamics(experiment, [log])
 
     assert found.converged
-    np.testing.assert_allclose(found.theta[:3], true[:3], rtol=0.05)
+    assert_allclose(found.theta[:3], true[:3], rtol=0.05)
     assert found.absent == ("kp",)
 
 

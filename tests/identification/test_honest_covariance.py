@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
 import mjfim
@@ -56,8 +57,8 @@ def test_one_wider_interval_leaves_a_known_product_known(system: System) -> None
 
     # A common factor changes no correlation.
     std = np.sqrt(np.diag(NARROW))
-    np.testing.assert_allclose(agreeing_covariance(9.0 * NARROW, std), NARROW, rtol=1e-9)
-    np.testing.assert_allclose(agreeing_covariance(NARROW, std), NARROW, rtol=1e-9)
+    assert_allclose(agreeing_covariance(9.0 * NARROW, std), NARROW, rtol=1e-9)
+    assert_allclose(agreeing_covariance(NARROW, std), NARROW, rtol=1e-9)
 
 
 def test_standard_deviations_agree_with_all_intervals() -> None:
@@ -75,7 +76,7 @@ def test_standard_deviations_agree_with_all_intervals() -> None:
 
     # Parameters about which the covariance says nothing are uncorrelated.
     alone = agreeing_covariance(np.zeros((2, 2)), np.array([2.0, 0.0]))
-    np.testing.assert_array_equal(alone, [[4.0, 0.0], [0.0, 0.0]])
+    assert_array_equal(alone, [[4.0, 0.0], [0.0, 0.0]])
 
 
 # ---- its parts
@@ -111,7 +112,7 @@ def test_recordings_disagree_along_what_differs_between_them() -> None:
 
     # Recordings of which none determines all unknowns.
     unknown = between_covariance(uncertainty(np.full((3, 3), np.nan), between, (0, 1)))
-    np.testing.assert_array_equal(unknown, np.diag(between**2))
+    assert_array_equal(unknown, np.diag(between**2))
 
 
 def test_lengths_and_selections_widen_along_their_differences(system: System) -> None:
@@ -151,7 +152,7 @@ def test_lengths_and_selections_widen_along_their_differences(system: System) ->
     ).honest_covariance
     assert size(found, np.append(PRODUCT, 0.0)) == pytest.approx(KNOWN, rel=0.2)
     std = interval_std(system.parameters, widened)[:2]
-    np.testing.assert_allclose(np.sqrt(np.diag(found))[:2], std, rtol=AGREEMENT + 0.01)
+    assert_allclose(np.sqrt(np.diag(found))[:2], std, rtol=AGREEMENT + 0.01)
 
 
 # ---- estimates
@@ -162,20 +163,20 @@ def test_it_is_saved_and_earlier_estimates_have_none(system: System, tmp_path: P
     saved = with_honest_covariance(earlier, parameters, 4.0 * COVARIANCE)
     saved.save(tmp_path)
     loaded = mjfim.Estimate.load(tmp_path)
-    np.testing.assert_array_equal(honest_covariance(parameters, loaded), saved.honest_covariance)
+    assert_array_equal(honest_covariance(parameters, loaded), saved.honest_covariance)
     assert loaded.summary()["honest_covariance"] is not None
 
     # Without it, formal correlations count.
-    np.testing.assert_allclose(honest_covariance(parameters, earlier), COVARIANCE, rtol=1e-4)
+    assert_allclose(honest_covariance(parameters, earlier), COVARIANCE, rtol=1e-4)
     assert with_honest_covariance(earlier, parameters) is earlier
 
     # Parameters that no recording determines, and values that differ between recordings.
     unknown = block_diag(COVARIANCE[:2, :2], np.inf)
     found = with_honest_covariance(earlier, parameters, unknown).honest_covariance
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), [*STD[:2], np.inf], rtol=AGREEMENT)
+    assert_allclose(np.sqrt(np.diag(found)), [*STD[:2], np.inf], rtol=AGREEMENT)
     differing = replace(saved, per_recording={"c": (1.0, 3.0)})
     added = honest_covariance(parameters, differing) - saved.honest_covariance
-    np.testing.assert_allclose(added, np.diag([0.0, 0.0, 2.0]), atol=1e-12)
+    assert_allclose(added, np.diag([0.0, 0.0, 2.0]), atol=1e-12)
 
 
 @pytest.mark.slow

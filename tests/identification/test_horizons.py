@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import SimulationDivergedError
@@ -84,7 +85,7 @@ def test_lengths_are_compared_where_the_model_lacks_a_term(tmp_path: Path) -> No
 
     found.save(tmp_path)
     loaded = mjfim.Estimate.load(tmp_path).horizons
-    np.testing.assert_array_equal(loaded.errors, study.errors)
+    assert_array_equal(loaded.errors, study.errors)
     assert str(loaded) == str(study)
 
 
@@ -112,10 +113,10 @@ def test_a_dependence_on_the_length_is_a_finding_that_the_interval_covers() -> N
         "mass depends on the length: 83 kg with segments of 0.5 s and 94 kg with whole recordings"
     )
     interval = study.widened(np.array([[92.0, 96.0], [9.0, 13.0]]))
-    np.testing.assert_array_equal(interval, [[83.0, 96.0], [9.0, 13.0]])
+    assert_array_equal(interval, [[83.0, 96.0], [9.0, 13.0]])
 
     # The errors are those by which lengths are compared: relative to the smallest of each horizon.
-    np.testing.assert_allclose(study.relative_errors, [1.179, 1.105], rtol=1e-3)
+    assert_allclose(study.relative_errors, [1.179, 1.105], rtol=1e-3)
     assert "each time: 1.1, 1.18 with segments of 0.5 s)" in study.about_choice
     assert "adds up with time" in study.about_growth
     flat = made_study(errors=np.array([[3.0, 3.2], [3.1, 3.3]]))
@@ -124,19 +125,19 @@ def test_a_dependence_on_the_length_is_a_finding_that_the_interval_covers() -> N
     # Without a dependence, nothing is widened and nothing is found.
     plain = made_study(is_apart=np.zeros((2, 2), dtype=bool))
     assert plain.findings == ()
-    np.testing.assert_array_equal(plain.widened(interval), interval)
+    assert_array_equal(plain.widened(interval), interval)
 
 
 def test_an_estimate_that_is_not_over_the_chosen_length_covers_it() -> None:
     study = made_study(chosen=0, is_apart=np.array([[False, False], [True, False]]))
     assert study.is_used and study.about_use == ""
     interval = np.array([[92.0, 96.0], [10.5, 13.0]])
-    np.testing.assert_array_equal(study.widened(interval), interval)
+    assert_array_equal(study.widened(interval), interval)
 
     # The estimate over whole recordings differs from that of the chosen length.
     unused = replace(study, why_not_used=DIVERGED)
     assert not unused.summary()["is_used"]
-    np.testing.assert_array_equal(unused.widened(interval), [[83.0, 96.0], [10.5, 13.0]])
+    assert_array_equal(unused.widened(interval), [[83.0, 96.0], [10.5, 13.0]])
     assert unused.about_use.endswith("segments of 0.5 s: the fit over this length diverged.")
     assert unused.about_use in str(unused)
     assert unused.about_use in [getattr(part, "text", "") for part in horizon_parts(unused)]

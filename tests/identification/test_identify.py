@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
@@ -80,7 +81,7 @@ def test_both_methods_find_the_minimum_of_the_weighted_squares(
         assert solution.success
         theta = solution.unknowns.theta
         assert cost(theta) <= slow.fun + 1e-5
-        np.testing.assert_allclose(theta, slow.x, atol=1e-5)
+        assert_allclose(theta, slow.x, atol=1e-5)
 
 
 def test_jacobian_agrees_with_independent_differences(
@@ -97,8 +98,8 @@ def test_jacobian_agrees_with_independent_differences(
 def test_covariance_is_the_cramer_rao_bound_at_the_estimate(
     design: mjfim.Design, estimate: mjfim.Estimate
 ) -> None:
-    np.testing.assert_allclose(estimate.std, design.final.std, rtol=0.05)
-    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
+    assert_allclose(estimate.std, design.final.std, rtol=0.05)
+    assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
 
 
 @pytest.mark.slow
@@ -165,8 +166,8 @@ def test_an_interrupted_search_keeps_the_best_result_so_far(
 def test_a_complete_model_has_the_cramer_rao_bound_and_no_misfit(
     design: mjfim.Design, estimate: mjfim.Estimate
 ) -> None:
-    np.testing.assert_allclose(estimate.std, design.final.std, rtol=0.05)
-    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
+    assert_allclose(estimate.std, design.final.std, rtol=0.05)
+    assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
     assert estimate.dof == 200 * 4 - 3
     assert 0.001 < chi2.sf(estimate.chi2, estimate.dof) < 0.999
     assert not estimate.misfit
@@ -203,7 +204,7 @@ def test_an_interruption_after_the_search_keeps_the_estimate(
     assert in_search + number < checks
     assert whole.predictions and not whole.interrupted
     assert found.interrupted and found.predictions == ()
-    np.testing.assert_array_equal(found.theta, whole.theta)
+    assert_array_equal(found.theta, whole.theta)
     assert any(sentence.startswith("interrupted after the search") for sentence in found.warnings)
 
 
@@ -251,7 +252,7 @@ def test_an_interruption_between_starts_keeps_the_earlier_ones(
         found = identify_system(several.system, [recording])
     assert found.interrupted
     assert searched == [1, 2]
-    np.testing.assert_allclose(found.theta, estimate.theta, rtol=1e-3)
+    assert_allclose(found.theta, estimate.theta, rtol=1e-3)
 
 
 def test_an_interruption_before_the_last_search_ends_all_searches(
@@ -268,7 +269,7 @@ def test_an_interruption_before_the_last_search_ends_all_searches(
     found = identify_system(segmented.system, [recording], callback=show)
     assert found.interrupted and not found.converged
     assert set(seen) == {"initial states"}
-    np.testing.assert_array_equal(found.theta, task.parameters.guess)
+    assert_array_equal(found.theta, task.parameters.guess)
 
 
 @pytest.mark.slow
@@ -343,7 +344,7 @@ def test_a_parameter_whose_effect_vanishes_at_the_estimate_is_named_and_no_other
         assert estimate.theta[-1] == 0.0 and np.isinf(estimate.std[-1])
     (sentence,) = [text for text in estimate.warnings if lost in text]
     assert "root" in sentence
-    np.testing.assert_allclose(estimate.std[:3], 1e-3, rtol=0.05)
+    assert_allclose(estimate.std[:3], 1e-3, rtol=0.05)
 
 
 @pytest.mark.slow

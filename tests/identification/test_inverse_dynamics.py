@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.experiment.initial import multisine
@@ -235,8 +236,8 @@ def test_a_robot_of_another_size_gives_the_same_numbers(units: Units, tmp_path: 
     rescaled = rescale(experiment, units, tmp_path / "rescaled")
     other = inverse_dynamics(rescaled.experiment, [rescaled.recording(log)])
     factors = [units.factor(unit) for unit in own.units]
-    np.testing.assert_allclose(other.theta / factors, own.theta, rtol=1e-5)
-    np.testing.assert_allclose(other.std / factors, own.std, rtol=1e-3)
+    assert_allclose(other.theta / factors, own.theta, rtol=1e-5)
+    assert_allclose(other.std / factors, own.std, rtol=1e-3)
     assert [each.rows for each in other.equations] == [each.rows for each in own.equations]
 
 
@@ -313,7 +314,7 @@ def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: P
     # The guess has no excess, so that the rows do not depend on the Stribeck speed there.
     assert System.resolve(experiment).parameters.guess[2] == 0.0
     fit = inverse_dynamics(experiment, [servo_log(experiment, true, 12.0)])
-    np.testing.assert_allclose(fit.theta, true, rtol=0.02)
+    assert_allclose(fit.theta, true, rtol=0.02)
     assert (np.abs(fit.theta - true) < 5.0 * fit.std).all()
 
 
@@ -337,7 +338,7 @@ def test_stated_bounds_priors_and_factors_of_stribeck_friction_hold(
     terms = {"bristle": {"kind": "stribeck", "joint": "j"}}
     experiment = servo(tmp_path, parameters, terms=terms)
     fit = inverse_dynamics(experiment, [servo_log(experiment, [0.4, true], 8.0)])
-    np.testing.assert_allclose(fit.theta, [0.4, true], rtol=0.2)
+    assert_allclose(fit.theta, [0.4, true], rtol=0.2)
     assert np.isfinite(fit.std).all()
     assert fit.std[1] > 0.0
 

@@ -34,33 +34,33 @@ def exact_fit(problem: FitProblem, solution: Solution, part: LeftOutPart) -> Arr
 
 @pytest.mark.parametrize("fit", [{}, pytest.param({"segments": 0.5}, marks=pytest.mark.slow)])
 def test_it_is_the_fit_to_the_others(fit: dict[str, object]) -> None:
+    """Theta moves by about a standard deviation, and misses a small share of it."""
     problem, solution = fitted(fit)
-    sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     for part in list(left_out_parts(problem))[:2]:
-        found = fit_without(problem, Budget(), solution=solution, part=part)
-        assert found is not None
+        found = fit_without(problem, Budget(), solution=solution, part=part).theta
+        moved, missed = (
+            np.linalg.norm((found - other) / sigma_of(solution))
+            for other in (solution.unknowns.theta, exact_fit(problem, solution, part))
+        )
+        assert moved > 0.1
+        assert missed < 0.2 * moved
 
-        # Theta moves by about a standard deviation, and misses a small share of it.
-        moved = found.theta - solution.unknowns.theta
-        missed = found.theta - exact_fit(problem, solution, part)
-        assert np.linalg.norm(moved / sigma) > 0.1
-        assert np.linalg.norm(missed / sigma) < 0.2 * np.linalg.norm(moved / sigma)
+
+def sigma_of(solution: Solution) -> Array:
+    """Formal standard deviations."""
+    return np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
 
 
 @pytest.mark.slow
 def test_a_search_follows_where_the_linearisation_does_not_lead_there() -> None:
     """Far from the fit, the search begins at the guess, where the others cost less."""
     problem, solution = fitted({})
-    sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     part = next(left_out_parts(problem))
     unknowns = replace(solution.unknowns, theta=solution.unknowns.theta * [3.0, 1.5, 0.2])
-    condensed = problem.condense(unknowns)
-    assert condensed is not None
-    away = replace(solution, unknowns=unknowns, condensed=condensed)
+    away = replace(solution, unknowns=unknowns, condensed=problem.condense(unknowns))
     found = fit_without(problem, Budget(), solution=away, part=part)
-    assert found is not None
-    missed = found.theta - exact_fit(problem, solution, part)
-    assert np.linalg.norm(missed / sigma) < 0.3
+    missed = (found.theta - exact_fit(problem, solution, part)) / sigma_of(solution)
+    assert np.linalg.norm(missed) < 0.3
 
 
 def test_nothing_is_left_of_a_problem_with_one_part_only() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 import mjfim
@@ -75,7 +76,7 @@ def test_a_stream_tells_what_a_fit_of_the_recording_predicts(
 ) -> None:
     experiment = cart_pendulum(fit=fit)
     found = watched(experiment, log, np.random.default_rng(2))
-    np.testing.assert_allclose(found.std, std_of_recording(experiment, log), rtol=TOLERANCE)
+    assert_allclose(found.std, std_of_recording(experiment, log), rtol=TOLERANCE)
     assert found.rows == len(log.t) and found.t[-1] == pytest.approx(4.0)
     # Formal standard deviations only fall.
     known = np.isfinite(found.std_over_time).all(axis=1)
@@ -89,7 +90,7 @@ def test_a_stream_may_begin_in_the_middle_of_a_motion(log: Recording) -> None:
     found = watched(STUDY, late, np.random.default_rng(9))
     assert "does not begin where [initial] says" in found.warnings[0]
     # The state at the begin follows from the first rows alone, which is the same in both.
-    np.testing.assert_allclose(found.std, std_of_recording(STUDY, late), rtol=TOLERANCE)
+    assert_allclose(found.std, std_of_recording(STUDY, late), rtol=TOLERANCE)
 
 
 def test_the_information_is_that_of_plain_simulations(log: Recording) -> None:
@@ -108,13 +109,13 @@ def test_the_information_is_that_of_plain_simulations(log: Recording) -> None:
     G = np.stack([(outputs(guess + h) - outputs(guess - h)) / (2.0 * h.sum()) for h in moves], -1)
     rows = (G / system.noise.sigma[:, None]).reshape(-1, len(guess))
     expected = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)))
-    np.testing.assert_allclose(watched(STUDY, log).std, expected, rtol=TOLERANCE)
+    assert_allclose(watched(STUDY, log).std, expected, rtol=TOLERANCE)
 
 
 def test_an_end_that_is_no_whole_segment_counts_nearly_as_in_a_fit(log: Recording) -> None:
     experiment = cart_pendulum(fit={"segments": 0.7})
     found = watched(experiment, log, np.random.default_rng(4))
-    np.testing.assert_allclose(found.std, std_of_recording(experiment, log), rtol=0.1)
+    assert_allclose(found.std, std_of_recording(experiment, log), rtol=0.1)
 
 
 def test_every_row_is_simulated_once(log: Recording) -> None:
@@ -139,7 +140,7 @@ def test_rows_between_samples_and_missing_values(log: Recording) -> None:
     y = np.where(rng.random(log.y.shape) < 0.2, np.nan, log.y)
     jittered = replace(log, t=t, y=y)
     found = watched(STUDY, jittered, rng)
-    np.testing.assert_allclose(found.std, std_of_recording(STUDY, jittered), rtol=TOLERANCE)
+    assert_allclose(found.std, std_of_recording(STUDY, jittered), rtol=TOLERANCE)
 
 
 def test_priors_count_as_in_a_fit(log: Recording) -> None:
@@ -148,7 +149,7 @@ def test_priors_count_as_in_a_fit(log: Recording) -> None:
     found = watched(experiment, log)
     j = found.parameters.index("c")
     assert found.std[j] < 0.01 and found.enough
-    np.testing.assert_allclose(found.std, std_of_recording(experiment, log), rtol=TOLERANCE)
+    assert_allclose(found.std, std_of_recording(experiment, log), rtol=TOLERANCE)
     # At the first result, the prior alone suffices.
     assert found.reached[j] < np.inf and found.asked.tolist() == [j]
 
@@ -184,7 +185,7 @@ def test_a_long_stream_keeps_a_bounded_history(
             meter.read()
     found = meter.read(ended=True)
     assert len(found.t) <= 2 * 20 + 1 and found.t[-1] == pytest.approx(4.0)
-    np.testing.assert_allclose(found.std, watched(STUDY, log).std, rtol=TOLERANCE)
+    assert_allclose(found.std, watched(STUDY, log).std, rtol=TOLERANCE)
     assert found.t[0] == 0.0 and np.diff(found.t).max() < 0.5
 
 
@@ -259,4 +260,4 @@ def test_a_measured_arm_of_24_parameters(segments: object, tolerance: float) -> 
     log = Recording(t=t, ctrl=motion[:-1, :6], y=motion[:, 6:], outputs=names)
     found = watched(experiment, log, np.random.default_rng(8))
     assert len(found.parameters) == 24
-    np.testing.assert_allclose(found.std, std_of_recording(experiment, log), rtol=tolerance)
+    assert_allclose(found.std, std_of_recording(experiment, log), rtol=tolerance)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.stats import chi2, kstest, truncnorm
 
 import mjfim
@@ -64,7 +65,7 @@ def test_the_moments_are_those_of_the_formal_covariance(system: System) -> None:
     assert len(draws) == 2000
     first, again, other = (drawn(system, estimate, 3, seed).values for seed in (0, 0, 1))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
-    np.testing.assert_allclose(draws.std, STD, rtol=1e-3)
+    assert_allclose(draws.std, STD, rtol=1e-3)
 
     deviation = draws.values - estimate.theta
     distance = np.einsum("ni,ij,nj->n", deviation, np.linalg.inv(COVARIANCE), deviation)
@@ -78,7 +79,7 @@ def test_wide_intervals_stretch_the_covariance_of_earlier_versions(system: Syste
     half = 1.959964 * factor * STD
     estimate = estimated(system, COVARIANCE, interval=np.column_stack([theta - half, theta + half]))
     found = honest_covariance(system.parameters, estimate)
-    np.testing.assert_allclose(found, COVARIANCE * np.outer(factor, factor), rtol=1e-5)
+    assert_allclose(found, COVARIANCE * np.outer(factor, factor), rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -88,7 +89,7 @@ def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
     theta = np.array([2.0, 1.0, 0.0])
     bounded = estimated(system, COVARIANCE, theta=theta, interval=interval)
     found = honest_covariance(system.parameters, bounded)
-    np.testing.assert_allclose(np.sqrt(found[2, 2]), 0.4 / 1.959964, rtol=1e-5)
+    assert_allclose(np.sqrt(found[2, 2]), 0.4 / 1.959964, rtol=1e-5)
     draws = drawn(system, bounded, 1000, 2)
     half_normal = truncnorm(0.0, np.inf, scale=0.4 / 1.959964)
     assert kstest(draws.values[:, 2], half_normal.cdf).pvalue > 1e-3
@@ -108,13 +109,13 @@ def test_deviations_between_recordings_count(system: System) -> None:
         system, COVARIANCE, std_sandwich=2.0 * STD, between_recordings=np.array([0.0, 0.0, 0.3])
     )
     found = np.sqrt(np.diag(honest_covariance(system.parameters, estimate)))
-    np.testing.assert_allclose(found, [0.04, 0.06, np.hypot(0.2, 0.3)], rtol=1e-3)
+    assert_allclose(found, [0.04, 0.06, np.hypot(0.2, 0.3)], rtol=1e-3)
 
     # A parameter with a value for each recording is centred at their mean, and scatters as they do.
     differing = estimated(system, COVARIANCE, per_recording={"c": (1.0, 2.0)})
     draws = drawn(system, differing, 10)
     assert draws.centre[2] == 1.5
-    np.testing.assert_allclose(draws.std[2], np.hypot(0.1, np.sqrt(0.5)), rtol=1e-3)
+    assert_allclose(draws.std[2], np.hypot(0.1, np.sqrt(0.5)), rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -231,15 +232,15 @@ def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
     known = KnownMoment(tmp_path)
     estimate = known.estimate
     of_rows = known.rows @ estimate.honest_covariance @ known.rows.T
-    np.testing.assert_allclose(np.sqrt(np.diag(of_rows)), KNOWN, rtol=1e-3)
+    assert_allclose(np.sqrt(np.diag(of_rows)), KNOWN, rtol=1e-3)
     draws = drawn(known.system, estimate, 400, 7)
     assert draws.held_combinations == 9
     assert "9 combinations of inertias that the recordings do not determine" in str(draws)
 
     # Standard deviations of 400 draws scatter by 3.5 %.
     found = known.relative(draws.values)
-    np.testing.assert_allclose(found.std(axis=1), KNOWN, rtol=0.12)
-    np.testing.assert_allclose(found.mean(axis=1), 1.0, atol=4 * KNOWN / 20)
+    assert_allclose(found.std(axis=1), KNOWN, rtol=0.12)
+    assert_allclose(found.mean(axis=1), 1.0, atol=4 * KNOWN / 20)
     assert all(map(known.body.is_physical, known.linear(draws.values)))
 
     # Along straight lines of log-Cholesky coordinates, they are lost.
@@ -265,6 +266,6 @@ def test_a_wide_prior_on_a_whole_inertia_gives_physical_robots(
 
     # The combinations that the recordings determine stay known, and the mass is not.
     found = known.relative(draws.values)
-    np.testing.assert_allclose(found.std(axis=1), KNOWN, rtol=0.4)
-    np.testing.assert_allclose(found.mean(axis=1), 1.0, atol=KNOWN)
+    assert_allclose(found.std(axis=1), KNOWN, rtol=0.4)
+    assert_allclose(found.mean(axis=1), 1.0, atol=KNOWN)
     assert np.std(linear[:, 0]) > 0.1 * np.mean(linear[:, 0])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
@@ -19,7 +20,7 @@ def test_amplification_of_an_exponential_motion(rate: float) -> None:
     """Also where the factor exceeds the largest number: it is known by its logarithm."""
     A = np.tile(np.diag([np.exp(rate), 0.5]), (1500, 1, 1))
     found = amplifications(A, np.array([3.0, 1e-3]))
-    np.testing.assert_allclose(found, 2.0 ** np.arange(11) * rate / np.log(10.0), rtol=1e-12)
+    assert_allclose(found, 2.0 ** np.arange(11) * rate / np.log(10.0), rtol=1e-12)
 
 
 def test_amplification_does_not_depend_on_units() -> None:
@@ -27,7 +28,7 @@ def test_amplification_does_not_depend_on_units() -> None:
     A, sizes = np.eye(3) + 0.1 * rng.normal(size=(40, 3, 3)), rng.uniform(1.0, 2.0, 3)
     unit = np.array([1e-3, 1.0, 1e5])
     again = amplifications(unit[:, None] * A / unit, unit * sizes)
-    np.testing.assert_allclose(amplifications(A, sizes), again, rtol=1e-9)
+    assert_allclose(amplifications(A, sizes), again, rtol=1e-9)
 
 
 def test_a_motion_that_stands_still_amplifies_nothing() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2, f, kstest
 
 from mjfim.identification.assessment.recording_comparison import (
@@ -27,7 +28,7 @@ def test_between_variance_solves_the_equation_of_paule_and_mandel() -> None:
     w = 1.0 / (variances + found)
     mean = np.sum(w * values, axis=0) / w.sum(axis=0)
     squares = np.sum(w * (values - mean) ** 2, axis=0)
-    np.testing.assert_allclose(squares[found > 0.0], 6.0, rtol=1e-8)
+    assert_allclose(squares[found > 0.0], 6.0, rtol=1e-8)
     assert (squares[found == 0.0] <= 6.0).all()
     assert 10 < np.sum(found > 0.0) < 30 and (found >= 0.0).all()
 
@@ -37,10 +38,10 @@ def test_missing_estimates_are_left_out() -> None:
     values = np.array([[1.0, nothing, nothing], [2.0, nothing, nothing], [nothing, 5.0, nothing]])
     variances = np.where(np.isnan(values), np.inf, [[1.0], [1.0], [2.0]])
     found = random_effects(values, variances, 1e9)
-    np.testing.assert_array_equal(found.count, [2, 1, 0])
-    np.testing.assert_allclose(found.mean, [1.5, 5.0, nothing])
-    np.testing.assert_allclose(found.variance, [0.5, 2.0, np.inf])
-    np.testing.assert_allclose(found.p, [chi2(1).sf(0.5), 1.0, 1.0])
+    assert_array_equal(found.count, [2, 1, 0])
+    assert_allclose(found.mean, [1.5, 5.0, nothing])
+    assert_allclose(found.variance, [0.5, 2.0, np.inf])
+    assert_allclose(found.p, [chi2(1).sf(0.5), 1.0, 1.0])
     assert not np.isfinite(found.prediction).any()
 
 
@@ -95,15 +96,15 @@ def test_scatter_adds_to_the_covariance_also_of_singular_information() -> None:
     found, of_one = with_scatter(np.array([full, rank_one]), tau2)
     A, vector = found[:, :-1], found[:, -1]
     expected = np.linalg.inv(J.T @ J) + tau2
-    np.testing.assert_allclose(np.linalg.inv(A), expected, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.solve(A, vector), estimate, rtol=1e-8)
-    np.testing.assert_allclose(of_one * (1.0 + direction @ tau2 @ direction), rank_one, atol=1e-11)
-    np.testing.assert_array_equal(with_scatter(rank_one, 0.0 * tau2), rank_one)
+    assert_allclose(np.linalg.inv(A), expected, rtol=1e-9, atol=1e-12)
+    assert_allclose(np.linalg.solve(A, vector), estimate, rtol=1e-8)
+    assert_allclose(of_one * (1.0 + direction @ tau2 @ direction), rank_one, atol=1e-11)
+    assert_array_equal(with_scatter(rank_one, 0.0 * tau2), rank_one)
 
 
 def test_distributions() -> None:
     assert f_tail(6.0, 3, 10.0) == pytest.approx(f(3, 10).sf(2.0))
     assert f_tail(6.0, 0, 10.0) == 1.0
-    np.testing.assert_allclose(
+    assert_allclose(
         satterthwaite(np.array([0.0, 1.0, 0.5]), 50.0, 2), [50.0, 2.0, 1.0 / (0.25 / 50 + 0.125)]
     )

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.identification.assessment.recording_comparison import compare_evidence
@@ -51,7 +52,7 @@ def test_values_are_those_of_separate_fits(with_offsets: bool) -> None:
     found = compared(Linear(X=X, with_offsets=with_offsets), y)
     for k in range(4):
         J = np.column_stack([X[k], np.ones((160, int(with_offsets)))])
-        np.testing.assert_allclose(found.values[k], np.linalg.lstsq(J, y[k])[0][:3], rtol=1e-8)
+        assert_allclose(found.values[k], np.linalg.lstsq(J, y[k])[0][:3], rtol=1e-8)
 
         # The deviations are the formal ones, a little larger where blocks happen to scatter more.
         formal = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))[:3]
@@ -135,8 +136,8 @@ def test_recordings_that_determine_some_parameters_only() -> None:
     y = X @ np.array([1.0, -2.0, 0.5]) + noise(0.0, (4, 400), np.random.default_rng(4))
     found = compared(Linear(X=X), y)
     unknown = np.vstack([np.eye(3), np.ones(3)]).astype(bool)
-    np.testing.assert_array_equal(np.isnan(found.values), unknown)
-    np.testing.assert_array_equal(np.isinf(found.std), unknown)
+    assert_array_equal(np.isnan(found.values), unknown)
+    assert_array_equal(np.isinf(found.std), unknown)
     assert np.isfinite(found.mean).all()
     assert "agree" in str(found)
 
@@ -190,7 +191,7 @@ def test_a_fit_names_the_odd_recording() -> None:
     differing = mjfim.identify(stated, recordings).recording_comparison
     assert differing.parameters == ("m", "l", "c")
     assert differing.odd == ()
-    np.testing.assert_array_equal(differing.is_stated, [0.0, 0.0, 1.0])
-    np.testing.assert_allclose(differing.values[:, 2], [1.0, 1.0, 1.7, 1.0, 1.0], atol=0.3)
+    assert_array_equal(differing.is_stated, [0.0, 0.0, 1.0])
+    assert_allclose(differing.values[:, 2], [1.0, 1.0, 1.7, 1.0, 1.0], atol=0.3)
     assert differing.tau[2] > 0.1
     assert differing.p[2] == 1.0

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import lfilter
 from scipy.stats import binom
 
@@ -18,6 +19,7 @@ from mjfim.identification.assessment.robust_covariance import (
     covering_covariance,
     merge_blocks,
     robust_uncertainty,
+    t_quantile,
 )
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
@@ -138,14 +140,14 @@ def test_deviations_are_the_spread_of_estimates_and_intervals_cover_the_truth(
     true = errors.std(axis=0)
     assert (true < prior).all()
     for deviation in (sandwich, bootstrap):
-        np.testing.assert_allclose(deviation.mean(axis=0), true, rtol=0.25 if phi else 0.15)
+        assert_allclose(deviation.mean(axis=0), true, rtol=0.25 if phi else 0.15)
     naive = (np.abs(errors) < 1.96 * formal).mean()
     if phi:
         assert naive < 0.8
         assert (formal.mean(axis=0) < 0.4 * true).all()
     else:
         assert naive > 0.9
-        np.testing.assert_allclose(sandwich.mean(axis=0), formal.mean(axis=0), rtol=0.05)
+        assert_allclose(sandwich.mean(axis=0), formal.mean(axis=0), rtol=0.05)
     assert covered.sum() >= binom.ppf(0.001, covered.size, 0.92)
     assert not covered.all(), "an interval that is never wrong is too wide"
 
@@ -206,7 +208,7 @@ def test_estimates_from_single_recordings_are_their_fits() -> None:
     y = rng.standard_normal((4, 240))
     _, _, result = Linear(X).assessed(y, 16.0)
     for k in (0, 1, 3):
-        np.testing.assert_allclose(result.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
+        assert_allclose(result.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
     assert np.isnan(result.each[2]).all()
 
 
@@ -224,8 +226,8 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
     )
     two = assess(other, theta / unit, 36.0, draws=50)
     for name in ("sandwich", "each", "draws"):
-        np.testing.assert_allclose(getattr(two, name) * unit, getattr(one, name), rtol=1e-6)
-    np.testing.assert_allclose(two.interval.T * unit, one.interval.T, rtol=1e-6)
+        assert_allclose(getattr(two, name) * unit, getattr(one, name), rtol=1e-6)
+    assert_allclose(two.interval.T * unit, one.interval.T, rtol=1e-6)
     assert len(two.draws) == 50
 
 
@@ -266,7 +268,7 @@ def test_merged_blocks_are_short_runs_of_one_recording(
 ) -> None:
     """They are as short as possible, and the last one has at least half of the length."""
     found = merge_blocks(np.array(recording, dtype=int), np.array(rows, dtype=float), length)
-    np.testing.assert_array_equal(found, expected)
+    assert_array_equal(found, expected)
 
 
 def test_a_covering_covariance_is_at_least_both_in_every_direction() -> None:
@@ -276,8 +278,8 @@ def test_a_covering_covariance_is_at_least_both_in_every_direction() -> None:
     found = covering_covariance(first, second)
     for smaller in (first, second):
         assert np.linalg.eigvalsh(found - smaller)[0] > -1e-9
-    np.testing.assert_allclose(covering_covariance(first, 0.1 * first), first, rtol=1e-6)
-    np.testing.assert_allclose(covering_covariance(first, 9.0 * first), 9.0 * first, rtol=1e-6)
+    assert_allclose(covering_covariance(first, 0.1 * first), first, rtol=1e-6)
+    assert_allclose(covering_covariance(first, 9.0 * first), 9.0 * first, rtol=1e-6)
 
 
 def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
@@ -285,9 +287,9 @@ def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
     for prior, factor in ((np.inf, 100.0), (1e-6, 1.0)):
         theta, condensed = Linear(X, prior=prior).fitted(y)
         plain, wide = (assess(condensed, theta, 1.0, inflation=each) for each in (1.0, 100.0))
-        np.testing.assert_array_equal(plain.interval, wide.interval)
+        assert_array_equal(plain.interval, wide.interval)
         ratio = np.diag(wide.covariance) / np.diag(plain.covariance)
-        np.testing.assert_allclose(ratio, factor, rtol=0.35)
+        assert_allclose(ratio, factor, rtol=0.35)
 
 
 def test_no_combination_is_better_known_than_by_the_formal_covariance() -> None:
@@ -305,3 +307,9 @@ def test_no_combination_is_better_known_than_by_the_formal_covariance() -> None:
     relative = np.linalg.eigvalsh(root.T @ scaled @ root)
     assert relative.min() > 0.99
     assert relative.max() < 3.0
+
+
+def test_the_quantile_is_that_of_student() -> None:
+    """Of 2 parts, 12.706 standard errors are 95 %; of many, 1.96."""
+    found = t_quantile(np.array([1, 10**7]), 0.95)
+    assert_allclose(found, [12.706, 1.959964], rtol=1e-4)

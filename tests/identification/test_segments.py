@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
@@ -70,7 +71,7 @@ def require_rows_covered_once(
     """Require that every row belongs to exactly one segment, which simulates its time."""
     for i, one in enumerate(recordings):
         rows = np.concatenate([np.arange(len(one.t))[p.rows] for p in segments if p.recording == i])
-        np.testing.assert_array_equal(rows, np.arange(len(one.t)))
+        assert_array_equal(rows, np.arange(len(one.t)))
     for p in segments:
         t = recordings[p.recording].t[p.rows] / recordings[p.recording].dt
         assert t[0] >= p.begin - 1e-9
@@ -145,7 +146,7 @@ def test_whole_recordings_start_as_stated(task: DesignTask) -> None:
     require_rows_covered_once(segments, recordings)
     assert [(p.recording, p.begin, p.samples) for p in segments] == [(0, 0, 200), (1, 0, 79)]
     for p in segments:
-        np.testing.assert_array_equal(p.start, start)
+        assert_array_equal(p.start, start)
 
 
 @pytest.mark.parametrize("hidden", [(), ("qvel",)])
@@ -188,7 +189,7 @@ def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
     noisy = np.array(y)
     noisy[:, 3:11] *= 1.01
     states = measured_initial_states(body.system, aligned_log(body, noisy), begins)
-    np.testing.assert_allclose(states[:, 3:11], y[begins, 3:11], rtol=0, atol=1e-9)
+    assert_allclose(states[:, 3:11], y[begins, 3:11], rtol=0, atol=1e-9)
     for part, share in ((slice(3), 0.02), (slice(11, None), 0.1)):
         error = np.abs(states[:, part] - y[begins, part]).max()
         assert error < share * np.ptp(y[:, part])
@@ -209,8 +210,8 @@ def test_unmeasured_states_follow_the_model_at_the_guess(
         ("qpos:ball", "qvel"): slice(7, 11),
         ("qpos:float.x",): slice(1),
     }[hidden]
-    np.testing.assert_allclose(states[:, from_model], guess[begins, from_model], atol=1e-9)
-    np.testing.assert_allclose(states[:, 3:7], y[begins, 3:7], rtol=0, atol=1e-9)
+    assert_allclose(states[:, from_model], guess[begins, from_model], atol=1e-9)
+    assert_allclose(states[:, 3:7], y[begins, 3:7], rtol=0, atol=1e-9)
     error = np.abs(states[:, 11:14] - y[begins, 11:14]).max()
     assert error < 0.1 * np.ptp(y[:, 11:14])
 

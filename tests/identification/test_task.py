@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.arrays import Array
@@ -51,7 +52,7 @@ def test_a_minimal_experiment_identifies_its_parameters(
     assert (np.abs(estimate.theta - [2.0, 1.0]) < 4.0 * estimate.std).all()
 
     (errors,) = mjfim.predict(experiment, estimate.theta, [recording], threads=1)
-    np.testing.assert_allclose(errors.rms, 0.05, rtol=0.2)
+    assert_allclose(errors.rms, 0.05, rtol=0.2)
 
 
 def test_a_design_of_a_minimal_experiment_says_what_is_missing(
@@ -68,9 +69,9 @@ def test_the_start_is_moved_inside_the_bounds_of_a_bounded_method(
 ) -> None:
     start = np.array([50.0, -1.0])
     bounded = FitTask.of(System.resolve(experiment), [recording], start=start)
-    np.testing.assert_array_equal(bounded.start, [10.0, 0.0])
+    assert_array_equal(bounded.start, [10.0, 0.0])
     unbounded = FitTask.of(System.resolve(experiment), [recording], start=start, method="newton")
-    np.testing.assert_array_equal(unbounded.start, start)
+    assert_array_equal(unbounded.start, start)
 
 
 def test_variants_of_a_problem_leave_the_problem_unchanged(
@@ -91,7 +92,7 @@ def test_variants_of_a_problem_leave_the_problem_unchanged(
     assert nothing.value_count == 0
 
     assert problem.cost(begin) == cost
-    np.testing.assert_array_equal(problem.lower, lower)
+    assert_array_equal(problem.lower, lower)
 
 
 def test_recordings_that_count_twice_are_refused(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import ks_2samp, kstest, norm, truncnorm
 
 from mjfim.identification.assessment import parameter_draws
@@ -45,7 +46,7 @@ def test_without_bounds_the_moments_are_those_of_the_normal_distribution() -> No
     drawn = truncated(mean, covariance_of(std, 0.7), -INFINITE, INFINITE, 4000, 1)
     for column in ((drawn - mean) / std).T:
         assert kstest(column, norm.cdf).pvalue > 1e-3
-    np.testing.assert_allclose(np.corrcoef(drawn.T)[0, 1:], 0.7, atol=0.03)
+    assert_allclose(np.corrcoef(drawn.T)[0, 1:], 0.7, atol=0.03)
 
 
 @pytest.mark.parametrize("correlation", [-0.45, 0.0, 0.9, 0.999])
@@ -86,8 +87,8 @@ def test_a_singular_covariance_keeps_its_directions() -> None:
     lower = np.array([0.5, -np.inf, -np.inf])
     mean = np.array([1.0, 2.0, 3.0])
     drawn = truncated(mean, np.outer(direction, direction), lower, INFINITE, 500, 5)
-    np.testing.assert_allclose(drawn[:, 0] * 2.0 + drawn[:, 1], 4.0, atol=1e-9)
-    np.testing.assert_array_equal(drawn[:, 2], 3.0)
+    assert_allclose(drawn[:, 0] * 2.0 + drawn[:, 1], 4.0, atol=1e-9)
+    assert_array_equal(drawn[:, 2], 3.0)
     assert drawn[:, 0].min() >= 0.5
 
 
@@ -129,4 +130,4 @@ def test_units_of_a_matrix_do_not_change_the_draws() -> None:
         )
         for u in (np.ones((2, 2)), np.outer([1e-6, 1e4], [1e-6, 1e4]))
     )
-    np.testing.assert_allclose(own, other, rtol=1e-6, atol=1e-9)
+    assert_allclose(own, other, rtol=1e-6, atol=1e-9)

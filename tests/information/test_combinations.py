@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import UnidentifiableError
@@ -93,7 +94,7 @@ def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> N
         for each in (task, again)
     )
     assert lost(tuple(PARAMETERS), told) == INVISIBLE
-    np.testing.assert_allclose(told[3:], alone[3:] * np.sqrt(0.5), rtol=1e-4)  # the data twice
+    assert_allclose(told[3:], alone[3:] * np.sqrt(0.5), rtol=1e-4)  # the data twice
 
 
 @pytest.mark.slow
@@ -108,9 +109,9 @@ def test_an_estimate_keeps_what_no_recording_shows_and_determines_the_rest(tmp_p
     assert not estimate.misfit
     assert abs(estimate.theta[4] - 0.1) < 4.0 * estimate.std[4]
     # not run away along what is invisible
-    np.testing.assert_allclose(estimate.theta[:3], task.parameters.guess[:3], rtol=0.1)
+    assert_allclose(estimate.theta[:3], task.parameters.guess[:3], rtol=0.1)
     told = [row.std for row in check_recordings(task.system, [recording]).rows[3:]]
-    np.testing.assert_allclose(estimate.std[3:], told, rtol=0.3)  # there at the guess
+    assert_allclose(estimate.std[3:], told, rtol=0.3)  # there at the guess
 
     # it serves as earlier information
     estimate.save(tmp_path)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
@@ -51,7 +52,7 @@ def designed(case: str, starts: int) -> mjfim.Design:
 def test_eigenvalues_of_the_initial_trajectory(case: str, place: str) -> None:
     task = DesignTask.resolve(experiment(case))
     criterion = task.problem.point(task.initial).criterion
-    np.testing.assert_allclose(criterion.eigenvalues, EIGENVALUES[place], rtol=1e-5)
+    assert_allclose(criterion.eigenvalues, EIGENVALUES[place], rtol=1e-5)
 
 
 def test_gradient_of_the_information_term() -> None:
@@ -67,9 +68,7 @@ def test_gradient_of_the_information_term() -> None:
     a, b = task.information.gradient(point.criterion, point.sensitivity, bilinear)
     gradient = Expansion(A=bilinear.A, B=bilinear.B, a=a, b=b).gradient(np.zeros((400, 1, 4)))[:, 0]
     assert np.linalg.norm(gradient) == pytest.approx(1.4318943623, rel=1e-4)
-    np.testing.assert_allclose(
-        gradient[[0, 100, 250]], [0.1734982191, 0.0586059128, 0.0474071683], rtol=1e-4
-    )
+    assert_allclose(gradient[[0, 100, 250]], [0.1734982191, 0.0586059128, 0.0474071683], rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -131,5 +130,5 @@ def test_the_optimum_agrees_with_exact_derivatives_of_the_hand_derived_model(cas
     stated = solvers.CASES[case]
     J, eigenvalues = solvers.objective(stated, design.trajectory.ctrl[:, 0], False)
     assert pytest.approx(design.final.cost, rel=1e-6) == J
-    np.testing.assert_allclose(eigenvalues, design.final.eigenvalues, rtol=1e-5)
+    assert_allclose(eigenvalues, design.final.eigenvalues, rtol=1e-5)
     assert design.final.cost <= (1 + 1e-6) * solvers.lbfgs(stated, False).J

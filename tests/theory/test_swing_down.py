@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -36,9 +37,9 @@ def test_a_check_predicts_the_standard_deviations_of_the_closed_form(tmp_path: P
     found = mjfim.check(experiment)
     theory = small_swing_information(t[1:], SMALL)
     size = np.sqrt(np.outer(np.diag(theory), np.diag(theory)))
-    np.testing.assert_allclose(found.information / size, theory / size, atol=1e-3)
+    assert_allclose(found.information / size, theory / size, atol=1e-3)
     predicted = [row.std for row in found.rows]
-    np.testing.assert_allclose(predicted, np.sqrt(np.diag(np.linalg.inv(theory))), rtol=2e-3)
+    assert_allclose(predicted, np.sqrt(np.diag(np.linalg.inv(theory))), rtol=2e-3)
     assert found.self_test.passed
     assert found.source == "the initial state"
 
