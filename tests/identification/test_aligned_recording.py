@@ -6,7 +6,6 @@ The control keeps its impulse, measured values stay unchanged, and messages name
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import (
-    AlignedRecording,
     align,
     measured_trajectory,
     resample_control,
@@ -224,18 +222,3 @@ def test_the_measured_trajectory_has_measured_velocities_or_none(task: DesignTas
     shown = measured_trajectory(task.system, log(task, y=y, outputs=names))
     assert_array_equal(shown.qvel[:, 1], y[:, 2])
     assert np.isnan(shown.qvel[:, 0]).all()
-
-
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 1.0])
-def test_measured_rows_near_a_place(share: float) -> None:
-    """They are those of a search in all rows, however many values are missing."""
-    measured = np.random.default_rng(0).random(400) < share
-    y = np.where(measured, 1.0, np.nan)[:, None]
-    recording = AlignedRecording(
-        name="log", t=np.arange(400.0), y=y, ctrl=np.zeros((399, 1)), dt=1.0, on_grid=True
-    )
-    rows = np.flatnonzero(measured)
-    for row, count in product((0, 1, 57, 398, 400), (1, 12)):
-        middle = int(np.searchsorted(rows, row))
-        expected = rows[max(middle - count, 0) : middle + count]
-        assert_array_equal(recording.measured_rows_near(0, row, count), expected)

@@ -10,9 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
-from mjfim.identification.starts import MIN_ROWS, segment_lengths
 from mjfim.parallel.budget import StopToken
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
@@ -146,18 +144,3 @@ def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Pa
     found = identify_system(system, [swings(system, 12.0)], start=start, callback=press, stop=stop)
     assert found.interrupted
     assert found.restart.cost <= found.restart.cost_before
-
-
-def test_segments_are_shares_of_the_whole_problem_with_enough_rows(tmp_path: Path) -> None:
-    """They share the system and the recordings, which workers then receive once."""
-    system = pendulum(tmp_path, 12.0)
-    problem = FitProblem.of(system, [swings(system, 12.0)])
-    part = problem.cut(1.0)
-    assert len(part.segments) == 12
-    assert part.recordings is problem.recordings and part.system is problem.system
-    assert problem.cut(0.01) is None
-
-    lengths = segment_lengths(problem.recordings)
-    assert lengths[0] * RATE >= MIN_ROWS
-    assert (np.diff(lengths) > 0.0).all()
-    assert lengths[-1] <= 6.0

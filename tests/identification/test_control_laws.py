@@ -15,7 +15,6 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import least_squares
 from mjfim.recordings.read import read_recording
 from mjfim.records.trajectory import Recording
 from tests.support import terms
@@ -93,23 +92,6 @@ def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> 
     assert elbow.columns == ("reference:elbow",)
     assert "latency" in shoulder.toml
     assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
-
-
-def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
-    """The rate matters: a slow law brakes less, and the plant would be blamed for it."""
-    laws = {"shoulder": {**SHOULDER, "rate": 50.0}, "elbow": ELBOW}
-    experiment = arm_experiment(laws, parameters=PLANT, noise=NOISE)
-    log = log_of(experiment, 300, 2)
-    wrong = experiment.replace(controllers={"shoulder": {**SHOULDER, "rate": 500.0}})
-
-    costs = []
-    for stated in (experiment, wrong):
-        problem = FitProblem.of(System.resolve(stated), [log])
-        costs.append(least_squares(problem, problem.system.parameters.guess).cost)
-
-    count = 2 * len(log.t)
-    assert 2.0 * costs[0] < 1.1 * count
-    assert 2.0 * costs[1] > 1.5 * count
 
 
 def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:

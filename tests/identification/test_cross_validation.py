@@ -11,10 +11,8 @@ from numpy.testing import assert_allclose
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System, simulate_system
-from mjfim.identification import left_out
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import identify_system, least_squares
-from mjfim.parallel.budget import Budget
+from mjfim.identification.identify import identify_system
 from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.trajectory import Recording
 from tests.support import terms
@@ -75,19 +73,6 @@ def test_without_held_out_recordings_each_is_predicted_by_the_others(
 
     # The fit to the other recordings does not explain the offset of this one.
     assert (found.predictions[2].identified.rms > 0.15).all()
-
-
-@pytest.mark.slow
-def test_predictions_of_some_segments_say_how_many(
-    base: mjfim.Experiment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    experiment = base.replace(horizon=1.0, fit={"segments": 0.25, "start": "measured"})
-    task = DesignTask.resolve(experiment, threads=1)
-    problem = FitProblem.of(task.system, [recorded(task, seed) for seed in range(2)])
-    solution = least_squares(problem, task.theta)
-    monkeypatch.setattr(left_out, "MAX_SAMPLES", problem.sample_count // 2)
-    some = left_out.predict_unfitted(problem, solution, None, Budget())
-    assert [found.name for found in some] == ["simulated (2 of 4 segments)"] * 2
 
 
 @pytest.mark.slow

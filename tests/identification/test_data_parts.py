@@ -14,7 +14,6 @@ from mjfim.experiment.system import System
 from mjfim.identification.assessment import term_tests
 from mjfim.identification.assessment.term_tests import (
     TermTests,
-    find_missing_terms,
     part_of_data,
 )
 from mjfim.identification.fit_problem import FitProblem
@@ -25,9 +24,6 @@ from tests.support.terms import (
     experiment_of,
     motor_torque,
     recorded,
-    small_logs,
-    solution_near,
-    write_pendulum,
 )
 
 RATE = 100.0
@@ -109,31 +105,6 @@ def test_what_was_not_tested_is_said() -> None:
     ):
         data = TermTestData(share=share, recordings=recordings, count=count, untested=untested)
         assert TermTests(data=data).remark.endswith(words)
-
-
-@pytest.mark.slow
-def test_a_term_that_the_first_recording_does_not_show_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first recording shows noise alone: where only it is tested, no term is significant."""
-    robot = experiment_of(tmp_path, "asymmetric_friction")
-    logs = small_logs(System.resolve(robot), 1, 2, 3)
-    write_pendulum(tmp_path, joint='frictionloss="0.03"')
-    damping = {"damping": {"target": "joint/pivot:damping"}}
-    tables = robot.model_dump(exclude_unset=True)
-    system = System.resolve(robot.restated({**tables, "terms": {}, "parameters": damping}))
-    logs = [recorded(system, np.zeros((150, 1)), 0), *logs]
-    problem = FitProblem.of(system, logs)
-    at = solution_near(problem, system.parameters.guess)
-
-    first = np.zeros(1, dtype=int)
-    assert not find_missing_terms(problem.of_segments(first), logs, of_subset(at, first)).terms
-
-    monkeypatch.setattr(term_tests, "part_of_data", lambda problem, _: part_of_data(problem, 300))
-    found = find_missing_terms(problem, logs, at)
-    assert found.data.recordings == 4
-    assert 0.4 < found.data.share <= 0.5
-    assert "term/pivot_asymmetric_friction:offset" in {term.path for term in found.terms}
 
 
 @pytest.mark.slow

@@ -18,7 +18,6 @@ import mjfim
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify, identify_system, least_squares
@@ -32,7 +31,6 @@ from mjfim.studies.campaign import identify_all
 from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import make_task
-from tests.support.paths import ROOT
 from tests.support.terms import recorded
 
 
@@ -93,13 +91,6 @@ def test_jacobian_agrees_with_independent_differences(
         plus, minus = (dense_residuals(fit, fit.begin(theta + s * h)).r for s in (1, -1))
         numeric = (plus - minus) / 6e-4
         assert np.linalg.norm(J[:, j] - numeric) < 1e-5 * np.linalg.norm(numeric)
-
-
-def test_covariance_is_the_cramer_rao_bound_at_the_estimate(
-    design: mjfim.Design, estimate: mjfim.Estimate
-) -> None:
-    assert_allclose(estimate.std, design.final.std, rtol=0.05)
-    assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
 
 
 @pytest.mark.slow
@@ -255,23 +246,6 @@ def test_an_interruption_between_starts_keeps_the_earlier_ones(
     assert_allclose(found.theta, estimate.theta, rtol=1e-3)
 
 
-def test_an_interruption_before_the_last_search_ends_all_searches(
-    task: DesignTask, recording: Recording
-) -> None:
-    segmented = DesignTask.resolve(task.experiment.replace(fit={"segments": 1.0}))
-    seen: list[str] = []
-
-    def show(event: FitEvent) -> None:
-        seen.append(event.phase)
-        if event.phase == "initial states":
-            signal.raise_signal(signal.SIGINT)
-
-    found = identify_system(segmented.system, [recording], callback=show)
-    assert found.interrupted and not found.converged
-    assert set(seen) == {"initial states"}
-    assert_array_equal(found.theta, task.parameters.guess)
-
-
 @pytest.mark.slow
 def test_a_robust_fit_tests_the_size_of_its_residuals(
     task: DesignTask, recording: Recording
@@ -285,23 +259,6 @@ def test_a_robust_fit_tests_the_size_of_its_residuals(
     truth = recorded(task.system, recording.ctrl, share=0.0).y
     loud = replace(recording, y=truth + 3.0 * (recording.y - truth))
     assert "times what you stated" in page_of(identify(robust, [loud])).verdict.sentence
-
-
-@pytest.mark.slow
-def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
-    """Their covariance is infinite; other correlations are computed without a warning of NumPy."""
-    experiment = Experiment.from_file(ROOT / "models" / "ball_pendulum.toml")
-    sigma = {"imu_gyro": 0.4, "imu_accelerometer": 4.0, "ball_orientation": 0.2}
-    experiment = experiment.replace(noise=sigma, parameters={"rod": {"cad_prior": False}})
-    estimate = identify(experiment, logs_of(experiment, 1))
-    assert estimate.combinations
-    assert "damping" in estimate.sloppy
-
-    # An entry near zero is known badly only as a share of its own value.
-    product = estimate.parameters.index("rod.t2")
-    assert estimate.std[product] > abs(estimate.theta[product])
-    assert estimate.sizes[product] > 10.0 * abs(estimate.theta[product])
-    assert "rod.t2" not in estimate.sloppy
 
 
 @pytest.mark.slow

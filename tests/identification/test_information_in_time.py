@@ -109,15 +109,6 @@ def test_residuals_that_are_larger_than_noise_are_marked(estimate: Estimate) -> 
         assert [mark.x.tolist() for mark in panel.marks] == [[2.5]] * len(symbols)
 
 
-def test_the_title_leaves_out_what_a_prior_tells(estimate: Estimate) -> None:
-    shares = np.array([[0.1, 0.9], [0.0, 0.1], [0.0, 0.0], [0.0, 0.0]])
-    found = made(parameters=("m", "l"), shares=shares, pulls=np.zeros((4, 2)))
-    shown = replace(estimate, in_time=found)
-    picture = deciding_seconds(shown, shown.labels)
-    assert "comes from 1 s (l) of " in picture.title
-    assert picture.panels[0].beside[1] == ("priors", "muted", ["90 %", "0 %"])
-
-
 def test_picture_table_and_json_have_the_same_numbers(estimate: Estimate, tmp_path: Path) -> None:
     found = in_time(estimate)
     first, second = deciding_seconds(estimate, estimate.labels).panels

@@ -134,21 +134,6 @@ def test_irregular_rows_missing_values_and_several_recordings(tmp_path: Path) ->
     assert errors(fit, true).max() < 0.05
 
 
-@pytest.mark.slow
-def test_dry_friction_needs_no_start(tmp_path: Path) -> None:
-    text = CART_PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.6"')
-    tables = {**CART, "f": {"target": "joint/slide:frictionloss", "scale": 1.0}}
-    experiment = cart(tmp_path, text, parameters=tables)
-    true = true_of(experiment)
-    log = cart_log(experiment, 0.002, seconds=12.0)
-    for start in (0.1 * true, 10.0 * true):
-        fit = inverse_dynamics(experiment, [log], start=start)
-        found = dict(zip(fit.parameters, errors(fit, true), strict=True))
-        assert found["f"] < 0.05
-        assert found["m"] < 0.05
-        assert found["d"] < 0.5
-
-
 def test_filtered_drives_and_delays(tmp_path: Path) -> None:
     experiment = cart(tmp_path, nuisance={"delay": True})
     parameters = System.resolve(experiment).parameters

@@ -17,10 +17,8 @@ from mjfim.identification import meter as meter_module
 from mjfim.identification.search import FitTask
 from mjfim.information.criteria import standard_deviations
 from mjfim.records.trajectory import Recording
-from scripts.benchmarks import so101
 from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.numerics import Loop
-from tests.support.paths import SHARED_DATA, SHARED_MODELS
 
 Array = NDArray[np.float64]
 
@@ -230,34 +228,3 @@ def test_a_slow_recording_has_no_gaps() -> None:
     slow = mjfim.Meter(STUDY, threads=1)
     for t in (0.0, 3.0, 6.0):
         slow.add(t, [0.0], np.zeros(4))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("segments", "tolerance"), [("whole", TOLERANCE), (1.0, 0.1)])
-def test_a_measured_arm_of_24_parameters(segments: object, tolerance: float) -> None:
-    """In the fit, segments are 1.003 s long, so that they begin in slightly other states."""
-    if not SHARED_DATA.is_dir():
-        pytest.skip("the measured recordings are not beside the repository")
-    fields = ("kp", "damping", "frictionloss", "armature")
-    stated: dict[str, Any] = {
-        f"{field}_{joint}": {
-            "target": f"{'actuator' if field == 'kp' else 'joint'}/{joint}:{field}",
-            "guess": 17.8 if field == "kp" else None,
-        }
-        for joint in so101.JOINTS
-        for field in fields
-    }
-    names = tuple(f"qpos:{joint}" for joint in so101.JOINTS)
-    experiment = mjfim.Experiment(
-        model=str(SHARED_MODELS / "so101" / "so101_nomesh.xml"),
-        rate=50.0,
-        parameters=stated,
-        noise=dict.fromkeys(names, 1.5e-3),
-        fit={"start": "measured", "segments": segments},
-    )
-    motion = so101.read_motion(SHARED_DATA / "sage_so101" / "multisine")[:151]
-    t = 0.02006 * np.arange(151)
-    log = Recording(t=t, ctrl=motion[:-1, :6], y=motion[:, 6:], outputs=names)
-    found = watched(experiment, log, np.random.default_rng(8))
-    assert len(found.parameters) == 24
-    assert_allclose(found.std, std_of_recording(experiment, log), rtol=tolerance)

@@ -57,12 +57,6 @@ def test_noise_is_averaged_and_its_size_found(sigma: float, derivative: int) -> 
     assert np.sqrt(np.mean(squares)) == pytest.approx(predicted, rel=0.35)
 
 
-def test_velocities_improve_velocities() -> None:
-    positions = readings(GRID, 1e-2)
-    both = fit_spline([positions, readings(GRID, 2e-2, derivative=1, seed=1)])
-    assert inner_error(both, 1) < 0.5 * inner_error(fit_spline([positions]), 1)
-
-
 def test_irregular_times_gaps_and_outliers() -> None:
     t = np.sort(np.random.default_rng(4).uniform(0.0, SECONDS, 1500))
     t = t[(t < 3.0) | (t > 3.4)]

@@ -41,22 +41,6 @@ def test_the_recordings_of_the_batch_that_diverges_are_named(
     assert str(caught.value).startswith(" or ".join(sorted(set(last))) + ": the simulation")
 
 
-def test_rows_without_error_are_those_of_one_sided_differences() -> None:
-    """They take one rollout for each parameter and one at the unknowns; others take two each."""
-    problem = fit_of(cart_pendulum(horizon=0.5), 0, 1).problem()
-    at = problem.begin(problem.system.parameters.guess)
-    found, counts = [], []
-    for with_error in (True, False):
-        begin = problem.system.plant.engine_steps
-        found.append(sensitivity_rows(problem, at, with_error=with_error))
-        counts.append(problem.system.plant.engine_steps - begin)
-    p = len(problem.system.parameters)
-    assert counts[1] == counts[0] * (1 + p) // (2 * (1 + 2 * p))
-    for (J, change), (other, none) in zip(*found, strict=True):
-        np.testing.assert_allclose(other.T @ other, J.T @ J, rtol=1e-5)
-        assert change.any() and not none.any()
-
-
 def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> None:
     task = fit_of(cart_pendulum(horizon=2.0), 0)
     problem = task.problem()

@@ -74,27 +74,6 @@ def test_the_start_is_moved_inside_the_bounds_of_a_bounded_method(
     assert_array_equal(unbounded.start, start)
 
 
-def test_variants_of_a_problem_leave_the_problem_unchanged(
-    experiment: mjfim.Experiment, recording: Recording
-) -> None:
-    """Variants share unchanged parts; the original problem does not change."""
-    task = FitTask.of(System.resolve(experiment.replace(fit={"segments": 0.5})), [recording])
-    problem = task.problem()
-    begin = problem.begin(task.start)
-    cost, lower = problem.cost(begin), np.array(problem.lower)
-
-    first = problem.of_segments(np.array([0, 2]))
-    assert first.value_count < problem.value_count
-    assert first.recordings is problem.recordings
-    assert np.isneginf(dataclasses.replace(problem, bounded=False).lower).all()
-    assert len(problem.with_shared_held().lower) == 0
-    nothing = problem.masked([np.zeros_like(mask) for mask in problem.masks])
-    assert nothing.value_count == 0
-
-    assert problem.cost(begin) == cost
-    assert_array_equal(problem.lower, lower)
-
-
 def test_recordings_that_count_twice_are_refused(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:

@@ -219,20 +219,6 @@ def test_a_fit_with_the_lines_of_a_cure_explains_the_log(tmp_path: Path) -> None
     assert low < 0.5 < high
 
 
-@pytest.mark.slow
-def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
-    stated, robot = without_term(tmp_path, "actuator_lag")
-    table = {"kind": "actuator_lag", "actuator": "motor"}
-    whole = stated.replace(
-        terms={"lag": table},
-        parameters={"tau": {"target": "term/lag:time_constant", "guess": 0.02}},
-    )
-    logs = small_logs(robot, 0, 1)
-    problem = FitProblem.of(System.resolve(whole), logs)
-    at = solution_near(problem, [0.01, 0.0105, 0.02, 0.03])
-    assert find_missing_terms(problem, logs, at).terms == ()
-
-
 def test_a_term_with_several_numbers_has_one_test() -> None:
     """The probability of the chi-squared value is that of the normal variable."""
     for explained, count in ((3.0, 1), (9.0, 2), (30.0, 3), (1400.0, 3)):

@@ -131,22 +131,6 @@ def test_friction_that_one_joint_lacks_is_a_term_of_this_joint(tmp_path: Path) -
     assert len(first.tables) == 1
 
 
-@pytest.mark.slow
-def test_a_selection_adds_the_friction_of_all_joints_in_one_step(tmp_path: Path) -> None:
-    experiment = stated(tmp_path)
-    robot = with_stribeck(experiment, JOINTS)
-    logs = [log_of(robot, seed) for seed in range(2)]
-    found = mjfim.select_terms(experiment, logs, threads=1, progress=False)
-    term = found.selection.terms[0]
-    assert term.description == "Stribeck friction at 3 joints"
-    assert not found.misfit
-
-    values = dict(zip(found.parameters, found.theta, strict=True))
-    names = {table["target"]: name for name, table in term.parameters.items()}
-    for joint, excess in zip(JOINTS, EXCESS, strict=True):
-        assert values[names[f"term/{joint}_stribeck:excess"]] == pytest.approx(excess, rel=0.2)
-
-
 def missing(path: str, *, sigmas: float, joints: tuple[str, ...] = ()) -> Term:
     """A significant term; one at several joints contains damping at them."""
     paths = [f"joint/{joint}:damping" for joint in joints[1:]]

@@ -172,16 +172,6 @@ def test_long_trajectories_have_accumulated_standard_deviations_that_are_not_too
         assert_allclose(found[k], upto, rtol=0.03)
 
 
-def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_rate(
-    tmp_path,
-) -> None:
-    (tmp_path / "b").mkdir()
-    dense, thin = cart_task(tmp_path), cart_task(tmp_path / "b", measure_rate=25.0)
-    a, b = (s.problem.point(s.initial) for s in (dense, thin))
-    assert relative_error(a.information, b.information) > 1.0  # four times the samples
-    assert b.criterion.value == pytest.approx(a.criterion.value, rel=0.3)
-
-
 def test_information_of_a_real_experiment_is_the_sum_with_its_noise_and_scale(tmp_path) -> None:
     task = cart_task(tmp_path, noise={"angle": 0.01, "acc": 0.3}, measure_rate=50.0)
     S = sensitivity_of(task)

@@ -222,17 +222,3 @@ def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     visible = {"a.mx", "b.mx", "b.mz", "b.Jyy", *lumped.members}
     assert set(silent.members) == set(seen.names) - visible
     assert silent.combinations == ()
-
-
-@pytest.mark.slow
-def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_motion(
-    tmp_path,
-) -> None:
-    task = double_pendulum(tmp_path, "logcholesky")
-    seen = task.identifiability_test.along(task.initial, sensitivity_of(task))
-    assert seen.basis.shape == (20, 6)
-    # a step along an invisible direction moves nothing measured, to second order
-    for n in seen.along_all.directions.T:
-        steps = np.outer([1e-4, -1e-4], n / np.linalg.norm(n))
-        ahead, behind = task.plant.measure(task.theta + steps, task.control)[0]
-        assert np.abs(ahead - behind).max() < 1e-8

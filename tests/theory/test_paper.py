@@ -7,15 +7,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Status
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.paths import ROOT
@@ -53,22 +50,6 @@ def test_eigenvalues_of_the_initial_trajectory(case: str, place: str) -> None:
     task = DesignTask.resolve(experiment(case))
     criterion = task.problem.point(task.initial).criterion
     assert_allclose(criterion.eigenvalues, EIGENVALUES[place], rtol=1e-5)
-
-
-def test_gradient_of_the_information_term() -> None:
-    task = DesignTask.resolve(experiment("a"))
-    point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    bilinear = task.plant.derivatives.bilinear(
-        task.theta,
-        task.initial,
-        point.sensitivity.psi,
-        point.criterion.directions,
-        CENTRAL_DIFFERENCES,
-    )
-    a, b = task.information.gradient(point.criterion, point.sensitivity, bilinear)
-    gradient = Expansion(A=bilinear.A, B=bilinear.B, a=a, b=b).gradient(np.zeros((400, 1, 4)))[:, 0]
-    assert np.linalg.norm(gradient) == pytest.approx(1.4318943623, rel=1e-4)
-    assert_allclose(gradient[[0, 100, 250]], [0.1734982191, 0.0586059128, 0.0474071683], rtol=1e-4)
 
 
 @pytest.mark.slow
