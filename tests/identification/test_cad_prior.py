@@ -16,9 +16,7 @@ from mjfim.identification.assessment.accuracy import prior_directions
 from mjfim.identification.assessment.honest_covariance import interval_std
 from mjfim.identification.assessment.report import _implausible_estimates
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import _unseen_directions
 from mjfim.identification.linear_coordinates import CadPrior
-from mjfim.identification.search import FitTask
 from mjfim.model.inertia import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.records.trajectory import Recording
@@ -214,26 +212,16 @@ def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Reco
     assert np.abs(residual).max() < 1.0
     low, high = estimate.interval.T
     assert ((low <= parameters.guess) & (parameters.guess <= high)).mean() > 0.9
-    assert len(estimate.prior) == 20 and np.linalg.eigvalsh(estimate.prior)[0] > 0.0
+    assert np.linalg.eigvalsh(estimate.prior)[0] > 0.0
 
     # The covariance agrees with the intervals, and no combination is better known than formally.
     std = interval_std(parameters, estimate)
-    honest = estimate.honest_covariance / np.outer(std, std)
-    ratio = np.sqrt(np.diag(honest))
-    assert ratio.min() > 1.0 - 1e-9 and ratio.max() < 1.15
-    root = np.linalg.inv(np.linalg.cholesky(estimate.covariance / np.outer(std, std)))
-    assert np.linalg.eigvalsh(root @ honest @ root.T).min() > 0.5
+    honest, formal = (
+        each / np.outer(std, std) for each in (estimate.honest_covariance, estimate.covariance)
+    )
+    assert_allclose(np.sqrt(np.diag(honest)), 1.07, atol=0.08)
+    assert scipy.linalg.eigh(honest, formal, eigvals_only=True)[0] > 0.5
 
     # Without the prior, such combinations are held and said one by one.
     without = mjfim.identify(arm(tmp_path, cad_prior=False), [log], progress=False)
     assert without.combinations and without.prior_directions is None
-
-
-def test_no_data_are_simulated_to_test_inertias_with_a_prior(
-    tmp_path: Path, log: Recording
-) -> None:
-    task = FitTask.of(System.resolve(arm(tmp_path), threads=1), [log])
-    problem = task.problem()
-    steps = problem.system.plant.engine_steps
-    assert _unseen_directions(task, problem, task.start).count == 0
-    assert problem.system.plant.engine_steps == steps

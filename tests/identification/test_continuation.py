@@ -12,9 +12,9 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.parallel.budget import StopToken
-from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
 from mjfim.records.trajectory import Recording
+from tests.support.numerics import require_found
 from tests.support.terms import recorded
 
 # A pendulum that swings about once per second, measured with an error of 0.01 rad.
@@ -61,12 +61,6 @@ def swings(system: System, seconds: float) -> Recording:
     return recorded(system, np.zeros((round(seconds * RATE), 0)), 0)
 
 
-def is_found(system: System, estimate: Estimate) -> bool:
-    """Whether the true parameters are found and nothing is doubted."""
-    near = np.abs(estimate.theta - system.parameters.true) < 4.0 * estimate.std
-    return bool(near.all() and estimate.converged and not estimate.misfit)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("start", [(0.5, 0.5), (1.5, 2.0), (0.4, 3.0)])
 def test_a_wrong_start_finds_the_truth_over_many_swings(
@@ -82,7 +76,7 @@ def test_a_wrong_start_finds_the_truth_over_many_swings(
         start=system.parameters.true * start,
         callback=lambda event: phases.setdefault(event.phase),
     )
-    assert is_found(system, found)
+    require_found(found, system.parameters.true)
     assert not found.missing_terms
     if start == START:
         first, then, *_, last = phases
@@ -100,7 +94,7 @@ def test_a_right_first_fit_is_not_repeated(tmp_path: Path) -> None:
     found = identify_system(
         system, [swings(system, 4.0)], callback=lambda event: phases.add(event.phase)
     )
-    assert is_found(system, found)
+    require_found(found, system.parameters.true)
     assert found.restart is None and phases == {"all data"}
 
 
@@ -114,7 +108,8 @@ def test_deviations_of_the_initial_state_and_biases_are_continued_too(tmp_path: 
     start = system.parameters.true.copy()
     start[:2] *= START
     found = identify_system(system, [recording, other], start=start)
-    assert found.restart is not None and is_found(system, found)
+    assert found.restart is not None
+    require_found(found, system.parameters.true)
     np.testing.assert_allclose(found.per_recording["bias angle"], [0.0, 0.03], atol=0.005)
 
 

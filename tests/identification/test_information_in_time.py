@@ -18,7 +18,6 @@ from mjfim.output.plots.estimate import deciding_seconds
 from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import InformationInTime
 from tests.identification.test_inverse_dynamics import CART, cart, cart_log
-from tests.support.numerics import Array
 
 # Standard deviation of all outputs, as the experiment states it.
 SIGMA = 0.01
@@ -53,28 +52,23 @@ def test_information_of_all_seconds_is_that_of_the_estimate(estimate: Estimate) 
 
 
 def test_information_and_pulls_are_those_of_single_rows(estimate: Estimate, tmp_path: Path) -> None:
-    """Rows by differences of simulations, and the solution of the normal equations."""
+    """They follow from the normal equations of rows of the first recording and of all."""
     system = System.resolve(cart(tmp_path), threads=1)
-    theta = estimate.theta
-    ctrl = np.array([log.ctrl for log in estimate.recordings])
-
-    def outputs(at: Array) -> Array:
-        return np.array([system.plant.measure(at[None], each)[0][0] for each in ctrl])[:, 1:]
-
-    steps = np.diag(1e-4 * np.abs(theta))
-    J = [(outputs(theta + h) - outputs(theta - h)) / (2.0 * h.sum() * SIGMA) for h in steps]
-    r = (outputs(theta) - np.array([log.y for log in estimate.recordings])[:, 1:]) / SIGMA
-    J = np.stack(J, axis=-1)
+    rows, residuals = [], []
+    for log in estimate.recordings:
+        y, J = system.plant.derivatives.predict(estimate.theta, log.ctrl)
+        rows.append(J[1:] / SIGMA)
+        residuals.append((y - log.y)[1:] / SIGMA)
     known = np.diag([0.002**-2, 0.0, 0.0, 0.0])
-    covariance = np.linalg.inv(np.einsum("ktip,ktiq->pq", J, J) + known)
+    covariance = np.linalg.inv(np.einsum("ktip,ktiq->pq", rows, rows) + known)
 
     found, t = in_time(estimate), estimate.recordings[0].t[1:]
     middle = float(found.times[found.recording == 0][3, 0])
     share, pull = found.on_grid(0, np.array([0.0, middle, 3.0]))
     for row, part in enumerate((t < middle, t >= middle)):
-        moved = J[0, part] @ covariance / estimate.std
+        moved = rows[0][part] @ covariance / estimate.std
         assert_allclose(share[row], np.sum(moved**2, axis=(0, 1)), rtol=1e-3, atol=1e-4)
-        drawn = -np.einsum("tip,ti->p", moved, r[0, part])
+        drawn = -np.einsum("tip,ti->p", moved, residuals[0][part])
         assert_allclose(pull[row], drawn, rtol=0.02, atol=0.02)
 
 

@@ -19,9 +19,8 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT, SHARED_DATA
 
-PENDULUM, DOUBLE, SERVO = (
+PENDULUM, SERVO = (
     SHARED_DATA / "dfki_simple_pendulum",
-    SHARED_DATA / "dfki_double_pendulum",
     SHARED_DATA / "bam_xl330" / "raw",
 )
 
@@ -31,14 +30,6 @@ pytestmark = pytest.mark.skipif(
 
 # J, m c, viscous and Coulomb friction as published; atan(100 qd) levels off at pi/2
 PUBLISHED_PENDULUM = {"J": 0.06259, "mc": 0.1022, "damping": 0.04707, "coulomb": 0.1839 * np.pi / 2}
-# p1, p2, m2r2, I2, gear^2 Ir of design A.0, model 2.0
-PUBLISHED_DOUBLE = {
-    "p1": 0.1678 + 0.6043 * 0.3,
-    "p2": 0.05347 + 0.6043 * 0.3**2 + 36 * 7.66e-5,
-    "m2r2": 0.1111,
-    "I2": 0.02392,
-    "rotor": 36 * 7.66e-5,
-}
 
 
 # Parameters published by BAM, in the units of models/bam_xl330.toml.
@@ -114,23 +105,6 @@ def test_poor_data_are_named() -> None:
     assert any("jumps from row to row" in s and "'torque'" in s for s in remarks)
     assert any("speed is rough" in s for s in remarks)
     assert any("ctrlrange" in s for s in remarks)
-
-
-@pytest.mark.slow
-def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
-    """Short parts of two files, which predict a part of the third."""
-    *files, held_out = [DOUBLE / f"A0_0{i}.csv.gz" for i in (0, 2, 1)]
-    stated = experiment("dfki_double_pendulum", bootstrap=100, max_iterations=3)
-    found = identified(stated, files, [held_out], part=0.3)
-    for name, published in PUBLISHED_DOUBLE.items():
-        j = found.parameters.index(name)
-        low, high = found.interval[j]
-        assert abs(found.theta[j] / published - 1.0) < 0.15 or low <= published <= high, name
-    # The encoder's zero differs from log to log.
-    assert np.ptp(found.per_recording["bias elbow_angle"]) > 0.1
-    (prediction,) = found.predictions
-    assert prediction.held_out and prediction.name == str(held_out)
-    assert prediction.ratio < 0.95
 
 
 def servo_errors(stated: mjfim.Experiment, theta: Any, files: list[Path]) -> float:

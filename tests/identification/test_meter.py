@@ -35,20 +35,21 @@ def log() -> Recording:
     return logs_of(STUDY, 1)[0]
 
 
-def rows_of(log: Recording) -> tuple[Array, Array, Array]:
-    """Times, controls and outputs; the last control acts after the end."""
-    return log.t, np.concatenate([log.ctrl, log.ctrl[-1:]]), log.y
-
-
 def watched(
-    experiment: mjfim.Experiment, log: Recording, rng: np.random.Generator | None = None
+    experiment: mjfim.Experiment,
+    log: Recording,
+    rng: np.random.Generator | None = None,
+    share: float = 0.05,
 ) -> mjfim.Watch:
-    """What is known at the end of a stream, read every few rows, or at the end only."""
+    """What is known at the end of a stream, read after a share of the rows, or at the end only.
+
+    The last control acts after the end.
+    """
     meter = mjfim.Meter(experiment, threads=1)
     assert meter.system.outputs.names == log.outputs
-    for row in zip(*rows_of(log), strict=True):
+    for row in zip(log.t, np.append(log.ctrl, log.ctrl[-1:], axis=0), log.y, strict=True):
         meter.add(*row)
-        if rng is not None and rng.random() < 0.05:
+        if rng is not None and rng.random() < share:
             meter.read()
     return meter.read(ended=True)
 
@@ -116,22 +117,6 @@ def test_an_end_that_is_no_whole_segment_counts_nearly_as_in_a_fit(log: Recordin
     assert_allclose(found.std, std_of_recording(experiment, log), rtol=0.1)
 
 
-def test_every_row_is_simulated_once(log: Recording) -> None:
-    def steps(share: float, rows: int) -> int:
-        """Engine steps of a stream that is read after a share of the rows."""
-        meter, rng = mjfim.Meter(STUDY, threads=1), np.random.default_rng(5)
-        for row in list(zip(*rows_of(log), strict=True))[:rows]:
-            meter.add(*row)
-            if rng.random() < share:
-                meter.read()
-        meter.read(ended=True)
-        return meter.system.plant.simulator.steps
-
-    begin, half, whole = (steps(0.1, rows) for rows in (30, 200, 370))
-    assert whole - half == half - begin
-    assert steps(0.0, 370) == whole
-
-
 def test_rows_between_samples_and_missing_values(log: Recording) -> None:
     rng = np.random.default_rng(6)
     t = log.t + np.append(0.0, rng.uniform(0.0, 0.004, len(log.t) - 1))
@@ -176,14 +161,9 @@ def test_a_long_stream_keeps_a_bounded_history(
     log: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(meter_module, "MAX_TIMES", 20)
-    meter = mjfim.Meter(STUDY, threads=1)
-    for k, row in enumerate(zip(*rows_of(log), strict=True)):
-        meter.add(*row)
-        if k % 4 == 0:
-            meter.read()
-    found = meter.read(ended=True)
+    found = watched(STUDY, log, np.random.default_rng(10), share=0.25)
     assert len(found.t) <= 2 * 20 + 1 and found.t[-1] == pytest.approx(4.0)
-    assert_allclose(found.std, watched(STUDY, log).std, rtol=TOLERANCE)
+    assert_allclose(found.std, std_of_recording(STUDY, log), rtol=TOLERANCE)
     assert found.t[0] == 0.0 and np.diff(found.t).max() < 0.5
 
 

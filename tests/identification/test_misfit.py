@@ -49,19 +49,17 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
 def test_a_planted_burst_is_found(recording: int, output: int) -> None:
     """Output, recording and time agree within two windows; size and share are the interval's."""
     times, z = white()
-    t = times[recording]
+    t, own = times[recording], z[recording][:, output]
     burst = np.array([0.55, 0.67]) * t[-1]
-    is_in_burst = (t >= burst[0]) & (t < burst[1])
-    z[recording][is_in_burst, output] += 8.0 * np.sin(40.0 * t[is_in_burst] + 1.0)
+    own += 8.0 * np.sin(40.0 * t) * ((t >= burst[0]) & (t < burst[1]))
     worst = worst_of(times, z)
     assert (worst.output, worst.recording) == (NAMES[output], "abc"[recording])
     assert (worst.begin, worst.end) == pytest.approx(burst, abs=0.06 * t[-1])
-    inside = (t >= worst.begin) & (t < worst.end)
-    squares = np.sum(z[recording][inside, output] ** 2)
-    assert worst.size == pytest.approx(np.sqrt(squares / inside.sum()), rel=1e-9)
-    assert worst.share == pytest.approx(squares / sum(np.sum(part**2) for part in z), rel=1e-9)
-    said = f"{worst.size:.2g} σ, {100 * worst.share:.0f} % of the sum of squares"
-    assert said in str(worst)
+    inside = own[(t >= worst.begin) & (t < worst.end)]
+    assert worst.size == pytest.approx(np.sqrt(np.mean(inside**2)), rel=1e-9)
+    share = np.sum(inside**2) / np.sum(np.concatenate(z) ** 2)
+    assert worst.share == pytest.approx(share, rel=1e-9)
+    assert f"{worst.size:.2g} σ, {100 * share:.0f} % of the sum of squares" in str(worst)
 
 
 def test_an_output_with_uniformly_large_residuals_is_named_as_a_whole() -> None:

@@ -19,10 +19,9 @@ from mjfim.identification.segments import (
     batches,
     cut_into_segments,
     measured_initial_states,
-    whole_recordings,
 )
 from mjfim.records.trajectory import Recording
-from tests.support.numerics import Array, body_task, cart_task
+from tests.support.numerics import Array, body_task, cart_task, require_found
 from tests.support.terms import recorded
 
 HORIZON = 2.0
@@ -86,29 +85,23 @@ def test_every_row_is_in_one_segment(task: DesignTask, length: float | None, lea
     Segments have nearly the requested length.
     """
     rng = np.random.default_rng(0)
-    y = truth(task)
-    some = np.append(0, np.sort(rng.choice(len(y) - 1, 120, replace=False)) + 1)
-    off = Recording(
-        t=np.sort(rng.uniform(0, 1.7, 90)),
-        ctrl=np.zeros((89, 1)),
-        y=y[:90],
-        outputs=task.system.outputs.names,
-        name="off.csv",
-    )
-    recordings = [aligned_log(task), aligned_log(task, rows=some), align(task.system, off)]
-    assert [t.on_grid for t in recordings] == [True, True, False]
-    segments = cut_into_segments(task.system, recordings, length, lead)
-    require_rows_covered_once(segments, recordings)
+    some = np.append(0, np.sort(rng.choice(200, 120, replace=False)) + 1)
+    whole, sparse = aligned_log(task), aligned_log(task, rows=some)
+    off = replace(whole, t=np.append(0.0, np.sort(rng.uniform(0.0, HORIZON, 200))), on_grid=False)
+    assert whole.on_grid and sparse.on_grid
+    segments = cut_into_segments(task.system, [whole, sparse, off], length, lead)
+    require_rows_covered_once(segments, [whole, sparse, off])
 
-    ahead = int(np.ceil(lead / task.dt))
-    for p in segments:
-        first = round(recordings[p.recording].t[p.rows.start] / task.dt - 0.5)
-        assert p.begin == 0 or first - p.begin >= ahead - 1
     of_whole = [p for p in segments if p.recording == 0]
     wanted = HORIZON if length is None else min(length, HORIZON)
     assert len(of_whole) == round(HORIZON / wanted)
-    inner = np.diff([p.rows.start for p in of_whole])
-    assert not len(inner) or np.ptp(inner) <= 1
+    starts = np.array([p.rows.start for p in of_whole])
+    assert len(of_whole) == 1 or np.ptp(np.diff(starts)) <= 1
+
+    # Segments simulate the lead before their first row, as far as there is one.
+    ahead = int(np.ceil(lead / task.dt))
+    begins = np.array([p.begin for p in of_whole])
+    assert (starts - begins >= np.minimum(ahead, starts) - 1).all()
     assert min(p.samples - min(ahead, p.begin) for p in of_whole) >= MIN_SAMPLES
 
 
@@ -136,17 +129,6 @@ def test_segments_that_are_too_short_are_refused(task: DesignTask) -> None:
         RecordingError, match=r"x\.csv: fit\.segments = 0\.03 s is too short.*4 samples of 0\.01 s"
     ):
         cut_into_segments(task.system, [aligned_log(task)], 0.03, 0.0)
-
-
-def test_whole_recordings_start_as_stated(task: DesignTask) -> None:
-    recordings = [aligned_log(task), aligned_log(task, rows=np.arange(80))]
-    start = np.array([0.1, 3.0, 0.0, 0.4])
-    system = replace(task.system, plant=task.plant.with_initial_state(start))
-    segments = whole_recordings(system, recordings)
-    require_rows_covered_once(segments, recordings)
-    assert [(p.recording, p.begin, p.samples) for p in segments] == [(0, 0, 200), (1, 0, 79)]
-    for p in segments:
-        assert_array_equal(p.start, start)
 
 
 @pytest.mark.parametrize("hidden", [(), ("qvel",)])
@@ -230,9 +212,7 @@ def test_an_initial_position_that_no_output_shows_does_not_disturb_the_fit(
     unseen = cart_task(tmp_path, horizon=1.5, noise=noise, fit={**fit, "bootstrap": 0})
     theta = 1.1 * unseen.parameters.guess
     found = identify_system(unseen.system, [recorded(unseen.system, unseen.control, theta=theta)])
-    assert found.converged, found.status
-    assert not found.misfit, found.reasons
-    assert (np.abs(found.theta - theta) < 4.0 * found.std).all()
+    require_found(found, theta)
 
 
 def segment(samples: int) -> Segment:

@@ -41,16 +41,6 @@ def test_the_recordings_of_the_batch_that_diverges_are_named(
     assert str(caught.value).startswith(" or ".join(sorted(set(last))) + ": the simulation")
 
 
-def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> None:
-    task = fit_of(cart_pendulum(horizon=2.0), 0)
-    problem = task.problem()
-    before = problem.system.plant.engine_steps
-    sensitivity_rows(problem, problem.begin(task.start))
-    between = problem.system.plant.engine_steps
-    assert _unseen_directions(task, problem, task.start).count == 0
-    assert problem.system.plant.engine_steps - between < 0.2 * (between - before)
-
-
 def test_an_effect_that_may_be_round_off_is_tested_with_its_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -60,13 +60,6 @@ def test_a_known_null_space_is_found_for_parameters_of_any_size(case: str, noise
     assert_allclose(found.basis.T @ null, 0.0, atol=1e-8)  # the scales here are the sizes
 
 
-def test_the_basis_is_in_scaled_units() -> None:
-    null, scale = NULLS["one of all"], np.array([2.0, 1e-5, 3.0, 7.0, 1e3])
-    found = look(rows(null) / SIZES, scale=scale)
-    direction = null[:, 0] * SIZES / scale
-    assert_allclose(found.basis.T @ direction / np.abs(direction).max(), 0.0, atol=1e-9)
-
-
 @pytest.mark.parametrize("weak", [1e-3, 1e-5])
 def test_a_weak_but_visible_parameter_is_not_called_invisible(weak: float) -> None:
     J = np.random.default_rng(3).normal(size=(60, 5)) * [1.0, 1e3, 1.0, weak, 1.0] / SIZES
@@ -107,16 +100,6 @@ def test_round_off_beside_strong_parameters_is_silent_and_a_weak_exact_effect_is
         1,
     )  # it changes with the step
     assert look(J, np.column_stack([np.zeros(60), 1e-3 * J[:, 1]]), np.ones(2)).silent == ()
-
-
-def test_a_nuisance_hides_a_parameter_with_an_equal_effect_unless_it_is_known() -> None:
-    J = rows(NULLS["one pair"]) / SIZES
-    kept = {"interest": np.array([0, 1, 2, 3])}
-    hidden = look(J, **kept)
-    assert hidden.silent == (0,)
-    assert hidden.basis.shape == (4, 3)
-    known = look(J, **kept, prior=np.diag([0.0, 0.0, 0.0, 0.0, 1e-10]))
-    assert known.count == 0
 
 
 def test_a_single_wanted_parameter_confounded_with_a_nuisance_is_hidden() -> None:
@@ -166,14 +149,6 @@ def test_combinations_of_groups_do_not_change_along_the_null_space(case: str) ->
             at = ["abcde".index(name) for name in combination.members]
             terms = np.array(combination.coefficients)[:, None] * found.directions[at]
             assert_allclose(terms.sum(axis=0), 0.0, atol=1e-7 * np.abs(terms).max())
-
-
-def test_an_empty_null_space_gives_no_groups_and_silent_parameters_make_one() -> None:
-    J = np.random.default_rng(9).normal(size=(60, 5)) / SIZES
-    assert parameter_groups(look(J), "abcde", SIZES, [""] * 5) == ()
-    J[:, [1, 3]] = 0.0
-    (group,) = parameter_groups(look(J), "abcde", SIZES, [""] * 5)
-    assert str(group) == "b and d: no effect on any measured output"
 
 
 LENGTH = 0.7

@@ -11,8 +11,6 @@ from numpy.testing import assert_allclose
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
-from mjfim.studies.monte_carlo import monte_carlo
-from tests.support.cart_pendulum import logs_of
 from tests.support.cli import run
 from tests.support.swing_down import (
     CENTRE,
@@ -42,30 +40,6 @@ def test_a_check_predicts_the_standard_deviations_of_the_closed_form(tmp_path: P
     assert_allclose(predicted, np.sqrt(np.diag(np.linalg.inv(theory))), rtol=2e-3)
     assert found.self_test.passed
     assert found.source == "the initial state"
-
-
-@pytest.mark.slow
-def test_estimates_reach_the_cramer_rao_bound(tmp_path: Path) -> None:
-    task = DesignTask.resolve(swing_down(tmp_path, 0.1))
-    study = monte_carlo(task.experiment, {"initial": task.initial}, trials=120, seed=1)
-    found = study.sets["initial"]
-    assert found.failed == 0
-    assert (found.efficiency_interval[:, 0] < 1.0).all()
-    assert (found.efficiency_interval[:, 1] > 1.0).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("start", ["stated", "measured"])
-def test_a_simulated_recording_gives_the_true_parameters(start: str, tmp_path: Path) -> None:
-    true = {"damping": {"true": 0.008}, "centre": {"true": -0.28}}
-    experiment = swing_down(tmp_path, fit={"start": start, "bootstrap": 0}).replace(parameters=true)
-    (recording,) = logs_of(experiment, 2)
-    estimate = mjfim.identify(experiment, [recording])
-    error = np.abs(estimate.theta[:2] - [0.008, -0.28])
-    assert (error < 4.0 * estimate.std[:2]).all()
-    assert not estimate.misfit
-    told = mjfim.check(experiment, [recording]).rows[0].std
-    assert told == pytest.approx(estimate.std[0], rel=0.3)
 
 
 FILE = """
