@@ -1,7 +1,8 @@
-"""Motions from measured values against the motions that were measured."""
+"""Regression splines, and motions from measured values against the motions that were measured."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,13 @@ import pytest
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import align
-from mjfim.identification.inverse_dynamics.motion import MeasuredMotion, measured_motion
+from mjfim.identification.inverse_dynamics.motion import (
+    MeasuredMotion,
+    Readings,
+    RegressionSpline,
+    fit_spline,
+    measured_motion,
+)
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
 from tests.support.terms import recorded
@@ -100,3 +107,61 @@ def test_unmeasured_degrees_of_freedom_are_named(tmp_path: Path) -> None:
     body = body_task(tmp_path, noise={"state": 0.01}, horizon=1.0)
     with pytest.raises(RecordingError, match=r"x\.csv: .* of ball\.rx, ball\.ry, ball\.rz;"):
         motion_of(body, hidden=("qpos:ball.qx",))
+
+
+GRID = np.arange(2000) / 200.0
+
+
+SECONDS = 10.0
+
+
+def curve(t: Array, derivative: int = 0) -> Array:
+    """A sum of two sines, or its derivative."""
+    total = np.zeros(len(t))
+    for amplitude, frequency, phase in ((1.0, 0.4, 0.3), (0.3, 1.7, 1.0)):
+        omega = 2 * np.pi * frequency
+        total += amplitude * omega**derivative * np.sin(omega * t + phase + derivative * np.pi / 2)
+    return total
+
+
+def readings(t: Array, sigma: float, derivative: int = 0, seed: int = 0) -> Readings:
+    """Noisy readings of the curve or of its slope."""
+    noise = np.random.default_rng(seed).standard_normal(len(t))
+    values = curve(t, derivative) + sigma * noise
+    return Readings(t=t, values=values, sigma=sigma or 1.0, derivative=derivative)
+
+
+def inner_error(spline: RegressionSpline, derivative: int) -> float:
+    """Root mean square error of a derivative away from the ends."""
+    t = np.linspace(0.5, SECONDS - 0.5, 500)
+    error = spline.at(t, derivative) - curve(t, derivative)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+@pytest.mark.parametrize("derivative", [0, 1, 2])
+@pytest.mark.parametrize("sigma", [1e-4, 1e-2])
+def test_noise_is_averaged_and_its_size_found(sigma: float, derivative: int) -> None:
+    inner = np.linspace(0.5, SECONDS - 0.5, 300)
+    squares, splines = [], []
+    for seed in range(8):
+        noisy = fit_spline([readings(GRID, sigma, seed=seed)])
+        exact = fit_spline([readings(GRID, 0.0)], spacing=noisy.spacing)
+        squares.append(np.mean((noisy.at(inner, derivative) - exact.at(inner, derivative)) ** 2))
+        splines.append(noisy)
+    assert inner_error(splines[0], 0) < 0.5 * sigma
+    assert np.mean([spline.variance for spline in splines]) == pytest.approx(1.0, abs=0.1)
+
+    # The predicted noise of a derivative is that of the fits.
+    predicted = np.mean([spline.sigma(derivative) for spline in splines])
+    assert np.sqrt(np.mean(squares)) == pytest.approx(predicted, rel=0.35)
+
+
+def test_irregular_times_gaps_and_outliers() -> None:
+    t = np.sort(np.random.default_rng(4).uniform(0.0, SECONDS, 1500))
+    t = t[(t < 3.0) | (t > 3.4)]
+    given = readings(t, 1e-3)
+    outliers = 5.0 * (np.arange(len(t)) % 200 == 0)
+    spline = fit_spline([replace(given, values=given.values + outliers)])
+    inner = np.concatenate([np.linspace(0.5, 2.5, 100), np.linspace(4.0, 9.5, 100)])
+    assert np.abs(spline.at(inner) - curve(inner)).max() < 3e-3
+    assert np.isfinite(spline.at(np.linspace(3.0, 3.4, 50))).all()
