@@ -89,16 +89,12 @@ def test_one_extreme_value_is_named_where_the_simulation_diverges(
     experiment: mjfim.Experiment, recording: Recording, name: str, row: int
 ) -> None:
     """A fault of the log is the likely cause, so the message says where it is."""
-    ctrl, y = recording.ctrl.copy(), recording.y.copy()
-    if name.startswith("ctrl"):
-        ctrl[row - 1, 0] = 1e200
-    else:
-        y[row - 1, recording.outputs.index(name)] = 1e200
-    faulty = dataclasses.replace(recording, ctrl=ctrl, y=y)
-
+    field, column = ("ctrl", 0) if name == "ctrl:force" else ("y", 2)
+    values = np.array(getattr(recording, field))
+    values[row - 1, column] = 1e200
     message = rf"diverges at the start .*; log: column '{name}' holds 1e\+200 in row {row} of"
     with pytest.raises(SimulationDivergedError, match=message):
-        mjfim.identify(experiment, [faulty], threads=1)
+        mjfim.identify(experiment, [dataclasses.replace(recording, **{field: values})], threads=1)
 
 
 @pytest.mark.slow
