@@ -10,6 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import FitEvent
@@ -139,3 +140,12 @@ def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Pa
     found = identify_system(system, [swings(system, 12.0)], start=start, callback=press, stop=stop)
     assert found.interrupted
     assert found.restart.cost <= found.restart.cost_before
+
+
+def test_segments_of_a_problem_are_cut_where_they_are_long_enough(tmp_path: Path) -> None:
+    system = pendulum(tmp_path, 4.0)
+    problem = FitProblem.of(system, [swings(system, 4.0)])
+    part = problem.cut(1.0)
+    assert len(part.segments) == 4
+    assert part.recordings is problem.recordings
+    assert problem.cut(0.01) is None

@@ -57,3 +57,12 @@ def test_an_effect_that_may_be_round_off_is_tested_with_its_error(
 
     monkeypatch.setattr("mjfim.identification.identify.sensitivity_rows", rows)
     assert _unseen_directions(task, task.problem(), task.start).silent == (count - 1,)
+
+
+def test_rows_without_error_are_those_of_one_sided_differences() -> None:
+    problem = fit_of(cart_pendulum(horizon=0.5), 0, 1).problem()
+    at = problem.begin(problem.system.parameters.guess)
+    full, fast = (sensitivity_rows(problem, at, with_error=each) for each in (True, False))
+    for (J, change), (other, none) in zip(full, fast, strict=True):
+        np.testing.assert_allclose(other.T @ other, J.T @ J, rtol=1e-5)
+        assert change.any() and not none.any()
