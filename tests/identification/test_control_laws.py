@@ -56,7 +56,7 @@ def references(samples: int, seed: int, width: int = 2, steps: float = 0.3) -> n
     t = np.arange(samples)[:, None] / 500.0
     waves = sum(np.sin(2 * np.pi * 0.7 * k * t + rng.uniform(0, 6, width)) / k for k in range(1, 6))
     jumps = t > rng.uniform(0.1, 0.9, width) * samples / 500.0
-    return np.asarray(0.25 * waves + jumps * rng.uniform(-steps, steps, width))
+    return 0.25 * waves + jumps * rng.uniform(-steps, steps, width)
 
 
 def log_of(experiment: mjfim.Experiment, samples: int, seed: int) -> Recording:

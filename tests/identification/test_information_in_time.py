@@ -35,13 +35,8 @@ def estimate(tmp_path_factory: pytest.TempPathFactory) -> Estimate:
     return mjfim.identify(experiment, recordings, progress=False)
 
 
-def in_time(estimate: Estimate) -> InformationInTime:
-    assert estimate.in_time is not None
-    return estimate.in_time
-
-
 def test_information_of_all_seconds_is_that_of_the_estimate(estimate: Estimate) -> None:
-    found = in_time(estimate)
+    found = estimate.in_time
     assert found.parameters == estimate.parameters
     assert set(found.recording) == {0, 1}
     # The other parameters follow the mass, so that its prior is information on them as well.
@@ -62,7 +57,7 @@ def test_information_and_pulls_are_those_of_single_rows(estimate: Estimate, tmp_
     known = np.diag([0.002**-2, 0.0, 0.0, 0.0])
     covariance = np.linalg.inv(np.einsum("ktip,ktiq->pq", rows, rows) + known)
 
-    found, t = in_time(estimate), estimate.recordings[0].t[1:]
+    found, t = estimate.in_time, estimate.recordings[0].t[1:]
     middle = float(found.times[found.recording == 0][3, 0])
     share, pull = found.on_grid(0, np.array([0.0, middle, 3.0]))
     for row, part in enumerate((t < middle, t >= middle)):
@@ -104,7 +99,7 @@ def test_residuals_that_are_larger_than_noise_are_marked(estimate: Estimate) -> 
 
 
 def test_picture_table_and_json_have_the_same_numbers(estimate: Estimate, tmp_path: Path) -> None:
-    found = in_time(estimate)
+    found = estimate.in_time
     first, second = deciding_seconds(estimate, estimate.labels).panels
     total = sum(panel.cells.values @ np.diff(panel.cells.edges) for panel in (first, second))
     assert_allclose(total, 100.0 * (1.0 - found.prior), rtol=1e-9)

@@ -19,7 +19,7 @@ def autoregressive(phi: float, count: int, rng: np.random.Generator) -> Array:
     """AR(1) noise of unit variance, from its stationary distribution."""
     e = rng.standard_normal(count) * np.sqrt(1.0 - phi**2)
     e[0] = rng.standard_normal()
-    return np.asarray(lfilter([1.0], [1.0, -phi], e))
+    return lfilter([1.0], [1.0, -phi], e)
 
 
 def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N) -> Whiteness:

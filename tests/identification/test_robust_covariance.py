@@ -91,14 +91,14 @@ def assess(
 def waves(K: int, N: int, c: int, slow: float = 3.0) -> Array:
     """(K, N, c) slow regressors, which autocorrelated noise disturbs most."""
     angles = 2 * np.pi * slow * np.outer(np.arange(N) / N, np.arange(1, c + 1))
-    return np.asarray(np.cos(angles + np.arange(c) + np.arange(K)[:, None, None]))
+    return np.cos(angles + np.arange(c) + np.arange(K)[:, None, None])
 
 
 def noise(phi: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:
     """AR(1) of unit variance along the last axis."""
     e = rng.standard_normal(shape) * np.sqrt(1.0 - phi**2)
     e[:, 0] /= np.sqrt(1.0 - phi**2)
-    return np.asarray(lfilter([1.0], [1.0, -phi], e))
+    return lfilter([1.0], [1.0, -phi], e)
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ class Rough(OneParameter):
         """(COUNT,) residuals."""
         phases = np.linspace(0.0, 6.0, COUNT)
         waves = np.sin(2.0 * np.pi * theta / WAVE_LENGTH + phases)
-        return np.asarray(SLOPE * (theta - 1.0) + WAVE * waves)
+        return SLOPE * (theta - 1.0) + WAVE * waves
 
     def condense(self, at: UnknownValues) -> Condensed:
         """Linearise by short differences."""
@@ -218,7 +218,7 @@ class Parts(OneParameter):
 
     def residuals(self, theta: float) -> Array:
         """One residual of each segment."""
-        return np.asarray(SLOPE * (theta - np.array(self.segments)))
+        return SLOPE * (theta - np.array(self.segments))
 
     def cost(self, at: UnknownValues) -> float:
         """Half of the sum of squares."""

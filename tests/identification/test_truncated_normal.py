@@ -24,7 +24,7 @@ def covariance_of(std: Array, correlation: float) -> Array:
     """Covariance of variables of which each pair has the same correlation."""
     count = len(std)
     matrix = np.full((count, count), correlation) + (1.0 - correlation) * np.eye(count)
-    return np.asarray(matrix * np.outer(std, std))
+    return matrix * np.outer(std, std)
 
 
 def require_same_distribution(drawn: Array, kept: Array) -> None:
