@@ -87,6 +87,11 @@ def information(
     """
     model = mujoco.MjModel.from_xml_string(xml)
     start = tables["initial"].get("qpos")
+
+    # The quaternion of a free body turns by half of the angle that its noise states.
+    sigma = np.full(model.nq + model.nv, tables["noise"]["state"])
+    sigma[3 : 3 + 4 * (model.nq - model.nv)] *= 0.5
+
     matrices = []
     for step in STEPS:
         G = []
@@ -95,7 +100,7 @@ def information(
                 play(changed(model, entry["target"], 1.0 + sign * step), start, ctrl, substeps)
                 for sign in (1.0, -1.0)
             )
-            G.append((above - below).ravel() / (2.0 * step * tables["noise"]["state"]))
+            G.append(((above - below) / (2.0 * step * sigma)).ravel())
         matrices.append(np.array(G) @ np.array(G).T)
 
     # The step with the least disagreement to its neighbour.
