@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import least_squares
-from mjfim.output.export.mjcf import write_identified
-from mjfim.recordings.read import read_recording
 from mjfim.records.trajectory import Recording
+from tests.support import terms
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
-from tests.support.paths import MODELS, SHARED_DATA
+from tests.support.numerics import require_found
 
 # Whole jobs: these tests run in `.ci/run` only.
 pytestmark = pytest.mark.slow
@@ -57,21 +56,13 @@ def references(samples: int, seed: int, width: int = 2, steps: float = 0.3) -> n
     t = np.arange(samples)[:, None] / 500.0
     waves = sum(np.sin(2 * np.pi * 0.7 * k * t + rng.uniform(0, 6, width)) / k for k in range(1, 6))
     jumps = t > rng.uniform(0.1, 0.9, width) * samples / 500.0
-    return np.asarray(0.25 * waves + jumps * rng.uniform(-steps, steps, width))
+    return 0.25 * waves + jumps * rng.uniform(-steps, steps, width)
 
 
-def recorded(experiment: mjfim.Experiment, samples: int, seed: int) -> Recording:
+def log_of(experiment: mjfim.Experiment, samples: int, seed: int) -> Recording:
     """A noisy log of a closed loop at the true parameters."""
     width = len(System.resolve(experiment).inputs)
     return mjfim.simulate(experiment, references(samples, seed, width), seed)
-
-
-def exact(system: System, inputs: np.ndarray) -> Recording:
-    """A log of a closed loop at the true parameters, without noise."""
-    y, finite = system.plant.measure(system.parameters.true[None], inputs)
-    assert finite.all()
-    t = np.arange(len(inputs) + 1) * system.dt
-    return Recording(t=t, ctrl=inputs, y=y[0], outputs=system.outputs.names, name="exact")
 
 
 def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> None:
@@ -84,11 +75,9 @@ def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> 
     )
     true = System.resolve(experiment).parameters.true
 
-    found = mjfim.identify(experiment, [recorded(experiment, 400, 1)], progress=False)
+    found = mjfim.identify(experiment, [log_of(experiment, 400, 1)], progress=False)
 
-    assert found.converged
-    assert not found.misfit
-    assert np.abs((found.theta - true) / found.std).max() < 4.0
+    require_found(found, true)
     assert (found.std < 0.05 * np.abs(true))[[0, 2, 3, 5]].all()
 
     # The estimate says which laws ran in the loop, with the identified numbers.
@@ -102,69 +91,42 @@ def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> 
     assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
 
 
-def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
-    """The rate matters: a slow law brakes less, and the plant would be blamed for it."""
-    laws = {"shoulder": {**SHOULDER, "rate": 50.0}, "elbow": ELBOW}
-    experiment = arm_experiment(laws, parameters=PLANT, noise=NOISE)
-    log = recorded(experiment, 300, 2)
-    wrong = experiment.replace(controllers={"shoulder": {**SHOULDER, "rate": 500.0}})
-
-    costs = []
-    for stated in (experiment, wrong):
-        problem = FitProblem.of(System.resolve(stated), [log])
-        costs.append(least_squares(problem, problem.system.parameters.guess).cost)
-
-    count = 2 * len(log.t)
-    assert 2.0 * costs[0] < 1.1 * count
-    assert 2.0 * costs[1] > 1.5 * count
-
-
 def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:
     """By gains and all times of the law, of a simulation and of a fit."""
-    law = {
+    numbers = {
         "kp": 60.0,
         "kd": 4.0,
-        "rate": 250.0,
         "latency": 0.0051,
         "time_constant": 0.011,
         "feedback_latency": 0.0057,
-        "velocity": "difference",
         "velocity_time_constant": 0.004,
-        "saturation": (-40.0, 40.0),
     }
-    names = ("kp", "kd", "latency", "time_constant", "feedback_latency", "velocity_time_constant")
-    parameters = {name: {"target": f"controller/shoulder:{name}"} for name in names}
+    law = {**numbers, "rate": 250.0, "velocity": "difference", "saturation": (-40.0, 40.0)}
+    parameters = {name: {"target": f"controller/shoulder:{name}"} for name in numbers}
     experiment = arm_experiment({"shoulder": law}, parameters=parameters, noise=NOISE)
     system = System.resolve(experiment)
     inputs = references(200, 3)
     guess = system.parameters.guess
     model = system.plant.model(guess)
+    columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
 
     def plain(values: np.ndarray) -> np.ndarray:
         """(samples + 1, 2) positions by the plain loop."""
-        made = PlainLaw(joint="shoulder", tick=4, low=-40.0, high=40.0, difference=True)
-        for name, value in zip(names, values, strict=True):
-            setattr(made, name, value)
-        columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
-        states, _ = simulate(model, {0: made}, columns, system.dt, len(inputs), np.zeros(4))
-        return states[:, :2]
+        stated = dict(zip(numbers, values, strict=True))
+        made = PlainLaw(joint="shoulder", tick=4, low=-40.0, high=40.0, difference=True, **stated)
+        return simulate(model, {0: made}, columns, system.dt, len(inputs), np.zeros(4))[0][:, :2]
 
-    expected = np.empty((len(inputs) + 1, 2, len(names)))
-    for j in range(len(names)):
-        step = np.zeros(len(names))
-        step[j] = 1e-4 * guess[j]
-        expected[..., j] = (plain(guess + step) - plain(guess - step)) / (2 * step[j])
-
+    steps = 1e-4 * np.diag(guess)
+    expected = [(plain(guess + h) - plain(guess - h)) / (2.0 * h.sum()) for h in steps]
+    expected = np.stack(expected, axis=-1)
     size = np.abs(expected).max(axis=(0, 1))
     assert (size * guess > 1e-4).all()
 
-    predicted = system.plant.derivatives.predict(guess, inputs)
-    assert predicted is not None
-    problem = FitProblem.of(system, [exact(system, inputs)])
+    problem = FitProblem.of(system, [terms.recorded(system, inputs, share=0.0)])
     batch = next(problem.batches(derivatives=True))
     (rows,) = problem.rows_of_batch(problem.begin(guess), batch)
-    for found in (predicted[1], rows.jacobians[0]):
-        np.testing.assert_allclose(found / size, expected / size, atol=2e-4)
+    for found in (system.plant.derivatives.predict(guess, inputs)[1], rows.jacobians[0]):
+        assert_allclose(found / size, expected / size, atol=2e-4)
 
 
 @pytest.mark.parametrize(("off", "tolerance"), [(0, 4e-4), (50, 2e-3)])
@@ -191,7 +153,7 @@ def test_segments_know_the_integral_of_the_law(off: int, tolerance: float) -> No
     inputs = references(1000, 4, 3, steps=0.0)
     inputs[:, 1] = 1.0
     inputs[400 : 400 + off, 1] = 0.0
-    log = exact(system, inputs)
+    log = terms.recorded(system, inputs, share=0.0)
 
     problem = FitProblem.of(system, [log])
     states = system.plant.simulate(system.parameters.true, inputs).state
@@ -201,16 +163,14 @@ def test_segments_know_the_integral_of_the_law(off: int, tolerance: float) -> No
     def error(recording: AlignedRecording) -> float:
         """Largest error of the prediction from the true states at the begins."""
         known = replace(problem, segments=segments, recordings=(recording,))
-        predicted = known.predict(known.begin(system.parameters.true))
-        assert predicted is not None
-        return float(np.abs(predicted[0] - log.y).max())
+        (predicted,) = known.predict(known.begin(system.parameters.true))
+        return float(np.abs(predicted - log.y).max())
 
     (recording,) = problem.recordings
     assert error(recording) < tolerance
 
     # Without the integral at their begins, segments would not follow.
-    forgotten = np.array(recording.ctrl)
-    forgotten[:, 3:] = 0.0
+    forgotten = recording.ctrl * (np.arange(recording.ctrl.shape[1]) < 3)
     assert error(replace(recording, ctrl=forgotten)) > 0.02
 
 
@@ -235,18 +195,6 @@ def test_a_check_of_a_log_knows_the_law() -> None:
     assert np.isfinite(mass.std)
 
 
-def test_the_identified_model_has_no_law(tmp_path: Path) -> None:
-    experiment = arm_experiment(
-        {"shoulder": SHOULDER}, parameters={**PLANT, "kp": {"target": "controller/shoulder:kp"}}
-    )
-    system = System.resolve(experiment)
-    (remark,) = write_identified(tmp_path / "identified.xml", system, np.array([1.1, 0.4, 55.0]))
-    assert "without the control laws of shoulder" in remark
-    text = (tmp_path / "identified.xml").read_text()
-    assert "numeric" not in text
-    assert 'mass="1.1"' in text
-
-
 def test_an_unstable_loop_is_explained(tmp_path: Path) -> None:
     path = tmp_path / "strong.xml"
     path.write_text(ARM.read_text().replace('<motor ctrlrange="-20 20"/>', ""))
@@ -254,133 +202,6 @@ def test_an_unstable_loop_is_explained(tmp_path: Path) -> None:
     experiment = arm_experiment({"shoulder": law}, parameters=PLANT, model=str(path))
     with pytest.raises(SimulationDivergedError, match=r"loop of the model and the control laws"):
         mjfim.simulate(experiment, references(100, 7))
-
-
-def servo_experiments() -> tuple[mjfim.Experiment, mjfim.Experiment]:
-    """The XL330 servo with three controls that a log yields, and with the law of its firmware."""
-    linear = mjfim.Experiment.from_file(MODELS / "bam_xl330.toml")
-    values = linear.model_dump(exclude_unset=True)
-    values["parameters"]["gain"] = {
-        "target": "actuator/pull:gainprm[0]",
-        "bounds": (0.01, 0.3),
-        "unit": "N m/V",
-    }
-    values["controllers"] = {
-        "pull": {
-            "kind": "voltage",
-            "kp": 0.02129259351647504,
-            "rate": 1000.0,
-            "saturation": (-7.4, 7.4),
-            "gain": True,
-            "enable": True,
-        }
-    }
-    values["recording"]["columns"] = {
-        "ctrl:stiffness": 0.0,
-        "reference:pull": "goal_position",
-        "gain:pull": "kp",
-        "enable:pull": "torque_enable",
-        "ctrl:brake": "torque_enable",
-        "angle": "position",
-    }
-    return linear, linear.restated(values)
-
-
-def servo_log(folder: Path, enabled: slice) -> Path:
-    """A log with the columns of BAM, whose rows lie on the engine's steps."""
-    t = np.arange(0, 1000, 5) / 1000.0
-    rows = {
-        "timestamp": t,
-        "position": 0.1 * np.sin(9.0 * t),
-        "goal_position": 0.6 * np.sin(9.0 * t) * np.sin(2.0 * t),
-        "torque_enable": np.isin(np.arange(len(t)), np.arange(len(t))[enabled]).astype(float),
-        "kp": np.full(len(t), 400.0),
-    }
-    path = folder / "log.csv"
-    lines = [
-        ",".join(rows),
-        *(",".join(map(repr, row)) for row in zip(*rows.values(), strict=True)),
-    ]
-    path.write_text("\n".join(lines).replace("np.float64(", "").replace(")", "") + "\n")
-    return path
-
-
-def predictions(log: Path, **tables: Any) -> list[np.ndarray]:
-    """Predictions of a log with three controls and with the law; tables change both experiments."""
-    outputs = []
-    for stated in servo_experiments():
-        system = System.resolve(stated.replace(**tables))
-        problem = FitProblem.of(system, [read_recording(log, system.channels)])
-        predicted = problem.predict(problem.begin(system.parameters.guess))
-        assert predicted is not None
-        outputs.append(predicted[0])
-    return outputs
-
-
-@pytest.mark.parametrize("enabled", [slice(0, None), slice(0, 120)], ids=["on", "switched off"])
-def test_a_duty_law_equals_the_same_law_as_three_controls(tmp_path: Path, enabled: slice) -> None:
-    """The firmware's law on volts, and affine actuators of MJCF whose controls a log yields."""
-    controls, law = predictions(servo_log(tmp_path, enabled), recording={"records": None})
-    np.testing.assert_allclose(law[:, 0], controls[:, 0], atol=1e-12)
-    assert np.ptp(controls[:, 0]) > 0.1
-
-
-@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="measured recordings are not here")
-def test_a_duty_law_predicts_measured_logs_as_three_controls() -> None:
-    """Where the torque is switched off inside an engine step, both differ by this step."""
-    logs = sorted((SHARED_DATA / "bam_xl330" / "raw").glob("*.json"))[:3]
-    differences = [np.abs(np.subtract(*predictions(log))).max() for log in logs]
-    assert sorted(differences)[1] < 1e-10
-    assert max(differences) < 2e-3
-
-
-def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
-    """Repetitions with whole recordings, and intervals of fits over segments."""
-    experiment = arm_experiment(
-        {"shoulder": SHOULDER, "elbow": ELBOW}, parameters={**PLANT, **GAINS}, noise=NOISE
-    )
-    system = System.resolve(experiment)
-    true = system.parameters.true
-    trajectory = system.plant.simulate(true, references(400, 11))
-
-    study = mjfim.monte_carlo(experiment, trajectory, trials=20, seed=1, progress=False)
-
-    found = study.sets["final"]
-    assert found.failed == 0
-    spread = np.sqrt(np.diag(found.covariance) / found.trials)
-    assert np.abs((found.mean - true) / spread).max() < 4.0
-    # The quantiles 2e-4 and 0.996 of the efficiency of 20 normal estimates.
-    assert (found.efficiency > 0.39).all()
-    assert (found.efficiency < 2.87).all()
-
-    inside = []
-    for seed in range(3):
-        log = recorded(experiment, 400, 100 + seed)
-        settings = {"segments": 0.2, "bootstrap": 100}
-        estimate = mjfim.identify(experiment.replace(fit=settings), [log], progress=False)
-        low, high = estimate.interval.T
-        inside.append((low < true) & (true < high))
-    assert np.mean(inside) > 0.8
-
-
-def test_a_law_acts_on_a_motor_with_a_lag() -> None:
-    """No log shows what a law commands, so that the state of the lag is free in every segment."""
-    terms = {"lag": {"kind": "actuator_lag", "actuator": "shoulder"}}
-    lag = {"target": "term/lag:time_constant", "true": 0.02, "guess": 0.01}
-    experiment = arm_experiment(
-        {"shoulder": SHOULDER}, terms=terms, parameters={**PLANT, "lag": lag}, noise=NOISE
-    )
-    log = recorded(experiment, 500, 8)
-    problem = FitProblem.of(System.resolve(experiment.replace(fit={"segments": 0.25})), [log])
-    assert problem.private_count == 5
-
-    found = least_squares(problem, problem.system.parameters.guess)
-
-    theta = problem.theta(found.unknowns)
-    true = problem.system.parameters.true
-    assert np.abs(theta / true - 1.0).max() < 0.2
-    assert abs(theta[2] - 0.02) < 1e-3
-    assert 2.0 * found.cost < 1.15 * problem.value_count
 
 
 # ---- the equation of motion
@@ -423,26 +244,13 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
 ) -> None:
     experiment = arm_with_torques(tmp_path, controllers, sensors)
     true = System.resolve(experiment).parameters.true
-    log = recorded(experiment, 3000, 4)
+    log = log_of(experiment, 3000, 4)
 
     found = mjfim.inverse_dynamics(experiment, [log])
 
     assert found.converged
-    np.testing.assert_allclose(found.theta[:3], true[:3], rtol=0.05)
+    assert_allclose(found.theta[:3], true[:3], rtol=0.05)
     assert found.absent == ("kp",)
-
-
-def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Path) -> None:
-    experiment = arm_with_torques(
-        tmp_path, {"shoulder": SHOULDER, "elbow": ELBOW}, TORQUE1 + TORQUE2
-    ).replace(fit={"start": "inverse_dynamics", "bootstrap": 0})
-    true = System.resolve(experiment).parameters.true
-
-    found = mjfim.identify(experiment, [recorded(experiment, 500, 5)], progress=False)
-
-    assert found.converged and not found.misfit
-    assert found.inverse_dynamics is not None
-    assert np.abs((found.theta - true) / found.std).max() < 4.0
 
 
 def test_the_equation_of_motion_needs_the_torque_of_every_law(tmp_path: Path) -> None:
@@ -450,14 +258,52 @@ def test_the_equation_of_motion_needs_the_torque_of_every_law(tmp_path: Path) ->
     laws = {"shoulder": SHOULDER, "elbow": ELBOW}
     experiment = arm_with_torques(tmp_path, laws, TORQUE1)
     with pytest.raises(ExperimentError, match=r"controllers.elbow: the equation of motion needs"):
-        mjfim.inverse_dynamics(experiment, [recorded(experiment, 100, 9)])
+        mjfim.inverse_dynamics(experiment, [log_of(experiment, 100, 9)])
 
     # The torque of one recording does not help another one.
     experiment = arm_with_torques(tmp_path, {"shoulder": SHOULDER}, TORQUE1)
-    log = recorded(experiment, 100, 9)
+    log = log_of(experiment, 100, 9)
     column = log.outputs.index("torque1")
     y = np.array(log.y)
     y[:, column] = np.nan
     without = replace(log, y=y, name="without.csv")
     with pytest.raises(ExperimentError, match=r"which without.csv does not hold"):
         mjfim.inverse_dynamics(experiment, [log, without])
+
+
+def test_estimates_reach_the_bound() -> None:
+    """Repetitions with whole recordings."""
+    experiment = arm_experiment(
+        {"shoulder": SHOULDER, "elbow": ELBOW}, parameters={**PLANT, **GAINS}, noise=NOISE
+    )
+    system = System.resolve(experiment)
+    trajectory = system.plant.simulate(system.parameters.true, references(400, 11))
+    study = mjfim.monte_carlo(experiment, trajectory, trials=20, seed=1, progress=False)
+
+    found = study.sets["final"]
+    assert found.failed == 0
+    spread = np.sqrt(np.diag(found.covariance) / found.trials)
+    assert np.abs((found.mean - system.parameters.true) / spread).max() < 4.0
+    # The quantiles 2e-4 and 0.996 of the efficiency of 20 normal estimates.
+    assert (found.efficiency > 0.39).all()
+    assert (found.efficiency < 2.87).all()
+
+
+def test_intervals_of_a_fit_over_segments_with_a_motor_that_lags() -> None:
+    """No log shows what a law commands, so that the state of the lag is free in every segment."""
+    lag = {"target": "term/lag:time_constant", "true": 0.02, "guess": 0.01}
+    experiment = arm_experiment(
+        {"shoulder": SHOULDER},
+        terms={"lag": {"kind": "actuator_lag", "actuator": "shoulder"}},
+        parameters={**PLANT, "lag": lag},
+        noise=NOISE,
+        fit={"segments": 0.25, "bootstrap": 0},
+    )
+    log = log_of(experiment, 500, 8)
+    true = System.resolve(experiment).parameters.true
+    assert FitProblem.of(System.resolve(experiment), [log]).private_count == 5
+
+    found = mjfim.identify(experiment, [log], progress=False)
+    require_found(found, true)
+    assert np.abs(found.theta / true - 1.0).max() < 0.2
+    assert abs(found.theta[2] - 0.02) < 1e-3

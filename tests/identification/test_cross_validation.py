@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.system import simulate_system
-from mjfim.identification import left_out
+from mjfim.experiment.system import System, simulate_system
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import identify_system, least_squares
-from mjfim.parallel.budget import Budget
+from mjfim.identification.identify import identify_system
 from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.trajectory import Recording
+from tests.support import terms
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.dense_residuals import dense_residuals
 from tests.support.paths import ROOT
@@ -41,21 +41,21 @@ def recorded(task: DesignTask, seed: int, swing: float = 1.0) -> Recording:
 @pytest.mark.slow
 def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.Experiment) -> None:
     task = DesignTask.resolve(base)
-    found = identify_system(task.system, [recorded(task, 0)], held_out=[recorded(task, 1, 1.5)])
+    other = recorded(task, 1, 1.5)
+    found = identify_system(task.system, [recorded(task, 0)], held_out=[other])
     (prediction,) = found.predictions
     assert prediction.held_out
-    np.testing.assert_allclose(prediction.identified.rms, 0.05, rtol=0.12)
+    assert_allclose(prediction.identified.rms, 0.05, rtol=0.12)
     assert (prediction.nominal.rms > 1.5 * prediction.identified.rms).any()
     assert prediction.ratio < 0.8
-    alone = mjfim.predict(task.experiment, found.theta, [recorded(task, 1, 1.5)])
-    np.testing.assert_allclose(alone[0].rms, prediction.identified.rms, rtol=1e-9)
-    assert (alone[0].mae < alone[0].rms).all()
+    (alone,) = mjfim.predict(task.experiment, found.theta, [other])
+    assert_allclose(alone.rms, prediction.identified.rms, rtol=1e-9)
+    assert (alone.mae < alone.rms).all()
 
     # The outputs are those of which the errors are told; the first row begins the simulation.
-    assert prediction.recording is not None
     errors = prediction.identified_outputs - prediction.recording.y
     rms = np.sqrt(np.nanmean(errors[1:] ** 2, axis=0))
-    np.testing.assert_allclose(rms, prediction.identified.rms, rtol=1e-9)
+    assert_allclose(rms, prediction.identified.rms, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -76,22 +76,6 @@ def test_without_held_out_recordings_each_is_predicted_by_the_others(
 
 
 @pytest.mark.slow
-def test_predictions_of_some_segments_say_how_many(
-    base: mjfim.Experiment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    experiment = base.replace(horizon=1.0, fit={"segments": 0.25, "start": "measured"})
-    task = DesignTask.resolve(experiment, threads=1)
-    problem = FitProblem.of(task.system, [recorded(task, seed) for seed in range(2)])
-    solution = least_squares(problem, task.theta)
-    everything = left_out.predict_unfitted(problem, solution, None, Budget())
-    assert [found.name for found in everything] == ["simulated"] * 2
-
-    monkeypatch.setattr(left_out, "MAX_SAMPLES", problem.sample_count // 2)
-    some = left_out.predict_unfitted(problem, solution, None, Budget())
-    assert [found.name for found in some] == ["simulated (2 of 4 segments)"] * 2
-
-
-@pytest.mark.slow
 def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
     task = DesignTask.resolve(base)
     recording = recorded(task, 0)
@@ -99,39 +83,35 @@ def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
     late[320:] += 1.0
     (prediction,) = identify_system(task.system, [replace(recording, y=late)]).predictions
     assert prediction.name.startswith("last 25 %")
-    np.testing.assert_allclose(
+    assert_allclose(
         prediction.identified.rms[0], np.sqrt(0.8 + 0.05**2), rtol=0.1
     )  # 80 of 100 rows
 
 
 @pytest.mark.slow
 def test_every_recording_has_a_separate_bias(short: mjfim.Experiment) -> None:
-    with_biases = short.replace(nuisance={"bias": {"qpos:hinge": True}, "per_recording": True})
-    task = DesignTask.resolve(with_biases)
+    one = short.replace(nuisance={"bias": {"qpos:hinge": True}})
+    task = DesignTask.resolve(one.replace(nuisance={"per_recording": True}))
     plain = DesignTask.resolve(short)
     biases = (0.1, -0.2, 0.0)
     recordings = []
     for seed, bias in enumerate(biases):
         clean = recorded(plain, seed)
-        shift = bias * (np.arange(4) == clean.outputs.index("qpos:hinge"))
+        shift = bias * (np.array(clean.outputs) == "qpos:hinge")
         recordings.append(replace(clean, y=clean.y + shift, name=f"log {seed}"))
     found = identify_system(task.system, recordings)
-    np.testing.assert_allclose(found.per_recording["bias qpos:hinge"], biases, atol=0.02)
-    j = found.parameters.index("bias qpos:hinge")
-    assert found.theta[j] == found.per_recording["bias qpos:hinge"][0]
+    assert_allclose(found.per_recording["bias qpos:hinge"], biases, atol=0.02)
+    assert found.parameters[3] == "bias qpos:hinge"
+    assert found.theta[3] == found.per_recording["bias qpos:hinge"][0]
     assert np.all(np.abs(found.theta[:3] - task.parameters.true[:3]) < 4.0 * found.std[:3])
     assert not found.misfit
-    assert identify_system(
-        DesignTask.resolve(short.replace(nuisance={"bias": {"qpos:hinge": True}})).system,
-        recordings,
-    ).misfit
-    alone = identify_system(task.system, recordings[:1])
-    assert alone.theta[j] == pytest.approx(found.theta[j], abs=0.01)
+    assert mjfim.identify(one, recordings).misfit
+
+    # The unknowns are m, l, c and the first recording's bias, and those of the others.
     fit = FitProblem.of(task.system, recordings)
-    H = dense_residuals(fit, fit.begin(found.theta)).J
-    order = [*range(3), 3]  # m, l, c, the first recording's bias
-    covariance = np.linalg.inv(H.T @ H)
-    np.testing.assert_allclose(found.std, np.sqrt(np.diag(covariance))[order], rtol=0.02)
+    J = dense_residuals(fit, fit.begin(found.theta)).J
+    covariance = np.linalg.inv(J.T @ J)
+    assert_allclose(found.std, np.sqrt(np.diag(covariance))[:4], rtol=0.02)
 
 
 def test_per_recording_belongs_to_nuisance(base: mjfim.Experiment) -> None:
@@ -144,8 +124,7 @@ def test_poor_data_are_described_and_good_data_are_not(base: mjfim.Experiment) -
     good = recorded(task, 0)
     assert plausibility_remarks(task.system.channels, good) == ()
     rng = np.random.default_rng(0)
-    y = np.array(good.y)
-    y[:, 3] += rng.normal(0.0, 2.0, len(y))
+    y = good.y + rng.normal(size=good.y.shape) * [0.0, 0.0, 0.0, 2.0]
     noisy = replace(good, ctrl=good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y=y)
     remarks = " ".join(plausibility_remarks(task.system.channels, noisy))
     assert "jumps from row to row" in remarks and "qvel:hinge is rough" in remarks
@@ -154,14 +133,11 @@ def test_poor_data_are_described_and_good_data_are_not(base: mjfim.Experiment) -
 def test_a_quick_motion_of_a_drone_is_not_taken_for_noise() -> None:
     """Rotors that switch every third row shake the drone; only a model tells this from noise."""
     stated = mjfim.Experiment.from_file(ROOT / "models" / "quadrotor.toml")
-    system = DesignTask.resolve(stated.replace(noise={"state": 1e-3})).system
-    rows = np.arange(120)
-    roll = np.where((rows // 3) % 2 == 0, 1.0, -1.0)
+    system = System.resolve(stated.replace(noise={"state": 1e-3}))
+    roll = np.where((np.arange(120) // 3) % 2 == 0, 1.0, -1.0)
     ctrl = 0.4905 + 0.05 * roll[:, None] * np.array([1.0, -1.0, 1.0, -1.0])
-    theta = system.parameters.true
-    trajectory = system.plant.simulate(theta, ctrl)
-    flight = simulate_system(system, trajectory, seed=0)
-    outputs, _ = system.plant.measure(theta[None], ctrl)
+    flight = terms.recorded(system, ctrl)
+    exact = terms.recorded(system, ctrl, share=0.0).y
 
     def remarks(recording: Recording, predicted: np.ndarray | None) -> str:
         """Remarks about rough outputs."""
@@ -169,12 +145,12 @@ def test_a_quick_motion_of_a_drone_is_not_taken_for_noise() -> None:
         return "; ".join(each for each in found if "is rough" in each)
 
     assert "qvel:base.rx is rough" in remarks(flight, None)
-    assert not remarks(flight, outputs[0])
+    assert not remarks(flight, exact)
 
     # Spikes are found beside the same motion, in any unit of the output.
     i = flight.outputs.index("qvel:base.rx")
     y = np.array(flight.y)
     y[::20, i] += 5.0 * np.nanstd(y[:, i])
-    found = remarks(replace(flight, y=y), outputs[0])
+    found = remarks(replace(flight, y=y), exact)
     assert found.startswith("qvel:base.rx is rough") and found.count("is rough") == 1
     assert "not explained by the identified motion" in found

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.arrays import Array
@@ -37,29 +38,23 @@ def problem(task: FitTask) -> FitProblem:
     return task.problem()
 
 
-def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, FitProblem, Array]:
+def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, Array]:
     """The oracle: the noise of the residuals, and a fit with this noise, in turn.
 
-    It begins a little beside theta, so that a wrong theta shows. Returned are theta, the problem
-    with the last noise, and the standard deviations of theta.
+    It begins a little beside theta, so that a wrong theta shows. Returned are theta and its
+    standard deviations.
     """
-    found = problem.begin(theta * 1.01)
-    weighted = problem
+    found, weighted = problem.begin(theta * 1.01), problem
+    correction = problem.value_count / (problem.value_count - problem.unknown_count)
     for _ in range(6):
-        errors = problem.errors_at(found)
-        assert errors is not None
-        count = problem.value_count
-        correction = count / (count - problem.unknown_count)
-        variances = [float(np.mean(e**2)) * correction for e in errors]
+        variances = [float(np.mean(e**2)) * correction for e in problem.errors_at(found)]
         noise = Noise(covariance=np.diag(variances), strides=problem.noise.strides)
         weighted = problem.with_noise(noise)
         solved = minimise(weighted, found, SearchSettings(tolerance=1e-5), Budget())
-        assert solved is not None and solved.success
+        assert solved.success
         found = solved.unknowns
-
-    condensed = weighted.condense(found)
-    assert condensed is not None
-    return found.theta, weighted, np.sqrt(np.diag(np.linalg.inv(condensed.information())))
+    information = weighted.condense(found).information()
+    return found.theta, np.sqrt(np.diag(np.linalg.inv(information)))
 
 
 @pytest.mark.slow
@@ -71,14 +66,15 @@ def test_an_estimate_with_estimated_noise_is_that_of_searches_in_turn(
     found = mjfim.identify(experiment, task.recordings, threads=1)
     assert found.converged
     assert abs(found.chi2 / found.dof - 1.0) < 1e-3
-    theta, _, sigma = in_turn(problem, found.theta)
+    theta, sigma = in_turn(problem, found.theta)
     assert (np.abs(found.theta - theta) < 1e-2 * sigma).all()
-    np.testing.assert_allclose(found.std, sigma, rtol=1e-2)
+    assert_allclose(found.std, sigma, rtol=1e-2)
 
 
 def test_the_noise_of_a_stopped_search_is_that_of_its_linearisation(
     task: FitTask, problem: FitProblem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The outputs contradict each other, so that the first step with estimated noise is long."""
     stop, condense = StopToken(), FitProblem.condense
     points: list[UnknownValues] = []
 
@@ -87,29 +83,24 @@ def test_the_noise_of_a_stopped_search_is_that_of_its_linearisation(
         points.append(at)
         return condense(self, at)
 
-    monkeypatch.setattr(FitProblem, "condense", recorded)
-
     def callback(event: FitEvent) -> None:
         """Stop after the first step with estimated noise."""
         if "noise estimated" in event.phase:
             stop.request()
 
-    # The outputs contradict each other, so that this step is long.
+    monkeypatch.setattr(FitProblem, "condense", recorded)
     search = FitSearch(task=task, budget=Budget(stop=stop), callback=callback)
     weighted, found = search.solve(problem, problem.begin(problem.system.parameters.guess))
     assert found.interrupted
-    anew = condense(weighted, points[-1])
-    assert anew is not None
-    np.testing.assert_allclose(found.condensed.information(), anew.information(), rtol=1e-6)
-    np.testing.assert_allclose(found.cost, weighted.cost(found.unknowns))
+    anew = condense(weighted, points[-1]).information()
+    assert_allclose(found.condensed.information(), anew, rtol=1e-6)
+    assert_allclose(found.cost, weighted.cost(found.unknowns))
 
 
 def test_the_noise_has_a_smallest_value(task: FitTask, problem: FitProblem) -> None:
     """Without a limit, an output without any error would outweigh all others."""
-    exact = problem.predict(problem.begin(problem.system.parameters.guess))
-    assert exact is not None
-    recording = replace(task.recordings[0], y=exact[0])
-    silent = replace(task, recordings=(recording,)).problem()
-    begin = silent.begin(problem.system.parameters.guess)
-    weighted, _ = FitSearch(task=task, budget=Budget()).solve(silent, begin)
-    np.testing.assert_allclose(weighted.noise.sigma, 1e-3 * problem.noise.sigma)
+    guess = problem.system.parameters.guess
+    (exact,) = problem.predict(problem.begin(guess))
+    silent = replace(task, recordings=(replace(task.recordings[0], y=exact),)).problem()
+    weighted, _ = FitSearch(task=task, budget=Budget()).solve(silent, silent.begin(guess))
+    assert_allclose(weighted.noise.sigma, 1e-3 * problem.noise.sigma)

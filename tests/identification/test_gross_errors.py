@@ -22,6 +22,7 @@ from mjfim.records.trajectory import Recording
 from scripts.benchmarks.starts import PENDULUM
 from tests.support.cli import run
 from tests.support.paths import MODELS
+from tests.support.terms import recorded
 
 # Whole jobs: these tests run in `.ci/run` only.
 pytestmark = pytest.mark.slow
@@ -60,44 +61,34 @@ def refused(system: System, recording: Recording, factors: tuple[float, ...] = (
     return ""
 
 
-def with_ctrl(recording: Recording, change: Any) -> Recording:
-    """The recording with other controls."""
-    return replace(recording, ctrl=change(recording.ctrl))
-
-
-def with_columns(recording: Recording, names: list[str], change: Any) -> Recording:
-    """The recording with other values of some outputs."""
-    y = np.array(recording.y)
-    for name in names:
-        y[:, recording.outputs.index(name)] = change(y[:, recording.outputs.index(name)])
-    return replace(recording, y=y)
-
-
 def cure_of(message: str) -> dict[str, Any]:
     """The lines of `[recording.columns]` in a message, as a file would state them."""
     lines = message.split("State in [recording.columns]: ")[1].replace("; ", "\n")
     return tomllib.loads(lines)
 
 
+def scaled(*factors: float, name: str = "ctrl") -> Any:
+    """Multiplies the controls, or the outputs, by factors."""
+    return lambda log: replace(log, **{name: getattr(log, name) * factors})
+
+
+# What is wrong with a log, and the entries that cure it.
 ERRORS: dict[str, tuple[Any, dict[str, dict[str, Any]]]] = {
+    "one control flipped": (scaled(-1.0, 1.0), {"ctrl:shoulder": {"scale": -1.0}}),
     "both controls flipped": (
-        lambda log: with_ctrl(log, lambda u: -u),
+        scaled(-1.0, -1.0),
         {"ctrl:shoulder": {"scale": -1.0}, "ctrl:elbow": {"scale": -1.0}},
     ),
-    "one control flipped": (
-        lambda log: with_ctrl(log, lambda u: u * [-1.0, 1.0]),
-        {"ctrl:shoulder": {"scale": -1.0}},
-    ),
     "currents in mA": (
-        lambda log: with_ctrl(log, lambda u: 770.0 * u),
+        scaled(770.0, 770.0),
         {"ctrl:shoulder": {"scale": 1 / 770}, "ctrl:elbow": {"scale": 1 / 770}},
     ),
     "torques times 1.3": (
-        lambda log: with_ctrl(log, lambda u: 1.3 * u),
+        scaled(1.3, 1.3),
         {"ctrl:shoulder": {"scale": 1 / 1.3}, "ctrl:elbow": {"scale": 1 / 1.3}},
     ),
     "controls swapped": (
-        lambda log: with_ctrl(log, lambda u: u[:, ::-1]),
+        lambda log: replace(log, ctrl=log.ctrl[:, ::-1]),
         {"ctrl:shoulder": {"column": "ctrl:elbow"}, "ctrl:elbow": {"column": "ctrl:shoulder"}},
     ),
     "joints swapped": (
@@ -105,11 +96,11 @@ ERRORS: dict[str, tuple[Any, dict[str, dict[str, Any]]]] = {
         {a: {"column": b} for a, b in zip(SHOULDER + ELBOW, ELBOW + SHOULDER, strict=True)},
     ),
     "zero of an encoder": (
-        lambda log: with_columns(log, SHOULDER[:1], lambda q: q + 0.35),
+        lambda log: replace(log, y=log.y + np.array([0.35, 0.0, 0.0, 0.0])),
         {"qpos:shoulder": {"offset": -0.35}},
     ),
     "joint flipped": (
-        lambda log: with_columns(log, ELBOW, lambda q: -q),
+        scaled(1.0, -1.0, 1.0, -1.0, name="y"),
         {name: {"scale": -1.0} for name in ELBOW},
     ),
 }
@@ -138,12 +129,12 @@ def test_an_error_is_named_with_the_lines_that_cure_it(
 def test_positions_alone_and_servos_are_enough(arm: tuple[System, Recording]) -> None:
     system, recording = arm
     positions = replace(recording, y=recording.y[:, :2], outputs=recording.outputs[:2])
-    flipped = refused(system, with_ctrl(positions, lambda u: -u))
+    flipped = refused(system, scaled(-1.0, -1.0)(positions))
     assert cure_of(flipped).keys() == {"ctrl:shoulder", "ctrl:elbow"}
 
     servos, commanded = logged(servo_arm())
     assert refused(servos, commanded) == ""
-    flipped = refused(servos, with_ctrl(commanded, lambda u: u * [1.0, -1.0, 1.0, 1.0]))
+    flipped = refused(servos, scaled(1.0, -1.0, 1.0, 1.0)(commanded))
     assert cure_of(flipped)["ctrl:shoulder"]["scale"] == -1.0
 
 
@@ -154,7 +145,8 @@ def test_the_command_line_ends_with_exit_code_1(
     experiment = tmp_path / "arm.toml"
     text = (MODELS / "two_joint_arm.toml").read_text()
     experiment.write_text(text.replace('"two', f'"{MODELS}/two', 1).replace("1000.0", "200.0"))
-    write_recording(tmp_path / "log.csv", with_ctrl(recording, lambda u: u[:, ::-1]), system)
+    swapped = ERRORS["controls swapped"][0](recording)
+    write_recording(tmp_path / "log.csv", swapped, system)
     result = run("identify", experiment, tmp_path / "log.csv", "-o", tmp_path / "fit")
     assert result.exit_code == 1
     assert "controls shoulder and elbow are swapped" in result.stderr
@@ -171,72 +163,68 @@ def test_a_factor_is_named_only_where_masses_are_not_free(arm: tuple[System, Rec
         f"spring_{joint}": {"target": f"joint/{joint}:stiffness", "bounds": [0.0, 20.0]}
         for joint in ("shoulder", "elbow")
     }
-    wide = two_joint_arm().model_copy()
+    wide = two_joint_arm()
     tables = {name: each for name, each in wide.parameters.items() if name != "payload"}
     system = System.resolve(
         wide.model_copy(update={"parameters": tables}).replace(parameters=free | springs)
     )
-    assert refused(system, with_ctrl(arm[1], lambda u: 1.3 * u)) == ""
-    assert "scale = -1" in refused(system, with_ctrl(arm[1], lambda u: -u))
+    assert refused(system, scaled(1.3, 1.3)(arm[1])) == ""
+    assert "scale = -1" in refused(system, scaled(-1.0, -1.0)(arm[1]))
 
 
 def test_other_misfits_have_no_name(arm: tuple[System, Recording]) -> None:
     system, recording = arm
-    rng = np.random.default_rng(0)
-    assert refused(system, with_ctrl(recording, lambda u: 0.0 * u)) == ""
-    late = with_ctrl(recording, lambda u: np.concatenate([u[12:], u[-12:]]))
-    assert refused(system, late) == ""
-    assert refused(system, replace(recording, y=rng.normal(size=recording.y.shape))) == ""
-    assert refused(system, replace(recording, y=0.5 * recording.y)) == ""
+    noise = np.random.default_rng(0).normal(size=recording.y.shape)
+    late = np.concatenate([recording.ctrl[12:], recording.ctrl[-12:]])
+    for changes in (
+        {"ctrl": 0.0 * recording.ctrl},
+        {"ctrl": late},
+        {"y": noise},
+        {"y": 0.5 * recording.y},
+    ):
+        assert refused(system, replace(recording, **changes)) == ""
 
 
 CLEAN = {
-    "arm": two_joint_arm,
-    "servos": servo_arm,
-    "cart": lambda: mjfim.Experiment.from_file(MODELS / "cart_pendulum_guess.toml"),
+    "arm": (two_joint_arm, 0.4),
+    "servos": (servo_arm, 0.08),
+    "cart": (lambda: mjfim.Experiment.from_file(MODELS / "cart_pendulum_guess.toml"), 0.5),
 }
 
 
 @pytest.mark.parametrize("name", CLEAN)
 def test_clean_logs_of_other_robots_have_no_error(name: str, tmp_path: Path) -> None:
     """Parameters are up to 50 % wrong, and every other robot has friction that the model lacks."""
-    stated = CLEAN[name]()
+    make, size = CLEAN[name]
+    stated = make()
     system = System.resolve(stated)
-    trajectory, guess = DesignTask.of(system).initial, system.parameters.guess
-    sizes = {"arm": 0.4, "servos": 0.08, "cart": 0.5}
+    trajectory, parameters = DesignTask.of(system).initial, system.parameters
     for seed in range(10):
         rng = np.random.default_rng(seed)
         robot = stated
         if seed % 2:
             spec = mujoco.MjSpec.from_file(str(system.model_path))
             for joint in spec.joints:
-                joint.frictionloss = sizes[name] * rng.uniform(0.5, 1.5)
+                joint.frictionloss = size * rng.uniform(0.5, 1.5)
             spec.compile()
             (tmp_path / "robot.xml").write_text(spec.to_xml())
             robot = stated.replace(model=str(tmp_path / "robot.xml"))
-        true = np.clip(
-            guess * rng.uniform(0.5, 1.5, len(guess)),
-            system.parameters.lower,
-            system.parameters.upper,
-        )
-        tables = {key: {"true": float(x)} for key, x in zip(stated.parameters, true, strict=True)}
-        made = System.resolve(robot.replace(parameters=tables))
-        assert refused(system, simulate_system(made, trajectory, seed=seed)) == ""
+        true = parameters.guess * rng.uniform(0.5, 1.5, len(parameters.guess))
+        true = np.clip(true, parameters.lower, parameters.upper)
+        log = recorded(System.resolve(robot), trajectory.ctrl, seed, theta=true)
+        assert refused(system, log) == ""
 
 
-FAR_OFF = [(0.32, 0.27, 0.13), (4.69, 0.15, 0.13), (3.39, 0.17, 5.59), (0.14, 0.13, 6.69)]
-
-
-@pytest.mark.parametrize("factors", FAR_OFF)
+@pytest.mark.parametrize("factors", [(0.32, 0.27, 0.13), (4.69, 0.15, 0.13), (0.14, 0.13, 6.69)])
 def test_a_guess_that_is_far_off_is_no_error_of_the_log(
     factors: tuple[float, ...], tmp_path: Path
 ) -> None:
     """A wrong length of a pendulum looks like a wrong scale of its torque, until it is fitted."""
     (tmp_path / "pendulum.xml").write_text(PENDULUM, encoding="utf-8")
-    path = "body/pole:ipos[2]"
+    com = {"path": "body/pole:ipos[2]", "scale": -1.0}
     unknown: dict[str, Any] = {
         "mass": {"target": "body/pole:mass", "bounds": [0.03, 12.0]},
-        "com": {"targets": [{"path": path, "scale": -1.0}], "bounds": [0.02, 8.0]},
+        "com": {"targets": [com], "bounds": [0.02, 8.0]},
         "damping": {"target": "joint/hinge:damping", "bounds": [0.0025, 1.0]},
     }
     experiment = mjfim.Experiment(
@@ -249,5 +237,4 @@ def test_a_guess_that_is_far_off_is_no_error_of_the_log(
     )
     system, recording = logged(experiment)
     assert refused(system, recording, factors) == ""
-    wrong = with_ctrl(recording, lambda u: -0.1 * u)
-    assert "another sign or unit" in refused(system, wrong)
+    assert "another sign or unit" in refused(system, scaled(-0.1)(recording))

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import block_diag
 
 import mjfim
-from mjfim.arrays import NORMAL_95
 from mjfim.excitation import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import (
@@ -18,13 +19,14 @@ from mjfim.identification.assessment.honest_covariance import (
     between_covariance,
     honest_covariance,
     interval_std,
-    stretched_formal_covariance,
     with_honest_covariance,
 )
-from mjfim.records.estimate import HorizonStudy, Uncertainty
+from mjfim.records.estimate import Uncertainty
+from tests.identification.test_horizons import made_study
 from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
+from tests.support.terms import recorded
 
 # Mass and lever, known to 10 % each, and their product to 0.1 %.
 PRODUCT = np.array([1.0, 1.0]) / np.sqrt(2.0)
@@ -53,37 +55,28 @@ def test_one_wider_interval_leaves_a_known_product_known(system: System) -> None
     assert ratio[1] == pytest.approx(1.0)
     assert 1.0 <= ratio[0] <= 1.05
 
-    # Formal correlations with the standard deviations of the intervals lose it.
-    covariance = np.zeros((3, 3))
-    covariance[:2, :2] = NARROW
-    covariance[2, 2] = 1.0
-    lost = stretched_formal_covariance(estimated(system, covariance), np.append(std, 1.0))
-    assert size(lost, np.append(PRODUCT, 0.0)) > 3.0 * KNOWN
-
-
-def test_a_common_factor_changes_no_correlation() -> None:
+    # A common factor changes no correlation.
     std = np.sqrt(np.diag(NARROW))
-    np.testing.assert_allclose(agreeing_covariance(9.0 * NARROW, std), NARROW, rtol=1e-9)
-    np.testing.assert_allclose(agreeing_covariance(NARROW, std), NARROW, rtol=1e-9)
+    assert_allclose(agreeing_covariance(9.0 * NARROW, std), NARROW, rtol=1e-9)
+    assert_allclose(agreeing_covariance(NARROW, std), NARROW, rtol=1e-9)
 
 
 def test_standard_deviations_agree_with_all_intervals() -> None:
     rng = np.random.default_rng(1)
     factor = rng.standard_normal((6, 6)) * np.geomspace(1e-6, 1e3, 6)[:, None]
     covariance = factor @ factor.T
-    wanted = np.sqrt(np.diag(covariance)) * [1.0, 0.3, 3.0, 1.0, 1.0, 1.0]
-    wanted[3:5] = 0.0, np.nan
+    scale = np.sqrt(np.diag(covariance))
+    wanted = scale * [1.0, 0.3, 3.0, 0.0, np.nan, 1.0]
     found = agreeing_covariance(covariance, wanted)
     ratio = np.sqrt(np.diag(found))[[0, 1, 2, 5]] / wanted[[0, 1, 2, 5]]
     assert (ratio > 1.0 - 1e-9).all()
     assert ratio[2] < 1.0 + AGREEMENT + 1e-9
     assert not found[3].any()
-    scale = np.sqrt(np.diag(covariance))
     assert np.linalg.eigvalsh(found / np.outer(scale, scale)).min() > -1e-9
 
     # Parameters about which the covariance says nothing are uncorrelated.
     alone = agreeing_covariance(np.zeros((2, 2)), np.array([2.0, 0.0]))
-    np.testing.assert_array_equal(alone, [[4.0, 0.0], [0.0, 0.0]])
+    assert_array_equal(alone, [[4.0, 0.0], [0.0, 0.0]])
 
 
 # ---- its parts
@@ -106,20 +99,20 @@ def uncertainty(each: Array, between: Array, apart: tuple[int, ...]) -> Uncertai
 def test_recordings_disagree_along_what_differs_between_them() -> None:
     """Mass and lever of 20 recordings, with one product, and a third unknown that agrees."""
     deviation = 0.1 * np.random.default_rng(2).standard_normal(20)
-    each = np.column_stack([1.0 + deviation, 1.0 - deviation, np.ones(20)])
+    each = 1.0 + np.outer(deviation, [1.0, -1.0, 0.0])
     between = np.array([0.1, 0.1, 0.0])
-    found = between_covariance(uncertainty(each, between, (0, 1)))
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), between)
-    assert size(found[:2, :2], PRODUCT) == pytest.approx(0.1 / np.sqrt(20), rel=1e-6)
-    assert not found[2].any()
+    product = np.append(PRODUCT, 0.0)
 
     # Two recordings show one direction only.
-    few = between_covariance(uncertainty(each[:2], between, (0, 1)))
-    assert size(few[:2, :2], PRODUCT) == pytest.approx(0.1 / np.sqrt(2), rel=1e-6)
+    for count in (20, 2):
+        found = between_covariance(uncertainty(each[:count], between, (0, 1)))
+        assert size(found, product) == pytest.approx(0.1 / np.sqrt(count), rel=1e-6)
+        assert not found[2].any()
+        assert count == 2 or np.sqrt(np.diag(found)) == pytest.approx(between)
 
     # Recordings of which none determines all unknowns.
     unknown = between_covariance(uncertainty(np.full((3, 3), np.nan), between, (0, 1)))
-    np.testing.assert_array_equal(unknown, np.diag(between**2))
+    assert_array_equal(unknown, np.diag(between**2))
 
 
 def test_lengths_and_selections_widen_along_their_differences(system: System) -> None:
@@ -127,102 +120,80 @@ def test_lengths_and_selections_widen_along_their_differences(system: System) ->
 
     Chance explains the difference of the lever alone, which follows that of the mass.
     """
-    covariance = np.zeros((3, 3))
-    covariance[:2, :2] = NARROW
-    covariance[2, 2] = 0.01
+    covariance = block_diag(NARROW, 0.01)
     theta = system.parameters.guess
-    step = np.array([0.5, -0.5, 0.0])
-    study = HorizonStudy(
-        lengths=np.array([1.0, 10.0]),
-        errors=np.ones((2, 2)),
+    study = made_study(
         chosen=0,
-        is_whole=True,
         parameters=system.parameters.names,
         units=("", "", ""),
-        theta=np.array([theta, theta + step]),
+        theta=theta + np.array([[0.0, 0.0, 0.0], [0.5, -0.5, 0.0]]),
         half_widths=np.zeros((2, 3)),
         is_apart=np.array([[False] * 3, [True, False, False]]),
     )
     narrow = estimated(system, covariance)
     wide = replace(narrow, horizons=study, interval=study.widened(narrow.interval))
-    found = with_honest_covariance(wide, system.parameters, covariance).honest_covariance
-    std = interval_std(system.parameters, wide)
-    assert std[0] > 1.5 * np.sqrt(NARROW[0, 0])
-    ratio = np.sqrt(np.diag(found)) / std
-    assert (ratio >= 1.0 - 1e-9).all()
-    assert ratio[0] <= 1.0 + AGREEMENT + 1e-9
-    assert size(found, np.append(PRODUCT, 0.0)) == pytest.approx(KNOWN, rel=0.2)
 
     # Estimates without each of five parts of the data.
     first = with_honest_covariance(narrow, system.parameters, covariance)
     shifts = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])
-    without = theta + shifts[:, None] * np.array([1.0, -1.0, 0.0])
-    jackknife = np.sqrt(4 / 5 * np.sum(shifts**2))
-    half = 2.776 * jackknife * np.array([1.0, 1.0, 0.0])
-    spread = np.column_stack([theta - half, theta + half])
-    low = np.minimum(first.interval[:, 0], spread[:, 0])
-    high = np.maximum(first.interval[:, 1], spread[:, 1])
-    widened = replace(first, interval=np.column_stack([low, high]))
-    found = with_honest_covariance(
-        widened, system.parameters, without_parts=without
-    ).honest_covariance
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(found))[:2], 2.776 * jackknife / NORMAL_95, rtol=AGREEMENT + 0.01
-    )
-    assert size(found, np.append(PRODUCT, 0.0)) == pytest.approx(KNOWN, rel=0.2)
+    half = 2.776 * np.sqrt(4 / 5 * np.sum(shifts**2))
+    interval = first.interval + np.outer([half, half, 0.0], [-1.0, 1.0])
+    parts = {"without_parts": theta + np.outer(shifts, [1.0, -1.0, 0.0])}
+
+    for widened, *known, settings in (
+        (wide, covariance, {}),
+        (replace(first, interval=interval), parts),
+    ):
+        honest = with_honest_covariance(widened, system.parameters, *known, **settings)
+        found = honest.honest_covariance
+        std = interval_std(system.parameters, widened)
+        assert std[0] > 1.5 * np.sqrt(NARROW[0, 0])
+        ratio = np.sqrt(np.diag(found)) / std
+        assert (ratio >= 1.0 - 1e-9).all()
+        assert ratio[0] <= 1.0 + AGREEMENT + 1e-9
+        assert size(found, np.append(PRODUCT, 0.0)) == pytest.approx(KNOWN, rel=0.2)
 
 
 # ---- estimates
 
 
 def test_it_is_saved_and_earlier_estimates_have_none(system: System, tmp_path: Path) -> None:
-    earlier = estimated(system, COVARIANCE)
-    parameters = system.parameters
+    earlier, parameters = estimated(system, COVARIANCE), system.parameters
     saved = with_honest_covariance(earlier, parameters, 4.0 * COVARIANCE)
     saved.save(tmp_path)
     loaded = mjfim.Estimate.load(tmp_path)
-    np.testing.assert_array_equal(loaded.honest_covariance, saved.honest_covariance)
+    assert_array_equal(honest_covariance(parameters, loaded), saved.honest_covariance)
     assert loaded.summary()["honest_covariance"] is not None
-    np.testing.assert_array_equal(honest_covariance(parameters, loaded), saved.honest_covariance)
 
     # Without it, formal correlations count.
-    np.testing.assert_allclose(honest_covariance(parameters, earlier), COVARIANCE, rtol=1e-4)
+    assert_allclose(honest_covariance(parameters, earlier), COVARIANCE, rtol=1e-4)
     assert with_honest_covariance(earlier, parameters) is earlier
 
     # Parameters that no recording determines, and values that differ between recordings.
-    unknown = np.array(COVARIANCE)
-    unknown[2], unknown[:, 2] = 0.0, 0.0
-    unknown[2, 2] = np.inf
+    unknown = block_diag(COVARIANCE[:2, :2], np.inf)
     found = with_honest_covariance(earlier, parameters, unknown).honest_covariance
-    assert np.isinf(found[2, 2])
-    np.testing.assert_allclose(np.sqrt(np.diag(found))[:2], STD[:2], rtol=AGREEMENT)
+    assert_allclose(np.sqrt(np.diag(found)), [*STD[:2], np.inf], rtol=AGREEMENT)
     differing = replace(saved, per_recording={"c": (1.0, 3.0)})
     added = honest_covariance(parameters, differing) - saved.honest_covariance
-    np.testing.assert_allclose(added, np.diag([0.0, 0.0, 2.0]), atol=1e-12)
+    assert_allclose(added, np.diag([0.0, 0.0, 2.0]), atol=1e-12)
 
 
 @pytest.mark.slow
 def test_noise_that_is_larger_than_stated_counts_in_all_combinations() -> None:
     factor = 1.8
     experiment = cart_pendulum(fit={"bootstrap": 100, "segments": "whole"})
-    motion = DesignTask.resolve(experiment).initial
-    logs = []
-    for seed in (1, 2):
-        clean = mjfim.simulate(experiment, motion)
-        noisy = mjfim.simulate(experiment, motion, seed=seed)
-        logs.append(replace(noisy, y=clean.y + factor * (noisy.y - clean.y)))
+    system = System.resolve(experiment)
+    control = DesignTask.of(system).initial.ctrl
+    logs = [recorded(system, control, seed, share=factor) for seed in (1, 2)]
     found = mjfim.identify(experiment, logs, progress=False)
     assert not found.misfit
 
     honest = found.honest_covariance
-    std = interval_std(System.resolve(experiment).parameters, found)
-    ratio = np.sqrt(np.diag(honest)) / std
+    ratio = np.sqrt(np.diag(honest)) / interval_std(system.parameters, found)
     assert (ratio > 1.0 - 1e-9).all()
     assert (ratio < 1.02 + AGREEMENT).all()
 
     # In the axes of the formal covariance.
     values, axes = np.linalg.eigh(found.covariance / np.outer(found.std, found.std))
-    weights = axes / found.std[:, None]
-    sizes = np.sqrt(np.einsum("ij,ik,kj->j", weights, honest, weights) / values)
-    assert (sizes > 0.85 * factor).all()
-    assert (sizes < 1.6 * factor).all()
+    for value, weights in zip(values, axes.T / found.std, strict=True):
+        assert 0.85 * factor < size(honest, weights) / np.sqrt(value) < 1.6 * factor

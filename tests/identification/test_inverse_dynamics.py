@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.errors import MjfimError, RecordingError
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.inverse_dynamics import inverse_dynamics
 from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.trajectory import Recording
-from tests.support.hinged_arm import arm_experiment, arm_log
+from tests.support.hinged_arm import arm_experiment, arm_log, arm_parameters
 from tests.support.numerics import CART_PENDULUM, Array
 from tests.support.rescaling import Units, rescale
+from tests.support.terms import recorded
 
 CART = {
     "m": {"target": "body/bob:mass", "unit": "kg"},
@@ -55,14 +56,11 @@ def cart_log(
     measured: tuple[str, ...] = STATE,
 ) -> Recording:
     """A log of the model at theta (default: the guess) under a multisine."""
-    system = System.resolve(experiment.replace(noise=dict.fromkeys(measured, 0.01)), threads=1)
+    system = System.resolve(experiment.replace(noise=dict.fromkeys(measured, sigma)), threads=1)
     rng = np.random.default_rng(seed)
-    t = np.arange(round(100.0 * seconds) + 1) / 100.0
-    ctrl = 4.0 * multisine(t[:-1], 1, 0.3, 6, rng)
+    ctrl = 4.0 * multisine(np.arange(round(100.0 * seconds)) / 100.0, 1, 0.3, 6, rng)
     at = system.parameters.guess if theta is None else theta
-    y = system.plant.measure(at[None], ctrl)[0][0]
-    y = y + sigma * rng.standard_normal(y.shape)
-    return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
+    return recorded(system, ctrl, seed, theta=at)
 
 
 def true_of(experiment: Experiment) -> Array:
@@ -124,37 +122,16 @@ def test_irregular_rows_missing_values_and_several_recordings(tmp_path: Path) ->
     for seed in range(2):
         log = cart_log(experiment, 0.005, seed)
         rng = np.random.default_rng(seed)
-        y = np.array(log.y)
-        y[rng.random(y.shape) < 0.1] = np.nan
+        y = np.where(rng.random(log.y.shape) < 0.1, np.nan, log.y)
         y[300:340, 1::2] = np.nan
-        rows = np.sort(rng.choice(len(log.t), 700, replace=False))
-        kept = np.zeros(len(log.t), dtype=bool)
-        kept[rows] = True
-        kept[[0, -1]] = True
 
         # Between rows that were dropped, the control is the mean of what acted.
-        places = np.flatnonzero(kept)
-        means = [log.ctrl[a:b].mean(axis=0) for a, b in pairwise(places)]
-        logs.append(
-            replace(log, t=log.t[kept], ctrl=np.array(means), y=y[kept], name=f"{seed}.csv")
-        )
+        inner = 1 + rng.choice(len(log.t) - 2, 700, replace=False)
+        rows = np.array([0, *np.sort(inner), len(log.t) - 1])
+        means = np.add.reduceat(log.ctrl, rows[:-1]) / np.diff(rows)[:, None]
+        logs.append(replace(log, t=log.t[rows], ctrl=means, y=y[rows], name=f"{seed}.csv"))
     fit = inverse_dynamics(experiment, logs, start=3.0 * true)
     assert errors(fit, true).max() < 0.05
-
-
-@pytest.mark.slow
-def test_dry_friction_needs_no_start(tmp_path: Path) -> None:
-    text = CART_PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.6"')
-    tables = {**CART, "f": {"target": "joint/slide:frictionloss", "scale": 1.0}}
-    experiment = cart(tmp_path, text, parameters=tables)
-    true = true_of(experiment)
-    log = cart_log(experiment, 0.002, seconds=12.0)
-    for start in (0.1 * true, 10.0 * true):
-        fit = inverse_dynamics(experiment, [log], start=start)
-        found = dict(zip(fit.parameters, errors(fit, true), strict=True))
-        assert found["f"] < 0.05
-        assert found["m"] < 0.05
-        assert found["d"] < 0.5
 
 
 def test_filtered_drives_and_delays(tmp_path: Path) -> None:
@@ -171,14 +148,12 @@ def test_filtered_drives_and_delays(tmp_path: Path) -> None:
 
 def arm_forces(joints: int, theta: Array, experiment: Experiment) -> Array:
     """(30, joints) forces that random motions of the arm need with some parameters."""
-    system = System.resolve(experiment, threads=1)
-    model = system.model_at(theta)
+    model = System.resolve(experiment, threads=1).model_at(theta)
     model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
     data = mujoco.MjData(model)
-    rng = np.random.default_rng(8)
     found = []
-    for _ in range(30):
-        data.qpos[:], data.qvel[:], data.qacc[:] = rng.uniform(-1.0, 1.0, (3, joints))
+    for motion in np.random.default_rng(8).uniform(-1.0, 1.0, (30, 3, joints)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = motion
         mujoco.mj_inverse(model, data)
         found.append(np.array(data.qfrc_inverse))
     return np.array(found)
@@ -189,25 +164,19 @@ def arm_forces(joints: int, theta: Array, experiment: Experiment) -> Array:
 def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_path: Path) -> None:
     joints = 3
     log, _ = arm_log(joints, 8.0, np.random.default_rng(1), sigma=1e-7)
-    experiment = arm_experiment(tmp_path, joints)
-    tables = {
-        name: {**spec.model_dump(exclude_none=True), "coordinates": coordinates}
-        for name, spec in experiment.parameters.items()
-        if spec.inertial
-    }
-    experiment = experiment.replace(parameters=tables)
+    tables = arm_parameters(joints, coordinates=coordinates)
+    experiment = arm_experiment(tmp_path, joints, parameters=tables)
     true = true_of(experiment)
 
-    # The start is a heavier arm with other friction.
+    # The start is an arm that is four times as heavy, with other friction.
     start = np.array(true)
-    names = System.resolve(experiment).parameters.names
-    for j, name in enumerate(names):
-        if name.endswith(".alpha"):
-            start[j] += 0.5 * np.log(4.0)
-        elif name.startswith(("damping", "armature")):
+    for j, name in enumerate(System.resolve(experiment).parameters.names):
+        if name.startswith(("damping", "armature")):
             start[j] *= 6.0
         elif coordinates == "barycentric":
             start[j] *= 4.0
+        elif name.endswith(".alpha"):
+            start[j] += 0.5 * np.log(4.0)
     fit = inverse_dynamics(experiment, [log], start=start)
     assert fit.converged
     assert fit.iterations == 1
@@ -252,29 +221,25 @@ def test_a_robot_of_another_size_gives_the_same_numbers(units: Units, tmp_path: 
     rescaled = rescale(experiment, units, tmp_path / "rescaled")
     other = inverse_dynamics(rescaled.experiment, [rescaled.recording(log)])
     factors = [units.factor(unit) for unit in own.units]
-    np.testing.assert_allclose(other.theta / factors, own.theta, rtol=1e-5)
-    np.testing.assert_allclose(other.std / factors, own.std, rtol=1e-3)
+    assert_allclose(other.theta / factors, own.theta, rtol=1e-5)
+    assert_allclose(other.std / factors, own.std, rtol=1e-3)
     assert [each.rows for each in other.equations] == [each.rows for each in own.equations]
 
 
 def test_misuse_is_explained(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
-    log = cart_log(experiment, 0.0, seconds=3.0)
-    with pytest.raises(RecordingError, match="at least one recording"):
-        inverse_dynamics(experiment, [])
-    with pytest.raises(ExperimentError, match=r"start: \(2,\) numbers; expected one per parameter"):
-        inverse_dynamics(experiment, [log], start=np.ones(2))
-    with pytest.raises(RecordingError, match=r"part: a degree of freedom has only 6 measured"):
-        inverse_dynamics(experiment, [_first(log, 6)])
-    arm = arm_experiment(tmp_path, 2)
-    log, _ = arm_log(2, 1.0, np.random.default_rng(1))
-    with pytest.raises(RecordingError, match=r"part: the equation of motion has only \d+ rows for"):
-        inverse_dynamics(arm, [_first(log, 25)])
-
-
-def _first(log: Recording, rows: int) -> Recording:
-    """The first rows of a log."""
-    return replace(log, t=log.t[:rows], ctrl=log.ctrl[: rows - 1], y=log.y[:rows], name="part")
+    log = cart_log(experiment, 1e-3, seconds=3.0)
+    part = replace(log.first_rows(6), name="part")
+    for logs, start, said in (
+        ([], None, "at least one recording"),
+        ([log], np.ones(2), r"start: \(2,\) numbers; expected one per parameter"),
+        ([part], None, "part: a degree of freedom has only 6 measured"),
+    ):
+        with pytest.raises(MjfimError, match=said):
+            inverse_dynamics(experiment, logs, start=start)
+    short = arm_log(2, 0.05, np.random.default_rng(1))[0]
+    with pytest.raises(RecordingError, match=r"the equation of motion has only \d+ rows for"):
+        inverse_dynamics(arm_experiment(tmp_path, 2), [short])
 
 
 def servo(
@@ -285,47 +250,24 @@ def servo(
     friction: float = 0.5,
     **tables: Any,
 ) -> Experiment:
-    """A servo at 500 Hz with dry friction.
-
-    Args:
-        folder: Where its model is written.
-        parameters: Tables of the unknowns.
-        stiffness: Gain of the servo [N m/rad].
-        friction: Dry friction [N m].
-        **tables: Further tables of the experiment.
-    """
+    """A servo at 500 Hz with a gain [N m/rad] and dry friction [N m]."""
     text = f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
       <body><joint name="j" axis="0 1 0" damping="0.3" frictionloss="{friction}"/>
         <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
       <actuator><position name="s" joint="j" kp="{stiffness}" kv="{stiffness / 30}"/></actuator>
       <sensor><actuatorfrc name="torque" actuator="s"/></sensor></mujoco>"""
     (folder / "servo.xml").write_text(text, encoding="utf-8")
-    return Experiment(
-        model="servo.xml",
-        directory=folder,
-        source="servo",
-        rate=500.0,
-        parameters=parameters,
-        **{"noise": {"qpos:j": 1e-5, "torque": 1e-3}, **tables},
-    )
-
-
-def bristle(kind: str) -> dict[str, Any]:
-    """Friction of the joint of some kind in the library of terms."""
-    return {"bristle": {"kind": kind, "joint": "j"}}
+    stated = {"noise": {"qpos:j": 1e-5, "torque": 1e-3}, "parameters": parameters, **tables}
+    return Experiment(model="servo.xml", directory=folder, source="servo", rate=500.0, **stated)
 
 
 def servo_log(
-    experiment: Experiment, theta: Array, seconds: float, slowest: float = 0.1, waves: int = 4
+    experiment: Experiment, theta: list[float], seconds: float, slowest: float = 0.1, waves: int = 4
 ) -> Recording:
     """A log of the servo at theta under a multisine."""
-    system = System.resolve(experiment, threads=1)
-    rng = np.random.default_rng(0)
-    t = np.arange(round(500.0 * seconds) + 1) / 500.0
-    ctrl = 0.6 * multisine(t[:-1], 1, slowest, waves, rng)
-    y = system.plant.measure(theta[None], ctrl)[0][0]
-    y = y + rng.standard_normal(y.shape) * system.noise.sigma
-    return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
+    t = np.arange(round(500.0 * seconds)) / 500.0
+    ctrl = 0.6 * multisine(t, 1, slowest, waves, np.random.default_rng(0))
+    return recorded(System.resolve(experiment, threads=1), ctrl, theta=np.array(theta))
 
 
 def test_servo_laws_with_recorded_references(tmp_path: Path) -> None:
@@ -336,11 +278,9 @@ def test_servo_laws_with_recorded_references(tmp_path: Path) -> None:
     }
     noise = {"qpos:j": 1e-4}
     experiment = servo(tmp_path, parameters, stiffness=30, friction=0.0, noise=noise)
-    log = servo_log(experiment, np.array([30.0, 0.3, 0.0]), 10.0, 0.3, 8)
+    log = servo_log(experiment, [30.0, 0.3, 0.0], 10.0, 0.3, 8)
     fit = inverse_dynamics(experiment, [log], start=np.array([5.0, 2.0, 0.1]))
-    assert fit.theta[0] == pytest.approx(30.0, rel=0.02)
-    assert fit.theta[1] == pytest.approx(0.3, rel=0.2)
-    assert fit.theta[2] == pytest.approx(0.0, abs=2e-3)
+    assert (np.abs(fit.theta - [30.0, 0.3, 0.0]) < [0.6, 0.06, 2e-3]).all()
 
 
 @pytest.mark.slow
@@ -350,16 +290,16 @@ def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: P
     parameters = {
         "damping": {"target": "joint/j:damping", "guess": 0.1},
         "coulomb": {"target": coulomb, "guess": 0.2},
-        "excess": {"target": "term/bristle:excess"},
-        "speed": {"target": "term/bristle:speed"},
+        "excess": EXCESS,
+        "speed": SPEED,
     }
-    experiment = servo(tmp_path, parameters, terms=bristle(kind))
-    true = np.array([0.3, 0.5, 0.4, 0.15])
+    experiment = servo(tmp_path, parameters, terms={"bristle": {"kind": kind, "joint": "j"}})
+    true = [0.3, 0.5, 0.4, 0.15]
 
     # The guess has no excess, so that the rows do not depend on the Stribeck speed there.
     assert System.resolve(experiment).parameters.guess[2] == 0.0
     fit = inverse_dynamics(experiment, [servo_log(experiment, true, 12.0)])
-    np.testing.assert_allclose(fit.theta, true, rtol=0.02)
+    assert_allclose(fit.theta, true, rtol=0.02)
     assert (np.abs(fit.theta - true) < 5.0 * fit.std).all()
 
 
@@ -368,29 +308,22 @@ EXCESS, SPEED = {"target": "term/bristle:excess"}, {"target": "term/bristle:spee
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "of_friction",
+    ("speed", "true"),
     [
-        {},
-        {
-            "excess": {**EXCESS, "guess": 0.3, "bounds": [0.1, 5.0]},
-            "speed": {**SPEED, "guess": 0.2},
-        },
-        {"excess": {**EXCESS, "guess": 0.3}, "speed": {**SPEED, "guess": 0.2, "prior": 0.05}},
-        {
-            "excess": {**EXCESS, "guess": 0.3},
-            "speed": {"targets": [{"path": "term/bristle:speed", "scale": 0.01}], "guess": 20.0},
-        },
+        ({**SPEED, "guess": 0.2, "bounds": [0.1, 5.0]}, 0.15),
+        ({**SPEED, "guess": 0.2, "prior": 0.05}, 0.15),
+        ({"targets": [{"path": "term/bristle:speed", "scale": 0.01}], "guess": 20.0}, 15.0),
     ],
-    ids=["free", "bounds", "prior", "factor"],
+    ids=["bounds", "prior", "factor"],
 )
 def test_stated_bounds_priors_and_factors_of_stribeck_friction_hold(
-    of_friction: dict[str, dict[str, Any]], tmp_path: Path
+    speed: dict[str, Any], true: float, tmp_path: Path
 ) -> None:
-    parameters = {"excess": EXCESS, "speed": SPEED} | of_friction
-    experiment = servo(tmp_path, parameters, terms=bristle("stribeck"))
-    true = np.array([0.4, 15.0 if "targets" in parameters["speed"] else 0.15])
-    fit = inverse_dynamics(experiment, [servo_log(experiment, true, 8.0)])
-    np.testing.assert_allclose(fit.theta, true, rtol=0.2)
+    parameters = {"excess": {**EXCESS, "guess": 0.3, "bounds": [0.1, 5.0]}, "speed": speed}
+    terms = {"bristle": {"kind": "stribeck", "joint": "j"}}
+    experiment = servo(tmp_path, parameters, terms=terms)
+    fit = inverse_dynamics(experiment, [servo_log(experiment, [0.4, true], 8.0)])
+    assert_allclose(fit.theta, [0.4, true], rtol=0.2)
     assert np.isfinite(fit.std).all()
     assert fit.std[1] > 0.0
 

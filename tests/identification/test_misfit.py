@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 import mjfim
+from mjfim.experiment.system import System
 from mjfim.identification.assessment.residual_tests import (
     autocorrelated,
     is_larger_than_noise,
@@ -23,18 +24,17 @@ from mjfim.records.estimate import Whiteness, WorstResidual
 from mjfim.records.verdict import Level
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
+from tests.support.terms import recorded
 
 NAMES = ("angle", "speed", "force")
 
 
-def worst_of(recordings: str, times: list[Array], z: list[Array]) -> WorstResidual | None:
+def worst_of(times: list[Array], z: list[Array]) -> WorstResidual | None:
     """The interval with the largest residuals, found output by output as a fit does."""
     return worst_residual(
-        [
-            largest_interval(output, name, t, part[:, j])
-            for j, output in enumerate(NAMES)
-            for name, t, part in zip(recordings, times, z, strict=True)
-        ]
+        largest_interval(output, name, t, part[:, j])
+        for j, output in enumerate(NAMES)
+        for name, t, part in zip("abc", times, z, strict=False)
     )
 
 
@@ -49,28 +49,25 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
 def test_a_planted_burst_is_found(recording: int, output: int) -> None:
     """Output, recording and time agree within two windows; size and share are the interval's."""
     times, z = white()
-    t = times[recording]
-    begin, end = 0.55 * t[-1], 0.67 * t[-1]
-    burst = (t >= begin) & (t < end)
-    z[recording][burst, output] += 8.0 * np.sin(40.0 * t[burst] + 1.0)
-    worst = worst_of("abc", times, z)
+    t, own = times[recording], z[recording][:, output]
+    burst = np.array([0.55, 0.67]) * t[-1]
+    own += 8.0 * np.sin(40.0 * t) * ((t >= burst[0]) & (t < burst[1]))
+    worst = worst_of(times, z)
     assert (worst.output, worst.recording) == (NAMES[output], "abc"[recording])
-    window = t[-1] / 25
-    assert worst.begin == pytest.approx(begin, abs=1.5 * window)
-    assert worst.end == pytest.approx(end, abs=1.5 * window)
-    inside = (t >= worst.begin) & (t < worst.end)
-    squares = np.sum(z[recording][inside, output] ** 2)
-    assert worst.size == pytest.approx(np.sqrt(squares / inside.sum()), rel=1e-9)
-    assert worst.share == pytest.approx(squares / sum(np.sum(part**2) for part in z), rel=1e-9)
+    assert (worst.begin, worst.end) == pytest.approx(burst, abs=0.06 * t[-1])
+    inside = own[(t >= worst.begin) & (t < worst.end)]
+    assert worst.size == pytest.approx(np.sqrt(np.mean(inside**2)), rel=1e-9)
+    share = np.sum(inside**2) / np.sum(np.concatenate(z) ** 2)
+    assert worst.share == pytest.approx(share, rel=1e-9)
+    assert f"{worst.size:.2g} σ, {100 * share:.0f} % of the sum of squares" in str(worst)
 
 
 def test_an_output_with_uniformly_large_residuals_is_named_as_a_whole() -> None:
     """The interval is the whole recording, not the window in which noise is largest by chance."""
     times, z = white()
     z[1][:, 2] *= 3.0
-    worst = worst_of("abc", times, z)
-    assert (worst.output, worst.recording) == ("force", "b")
-    assert worst.begin == times[1][0]
+    worst = worst_of(times, z)
+    assert (worst.output, worst.recording, worst.begin) == ("force", "b", times[1][0])
     assert worst.end == pytest.approx(times[1][-1])
     assert worst.size == pytest.approx(3.0, rel=0.1)
 
@@ -81,12 +78,11 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
     z[0][:, 1] = np.nan
     z[0][200:700, 0] = np.nan
     z[0][720:780, 0] += 7.0
-    worst = worst_of("abc", times, z)
+    worst = worst_of(times, z)
     assert (worst.output, worst.recording) == ("angle", "a")
     assert worst.begin <= 7.2 + 0.4
     assert worst.end >= 7.8 - 0.4
-    assert worst_of("abc", times, [np.full(part.shape, np.nan) for part in z]) is None
-    assert worst_of("", [], []) is None
+    assert worst_of(times, [np.full(part.shape, np.nan) for part in z]) is None
 
 
 def test_a_single_value_is_not_an_interval() -> None:
@@ -96,36 +92,20 @@ def test_a_single_value_is_not_an_interval() -> None:
     """
     for seed in range(20):
         times, z = white(seed)
-        sparse = np.full(1000, np.nan)
-        sparse[:300:40] = z[0][:300:40, 1]
-        sparse[:100] = z[0][:100, 1]
-        sparse[700] = 3.6
-        z[0][:, 1] = sparse
+        rows = np.arange(1000)
+        is_measured = (rows < 100) | (rows < 300) & (rows % 40 == 0) | (rows == 700)
+        z[0][~is_measured, 1] = np.nan
+        z[0][700, 1] = 3.6
         z[0][500:600, 0] += 2.5
-        assert worst_of("abc", times, z).output == "angle"
+        assert worst_of(times, z).output == "angle"
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 9])
 def test_short_recordings(count: int) -> None:
     """The interval is the whole recording."""
-    times, z = [np.arange(count) * 0.1 + 0.5], [np.tile([0.1, 2.0, 0.1], (count, 1))]
-    worst = worst_of("x", times, z)
-    assert worst is not None
+    worst = worst_of([np.arange(count) * 0.1 + 0.5], [np.tile([0.1, 2.0, 0.1], (count, 1))])
     assert (worst.output, worst.begin) == ("speed", 0.5)
     assert worst.size == pytest.approx(2.0)
-
-
-def test_a_worst_residual_in_words() -> None:
-    """The sentence has output, time, recording, size and share."""
-    sentence = str(
-        WorstResidual(
-            output="angle", recording="run.csv", begin=1.25, end=2.5, size=7.93, share=0.412
-        )
-    )
-    assert (
-        sentence
-        == "largest residuals in angle, 1.25 to 2.5 s of run.csv: 7.9 σ, 41 % of the sum of squares"
-    )
 
 
 def seen(output: str = "y", p: float = 1.0, inflation: float = 1.0, **fields: Any) -> Whiteness:
@@ -139,19 +119,14 @@ def test_larger_and_smaller_need_probability_and_size() -> None:
 
     With much data, a small probability alone is not enough.
     """
-    for dof in (10, 300, 10_000):
-        top, bottom = chi2.isf(1e-3, dof), chi2.ppf(1e-3, dof)
-        assert is_larger_than_noise(1.01 * top, dof) == (np.sqrt(1.01 * top / dof) > 1.03)
-        assert not is_larger_than_noise(0.99 * top, dof)
-        assert is_smaller_than_noise(0.99 * bottom, dof) == (
-            np.sqrt(0.99 * bottom / dof) < 1 / 1.03
-        )
-        assert not is_smaller_than_noise(1.01 * bottom, dof)
-        assert not (is_larger_than_noise(dof, dof) or is_smaller_than_noise(dof, dof))
-    assert is_larger_than_noise(1.07 * 1e5, 100_000)
-    assert not is_larger_than_noise(1.02 * 1e5, 100_000)
-    assert is_smaller_than_noise(0.9 * 1e5, 100_000)
-    assert not is_smaller_than_noise(0.98 * 1e5, 100_000)
+    for dof in (10, 300):
+        for share in (0.99, 1.01):
+            top, bottom = share * chi2.isf(1e-3, dof), share * chi2.ppf(1e-3, dof)
+            assert is_larger_than_noise(top, dof) == (share > 1.0)
+            assert is_smaller_than_noise(bottom, dof) == (share < 1.0)
+    for ratio in (0.9, 0.98, 1.0, 1.02, 1.07):
+        assert is_larger_than_noise(ratio * 1e5, 100_000) == (ratio == 1.07)
+        assert is_smaller_than_noise(ratio * 1e5, 100_000) == (ratio == 0.9)
 
 
 def test_autocorrelation_matters_where_it_is_large_enough() -> None:
@@ -159,44 +134,41 @@ def test_autocorrelation_matters_where_it_is_large_enough() -> None:
 
     The strongest autocorrelation comes first.
     """
-    assert [
-        w.output
-        for w in autocorrelated([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])
-    ] == ["b", "a"]
+    several = [seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)]
+    assert [each.output for each in autocorrelated(several)] == ["b", "a"]
     assert not autocorrelated([seen(p=1e-9, inflation=1.1)])
-    assert not autocorrelated([seen(p=1e-9, inflation=5.0, variance=0.01)]), (
-        "far below the stated noise"
-    )
-    assert autocorrelated([seen(p=1e-9, inflation=1.0, time=3.0)])
+    assert not autocorrelated([seen(p=1e-9, inflation=5.0, variance=0.01)]), "far below the noise"
+    assert autocorrelated([seen(p=1e-9, time=3.0)])
     assert autocorrelated([seen(p=5e-4, inflation=2.0)])
     assert not autocorrelated([seen(p=5e-4, inflation=2.0), seen("z")])
 
 
 def test_reasons_in_sentences() -> None:
     """There is one sentence for each cause, and none for the stated noise."""
-    assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
-    assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (), "white: larger noise"
+    larger = "residuals are 2.00 times the stated noise"
+    coloured = "residuals are autocorrelated: speed (lag-1 correlation +0.30)"
+    slow = (
+        "residuals are autocorrelated: speed (long-run variance is 16.0 times that of white noise)"
+    )
+    speed = seen("speed", 1e-9, 4.0)
     burst = WorstResidual(output="y", recording="log", begin=0.0, end=0.1, size=9.0, share=0.5)
-    few = seen(count=20)
-    larger = ("residuals are 2.00 times the stated noise",)
-    assert misfit_reasons(4000.0, 1000, True, [seen()], (), burst) == larger
-    assert misfit_reasons(4000.0, 1000, True, [few], ()) == larger
-    assert misfit_reasons(4000.0, 1000, False, [seen()], (), burst) == (), (
-        "where sigmas are estimated, size tells nothing"
-    )
-    reasons = misfit_reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
-    assert reasons == ("residuals are autocorrelated: speed (lag-1 correlation +0.30)",)
-    slow = misfit_reasons(1000.0, 1000, True, [seen("speed", 1e-9, 16.0, correlation=0.001)], ())
-    assert slow == (
-        "residuals are autocorrelated: speed (long-run variance is 16.0 times that of white noise)",
-    )
-    assert len(misfit_reasons(4000.0, 1000, True, [seen("speed", 1e-9, 4.0)], ())) == 2
-    many = misfit_reasons(1000.0, 1000, True, [seen(f"y{i}", 1e-9, 9.0 - i) for i in range(6)], ())
-    assert (
-        "y0 (" in many[0] and "y3 (" in many[0] and "y4" not in many[0] and "and 2 more" in many[0]
-    )
-    lacking = misfit_reasons(1000.0, 1000, True, [seen()], ["dry friction"])
-    assert len(lacking) == 1 and "model lacks" in lacking[0]
+    for squares, is_stated, test, worst, reasons in (
+        (1000.0, True, seen(), None, ()),
+        # White residuals of another size are larger noise, but for a burst or few values.
+        (4000.0, True, seen(), None, ()),
+        (4000.0, True, seen(), burst, (larger,)),
+        (4000.0, True, seen(count=20), None, (larger,)),
+        # Where sigmas are estimated, the size tells nothing.
+        (4000.0, False, seen(), burst, ()),
+        (1000.0, False, speed, None, (coloured,)),
+        (1000.0, True, seen("speed", 1e-9, 16.0, correlation=0.001), None, (slow,)),
+        (4000.0, True, speed, None, (larger, coloured)),
+    ):
+        assert misfit_reasons(squares, 1000, is_stated, [test], (), worst) == reasons
+    several = [seen(f"y{i}", 1e-9, 9.0 - i) for i in range(6)]
+    (many,) = misfit_reasons(1000.0, 1000, True, several, ())
+    assert "y3 (" in many and "y4" not in many and "and 2 more" in many
+    assert "model lacks" in misfit_reasons(1000.0, 1000, True, [seen()], ["dry friction"])[0]
 
 
 @pytest.mark.parametrize(
@@ -210,21 +182,17 @@ def test_reasons_in_sentences() -> None:
 def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, said: str) -> None:
     """The verdict says the size; coloured residuals remain a misfit."""
     experiment = cart_pendulum(noise={"state": 0.01}, fit={"bootstrap": 0})
+    system = System.resolve(experiment, threads=1)
     control = 5.0 * np.sin(0.04 * np.arange(400))[:, None]
-    log, clean = (
-        mjfim.simulate(experiment.replace(noise={"state": size}), control) for size in (0.01, 1e-9)
-    )
-    noise = ratio * (log.y - clean.y)
+    log, clean = (recorded(system, control, share=share) for share in (ratio, 0.0))
+    noise = log.y - clean.y
     if filtered:
         noise[1:] = (noise[1:] + noise[:-1]) / np.sqrt(2.0)
     found = mjfim.identify(experiment, [replace(log, y=clean.y + noise)], progress=False)
     assert found.misfit == filtered
     page = estimate_page(found)
-    verdict = page.verdict
-    assert said in verdict.sentence or any(said in warning for warning in found.warnings)
+    sentence = page.verdict.sentence
+    assert said in sentence or any(said in warning for warning in found.warnings)
     # It is said once.
-    assert sum(each.count("noise is") for each in (verdict.sentence, *page.warnings)) <= 1
-    assert (verdict.level is Level.GOOD) != filtered
-    assert (f"the noise is {np.sqrt(found.chi2 / found.dof):.2f} times" in verdict.sentence) == (
-        said.startswith("the noise")
-    )
+    assert sum(each.count("noise is") for each in (sentence, *page.warnings)) <= 1
+    assert (page.verdict.level is Level.GOOD) != filtered

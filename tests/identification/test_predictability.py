@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
@@ -19,15 +20,7 @@ def test_amplification_of_an_exponential_motion(rate: float) -> None:
     """Also where the factor exceeds the largest number: it is known by its logarithm."""
     A = np.tile(np.diag([np.exp(rate), 0.5]), (1500, 1, 1))
     found = amplifications(A, np.array([3.0, 1e-3]))
-    np.testing.assert_allclose(found, 2.0 ** np.arange(11) * rate / np.log(10.0), rtol=1e-12)
-
-
-def test_amplification_does_not_depend_on_units() -> None:
-    rng = np.random.default_rng(0)
-    A, sizes = np.eye(3) + 0.1 * rng.normal(size=(40, 3, 3)), rng.uniform(1.0, 2.0, 3)
-    unit = np.array([1e-3, 1.0, 1e5])
-    again = amplifications(unit[:, None] * A / unit, unit * sizes)
-    np.testing.assert_allclose(amplifications(A, sizes), again, rtol=1e-9)
+    assert_allclose(found, 2.0 ** np.arange(11) * rate / np.log(10.0), rtol=1e-12)
 
 
 def test_a_motion_that_stands_still_amplifies_nothing() -> None:
@@ -46,9 +39,9 @@ def test_rounding_errors_are_mentioned_where_they_change_the_motion() -> None:
 @pytest.mark.slow
 def test_a_chaotic_motion_is_fitted_with_the_recommended_segments(tmp_path: Path) -> None:
     """One simulation ends in a local minimum; the warning says with which segments it works."""
-    study = PLANTS["acrobot"](Setting(horizon=6.0))
-    (tmp_path / "plant.xml").write_text(study.xml, encoding="utf-8")
-    tables = {"model": "plant.xml", "directory": tmp_path, "source": "chaos.toml", **study.tables}
+    xml, stated = PLANTS["acrobot"](Setting(horizon=6.0))
+    (tmp_path / "plant.xml").write_text(xml, encoding="utf-8")
+    tables = {"model": "plant.xml", "directory": tmp_path, "source": "chaos.toml", **stated}
     experiment = mjfim.Experiment(**tables)
     control = DesignTask.resolve(experiment, threads=1).initial
     recording = mjfim.simulate(experiment, control, seed=1, threads=1)
@@ -62,7 +55,7 @@ def test_a_chaotic_motion_is_fitted_with_the_recommended_segments(tmp_path: Path
 
     experiment = mjfim.Experiment(**tables, fit={"segments": float(advice[1])})
     good = mjfim.identify(experiment, [recording], threads=1)
-    true = [entry["true"] for entry in study.tables["parameters"].values()]
+    true = [entry["true"] for entry in stated["parameters"].values()]
     assert (np.abs(good.theta - true) < 4.0 * good.std).all()
     assert good.chi2 / good.dof == pytest.approx(1.0, abs=0.1)
     assert not good.misfit

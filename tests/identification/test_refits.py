@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.report import FitResult, estimate_from
@@ -25,6 +26,31 @@ from tests.support.terms import experiment_of, motor_torque, recorded
 BIASES = (0.5, -0.5)
 
 
+KNOWN = {"damping": {"target": "joint/pivot:damping", "true": 0.01, "guess": 0.01}}
+
+
+def test_values_of_single_recordings_and_the_cheaper_start_are_kept(
+    fitted: FitResult, begins: list[UnknownValues]
+) -> None:
+    far = fitted.theta * 1.2
+    events: list[FitEvent] = []
+    for start, other, expected in (
+        (fitted.theta, None, fitted.theta),
+        (far, None, far),
+        (far, fitted.theta, fitted.theta),
+        (far, 1.5 * far, far),
+    ):
+        begins.clear()
+        search = searched(replace(fitted.task, start=start), events)
+        refit_task(search, fitted, other_start=other)
+        assert_array_equal(begins[0].theta[:3], expected[:3])
+        assert_array_equal(begins[0].per_recording, fitted.solution.unknowns.per_recording)
+
+    # Without them, the second recording would begin 20 standard deviations away.
+    assert events[0].cost == pytest.approx(fitted.solution.cost, rel=1e-3)
+    assert np.ptp(begins[0].per_recording) == pytest.approx(1.0, abs=0.1)
+
+
 @pytest.fixture(scope="module")
 def fitted() -> FitResult:
     """A fit to two short recordings whose zeros of the angle differ."""
@@ -34,7 +60,7 @@ def fitted() -> FitResult:
         nuisance={"bias": {"qpos:hinge": True}, "per_recording": True},
     )
     made = fit_of(experiment, 0, 1)
-    shift = np.array([name == "qpos:hinge" for name in made.system.outputs.names])
+    shift = np.array(made.system.outputs.names) == "qpos:hinge"
     pairs = zip(made.recordings, BIASES, strict=True)
     logs = [replace(log, y=log.y + bias * shift) for log, bias in pairs]
     return fit_task(searched(FitTask.of(made.system, logs)))
@@ -59,47 +85,19 @@ def begins(monkeypatch: pytest.MonkeyPatch) -> list[UnknownValues]:
     return found
 
 
-def test_values_of_single_recordings_are_kept(
-    fitted: FitResult, begins: list[UnknownValues]
-) -> None:
-    events: list[FitEvent] = []
-    refit_task(searched(replace(fitted.task, start=fitted.theta), events), fitted)
-
-    # Without them, the second recording would begin 20 standard deviations away.
-    assert events[0].cost == pytest.approx(fitted.solution.cost, rel=1e-3)
-    found = begins[0].per_recording
-    np.testing.assert_array_equal(found, fitted.solution.unknowns.per_recording)
-    assert np.ptp(found) == pytest.approx(1.0, abs=0.1)
-
-
-def test_the_cheaper_one_of_two_starts_is_taken(
-    fitted: FitResult, begins: list[UnknownValues]
-) -> None:
-    far = fitted.theta * 1.2
-    task = replace(fitted.task, start=far)
-    for other, expected in ((None, far), (fitted.theta, fitted.theta), (1.5 * far, far)):
-        begins.clear()
-        refit_task(searched(task), fitted, other_start=other)
-        np.testing.assert_array_equal(begins[0].theta[:3], expected[:3])
-
-
 @pytest.mark.slow
 def test_a_model_with_more_states_begins_at_its_own_initial_states(tmp_path: Path) -> None:
     """Backlash adds a joint, whose initial states a fit without it does not have."""
     segments = {"segments": 0.5, "start": "measured", "bootstrap": 0}
-    known = {"damping": {"target": "joint/pivot:damping", "true": 0.01, "guess": 0.01}}
-    plain = experiment_of(tmp_path, "tilt", parameters=known, terms={}, fit=segments)
-    richer = experiment_of(
-        tmp_path,
-        "backlash",
-        fit=segments,
-        parameters={**known, "gap": {"target": "term/extra:gap", "true": 0.06, "guess": 0.03}},
-    )
-    recording = recorded(System.resolve(plain), motor_torque(2.0, 100.0), 0)
-    fitted = fit_task(searched(FitTask.of(System.resolve(plain), [recording])))
-    task = FitTask.of(System.resolve(richer), [recording])
-    widths = [each.private_count for each in (fitted.problem, task.problem())]
-    assert widths == [2, 4]
+    gap = {"target": "term/extra:gap", "true": 0.06, "guess": 0.03}
+    richer = experiment_of(tmp_path, "backlash", fit=segments, parameters={**KNOWN, "gap": gap})
+    richer = System.resolve(richer)
+    plain = experiment_of(tmp_path, "tilt", parameters=KNOWN, terms={}, fit=segments)
+    plain = System.resolve(plain)
+    recording = recorded(plain, motor_torque(2.0, 100.0), 0)
+    fitted = fit_task(searched(FitTask.of(plain, [recording])))
+    task = FitTask.of(richer, [recording])
+    assert [each.private_count for each in (fitted.problem, task.problem())] == [2, 4]
     again = refit_task(searched(task), fitted, other_start=np.array([0.01, 0.01]))
     assert again.solution.unknowns.private.shape == (len(fitted.problem.segments), 4)
     assert np.isfinite(again.solution.cost)

@@ -19,7 +19,7 @@ def autoregressive(phi: float, count: int, rng: np.random.Generator) -> Array:
     """AR(1) noise of unit variance, from its stationary distribution."""
     e = rng.standard_normal(count) * np.sqrt(1.0 - phi**2)
     e[0] = rng.standard_normal()
-    return np.asarray(lfilter([1.0], [1.0, -phi], e))
+    return lfilter([1.0], [1.0, -phi], e)
 
 
 def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N) -> Whiteness:
@@ -28,16 +28,7 @@ def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N
     return whiteness_of("y", [autoregressive(phi, count, rng) + extra])
 
 
-@pytest.mark.parametrize(
-    "lengths",
-    [
-        (40,),
-        (400,),
-        (3000,),
-        (700, 90, 1300),
-        pytest.param(tuple([60] * 30), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("lengths", [(40,), (3000,), (700, 90, 1300)])
 def test_white_noise_rarely_fails(lengths: tuple[int, ...]) -> None:
     """The rate of false alarms is at most the level, within the scatter of the draws."""
     rng = np.random.default_rng(len(lengths))
@@ -47,8 +38,7 @@ def test_white_noise_rarely_fails(lengths: tuple[int, ...]) -> None:
     )
     for level in (0.2, 0.05, 0.01):
         assert (p < level).sum() <= binom.ppf(0.999, draws, level), f"at {level}"
-    if max(lengths) > 1000:  # and not for want of looking
-        assert (p < 0.2).mean() > 0.05
+    assert max(lengths) < 1000 or (p < 0.2).mean() > 0.05, "and not for want of looking"
 
 
 def test_gaps_do_not_make_white_noise_coloured() -> None:
@@ -56,11 +46,10 @@ def test_gaps_do_not_make_white_noise_coloured() -> None:
     rng = np.random.default_rng(2)
     p = []
     for _ in range(200):
-        y = rng.standard_normal(2000)
-        y[rng.random(2000) < 0.3] = np.nan
+        y = np.where(rng.random(2000) < 0.3, np.nan, rng.standard_normal(2000))
         y[600:1000] = np.nan
         p.append(whiteness_of("y", [y, np.full(50, np.nan), rng.standard_normal(300)]).p)
-    assert (np.array(p) < 0.05).sum() <= binom.ppf(0.999, 200, 0.05)
+    assert np.sum(np.array(p) < 0.05) <= binom.ppf(0.999, 200, 0.05)
     assert whiteness_of("y", [y]).count == np.isfinite(y).sum()
 
 
@@ -72,15 +61,17 @@ def test_correlated_noise_is_seen(phi: float) -> None:
     assert np.mean([w.correlation for w in found]) == pytest.approx(phi, abs=0.02)
 
 
+ROWS = np.arange(N)
+
+
 @pytest.mark.parametrize(
     "extra",
     [
         pytest.param(np.linspace(-0.3, 0.3, N), id="slow drift"),
-        pytest.param(0.2 * np.sin(2 * np.pi * np.arange(N) / 1500), id="slow sinusoid"),
-        pytest.param(0.3 * np.sin(2 * np.pi * np.arange(N) / 37), id="sinusoid"),
-        pytest.param(0.5 * np.sin(2 * np.pi * np.arange(N) / 5.3), id="fast sinusoid"),
+        pytest.param(0.2 * np.sin(2 * np.pi * ROWS / 1500), id="slow sinusoid"),
+        pytest.param(0.5 * np.sin(2 * np.pi * ROWS / 5.3), id="fast sinusoid"),
         pytest.param(0.15, id="offset"),
-        pytest.param(np.where(np.arange(N) % 400 < 30, 0.7, 0.0), id="bursts"),
+        pytest.param(np.where(ROWS % 400 < 30, 0.7, 0.0), id="bursts"),
     ],
 )
 def test_small_signals_in_noise_are_found(extra: Array | float) -> None:
@@ -94,21 +85,11 @@ def test_long_runs_see_what_short_lags_do_not() -> None:
 
     Their inflation shows how much less accurate an average is.
     """
-    drift = 0.15 * np.sign(np.sin(2 * np.pi * np.arange(N) / 2000))
+    drift = 0.15 * np.sign(np.sin(2 * np.pi * ROWS / 2000))
     found = [seen(seed, drift) for seed in range(20)]
     assert sum(w.p < 1e-3 for w in found) >= 18
     run = 256  # the longest of which there are more than a few
     assert np.median([w.inflation for w in found]) == pytest.approx(1.0 + run * 0.15**2, rel=0.5)
-
-
-def test_several_recordings_are_seen_together() -> None:
-    """Each recording is too short; all have one correlation, or different offsets."""
-    rng = np.random.default_rng(7)
-    parts = [autoregressive(0.3, 60, rng) for _ in range(40)]
-    assert whiteness_of("y", parts).p < 1e-4
-    assert sum(whiteness_of("y", [part]).p < 1e-4 for part in parts) <= 4
-    moved = [rng.standard_normal(70) + 0.35 * rng.standard_normal() for _ in range(40)]
-    assert whiteness_of("y", moved).p < 1e-4
 
 
 def test_borders_of_recordings_are_not_crossed() -> None:
@@ -125,35 +106,25 @@ def test_the_statistic_is_that_of_ljung_and_box() -> None:
     """
     rng = np.random.default_rng(0)
     for phi in (-0.06, -0.1):
-        y = autoregressive(phi, 600, rng)
-        n = len(y)
-        rho = [
-            sum(y[i] * y[i + k] for i in range(n - k)) / sum(v * v for v in y)
-            for k in range(LAGS + 1)
-        ]
-        statistic = n * (n + 2) * sum(rho[k] ** 2 / (n - k) for k in range(1, LAGS + 1))
-        looks = 1 + sum(n // w >= 8 for w in (4, 16, 64))
-        tails = [chi2.sf(statistic, LAGS)]
+        y, n = autoregressive(phi, 600, rng), 600
+        rho = np.array([y[k:] @ y[: n - k] for k in range(LAGS + 1)]) / (y @ y)
+        lags = np.arange(1, LAGS + 1)
+        tails = [chi2.sf(n * (n + 2) * np.sum(rho[1:] ** 2 / (n - lags)), LAGS)]
         for w in (4, 16, 64):
             means = y[: n // w * w].reshape(-1, w).mean(axis=1)
-            if len(means) >= 8:
-                tails.append(chi2.sf(w * np.sum(means**2) / np.mean(y**2), len(means)))
+            tails.append(chi2.sf(w * np.sum(means**2) / np.mean(y**2), len(means)))
         found = whiteness_of("y", [y])
-        assert found.p == pytest.approx(min(looks * min(tails), 1.0), rel=1e-8)
+        assert found.p == pytest.approx(min(4 * min(tails), 1.0), rel=1e-8)
         assert found.correlation == pytest.approx(rho[1], rel=1e-10)
 
 
-@pytest.mark.parametrize("phi", [0.3, 0.7, 0.9, 0.97])
-def test_the_integrated_time_is_that_of_theory(phi: float) -> None:
+@pytest.mark.parametrize(
+    ("phi", "time"), [(0.3, 1.857), (0.7, 5.667), (0.9, 19.0), (0.97, 65.67), (0.0, 1.0)]
+)
+def test_the_integrated_time_is_that_of_theory(phi: float, time: float) -> None:
     """The mean over draws is (1 + phi) / (1 - phi)."""
     times = [seen(seed, phi=phi, count=30_000).time for seed in range(12)]
-    assert np.mean(times) == pytest.approx((1.0 + phi) / (1.0 - phi), rel=0.12)
-
-
-def test_white_and_alternating_noise_has_no_memory() -> None:
-    """The autocorrelation time is one row."""
-    assert np.mean([seen(seed).time for seed in range(20)]) == pytest.approx(1.0, abs=0.02)
-    assert seen(0, phi=-0.6).time == 1.0
+    assert np.mean(times) == pytest.approx(time, rel=0.12 if phi else 0.02)
 
 
 def test_variance_and_inflation() -> None:
@@ -163,8 +134,8 @@ def test_variance_and_inflation() -> None:
     assert found.output == "speed"
     assert found.variance == pytest.approx(4.0, rel=0.05)
     assert 1.0 <= found.inflation < 2.5
-    slow = whiteness_of("y", [autoregressive(0.9, 50_000, rng)])
-    assert slow.inflation > 10.0  # 19 in the limit of long runs
+    # Alternating noise has no memory.
+    assert seen(0, phi=-0.6).time == 1.0
 
 
 @pytest.mark.parametrize(
@@ -179,15 +150,13 @@ def test_too_few_residuals_pass(parts: list[Array]) -> None:
 
 def test_lagged_products_do_not_depend_on_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few lags are computed first, part by part; slow residuals need more of them."""
-    rng = np.random.default_rng(3)
-    slow, quick = autoregressive(0.98, 3000, rng), rng.standard_normal(3000)
-    whole = [whiteness_of("y", [series]) for series in (slow, quick)]
-
+    cases = [{"phi": 0.98, "count": 3000}, {"count": 3000}]
+    whole = [seen(3, **case) for case in cases]
     monkeypatch.setattr(residual_tests, "FIRST_LAGS", 5)
     monkeypatch.setattr(residual_tests, "VALUES_AT_ONCE", 100)
-    for expected, series in zip(whole, (slow, quick), strict=True):
-        found = whiteness_of("y", [series])
-        assert found.time == pytest.approx(expected.time, rel=1e-9)
+    for expected, case in zip(whole, cases, strict=True):
+        found = seen(3, **case)
+        assert (found.time, found.correlation) == pytest.approx(
+            (expected.time, expected.correlation), rel=1e-9
+        )
         assert found.p == pytest.approx(expected.p, rel=1e-6)
-        direct = float(series[1:] @ series[:-1] / (series @ series))
-        assert found.correlation == pytest.approx(direct, rel=1e-9)

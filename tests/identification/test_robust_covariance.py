@@ -6,11 +6,11 @@ compared with that spread.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.signal import lfilter
 
@@ -19,6 +19,7 @@ from mjfim.identification.assessment.robust_covariance import (
     covering_covariance,
     merge_blocks,
     robust_uncertainty,
+    t_quantile,
 )
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
@@ -46,25 +47,20 @@ class Linear:
         """Estimate from y: (K, N), and the linearisation there."""
         K, N, c = self.X.shape
         n = int(self.with_offsets)
-        ahead = np.kron(np.eye(K), np.ones((N, 1))) if n else np.zeros((K * N, 0))
-        wide = np.concatenate([ahead, self.X.reshape(K * N, c)], axis=1)
-        rows = np.eye(wide.shape[1])[K * n :] / self.prior
-        found = np.linalg.lstsq(np.concatenate([wide, rows]), np.append(y.ravel(), np.zeros(c)))[0]
+        offsets = np.kron(np.eye(K), np.ones((N, n)))
+        wide = np.hstack([offsets, self.X.reshape(K * N, c)])
+        known = np.eye(K * n + c)[K * n :] / self.prior
+        values = np.append(y.ravel(), np.zeros(c))
+        found = np.linalg.lstsq(np.vstack([wide, known]), values)[0]
         r = (wide @ found - y.ravel()).reshape(K, N, 1)
-        stacked = np.concatenate([np.ones((K, N, n)), self.X, r], axis=2).reshape(
-            -1, FINE, n + c + 1
-        )
-        blocks = np.linalg.qr(np.pad(stacked, ((0, 0), (0, c), (0, 0))), mode="r")
-        owner = np.repeat(np.arange(K), N // FINE)
+        rows = np.concatenate([np.ones((K, N, n)), self.X, r], axis=2)
+        stacked = rows.reshape(-1, FINE, n + c + 1)
         theta = found[K * n :]
-        known = (
-            np.column_stack([np.eye(c), theta])[: c * bool(np.isfinite(self.prior))] / self.prior
-        )
         return theta, Condensed(
-            blocks=blocks,
-            segment_of_block=owner,
+            blocks=np.linalg.qr(np.pad(stacked, ((0, 0), (0, c), (0, 0))), mode="r"),
+            segment_of_block=np.repeat(np.arange(K), N // FINE),
             private_rows=np.zeros((K, 0, n + c + 1)),
-            common_rows=known,
+            common_rows=np.column_stack([np.eye(c), theta]) / self.prior,
         )
 
     def assessed(self, y: Array, length: float, draws: int = 0) -> tuple[Array, Array, Uncertainty]:
@@ -100,131 +96,82 @@ def assess(
 
 def waves(K: int, N: int, c: int, slow: float = 3.0) -> Array:
     """(K, N, c) slow regressors, which autocorrelated noise disturbs most."""
-    t = np.arange(N) / N
-    return np.stack(
-        [[np.cos(2 * np.pi * slow * (j + 1) * t + j + k) for j in range(c)] for k in range(K)]
-    ).swapaxes(1, 2)
+    angles = 2 * np.pi * slow * np.outer(np.arange(N) / N, np.arange(1, c + 1))
+    return np.cos(angles + np.arange(c) + np.arange(K)[:, None, None])
 
 
 def noise(phi: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:
     """AR(1) of unit variance along the last axis."""
     e = rng.standard_normal(shape) * np.sqrt(1.0 - phi**2)
     e[:, 0] /= np.sqrt(1.0 - phi**2)
-    return np.asarray(lfilter([1.0], [1.0, -phi], e))
+    return lfilter([1.0], [1.0, -phi], e)
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
-    """Results of n repetitions.
+@pytest.mark.parametrize(
+    ("phi", "with_offsets", "prior"),
+    [
+        (0.0, False, np.inf),
+        (0.0, True, np.inf),
+        (0.9, False, np.inf),
+        (0.9, True, np.inf),
+        (0.0, False, 0.03),
+    ],
+)
+@pytest.mark.slow
+def test_deviations_are_the_spread_of_estimates_and_intervals_cover_the_truth(
+    phi: float, with_offsets: bool, prior: float
+) -> None:
+    """With correlated noise, the formal deviation is much too small.
 
-    Attributes:
-        theta: (n, c) errors of the estimates.
-        formal: (n, c) formal standard deviations.
-        sandwich: (n, c) standard deviations of the sandwich covariance.
-        bootstrap: (n, c) standard deviations of the bootstrap.
-        covered: (n, c) True where the interval contains the truth.
-        apart: (n,) True where recordings disagree.
+    The coverage is nearly 95 % and not 100 %; formal intervals cover less. A truth that is drawn
+    from the prior scatters less than the prior says.
     """
-
-    theta: Array
-    formal: Array
-    sandwich: Array
-    bootstrap: Array
-    covered: Array
-    apart: Array
-
-
-@cache
-def study(
-    phi: float, with_offsets: bool = False, prior: float = np.inf, repetitions: int = 150
-) -> Study:
-    """Repetitions with one recording, or with four recordings that have offsets."""
     K, N = (4, 480) if with_offsets else (1, 1600)
     model, rng = Linear(waves(K, N, 2), with_offsets, prior), np.random.default_rng(11)
     length = block_length([(1 + phi) / (1 - phi)], K * N)
     found = []
-    for _ in range(repetitions):
-        truth = prior * rng.standard_normal(2) if np.isfinite(prior) else np.zeros(2)
+    for _ in range(150):
+        truth = (prior if np.isfinite(prior) else 0.0) * rng.standard_normal(2)
         offsets = 3.0 * rng.standard_normal((K, 1)) * with_offsets
-        theta, formal, result = model.assessed(
-            model.X @ truth + offsets + noise(phi, (K, N), rng), length, draws=150
-        )
+        y = model.X @ truth + offsets + noise(phi, (K, N), rng)
+        theta, formal, result = model.assessed(y, length, draws=150)
         low, high = result.interval.T
         covered = (low <= truth) & (truth <= high)
         bootstrap = result.draws.std(axis=0)
-        errors = theta - truth
-        found.append((errors, formal, result.sandwich, bootstrap, covered, bool(result.apart)))
-    return Study(*(np.array(column) for column in zip(*found, strict=True)))
+        found.append((theta - truth, formal, result.sandwich, bootstrap, covered))
+    errors, formal, sandwich, bootstrap, covered = map(np.array, zip(*found, strict=True))
 
-
-@pytest.mark.parametrize(
-    ("phi", "with_offsets"), [(0.0, False), (0.0, True), (0.6, False), (0.9, False), (0.9, True)]
-)
-@pytest.mark.slow
-def test_deviations_are_the_spread_of_estimates_and_intervals_cover_the_truth(
-    phi: float, with_offsets: bool
-) -> None:
-    """With correlated noise, the formal deviation is much too small.
-
-    The coverage is nearly 95 % and not 100 %; formal intervals cover less.
-    """
-    s = study(phi, with_offsets)
-    true = s.theta.std(axis=0)
-    naive = (np.abs(s.theta) < 1.96 * s.formal).mean()
-    if phi == 0.0:
-        assert naive > 0.9
-        np.testing.assert_allclose(s.formal.mean(axis=0), true, rtol=0.15)
-        np.testing.assert_allclose(s.sandwich.mean(axis=0), s.formal.mean(axis=0), rtol=0.05)
-    else:
+    true = errors.std(axis=0)
+    assert (true < prior).all()
+    for deviation in (sandwich, bootstrap):
+        assert_allclose(deviation.mean(axis=0), true, rtol=0.25 if phi else 0.15)
+    naive = (np.abs(errors) < 1.96 * formal).mean()
+    if phi:
         assert naive < 0.8
-    if phi == 0.9:
-        assert (s.formal.mean(axis=0) < 0.4 * true).all()
-    if phi != 0.6:
-        for deviation in (s.sandwich, s.bootstrap):
-            np.testing.assert_allclose(deviation.mean(axis=0), true, rtol=0.25 if phi else 0.15)
-
-    assert s.covered.sum() >= stats.binom.ppf(0.001, s.covered.size, 0.92)
-    assert not s.covered.all(), "an interval that is never wrong is too wide"
-    assert s.apart.sum() <= 3
-
-
-@pytest.mark.slow
-def test_priors_count_as_scatter() -> None:
-    """Sandwich and bootstrap are the spread about truths that are drawn from the prior.
-
-    The spread due to the data alone is smaller.
-    """
-    s = study(0.0, prior=0.03)
-    true = s.theta.std(axis=0)
-    assert (true < 0.03).all()
-    for deviation in (s.formal, s.sandwich, s.bootstrap):
-        np.testing.assert_allclose(deviation.mean(axis=0), true, rtol=0.15)
+        assert (formal.mean(axis=0) < 0.4 * true).all()
+    else:
+        assert naive > 0.9
+        assert_allclose(sandwich.mean(axis=0), formal.mean(axis=0), rtol=0.05)
+    assert covered.sum() >= stats.binom.ppf(0.001, covered.size, 0.92)
+    assert not covered.all(), "an interval that is never wrong is too wide"
 
 
 @pytest.mark.slow
 def test_recordings_that_disagree_are_found() -> None:
-    """The interval includes the spread of recordings that differ; equal recordings agree."""
+    """The interval includes the spread of recordings that differ in the first unknown."""
     rng, K, N = np.random.default_rng(5), 8, 480
     model = Linear(waves(K, N, 2))
-    apart, between, equal = [], [], []
+    apart, between = [], []
     for _ in range(60):
         truth = np.array([0.4, 0.0]) * rng.standard_normal((K, 2))
-        y = np.einsum("knc,kc->kn", model.X, truth)
-        for other, found in ((0.0, equal), (1.0, apart)):
-            theta, _, result = model.assessed(
-                other * y + noise(0.5, (K, N), rng), block_length([3.0], K * N)
-            )
-            found.append(result.apart)
-            if other:
-                between.append(result.between)
-                single = np.linalg.lstsq(model.X[3], (y + 0.0)[3])[0]
-                assert abs(result.each[3, 0] - single[0]) < 1.0
-                assert result.interval[0, 1] - theta[0] >= 1.95 * result.between[0]
-    assert sum(0 in names for names in apart) >= 58
-    assert sum(1 in names for names in apart) <= 3
-    assert sum(bool(names) for names in equal) <= 3
-    assert np.mean(np.array(between)[:, 0] ** 2) == pytest.approx(0.16, rel=0.25)
-    assert np.mean(np.array(between)[:, 1]) < 0.02
+        y = np.einsum("knc,kc->kn", model.X, truth) + noise(0.5, (K, N), rng)
+        theta, _, result = model.assessed(y, block_length([3.0], K * N))
+        apart.extend(result.apart)
+        between.append(result.between)
+        assert result.interval[0, 1] - theta[0] >= 1.95 * result.between[0]
+    assert apart.count(0) >= 58
+    assert apart.count(1) <= 3
+    assert np.mean(np.array(between) ** 2, axis=0) == pytest.approx([0.16, 0.0], abs=0.04)
 
 
 @pytest.mark.slow
@@ -265,7 +212,7 @@ def test_estimates_from_single_recordings_are_their_fits() -> None:
     y = rng.standard_normal((4, 240))
     _, _, result = Linear(X).assessed(y, 16.0)
     for k in (0, 1, 3):
-        np.testing.assert_allclose(result.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
+        assert_allclose(result.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
     assert np.isnan(result.each[2]).all()
 
 
@@ -276,18 +223,16 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
     _, _, one = Linear(X).assessed(y, 36.0, draws=50)
     theta, condensed = Linear(X).fitted(y)
     wide = np.append(unit, 1.0)
-    other = Condensed(
+    other = replace(
+        condensed,
         blocks=condensed.blocks * wide,
-        segment_of_block=condensed.segment_of_block,
-        private_rows=condensed.private_rows * wide,
         common_rows=condensed.common_rows * wide,
     )
     two = assess(other, theta / unit, 36.0, draws=50)
-    np.testing.assert_allclose(two.sandwich * unit, one.sandwich, rtol=1e-6)
-    np.testing.assert_allclose(two.interval * unit[:, None], one.interval, rtol=1e-6)
-    np.testing.assert_allclose(two.each * unit, one.each, rtol=1e-6)
-    assert len(two.draws) == len(one.draws) == 50
-    np.testing.assert_allclose(two.draws * unit, one.draws, rtol=1e-6)
+    for name in ("sandwich", "each", "draws"):
+        assert_allclose(getattr(two, name) * unit, getattr(one, name), rtol=1e-6)
+    assert_allclose(two.interval.T * unit, one.interval.T, rtol=1e-6)
+    assert len(two.draws) == 50
 
 
 def test_the_interval_is_the_hull() -> None:
@@ -295,12 +240,12 @@ def test_the_interval_is_the_hull() -> None:
     y = noise(0.9, (1, 1600), np.random.default_rng(4))
     theta, formal, result = Linear(waves(1, 1600, 2)).assessed(y, 80.0, draws=400)
     tails = np.quantile(result.draws, [0.025, 0.975], axis=0)
-    sides = np.array([1.959 * formal, 1.96 * result.sandwich])
-    assert (result.interval[:, 0] <= np.vstack([theta - sides, tails[0]]) + 1e-12).all()
-    assert (result.interval[:, 1] >= np.vstack([theta + sides, tails[1]]) - 1e-12).all()
+    side = np.maximum(1.959 * formal, 1.96 * result.sandwich)
+    low, high = result.interval.T
+    assert (low <= np.minimum(theta - side, tails[0]) + 1e-12).all()
+    assert (high >= np.maximum(theta + side, tails[1]) - 1e-12).all()
     assert result.blocks == 20
     assert result.draws.shape == (400, 2)
-    np.testing.assert_array_equal(result.between, 0.0)
 
 
 def test_residuals_that_are_alike_in_slow_parts_count_as_few_groups() -> None:
@@ -321,7 +266,7 @@ def test_residuals_that_are_alike_in_slow_parts_count_as_few_groups() -> None:
     std = np.sqrt(4.0 / 3.0 * np.sum((groups - groups.mean()) ** 2)) / np.sum(X**2)
     half = float(stats.t.ppf(0.975, 3)) * std
     assert half > 1.5 * (narrow.interval[0, 1] - theta[0])
-    np.testing.assert_allclose(wide.interval[0], theta + np.array([-half, half]), rtol=1e-9)
+    assert_allclose(wide.interval[0], theta + np.array([-half, half]), rtol=1e-9)
 
 
 def test_blocks_are_four_autocorrelation_times_long() -> None:
@@ -338,7 +283,6 @@ def test_blocks_are_four_autocorrelation_times_long() -> None:
     [
         ([], [], 5.0, []),
         ([0, 0, 1, 1], [1, 1, 1, 1], 1.0, [0, 1, 2, 3]),
-        ([0, 0, 0, 2, 2], [1, 1, 1, 1, 1], 2.0, [0, 0, 1, 2, 2]),
         ([0, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1], 4.0, [0, 0, 0, 0, 0, 1]),
         ([0, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1], 3.0, [0, 0, 0, 1, 1, 2]),
         ([0, 0, 0, 0], [4, 1, 5, 2], 4.0, [0, 1, 1, 2]),
@@ -349,7 +293,7 @@ def test_merged_blocks_are_short_runs_of_one_recording(
 ) -> None:
     """They are as short as possible, and the last one has at least half of the length."""
     found = merge_blocks(np.array(recording, dtype=int), np.array(rows, dtype=float), length)
-    np.testing.assert_array_equal(found, expected)
+    assert_array_equal(found, expected)
 
 
 def test_a_covering_covariance_is_at_least_both_in_every_direction() -> None:
@@ -359,8 +303,9 @@ def test_a_covering_covariance_is_at_least_both_in_every_direction() -> None:
     found = covering_covariance(first, second)
     for smaller in (first, second):
         assert np.linalg.eigvalsh(found - smaller)[0] > -1e-9
-    np.testing.assert_allclose(covering_covariance(first, 0.1 * first), first, rtol=1e-6)
-    np.testing.assert_allclose(covering_covariance(first, 9.0 * first), 9.0 * first, rtol=1e-6)
+    for factor in (0.1, 9.0):
+        covering = covering_covariance(first, factor * first)
+        assert_allclose(covering, max(factor, 1.0) * first, rtol=1e-6)
 
 
 def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
@@ -368,35 +313,29 @@ def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
     for prior, factor in ((np.inf, 100.0), (1e-6, 1.0)):
         theta, condensed = Linear(X, prior=prior).fitted(y)
         plain, wide = (assess(condensed, theta, 1.0, inflation=each) for each in (1.0, 100.0))
-        np.testing.assert_array_equal(plain.interval, wide.interval)
+        assert_array_equal(plain.interval, wide.interval)
         ratio = np.diag(wide.covariance) / np.diag(plain.covariance)
-        np.testing.assert_allclose(ratio, factor, rtol=0.35)
-
-
-def test_combinations_known_far_better_than_others_keep_their_digits() -> None:
-    """Two regressors that differ by 1e-5, whose sum is known far better than each factor."""
-    rng = np.random.default_rng(3)
-    first, second = rng.standard_normal((2, 1, 1600))
-    X = np.stack([first, first + 1e-5 * second], axis=2)
-    y = 5.0 * rng.standard_normal((1, 1600))
-    _, condensed = Linear(X).fitted(y)
-    found = assess(condensed, np.zeros(2), 16.0, inflation=25.0)
-    weights = np.array([1.0, 1.0])
-    known = 5.0 / np.linalg.norm(first + 0.5e-5 * second)
-    assert np.sqrt(weights @ found.covariance @ weights) == pytest.approx(known, rel=0.15)
+        assert_allclose(ratio, factor, rtol=0.35)
 
 
 def test_no_combination_is_better_known_than_by_the_formal_covariance() -> None:
-    """Twelve unknowns, whose combinations are known to 1e-5 to 1 of them."""
+    """Twelve unknowns, whose combinations are known to 1e-5 to 1 of them, keep their digits."""
     rng = np.random.default_rng(4)
     axes = np.linalg.qr(rng.standard_normal((12, 12)))[0]
     sizes = np.geomspace(1.0, 1e-5, 12)
     plain = rng.standard_normal((1600, 12))
-    X = (plain * sizes @ axes)[None]
-    _, condensed = Linear(X).fitted(rng.standard_normal((1, 1600)))
+    _, condensed = Linear((plain * sizes @ axes)[None]).fitted(rng.standard_normal((1, 1600)))
     found = assess(condensed, np.zeros(12), 16.0)
 
     # In coordinates in which the formal covariance is nearly that of all combinations alike.
     scaled = sizes[:, None] * (axes @ found.covariance @ axes.T) * sizes
     root = np.linalg.cholesky(plain.T @ plain)
-    assert np.linalg.eigvalsh(root.T @ scaled @ root).min() > 0.99
+    relative = np.linalg.eigvalsh(root.T @ scaled @ root)
+    assert relative.min() > 0.99
+    assert relative.max() < 3.0
+
+
+def test_the_quantile_is_that_of_student() -> None:
+    """Of 2 parts, 12.706 standard errors are 95 %; of many, 1.96."""
+    found = t_quantile(np.array([1, 10**7]), 0.95)
+    assert_allclose(found, [12.706, 1.959964], rtol=1e-4)

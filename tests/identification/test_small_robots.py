@@ -14,7 +14,6 @@ from mjfim.records.estimate import Estimate
 from tests.support.cart_pendulum import logs_of
 from tests.support.numerics import shared_model
 from tests.support.paths import SHARED_MODELS
-from tests.support.rescaling import Units, rescale
 from tests.support.shared_models import EXPERIMENTS
 
 # A rotary pendulum for a table top: friction of 1e-3 N m, inertias of 1e-4 kg m².
@@ -43,29 +42,13 @@ STATED: dict[str, Any] = {
         "control": {"kind": "multisine", "amplitude": 0.02, "frequency": 0.7, "harmonics": 6}
     },
     "parameters": {
-        "mass": {"target": "body/pole:mass", "guess": 0.03, "true": 0.025, "unit": "kg"},
-        "length": {"target": "body/pole:ipos[2]", "guess": -0.06, "true": -0.065, "unit": "m"},
-        "damping": {
-            "target": "joint/yaw:damping",
-            "guess": 3e-4,
-            "true": 2e-4,
-            "unit": "N m s/rad",
-        },
-        "friction": {
-            "target": "joint/yaw:frictionloss",
-            "guess": 8e-4,
-            "true": 1e-3,
-            "unit": "N m",
-        },
+        "mass": {"target": "body/pole:mass", "guess": 0.03, "true": 0.025},
+        "length": {"target": "body/pole:ipos[2]", "guess": -0.06, "true": -0.065},
+        "damping": {"target": "joint/yaw:damping", "guess": 3e-4, "true": 2e-4},
+        "friction": {"target": "joint/yaw:frictionloss", "guess": 8e-4, "true": 1e-3},
     },
     "noise": {"qpos:yaw": 2e-3, "qpos:swing": 2e-3, "qvel:yaw": 0.02, "qvel:swing": 0.02},
     "fit": {"bootstrap": 0},
-}
-
-# The same robot large, heavy and quick, and small, light and slow.
-SIZES = {
-    "violent": Units(length=1e2, mass=1e3, time=1e-1),
-    "sluggish": Units(length=1e-2, mass=1e-3, time=1e1),
 }
 
 
@@ -78,28 +61,14 @@ def complete_fits(experiment: Experiment, count: int = 1) -> list[Estimate]:
     return found
 
 
-@pytest.fixture(scope="module")
-def furuta(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
-    """The rotary pendulum."""
-    folder = tmp_path_factory.mktemp("furuta")
-    (folder / "furuta.xml").write_text(FURUTA, encoding="utf-8")
-    return Experiment(**STATED, directory=folder, source="furuta")
-
-
 @pytest.mark.slow
-def test_a_table_top_furuta_has_no_misfit_with_any_seed(furuta: Experiment) -> None:
+def test_a_table_top_furuta_has_no_misfit_with_any_seed(tmp_path: Path) -> None:
+    (tmp_path / "furuta.xml").write_text(FURUTA, encoding="utf-8")
+    furuta = Experiment(**STATED, directory=tmp_path, source="furuta")
     true = System.resolve(furuta).parameters.true
     for each in complete_fits(furuta, 3):
         assert 0.8 < each.chi2 / each.dof < 1.2
         assert (abs(each.theta - true) < 4.0 * each.std).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", SIZES)
-def test_its_verdicts_are_the_same_in_all_sizes(
-    size: str, furuta: Experiment, tmp_path: Path
-) -> None:
-    complete_fits(rescale(furuta, SIZES[size], tmp_path).experiment)
 
 
 @pytest.mark.slow

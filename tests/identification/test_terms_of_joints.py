@@ -17,17 +17,14 @@ from mjfim.identification.assessment.term_tests import (
     TermTests,
     find_missing_terms,
     first_terms,
-    with_names,
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
-from tests.support.numerics import Array
-from tests.support.terms import solution_near
+from tests.support.terms import recorded, solution_near
 
 JOINTS = ("pan", "lift", "roll")
 EXCESS = (0.5, 0.4, 0.1)
-SPEED = 0.15
 RATE = 200.0
 
 ARM = """<mujoco><option timestep="0.005" integrator="implicitfast" gravity="0 0 -9.81"/>
@@ -71,27 +68,20 @@ def stated(folder: Path) -> mjfim.Experiment:
 
 def with_stribeck(experiment: mjfim.Experiment, joints: tuple[str, ...]) -> mjfim.Experiment:
     """The arm with Stribeck friction at some joints."""
-    terms = {
-        f"s_{joint}": {
-            "kind": "stribeck",
-            "joint": joint,
-            "values": {"excess": EXCESS[JOINTS.index(joint)], "speed": SPEED},
+    values = {joint: {"excess": e, "speed": 0.15} for joint, e in zip(JOINTS, EXCESS, strict=True)}
+    return experiment.replace(
+        terms={
+            f"s_{joint}": {"kind": "stribeck", "joint": joint, "values": values[joint]}
+            for joint in joints
         }
-        for joint in joints
-    }
-    return experiment.replace(terms=terms)
+    )
 
 
-def log_of(experiment: mjfim.Experiment, seed: int, seconds: float = 3.0) -> Recording:
-    """A recording with noise under a slow multisine."""
+def log_of(experiment: mjfim.Experiment, seed: int) -> Recording:
+    """A recording of 3 s with noise under a slow multisine."""
     system = System.resolve(experiment, threads=1)
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(RATE * seconds)) / RATE
-    control: Array = 0.4 * multisine(t, 3, 0.3, 4, rng)
-    y = system.plant.measure(system.parameters.guess[None], control)[0][0]
-    y = y + rng.standard_normal(y.shape) * system.noise.sigma
-    times = np.arange(len(y)) / RATE
-    return Recording(t=times, ctrl=control, y=y, outputs=system.outputs.names)
+    control = 0.4 * multisine(np.arange(600) / RATE, 3, 0.3, 4, np.random.default_rng(seed))
+    return recorded(system, control, seed, theta=system.parameters.guess)
 
 
 def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
@@ -104,8 +94,7 @@ def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
 @pytest.mark.slow
 def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
-    log = log_of(with_stribeck(experiment, JOINTS), 0)
-    tests = term_tests(experiment, log)
+    tests = term_tests(experiment, log_of(with_stribeck(experiment, JOINTS), 0))
     first = tests.terms[0]
     assert first.description == "Stribeck friction at 3 joints"
     assert set(first.joints) == set(JOINTS)
@@ -122,14 +111,6 @@ def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: 
     assert f'target = "term/{leader}_stribeck:speed"' in first.recipe
     assert first.recipe.endswith(f"# The same for {', '.join(others)}.")
     assert len(tomllib.loads(first.recipe)["parameters"]) == 2
-    assert f"{others[0]}_stribeck" not in first.recipe
-
-    # What the term needs can be added as one.
-    term = with_names(first, ())
-    extended = System.resolve(experiment.replace(parameters=term.parameters, terms=term.tables))
-    assert len(term.parameters) == 6
-    assert set(term.parameters) < set(extended.parameters.names)
-    assert len(first.summary()["terms"]) == 3
     assert first.summary()["joints"] == list(first.joints)
 
     # An estimate names other effects in place of those of its single joints, which a selection
@@ -137,8 +118,7 @@ def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: 
     members = [term for term in tests.terms if first.contains(term)]
     assert members and not any(term in tests.named for term in members)
     assert len(tests.named) == MAX_NAMED_TERMS
-    left = tests.without({first.key})
-    assert members[0] in left.named
+    assert members[0] in tests.without({first.key}).named
 
 
 @pytest.mark.slow
@@ -147,27 +127,8 @@ def test_friction_that_one_joint_lacks_is_a_term_of_this_joint(tmp_path: Path) -
     tests = term_tests(experiment, log_of(with_stribeck(experiment, ("lift",)), 0))
     first = tests.named[0]
     assert first == tests.terms[0]
-    assert first.path == "term/lift_stribeck:excess"
-    assert first.joints == ()
+    assert (first.path, first.joints) == ("term/lift_stribeck:excess", ())
     assert len(first.tables) == 1
-
-
-@pytest.mark.slow
-def test_a_selection_adds_the_friction_of_all_joints_in_one_step(tmp_path: Path) -> None:
-    experiment = stated(tmp_path)
-    robot = with_stribeck(experiment, JOINTS)
-    logs = [log_of(robot, seed) for seed in range(2)]
-    found = mjfim.select_terms(experiment, logs, threads=1, progress=False)
-    assert found.selection is not None
-    assert found.selection.terms[0].description == "Stribeck friction at 3 joints"
-    assert not found.misfit
-
-    values = dict(zip(found.parameters, found.theta, strict=True))
-    names = {
-        str(table["target"]): name for name, table in found.selection.terms[0].parameters.items()
-    }
-    for joint, excess in zip(JOINTS, EXCESS, strict=True):
-        assert values[names[f"term/{joint}_stribeck:excess"]] == pytest.approx(excess, rel=0.2)
 
 
 def missing(path: str, *, sigmas: float, joints: tuple[str, ...] = ()) -> Term:

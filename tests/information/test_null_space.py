@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.information.null_space import NullSpace, find_null_space, parameter_groups
 from tests.support.numerics import Array, make_task, sensitivity_of
@@ -53,23 +52,12 @@ NULLS = {
 def test_a_known_null_space_is_found_for_parameters_of_any_size(case: str, noise: float) -> None:
     null = NULLS[case]
     J = rows(null) / SIZES
-    rng = np.random.default_rng(2)
-    error = noise * rng.normal(size=J.shape) / SIZES
+    error = noise * np.random.default_rng(2).normal(size=J.shape) / SIZES
     found = look(J + error, 4.0 * error)
     assert found.count == null.shape[1]
     assert same_span(found.directions / SIZES[:, None], null)
-    assert found.basis.shape == (5, 5 - found.count)
     assert_allclose(found.basis.T @ found.basis, np.eye(5 - found.count), atol=1e-12)
     assert_allclose(found.basis.T @ null, 0.0, atol=1e-8)  # the scales here are the sizes
-    assert np.linalg.matrix_rank(J * SIZES @ found.basis, tol=1e-6) == 5 - found.count
-
-
-def test_the_basis_is_in_scaled_units() -> None:
-    null, scale = NULLS["one of all"], np.array([2.0, 1e-5, 3.0, 7.0, 1e3])
-    found = look(rows(null) / SIZES, scale=scale)
-    assert_allclose(
-        found.basis.T @ (null[:, 0] * SIZES / scale / np.abs(SIZES / scale).max()), 0.0, atol=1e-9
-    )
 
 
 @pytest.mark.parametrize("weak", [1e-3, 1e-5])
@@ -114,61 +102,39 @@ def test_round_off_beside_strong_parameters_is_silent_and_a_weak_exact_effect_is
     assert look(J, np.column_stack([np.zeros(60), 1e-3 * J[:, 1]]), np.ones(2)).silent == ()
 
 
-def test_a_nuisance_hides_a_parameter_with_an_equal_effect_unless_it_is_known() -> None:
-    J = rows(NULLS["one pair"]) / SIZES
-    kept = {"interest": np.array([0, 1, 2, 3])}
-    hidden = look(J, **kept)
-    assert hidden.silent == (0,)
-    assert hidden.basis.shape == (4, 3)
-    known = look(J, **kept, prior=np.diag([0.0, 0.0, 0.0, 0.0, 1e-10]))
-    assert known.count == 0
-
-
-@pytest.mark.parametrize("strength", [1.0, 1e5], ids=["weak", "strong"])
-def test_a_single_wanted_parameter_confounded_with_a_nuisance_is_hidden(
-    strength: float,
-) -> None:
+def test_a_single_wanted_parameter_confounded_with_a_nuisance_is_hidden() -> None:
     rng = np.random.default_rng(8)
-    wanted = strength * rng.normal(size=60)
-    J = np.column_stack([wanted, -3.0 * wanted + 1e-11 * strength * rng.normal(size=60)])
-    error = 1e-11 * strength * rng.normal(size=J.shape)
+    wanted = 1e5 * rng.normal(size=60)
+    J = np.column_stack([wanted, -3.0 * wanted + 1e-6 * rng.normal(size=60)])
+    error = 1e-6 * rng.normal(size=J.shape)
     for known in (None, error):
         assert look(J, known, np.ones(2), interest=np.array([0])).silent == (0,)
-    J[:, 1] += 1e-3 * strength * rng.normal(size=60)
+    J[:, 1] += 100.0 * rng.normal(size=60)
     seen = look(J, error, np.ones(2), interest=np.array([0]))
     assert seen.count == 0
     assert seen.smallest < 1e-3  # little is left of it: a doubt that deserves a second look
 
 
 def test_a_direction_known_to_be_invisible_stays_so_despite_large_round_off() -> None:
-    rng = np.random.default_rng(10)
-    chaotic = rng.normal(size=(60, 5)) / SIZES  # everything seems to show
-    direction = NULLS["one of all"] * SIZES[:, None]
-    found = look(chaotic, known=direction)
-    assert found.count == 1
-    assert same_span(found.directions / SIZES[:, None], NULLS["one of all"])
-    assert found.silent == ()
-    single = look(chaotic, known=np.eye(5)[:, [1]])
-    assert single.silent == (1,)
+    chaotic = np.random.default_rng(10).normal(size=(60, 5)) / SIZES  # everything seems to show
+    one, two = NULLS["one of all"], NULLS["two"]
     # what the rows do not show is added to what is known
-    both = look(rows(NULLS["two"][:, :1]) / SIZES, known=NULLS["two"][:, 1:] * SIZES[:, None])
-    assert same_span(both.directions / SIZES[:, None], NULLS["two"])
-    again = look(rows(NULLS["two"]) / SIZES, known=NULLS["two"][:, 1:] * SIZES[:, None])
-    assert again.count == 2
-
-
-def words(null: Array, units: tuple[str, ...] = ("",) * 5, size: Array = SIZES) -> list[str]:
-    """Groups of parameters a to e in words."""
-    return [
-        str(g) for g in parameter_groups(look(rows(null) / size, size=size), "abcde", size, units)
-    ]
+    for J, known, expected in (
+        (chaotic, one, one),
+        (rows(two[:, :1]) / SIZES, two[:, 1:], two),
+        (rows(two) / SIZES, two[:, 1:], two),
+    ):
+        found = look(J, known=known * SIZES[:, None])
+        assert same_span(found.directions / SIZES[:, None], expected)
+        assert found.silent == ()
+    assert look(chaotic, known=np.eye(5)[:, [1]]).silent == (1,)
 
 
 def test_groups_name_their_members_and_identifiable_combinations() -> None:
-    said = words(NULLS["two"], size=np.ones(5))
-    assert len(said) == 2
-    assert said[0] == "a and b only as a + b"
-    assert said[1].startswith("c, d and e only as ")
+    found = look(rows(NULLS["two"]), size=np.ones(5))
+    first, second = map(str, parameter_groups(found, "abcde", np.ones(5), [""] * 5))
+    assert first == "a and b only as a + b"
+    assert second.startswith("c, d and e only as ")
 
 
 @pytest.mark.parametrize("case", NULLS)
@@ -183,19 +149,6 @@ def test_combinations_of_groups_do_not_change_along_the_null_space(case: str) ->
             at = ["abcde".index(name) for name in combination.members]
             terms = np.array(combination.coefficients)[:, None] * found.directions[at]
             assert_allclose(terms.sum(axis=0), 0.0, atol=1e-7 * np.abs(terms).max())
-
-
-def test_an_empty_null_space_gives_no_groups_and_silent_parameters_make_one() -> None:
-    assert (
-        parameter_groups(
-            look(np.random.default_rng(9).normal(size=(60, 5)) / SIZES), "abcde", SIZES, [""] * 5
-        )
-        == ()
-    )
-    J = np.random.default_rng(9).normal(size=(60, 5)) / SIZES
-    J[:, [1, 3]] = 0.0
-    (group,) = parameter_groups(look(J), "abcde", SIZES, [""] * 5)
-    assert str(group) == "b and d: no effect on any measured output"
 
 
 LENGTH = 0.7
@@ -232,32 +185,15 @@ def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     task = double_pendulum(tmp_path, "barycentric")
     seen = task.identifiability_test.along(task.initial, sensitivity_of(task))
     assert (seen.along_trajectory.count, seen.along_all.count) == (14, 14)
-    assert seen.basis.shape == (20, 6)
     lumped, silent = seen.groups_along_all
     # first moment m1 r1 + l m2 and inertia J1 + l^2 m2 about the first hinge, each a textbook base
     # parameter
     assert lumped.members == ("a.mz", "a.Jyy", "b.mass")
-    (first, inertia) = lumped.combinations
-    assert first.members == ("a.mz", "b.mass")
-    assert first.coefficients == pytest.approx((1.0, LENGTH), rel=1e-5)
-    assert inertia.members == ("a.Jyy", "b.mass")
-    assert inertia.coefficients == pytest.approx((1.0, LENGTH**2), rel=1e-5)
-    visible = {"a.mx", "b.mx", "b.mz", "b.Jyy"}
-    assert set(silent.members) == set(seen.names) - visible - set(lumped.members)
+    for combination, member, power in zip(
+        lumped.combinations, lumped.members, (1, 2), strict=False
+    ):
+        assert combination.members == (member, "b.mass")
+        assert combination.coefficients == pytest.approx((1.0, LENGTH**power), rel=1e-5)
+    visible = {"a.mx", "b.mx", "b.mz", "b.Jyy", *lumped.members}
+    assert set(silent.members) == set(seen.names) - visible
     assert silent.combinations == ()
-
-
-@pytest.mark.slow
-def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_motion(
-    tmp_path,
-) -> None:
-    task = double_pendulum(tmp_path, "logcholesky")
-    seen = task.identifiability_test.along(task.initial, sensitivity_of(task))
-    assert seen.basis.shape == (20, 6)
-    # a step along an invisible direction moves nothing measured, to second order
-    for n in (seen.along_all.directions / np.linalg.norm(seen.along_all.directions, axis=0)).T:
-        y, _ = task.plant.measure(task.theta + np.outer([0.0, 1e-4, -1e-4], n), task.control)
-        assert np.abs(y[1] - y[2]).max() < 1e-8
-    evaluation = evaluate_task(task, task.initial)
-    assert len(evaluation.eigenvalues) == 6
-    assert evaluation.eigenvalues[0] > 0.0

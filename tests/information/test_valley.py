@@ -18,6 +18,7 @@ from mjfim.output.pages import page_of
 from mjfim.output.plots.pictures import pictures_of
 from mjfim.records.rehearsal import Separation, Valley
 from mjfim.records.trajectory import Trajectory
+from tests.support.numerics import Loop, make_task
 from tests.support.paths import MODELS
 
 # The measurements of the paper are so accurate that the initial motion determines every parameter.
@@ -34,20 +35,6 @@ PUSHED_CART = """
 </mujoco>
 """
 
-PUSHED_CART_STUDY = """
-model = "cart.xml"
-rate = 100.0
-horizon = 1.0
-[initial]
-control = { kind = "chirp", amplitude = 1.0, frequency = 1.0 }
-[parameters.mass]
-target = "body/cart:mass"
-[parameters.gear]
-target = "actuator/push:gear[0]"
-[noise]
-state = 0.01
-"""
-
 
 def noisy_cart_pendulum() -> mjfim.Experiment:
     """The cart-pendulum with measurements that hardly show its friction."""
@@ -62,13 +49,9 @@ def outputs(theta: Array, ctrl: Array) -> Array:
     model = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
     bob, hinge = model.body("bob").id, model.joint("hinge").dofadr[0]
     model.body_mass[bob], model.body_pos[bob, 2], model.dof_damping[hinge] = theta
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    rows = [[*data.qpos, *data.qvel]]
+    loop, rows = Loop(model, 1), [np.append(model.key_qpos[0], model.key_qvel[0])]
     for u in ctrl:
-        data.ctrl[:] = u
-        mujoco.mj_step(model, data)
-        rows.append([*data.qpos, *data.qvel])
+        rows.append(loop.F(rows[-1], u))
     return np.array(rows)
 
 
@@ -87,13 +70,11 @@ def design() -> mjfim.Design:
 @pytest.fixture(scope="module")
 def valley(design: mjfim.Design) -> Valley:
     """Its robots."""
-    assert design.valley is not None
     return design.valley
 
 
 def motions(design: mjfim.Design) -> list[tuple[Separation, Trajectory]]:
     """Both motions, and what they tell of the robots."""
-    assert design.valley is not None and design.valley.designed is not None
     plans = design.initial.trajectory, design.final.trajectory
     return list(zip((design.valley.motion, design.valley.designed), plans, strict=True))
 
@@ -115,9 +96,6 @@ def test_the_initial_motion_tells_nothing_and_the_designed_one_tells_them_apart(
     assert before.total <= NORMAL_95 < after.total
     assert np.isinf(before.seen_after)
     assert distance(valley.theta, plan.ctrl)[-1] <= NORMAL_95
-    # The model between them is no third robot that can be told from them.
-    for theta in valley.theta:
-        assert distance(np.array([theta, valley.nominal]), plan.ctrl)[-1] <= NORMAL_95
     # A step that is 2 % longer would be seen.
     longer = valley.nominal + 1.02 * (valley.theta - valley.nominal)
     assert distance(longer, plan.ctrl)[-1] > NORMAL_95
@@ -128,24 +106,33 @@ def test_the_initial_motion_tells_nothing_and_the_designed_one_tells_them_apart(
 def test_other_parameters_hide_the_one_that_is_known_worst(
     design: mjfim.Design, valley: Valley
 ) -> None:
+    """A change of any other direction with the same change of the friction is seen better."""
     ctrl = design.initial.trajectory.ctrl
     gap = np.diff(valley.theta, axis=0)[0]
-    # Without the help of the others, the same change of the friction would be seen.
-    alone = valley.nominal + np.outer((-0.5, 0.5), np.where([False, False, True], gap, 0.0))
-    assert distance(alone, ctrl)[-1] > NORMAL_95 > valley.motion.total
-    # A change of any other direction with this friction is seen better.
     rng = np.random.default_rng(0)
-    for _ in range(20):
-        other = gap * np.append(1.0 + 0.2 * rng.standard_normal(2), 1.0)
-        pair = valley.nominal + np.outer((-0.5, 0.5), other)
-        assert distance(pair, ctrl)[-1] > 0.999 * valley.motion.total
+    others = [[0.0, 0.0], *(1.0 + 0.2 * rng.standard_normal((20, 2)))]
+    totals = [
+        distance(valley.nominal + np.outer((-0.5, 0.5), gap * [*other, 1.0]), ctrl)[-1]
+        for other in others
+    ]
+    assert min(totals) > 0.999 * valley.motion.total
+    # Without the help of the others, it would be seen.
+    assert totals[0] > NORMAL_95 > valley.motion.total
 
 
 def test_robots_with_an_equal_ratio_move_exactly_alike(tmp_path: Path) -> None:
-    (tmp_path / "cart.xml").write_text(PUSHED_CART, encoding="utf-8")
-    (tmp_path / "cart.toml").write_text(PUSHED_CART_STUDY, encoding="utf-8")
-    found = mjfim.check(mjfim.Experiment.from_file(tmp_path / "cart.toml")).valley
-    assert found is not None and found.designed is None
+    experiment = make_task(
+        PUSHED_CART,
+        tmp_path,
+        horizon=1.0,
+        parameters={
+            "mass": {"target": "body/cart:mass"},
+            "gear": {"target": "actuator/push:gear[0]"},
+        },
+        noise={"state": 0.01},
+    ).experiment
+    found = mjfim.check(experiment).valley
+    assert found.designed is None
     assert found.motion.total < 1e-6
     ratio = found.theta[:, 1] / found.theta[:, 0]
     assert ratio == pytest.approx(1.5, rel=1e-9)
@@ -155,50 +142,15 @@ def test_robots_with_an_equal_ratio_move_exactly_alike(tmp_path: Path) -> None:
 
 def test_a_bound_holds_one_robot_back() -> None:
     stated = noisy_cart_pendulum().replace(parameters={"c": {"bounds": [1.3, 10.0], "true": 1.4}})
-    found = mjfim.check(stated).valley
-    assert found is not None
-    low, high = np.sort(found.theta[:, 2])
+    low, high = np.sort(mjfim.check(stated).valley.theta[:, 2])
     assert low >= 1.3 and high - 1.4 > 1.4 - low
 
 
 def test_nothing_is_shown_where_everything_is_determined() -> None:
     found = mjfim.check(mjfim.Experiment.from_file(MODELS / "cart_pendulum_guess.toml"))
-    assert found.valley is None
+    assert found.valley is None and found.summary()["valley"] is None
     assert "valley" not in found.pictures
     assert "Two robots" not in [section.title for section in page_of(found).sections]
-    assert found.summary()["valley"] is None
-
-
-def test_picture_table_and_json_agree(design: mjfim.Design, tmp_path: Path) -> None:
-    design.save(tmp_path)
-    stored = json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))["valley"]
-    valley = mjfim.Design.load(tmp_path).valley
-    assert valley is not None and valley.designed is not None
-
-    sentence = str(valley)
-    for number in (
-        f"are apart by {stored['motion']['distance']:.3g} σ of the noise",
-        f"are apart by {stored['designed']['distance']:.3g} σ, most in qvel:hinge",
-        f"({stored['designed']['largest_difference']:.2g} rad/s at "
-        f"{stored['designed']['time']:.3g} s)",
-    ):
-        assert number in sentence
-
-    section = next(each for each in page_of(design).sections if each.title == "Two robots")
-    table = next(part for part in section.parts if isinstance(part, Table))
-    picture = pictures_of(design)["valley"]()
-    assert sentence.startswith(picture.title)
-    assert picture.title.endswith(f"apart by {stored['designed']['distance']:.3g} σ")
-    names = [row.cells[0].partition(" (")[0] for row in table.rows]
-    columns = [stored["parameters"].index(name) for name in names]
-    theta = np.array(stored["theta"])[:, columns]
-    shown = np.array([[float(cell) for cell in row.cells[1:3]] for row in table.rows]).T
-    assert np.allclose(shown, theta, rtol=1e-3)
-    drawn = [mark.x for mark in picture.panels[-1].marks if mark.kind == "dots"]
-    assert np.allclose(drawn, np.array(stored["percent"])[:, columns])
-    for panel, motion in zip(picture.panels[1:4:2], ("motion", "designed"), strict=True):
-        line = next(mark for mark in panel.marks if mark.kind == "line")
-        assert line.y[-1] == pytest.approx(stored[motion]["distance"])
 
 
 def test_a_film_shows_both_robots_as_ghosts_whose_differences_are_magnified(
@@ -215,3 +167,31 @@ def test_a_film_shows_both_robots_as_ghosts_whose_differences_are_magnified(
         for ghost, theta in zip(ghosts, valley.theta, strict=True):
             own = outputs(theta, plan.ctrl)[::4, :2]
             assert np.allclose(ghost.qpos, model.qpos + factor * (own - model.qpos), atol=1e-9)
+
+
+def test_sentence_table_picture_and_json_agree(design: mjfim.Design, tmp_path: Path) -> None:
+    design.save(tmp_path)
+    stored = json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))["valley"]
+    sentence = str(mjfim.Design.load(tmp_path).valley)
+    motion, designed = stored["motion"], stored["designed"]
+    for number in (
+        f"are apart by {motion['distance']:.3g} σ of the noise",
+        f"are apart by {designed['distance']:.3g} σ, most in qvel:hinge",
+        f"({designed['largest_difference']:.2g} rad/s at {designed['time']:.3g} s)",
+    ):
+        assert number in sentence
+
+    picture = pictures_of(design)["valley"]()
+    assert sentence.startswith(picture.title)
+    (table,) = (
+        part
+        for section in page_of(design).sections
+        if section.title == "Two robots"
+        for part in section.parts
+        if isinstance(part, Table)
+    )
+    columns = [stored["parameters"].index(row.cells[0].partition(" (")[0]) for row in table.rows]
+    shown = np.array([[float(cell) for cell in row.cells[1:3]] for row in table.rows]).T
+    assert np.allclose(shown, np.array(stored["theta"])[:, columns], rtol=1e-3)
+    drawn = [mark.x for mark in picture.panels[-1].marks if mark.kind == "dots"]
+    assert np.allclose(drawn, np.array(stored["percent"])[:, columns])

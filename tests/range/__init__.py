@@ -1,1 +1,0 @@
-"""Numerical range: extreme masses, integrators, timesteps, horizons, judged by plain MuJoCo."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -25,87 +24,55 @@ ARRAYS = {
     ("joint", "stiffness"): "jnt_stiffness",
 }
 
-
-@dataclass(frozen=True, kw_only=True)
-class Information:
-    """Fisher information by plain MuJoCo.
-
-    Attributes:
-        matrix: (p, p) information about relative parameters; NaN where it diverges.
-        error: Its relative error, from the difference of two steps.
-        warning: Name of MuJoCo's warning if the simulation diverges; else empty.
-    """
-
-    matrix: Array
-    error: float
-    warning: str
+# Warnings of MuJoCo about a diverging simulation.
+BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 
 
-def divergence(data: Any) -> str:
-    """Name of MuJoCo's warning about a diverging simulation; empty without one."""
-    for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL"):
-        kind = getattr(mujoco.mjtWarning, f"mjWARN_{name}")
-        if data.warning[int(kind)].number:
-            return name
-    return ""
-
-
-def play(model: Any, start: Any, ctrl: Array, substeps: int) -> tuple[Array, Array, str]:
-    """Play a control.
+def play(model: Any, start: Any, ctrl: Array, substeps: int) -> Array:
+    """(N+1, nq+nv) states, or NaN where the simulation diverges.
 
     Args:
         model: The model.
         start: qpos at the begin, or None for the reference pose.
         ctrl: (N, nu) controls.
         substeps: Engine steps per sample.
-
-    Returns:
-        (N+1, nq+nv) states, (N+1, nsensordata) sensor data, and the name of MuJoCo's warning.
     """
     data = mujoco.MjData(model)
     if start is not None:
         data.qpos[:] = start
-    states, sensors = [], []
     level = mujoco.MjLogConfig.get()
     level.logto_console = level.logto_file = False
     mujoco.MjLogConfig.set(level)
-    for u in [*ctrl, ctrl[-1]]:
-        states.append(np.concatenate([data.qpos, data.qvel]))
+
+    states = [np.concatenate([data.qpos, data.qvel])]
+    for u in ctrl:
         data.ctrl[:] = u
-        if model.nsensordata:
-            mujoco.mj_forward(model, data)
-            sensors.append(np.array(data.sensordata))
         mujoco.mj_step(model, data, substeps)
-        # The last step belongs to no sample.
-        if len(states) <= len(ctrl) and divergence(data):
-            break
-    return np.array(states), np.array(sensors), divergence(data)
+        states.append(np.concatenate([data.qpos, data.qvel]))
+    if any(data.warning[kind].number for kind in BAD):
+        return np.full((len(states), len(states[0])), np.nan)
+    return np.array(states)
 
 
-def changed(model: Any, targets: list[str], factors: Array) -> Any:
-    """A copy of a model with every parameter multiplied by a factor."""
+def changed(model: Any, target: str, factor: float) -> Any:
+    """A copy of a model with one parameter multiplied by a factor."""
     other = copy.copy(model)
-    for target, factor in zip(targets, factors, strict=True):
-        path, _, field = target.partition(":")
-        kind, _, name = path.partition("/")
-        field, _, index = field.partition("[")
-        values = getattr(other, ARRAYS[kind, field])
-        row = mujoco.mj_name2id(
-            model,
-            mujoco.mjtObj.mjOBJ_BODY if kind == "body" else mujoco.mjtObj.mjOBJ_JOINT,
-            name,
-        )
-        if field in ("damping", "armature"):
-            row = model.jnt_dofadr[row]
-        if index:
-            values[row, int(index[:-1])] *= factor
-        else:
-            values[row] *= factor
+    path, _, field = target.partition(":")
+    kind, _, name = path.partition("/")
+    field, _, index = field.partition("[")
+    place: Any = getattr(model, kind)(name).id
+    if field in ("damping", "armature"):
+        place = model.jnt_dofadr[place]
+    if index:
+        place = (place, int(index[:-1]))
+    getattr(other, ARRAYS[kind, field])[place] *= factor
     mujoco.mj_setConst(other, mujoco.MjData(other))
     return other
 
 
-def information(xml: str, tables: dict[str, Any], ctrl: Array, substeps: int) -> Information:
+def information(
+    xml: str, tables: dict[str, Any], ctrl: Array, substeps: int
+) -> tuple[Array, float]:
     """Fisher information about the relative parameters at their true values.
 
     Args:
@@ -113,51 +80,41 @@ def information(xml: str, tables: dict[str, Any], ctrl: Array, substeps: int) ->
         tables: Tables of the experiment.
         ctrl: (N, nu) controls.
         substeps: Engine steps per sample.
+
+    Returns:
+        (p, p) information, and its relative error from the difference of two steps; where the
+        simulation diverges, the information is NaN and the error is infinite.
     """
     model = mujoco.MjModel.from_xml_string(xml)
-    targets = [entry["target"] for entry in tables["parameters"].values()]
     start = tables["initial"].get("qpos")
-    p = len(targets)
-    _, _, warning = play(model, start, ctrl, substeps)
-    if warning:
-        return Information(matrix=np.full((p, p), np.nan), error=np.inf, warning=warning)
+
+    # The quaternion of a free body turns by half of the angle that its noise states.
+    sigma = np.full(model.nq + model.nv, tables["noise"]["state"])
+    sigma[3 : 3 + 4 * (model.nq - model.nv)] *= 0.5
 
     matrices = []
     for step in STEPS:
         G = []
-        for j in range(p):
-            ends = []
-            for sign in (1.0, -1.0):
-                factors = np.ones(p)
-                factors[j] += sign * step
-                states, sensors, bad = play(changed(model, targets, factors), start, ctrl, substeps)
-                y = _outputs(model, tables, states, sensors)
-                ends.append(np.full((len(ctrl) + 1, y.shape[1]), np.nan) if bad else y)
-            G.append((ends[0] - ends[1]) / (2.0 * step) / 0.01)
-        rows = np.array(G).reshape(p, -1)
-        matrices.append(rows @ rows.T)
+        for entry in tables["parameters"].values():
+            above, below = (
+                play(changed(model, entry["target"], 1.0 + sign * step), start, ctrl, substeps)
+                for sign in (1.0, -1.0)
+            )
+            G.append(((above - below) / (2.0 * step * sigma)).ravel())
+        matrices.append(np.array(G) @ np.array(G).T)
 
     # The step with the least disagreement to its neighbour.
-    best, error = matrices[0], np.inf
+    best, error = np.full_like(matrices[0], np.nan), np.inf
     for one, two in pairwise(matrices):
         change = relative_change(one, two)
         if change < error:
             best, error = two, change
-    return Information(matrix=best, error=error, warning="")
+    return best, error
 
 
 def relative_change(one: Array, two: Array) -> float:
     """Largest relative difference of two information matrices, along all directions."""
-    if not (np.isfinite(one).all() and np.isfinite(two).all()):
-        return float("inf")
     scale = np.sqrt(np.diag(two))
-    if not one.any() and not two.any():
-        return 0.0
-    if not (scale > 0.0).all():
-        return float("inf")
+    if not (np.isfinite(one).all() and (scale > 0.0).all()):
+        return np.inf
     return float(np.abs((one - two) / np.outer(scale, scale)).max())
-
-
-def _outputs(model: Any, tables: dict[str, Any], states: Array, sensors: Array) -> Array:
-    """(N+1, ny) outputs: the state, or all sensors."""
-    return states if "state" in tables["noise"] else sensors

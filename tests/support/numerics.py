@@ -281,3 +281,10 @@ def independent_noise(sigma: Sequence[float] | Array, stride: int = 1) -> Noise:
         covariance=np.diag(np.asarray(sigma, dtype=np.float64) ** 2),
         strides=np.full(len(sigma), stride),
     )
+
+
+def require_found(found: Any, true: Array, sigmas: float = 4.0) -> None:
+    """Require that a fit converged without misfit, within some standard deviations of the truth."""
+    assert found.converged, found.status
+    assert not found.misfit, found.reasons
+    assert (np.abs(found.theta - true) < sigmas * found.std).all()

@@ -106,14 +106,29 @@ def motor_torque(duration: float, rate: float, seed: int = 0, size: float = 0.25
     return size * np.sum(waves, axis=0)[:, None]
 
 
-def recorded(system: System, ctrl: Array, seed: int) -> Recording:
-    """A recording of a system at the true values of its parameters, with noise."""
-    rng = np.random.default_rng(seed)
-    y, finite = system.plant.measure(system.parameters.true[None], ctrl)
+def recorded(
+    system: System,
+    ctrl: Array,
+    seed: int = 0,
+    *,
+    theta: Array | None = None,
+    share: float = 1.0,
+) -> Recording:
+    """A recording of a system under a control.
+
+    Args:
+        system: The system.
+        ctrl: (N, nu) control.
+        seed: Seed of the noise.
+        theta: Values of the parameters; default: the true ones.
+        share: Size of the noise over the stated one.
+    """
+    values = system.parameters.true if theta is None else theta
+    y, finite = system.plant.measure(values[None], ctrl)
     assert finite.all()
-    noise = rng.normal(size=y[0].shape) * system.noise.sigma
+    noise = np.random.default_rng(seed).normal(size=y[0].shape) * system.noise.sigma
     t = np.arange(len(ctrl) + 1) * system.dt
-    return Recording(t=t, y=y[0] + noise, ctrl=ctrl, outputs=system.outputs.names)
+    return Recording(t=t, y=y[0] + share * noise, ctrl=ctrl, outputs=system.outputs.names)
 
 
 def small_logs(system: System, *seeds: int) -> list[Recording]:
