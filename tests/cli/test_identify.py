@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from typer.testing import Result
 
 import mjfim
@@ -135,7 +136,7 @@ def test_the_accuracy_that_a_design_predicted_stands_beside_the_estimates(
     words = ("identify", study, recorded, "-o", folder, "--held-out", held, "--predicted")
     done(*words, home / "out")
     stated = mjfim.Design.load(home / "out").stated_std
-    np.testing.assert_allclose(read(folder / "estimate.json")["predicted_std"], stated, rtol=1e-9)
+    assert_allclose(read(folder / "estimate.json")["predicted_std"], stated, rtol=1e-9)
     (prediction,) = mjfim.Estimate.load(folder).predictions
     assert prediction.held_out and prediction.recording is not None
     misused(run(*words, tmp_path, "--force"), "design.npz: this file is missing")

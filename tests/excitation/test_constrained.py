@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.design import design_task
@@ -59,7 +60,7 @@ def test_the_study_of_the_paper_under_hard_limits_beats_a_general_solver() -> No
     G = np.array(columns).T
     eigenvalues = np.linalg.eigvalsh(G.T @ G) / 100.0
     assert eigenvalues[0] >= 399.0
-    np.testing.assert_allclose(eigenvalues, paper.final.eigenvalues, rtol=1e-4)
+    assert_allclose(eigenvalues, paper.final.eigenvalues, rtol=1e-4)
 
     # No engine step violates a limit. Both ranges are used, and the design says so.
     excess = excess_of(DesignTask.resolve(limited), ctrl)
@@ -222,7 +223,7 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
     assert basis.shape[1] == 8
     swing = ctrl - task.initial_hold
     assert relative_error(basis @ np.linalg.lstsq(basis, swing)[0], swing) < 1e-9
-    np.testing.assert_allclose(ctrl[0], hold, rtol=0, atol=1e-6)
+    assert_allclose(ctrl[0], hold, rtol=0, atol=1e-6)
     assert np.abs(ctrl[1] - ctrl[0]).max() < 0.05 * np.ptp(ctrl)
     assert_arm(task, design, (hold, hold))
     power = np.abs(np.fft.rfft(swing, axis=0)) ** 2

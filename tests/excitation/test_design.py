@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError, ModelError, UnidentifiableError
@@ -43,7 +44,7 @@ def test_scale_does_not_change_the_predicted_deviation(experiment: Experiment) -
         tables = {name: {"scale": scale} for name in "mlc"}
         task = DesignTask.resolve(experiment.replace(parameters=tables))
         stds.append(evaluate_task(task, task.initial).std)
-    np.testing.assert_allclose(stds[0], stds[1], rtol=1e-9)
+    assert_allclose(stds[0], stds[1], rtol=1e-9)
 
 
 MOTOR = '<motor name="force" joint="slide"'
@@ -93,7 +94,7 @@ def test_a_given_initial_control_is_checked_and_is_the_start(
     given = np.sin(0.05 * np.arange(100))[:, None]
     design = mjfim.design(short.replace(descent={"max_iterations": 0}), initial_control=given)
     assert design.found_by == "given control"
-    np.testing.assert_allclose(design.trajectory.ctrl, given, atol=1e-12)
+    assert_allclose(design.trajectory.ctrl, given, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -147,7 +148,7 @@ def test_a_design_that_knows_its_nuisance_parameters_beats_one_that_does_not(
     theta = unsure.theta[:3]
     block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(theta, theta)
     seen = np.sort(1.0 / np.linalg.eigvalsh(block)) / unsure.system.measure_rate
-    np.testing.assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
+    assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import MetricDescent
@@ -84,7 +85,7 @@ def test_extended_slope_is_the_reduced_slope(case: str, tmp_path) -> None:
     for v in rng.normal(size=(3, *task.control.shape)):
         short, full = e.lift(open_loop, v), response(e.extended, v)
         z = full[:, : task.space.nx]
-        np.testing.assert_allclose(z, short.z, rtol=1e-5, atol=1e-5 * np.abs(z).max())
+        assert_allclose(z, short.z, rtol=1e-5, atol=1e-5 * np.abs(z).max())
         slope = e.slope(short)
         assert e.extended.slope(TangentCurve(z=full, v=v)) == pytest.approx(slope, rel=1e-4)
 

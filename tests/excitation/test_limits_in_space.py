@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
@@ -283,8 +284,8 @@ def test_derivatives_of_the_barrier_of_a_norm_are_those_of_differences(is_angle:
         slope = np.array([up.value - down.value for up, down in pairs]) / (2 * step * share)
         bend = np.array([up.slope - down.slope for up, down in pairs]) / (2 * step * share)
         size = np.abs(found.curvature).max()
-        np.testing.assert_allclose(found.slope, slope, rtol=1e-5, atol=1e-7 * size)
-        np.testing.assert_allclose(found.curvature, bend, rtol=1e-4, atol=1e-4 * size)
+        assert_allclose(found.slope, slope, rtol=1e-5, atol=1e-7 * size)
+        assert_allclose(found.curvature, bend, rtol=1e-4, atol=1e-4 * size)
         assert np.linalg.eigvalsh(found.curvature).min() > 0.0
 
 

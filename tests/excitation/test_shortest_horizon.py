@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import mjfim
 from mjfim.errors import ExperimentError, NoResultError, UnidentifiableError
@@ -113,7 +114,7 @@ def test_it_is_saved_and_loaded_with_its_experiment(
     assert loaded.experiment == shorter.experiment
     assert loaded.experiment.directory == shorter.experiment.directory
     assert loaded.summary() == shorter.summary()
-    np.testing.assert_array_equal(loaded.design.trajectory.ctrl, shorter.design.trajectory.ctrl)
+    assert_array_equal(loaded.design.trajectory.ctrl, shorter.design.trajectory.ctrl)
 
 
 @pytest.mark.slow

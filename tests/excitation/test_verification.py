@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.verification import SAME_STATE_TOLERANCE, verify
@@ -248,7 +249,7 @@ def test_reference_csv_has_no_acceleration_above_a_limit_that_holds(
     columns = reference_columns(simulate_playback(task.system, task.initial, gain), task.system)
     acceleration, speed = columns["qacc:hinge"], columns["qvel:hinge"]
     largest = float(np.abs(acceleration).max())
-    np.testing.assert_allclose(acceleration[:-1], np.diff(speed) / 0.005, atol=1e-9)
+    assert_allclose(acceleration[:-1], np.diff(speed) / 0.005, atol=1e-9)
 
     limits = {"acceleration": 1.001 * largest}
     limited = light_link(tmp_path, integrator, drive, limits=limits, **playback)

@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.excitation.task import DesignTask
@@ -218,7 +219,7 @@ def test_extended_contract_parses_and_resolves(resolve: Resolve) -> None:
     assert e.robust == Robust(over="worst", samples=3, seed=4)
     assert (e.descent.starts, e.descent.coarse, e.descent.seed) == (3, 2, 5)
     assert noise.strides.tolist() == [2] * 4 + [1] * 2
-    np.testing.assert_allclose(noise.sigma, [2.0, 2.0, 1.0, 1.0, 0.02, 0.01])
+    assert_allclose(noise.sigma, [2.0, 2.0, 1.0, 1.0, 0.02, 0.01])
     assert (noise.covariance[0, 1], noise.covariance[4, 5]) == (1.0, 1e-5)
     deviations = ("initial qpos:slide", "initial qvel:hinge", *(f"bias {n}" for n in outputs))
     bob = [f"bob.{name}" for name in INERTIA_PARAMETRISATIONS["barycentric"].names]

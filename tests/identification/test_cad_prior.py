@@ -102,7 +102,7 @@ def test_the_prior_of_barycentric_coordinates_is_that_metric_to_second_order(
     values = parameters.guess[body.columns]
     near = values + 1e-5 * body.sizes
     exact = body.linear_difference(near).residual
-    np.testing.assert_allclose(body.difference(near).residual, exact, atol=2e-6)
+    assert_allclose(body.difference(near).residual, exact, atol=2e-6)
 
     # It also exists where no body has the coordinates.
     assert np.isfinite(body.difference(-values).residual).all()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.experiment.system import System
@@ -111,7 +112,7 @@ def test_deviations_of_the_initial_state_and_biases_are_continued_too(tmp_path: 
     found = identify_system(system, [recording, other], start=start)
     assert found.restart is not None
     require_found(found, system.parameters.true)
-    np.testing.assert_allclose(found.per_recording["bias angle"], [0.0, 0.03], atol=0.005)
+    assert_allclose(found.per_recording["bias angle"], [0.0, 0.03], atol=0.005)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
@@ -88,7 +89,7 @@ def test_orientations_turn_with_the_angular_velocity_of_the_body(tmp_path: Path)
     assert np.abs(motion.qacc[inside] - change).max() < 0.1 * np.abs(change).max()
     for first in (3, 7):
         norm = np.linalg.norm(motion.qpos[:, first : first + 4], axis=1)
-        np.testing.assert_allclose(norm, 1.0, rtol=1e-12)
+        assert_allclose(norm, 1.0, rtol=1e-12)
     places, _ = inner(motion, qpos, task.dt)
     assert np.abs(motion.qpos[inside] - places).max() < 0.01
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
@@ -95,7 +96,7 @@ def test_the_picture_shows_the_medians_and_the_worst_joints(tmp_path: Path) -> N
     assert fit.pictures == ("residual_torque",)
     picture = residual_torque(fit.residual_forces)
     median = next(m for m in picture.panels[0].marks if m.label == "median, forwards")
-    np.testing.assert_array_equal(median.y, slide.medians(slide.speed, slide.speed > 0.0)[1])
+    assert_array_equal(median.y, slide.medians(slide.speed, slide.speed > 0.0)[1])
     written = [each["rms"] for each in fit.summary()["residual_forces"]]
     assert written == [slide.rms, hinge.rms]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
@@ -64,5 +65,5 @@ def test_rows_without_error_are_those_of_one_sided_differences() -> None:
     at = problem.begin(problem.system.parameters.guess)
     full, fast = (sensitivity_rows(problem, at, with_error=each) for each in (True, False))
     for (J, change), (other, none) in zip(full, fast, strict=True):
-        np.testing.assert_allclose(other.T @ other, J.T @ J, rtol=1e-5)
+        assert_allclose(other.T @ other, J.T @ J, rtol=1e-5)
         assert change.any() and not none.any()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.evaluation import require_designable
@@ -227,7 +228,7 @@ def test_random_controls_stay_in_the_ranges_of_the_actuators_and_about_the_initi
     assert (np.ptp(right, axis=1) > 3.0).all()
 
     # the seed decides them
-    np.testing.assert_array_equal(made, again)
+    assert_array_equal(made, again)
     assert not np.array_equal(made, other)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
+from numpy.testing import assert_array_equal
 
 from tests.support.limits import floating_task
 from tests.support.numerics import cart_task
@@ -29,4 +29,4 @@ def test_an_entry_of_a_vector_has_the_size_of_the_whole(tmp_path: Path) -> None:
 
 def test_the_size_of_a_single_number_follows_its_value(tmp_path: Path) -> None:
     task = cart_task(tmp_path, parameters={"m": {"target": "body/cart:mass"}})
-    np.testing.assert_array_equal(task.parameters.sizes(-3.0 * task.theta), 3.0 * task.theta)
+    assert_array_equal(task.parameters.sizes(-3.0 * task.theta), 3.0 * task.theta)

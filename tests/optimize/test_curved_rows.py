@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy
+from numpy.testing import assert_allclose
 
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import step_over_curved_rows
@@ -34,8 +35,8 @@ def test_over_straight_rows_it_is_the_linear_step() -> None:
 
     expected = condensed.step(1e-3, scale, -bound, bound)
     found = step_over_curved_rows(condensed, straight, 1e-3, scale, -bound, bound)
-    np.testing.assert_allclose(found.common, expected.common, atol=1e-10)
-    np.testing.assert_allclose(found.private, expected.private, atol=1e-10)
+    assert_allclose(found.common, expected.common, atol=1e-10)
+    assert_allclose(found.private, expected.private, atol=1e-10)
     assert np.isclose(found.predicted_decrease, expected.predicted_decrease)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.optimize.directions import convex_pairs, inverse_hessian_product
 from tests.support.lq import positive
@@ -38,7 +39,7 @@ def test_the_product_is_that_with_the_dense_bfgs_matrix(count: int) -> None:
         found = inverse_hessian_product(
             g, pairs, lambda rows: (rows.reshape(-1, 6) @ start).reshape(rows.shape)
         )
-        np.testing.assert_allclose(found, product, rtol=1e-9)
+        assert_allclose(found, product, rtol=1e-9)
 
 
 def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:
@@ -46,7 +47,7 @@ def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:
     y = np.array([[3.0, 1.0], [-1.0, 5.0], [1.0, 1.0], [1.0, 1e-9]])
     kept = convex_pairs(s, y, 1e-8)
     assert [curvature for _, _, curvature in kept] == [3.0]
-    np.testing.assert_array_equal(kept[0][1], y[0])
+    assert_array_equal(kept[0][1], y[0])
 
     for step, change in zip(s, y, strict=True):
         alone = convex_pairs(step[None], change[None], 1e-8)

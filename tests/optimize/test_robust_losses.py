@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
 from mjfim.optimize.condensed_least_squares import RobustLoss
@@ -50,7 +51,7 @@ def test_the_optimum_agrees_with_scipy(kind: Kind, scale: float) -> None:
     x = reweighted(loss, y)
     of_scipy = partial(least_squares, residuals, args=(y,), loss=kind, f_scale=scale)
     wanted = of_scipy(x, xtol=1e-15, ftol=1e-15, gtol=1e-13)
-    np.testing.assert_allclose(x, wanted.x, rtol=1e-6)
+    assert_allclose(x, wanted.x, rtol=1e-6)
     for found in (wanted, of_scipy([5.0, -9.0], max_nfev=1)):
         assert 0.5 * loss.value(residuals(found.x, y)) == pytest.approx(found.cost, rel=1e-12)
 
@@ -69,14 +70,14 @@ def test_the_weight_follows_from_the_value(kind: Kind) -> None:
         weight = loss.weight(np.array([r]))[0]
         assert weight**2 * r == pytest.approx(slope, rel=1e-6)
     assert loss.weight(np.zeros((3, 2))).shape == (3, 2)
-    np.testing.assert_array_equal(loss.weight(np.zeros(3)), 1.0)
+    assert_array_equal(loss.weight(np.zeros(3)), 1.0)
 
 
 def test_losses_equal_the_square_near_zero_and_huber_to_its_scale() -> None:
     for kind in KINDS:
         assert RobustLoss(kind=kind).value(np.full(5, 1e-4)) == pytest.approx(5e-8, rel=1e-6)
     huber = RobustLoss(kind="huber", scale=3.0)
-    np.testing.assert_array_equal(huber.weight(np.array([-3.0, 0.0, 2.9, 3.0])), 1.0)
+    assert_array_equal(huber.weight(np.array([-3.0, 0.0, 2.9, 3.0])), 1.0)
     assert huber.weight(np.array([3.3]))[0] < 1.0
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
@@ -148,7 +148,7 @@ def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
         mujoco.mj_step(model, data)
         change = (data.qvel - before) / model.opt.timestep
         assert_allclose(qacc[k], change, rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : task.space.nq])
+    assert_array_equal(starting(rows, "qpos:"), played.state[:, : task.space.nq])
 
 
 @pytest.mark.parametrize("rate", [37.0, 75.0, 12.5, 400.0, 150.0])

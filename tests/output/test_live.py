@@ -17,6 +17,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip("rerun")
 import rerun as rr
@@ -126,7 +127,7 @@ def test_every_iterate_of_a_design_changes_curves_robot_and_path(
     design, events = searched
     for plot, field in (("cost", "cost"), ("eigenvalue", "min_eigenvalue")):
         expected = np.log10([getattr(row, field) for row in design.history])
-        np.testing.assert_allclose(received.series(f"/{plot}/initial\\ control"), expected)
+        assert_allclose(received.series(f"/{plot}/initial\\ control"), expected)
 
     numbers, paths = received.rows("/robot/path", "LineStrips3D:strips")
     assert numbers == list(range(len(events)))

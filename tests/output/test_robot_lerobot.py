@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -127,7 +127,7 @@ def test_actions_are_the_controls_in_the_unit(unit: str, arm: Designed, tmp_path
     actions = np.array(data.column("action").to_pylist())
     states = np.array(data.column("observation.state").to_pylist())
     assert_allclose(actions[:-1], factor * curve.ctrl, rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(actions[-1], actions[-2])
+    assert_array_equal(actions[-1], actions[-2])
     wanted = factor * np.concatenate([curve.qpos, curve.qvel], axis=1)
     assert_allclose(states, wanted, rtol=1e-6, atol=1e-5)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import mjfim
 from mjfim.experiment.system import System
@@ -100,7 +101,7 @@ def test_every_model_is_the_one_in_memory(
         header, *rows = csv.reader(stream)
     assert header[:2] == ["robot", "mass [kg]" if is_included else "m [kg]"]
     table = np.array([[float(cell) for cell in row] for row in rows])
-    np.testing.assert_array_equal(table, np.column_stack([np.arange(1.0, 6.0), values]))
+    assert_array_equal(table, np.column_stack([np.arange(1.0, 6.0), values]))
 
 
 def test_all_models_are_written_or_none(

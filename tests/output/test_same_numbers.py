@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
@@ -149,5 +150,5 @@ def test_what_would_help_is_the_same_in_json_table_and_picture(check: Check) -> 
     assert panel.y.names is not None
     drawn = next(mark for mark in panel.marks if mark.label == "without it")
     shown = [panel.y.names[int(place)] for place in drawn.y]
-    np.testing.assert_allclose(drawn.x, [without[name] for name in shown], rtol=1e-12)
+    assert_allclose(drawn.x, [without[name] for name in shown], rtol=1e-12)
     assert shown

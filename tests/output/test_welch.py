@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import welch as reference
 
 from mjfim.output.plots import estimate
@@ -17,5 +18,5 @@ def test_parts_give_the_density_of_the_whole(
     x = np.random.default_rng(0).normal(size=count)
     frequencies, density = estimate.power_density(x, 10.0, length)
     expected, wanted = reference(x, 10.0, nperseg=length, detrend=False)
-    np.testing.assert_array_equal(frequencies, expected)
-    np.testing.assert_allclose(density, wanted, rtol=1e-12)
+    assert_array_equal(frequencies, expected)
+    assert_allclose(density, wanted, rtol=1e-12)

@@ -15,6 +15,7 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 import scipy.io
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from mjfim.errors import RecordingError
@@ -353,7 +354,7 @@ def test_json_records(tmp_path: Path) -> None:
     }
     assert set(table.names) == {*expected, "motor.name", "note"}
     for name, values in expected.items():
-        np.testing.assert_array_equal(table.column(name), values)
+        assert_array_equal(table.column(name), values)
     with pytest.raises(RecordingError, match="row 2 holds 'x'"):
         table.column("note")
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.search.levels import DescentLevel
@@ -44,7 +45,7 @@ FRAME = ExcitationSettings(
 def test_schroeder_phases_of_equal_powers_are_the_known_ones() -> None:
     k = np.arange(1, 9)
     turns = (schroeder_phases(np.ones(8)) + np.pi * k * (k - 1) / 8) / (2.0 * np.pi)
-    np.testing.assert_allclose(turns, np.round(turns), atol=1e-12)
+    assert_allclose(turns, np.round(turns), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def test_waves_are_of_size_one_for_any_numbers(made: Any, count: int) -> None:
         assert wave.shape == (500, 2)
         assert np.isfinite(wave).all()
         assert np.abs(wave).max() <= 1.5 + 1e-9
-        np.testing.assert_array_equal(wave, made(FRAME, z))
+        assert_array_equal(wave, made(FRAME, z))
 
 
 def test_chirps_stay_within_their_band() -> None:
@@ -115,4 +116,4 @@ def test_series_remain_sums_of_their_curves(tmp_path: Path) -> None:
 
 
 def test_numbers_are_reflected_at_their_ends() -> None:
-    np.testing.assert_allclose(reflected(np.array([-0.2, 0.3, 1.1, 2.3])), [0.2, 0.3, 0.9, 0.3])
+    assert_allclose(reflected(np.array([-0.2, 0.3, 1.1, 2.3])), [0.2, 0.3, 0.9, 0.3])

@@ -13,6 +13,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 from typer.testing import Result
 
@@ -119,12 +120,12 @@ def test_the_guess_of_an_inertia_moves_where_the_recordings_determine_it(tmp_pat
     shown = bare_estimate(p.names, theta, 0.01 * p.magnitude, data=data)
     moved = DesignTask.resolve(restate_experiment(base, theta, shown))
     assert moved.parameters.names == p.names
-    np.testing.assert_allclose(moved.theta, theta)
-    np.testing.assert_allclose(moved.parameters.scale, p.scale)
+    assert_allclose(moved.theta, theta)
+    assert_allclose(moved.parameters.scale, p.scale)
     data[3, 3] = 0.0
     kept = DesignTask.resolve(restate_experiment(base, theta, replace(shown, data=data)))
-    np.testing.assert_allclose(kept.theta[1:11], p.guess[1:11])
-    np.testing.assert_allclose(kept.theta[[0, 11]], theta[[0, 11]])
+    assert_allclose(kept.theta[1:11], p.guess[1:11])
+    assert_allclose(kept.theta[[0, 11]], theta[[0, 11]])
 
 
 def test_robust_redesigns_sample_around_the_estimate(campaign: Campaign) -> None:
@@ -202,7 +203,7 @@ def test_interrupted_while_recording(campaign: Campaign) -> None:
     assert found.status is CampaignStatus.INTERRUPTED and found.pending is not None
     (first,) = found.rounds
     expected = campaign.rounds[0].estimate.theta
-    np.testing.assert_allclose(first.estimate.theta, expected, rtol=1e-9)
+    assert_allclose(first.estimate.theta, expected, rtol=1e-9)
 
 
 def test_a_design_that_violates_limits_is_not_played(
@@ -229,7 +230,7 @@ def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_are_
 
     monkeypatch.setattr(campaign_module._CampaignRun, "_redesign", fails_once)
     found = mjfim.run_campaign(STUDY, robot, rounds=2, done=[earlier(campaign)])
-    np.testing.assert_array_equal(asked, [first.estimate.theta, first.theta])
+    assert_array_equal(asked, [first.estimate.theta, first.theta])
     (said,) = [text for text in found.warnings if "no design could be made at the estimate" in text]
     assert "too fast" in said
 
@@ -291,7 +292,7 @@ def require_equal_rounds(folder: Path, other: Path) -> None:
     assert len(rounds[1]) >= 2
     for one, two in zip(*rounds, strict=True):
         for key in ("theta", "std", "predicted", "designed_at"):
-            np.testing.assert_allclose(one[key], two[key], rtol=1e-6)
+            assert_allclose(one[key], two[key], rtol=1e-6)
 
 
 @pytest.mark.usefixtures("empty_figures")

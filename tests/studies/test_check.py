@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.experiment.system import simulate_system
@@ -41,9 +42,9 @@ def test_sigmas_are_the_square_roots_of_the_inverse_information(tmp_path) -> Non
     found = check_task(cart_task(tmp_path))
     covariance = np.linalg.inv(found.information)
     std = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose([row.std for row in found.rows], std, rtol=1e-8)
+    assert_allclose([row.std for row in found.rows], std, rtol=1e-8)
     relative = [row.relative for row in found.rows]
-    np.testing.assert_allclose(relative, std / [1.5, 0.8, 0.4], rtol=1e-8)
+    assert_allclose(relative, std / [1.5, 0.8, 0.4], rtol=1e-8)
     assert relative_error(found.correlation, covariance / np.outer(std, std)) < 1e-8
     assert found.self_test.passed
 
@@ -58,7 +59,7 @@ def test_sigmas_are_those_of_evaluate_also_with_priors_and_nuisance(tmp_path) ->
     )
     found, told = check_task(task), evaluate_task(task, task.initial)
     wanted = [row.std for row in found.rows if not row.nuisance]
-    np.testing.assert_allclose(wanted, told.std[:3], rtol=1e-6)
+    assert_allclose(wanted, told.std[:3], rtol=1e-6)
     assert found.wanted == ("m", "l", "c")
     assert [row.name for row in found.rows if row.nuisance][:2] == ["gain", "initial qpos:slide"]
 
@@ -137,14 +138,14 @@ def test_segments_of_a_recording_have_its_bias_in_common(tmp_path) -> None:
         task = cart_task(tmp_path, nuisance=nuisance, fit=fit)
         log = simulate_system(task.system, task.initial, seed=1)
         stds.append([row.std for row in check_recordings(task.system, [log]).rows[:3]])
-    np.testing.assert_allclose(stds[1], stds[0], rtol=1e-6)
+    assert_allclose(stds[1], stds[0], rtol=1e-6)
 
 
 def test_a_given_trajectory_is_checked_instead_of_the_initial_one(tmp_path) -> None:
     task = cart_task(tmp_path)
     other = task.plant.simulate(task.theta, 2.0 * task.control)
     stds = [row.std for row in check_task(task, trajectory=other).rows]
-    np.testing.assert_allclose(stds, evaluate_task(task, other).std, rtol=1e-6)
+    assert_allclose(stds, evaluate_task(task, other).std, rtol=1e-6)
 
 
 def test_dry_friction_says_why_the_derivatives_do_not_agree(tmp_path) -> None:

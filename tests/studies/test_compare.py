@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -75,7 +76,7 @@ def test_rows_hold_the_numbers_of_their_controls(monkeypatch: pytest.MonkeyPatch
     for r in found.rows:
         trajectory = task.plant.simulate(task.theta, r.control)
         told = evaluate_task(task, trajectory)
-        np.testing.assert_allclose(r.std, told.std, rtol=1e-5)
+        assert_allclose(r.std, told.std, rtol=1e-5)
         assert r.cost == pytest.approx(told.cost, rel=1e-5)
         assert r.criterion == pytest.approx(told.criterion, rel=1e-5)
         scale = task.parameters.scale

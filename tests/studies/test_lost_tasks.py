@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import mjfim
 from mjfim.excitation.task import DesignTask
@@ -23,8 +23,8 @@ def test_trials_do_not_depend_on_lost_tasks(monkeypatch: pytest.MonkeyPatch) -> 
     with LosingThreads() as threads:
         study = mjfim.monte_carlo(experiment, initial, executor=threads, **numbers)
     assert threads.submitted == 3
-    np.testing.assert_array_equal(study.sets["final"].estimates, alone.estimates)
-    np.testing.assert_array_equal(study.sets["final"].covariance, alone.covariance)
+    assert_array_equal(study.sets["final"].estimates, alone.estimates)
+    assert_array_equal(study.sets["final"].covariance, alone.covariance)
 
 
 def test_random_motions_of_a_check_do_not_depend_on_lost_tasks() -> None:

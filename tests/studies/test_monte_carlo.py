@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
 
 import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
@@ -56,11 +57,11 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Desig
     for s in study.sets.values():
         assert (s.failed, s.trials) == (0, 60)
         # Two standard deviations of a variance of 60 values, sqrt(2 / 60).
-        np.testing.assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.37)
+        assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.37)
         low, high = s.efficiency_interval.T
         assert ((low < s.efficiency) & (s.efficiency < high)).all()
-    np.testing.assert_allclose(np.diag(study.sets["initial"].covariance), PAPER_BOUND, rtol=0.42)
-    np.testing.assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
+    assert_allclose(np.diag(study.sets["initial"].covariance), PAPER_BOUND, rtol=0.42)
+    assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
 
 
 def test_the_seed_determines_the_result(short: Experiment, motion: Trajectory) -> None:
@@ -68,7 +69,7 @@ def test_the_seed_determines_the_result(short: Experiment, motion: Trajectory) -
         monte_carlo(short, motion, trials=3, seed=seed).sets["final"].estimates
         for seed in (1, 1, 2)
     ]
-    np.testing.assert_array_equal(runs[0], runs[1])
+    assert_array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
 
 
@@ -91,7 +92,7 @@ def test_failed_trials_are_counted_not_averaged() -> None:
     estimates[0] = np.nan
     s = _statistics(estimates, np.eye(2), 0.0)
     assert (s.failed, s.trials) == (1, 100)
-    np.testing.assert_allclose(s.covariance, without.covariance)
+    assert_allclose(s.covariance, without.covariance)
 
 
 PAIR = ((0.05**2, 0.8 * 0.05**2), (0.8 * 0.05**2, 0.05**2))
@@ -123,8 +124,8 @@ def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estim
         y = np.where(mask, exact[0] + z @ noise.factor.T, np.nan)
         log = Recording(t=np.arange(401) * 0.01, ctrl=ctrl, y=y, outputs=task.system.outputs.names)
         alone = identify(free, [log])
-        np.testing.assert_array_less(np.abs(found.estimates[i] - alone.theta), 0.01 * std)
-        np.testing.assert_allclose(alone.std, std, rtol=0.2)
+        assert_array_less(np.abs(found.estimates[i] - alone.theta), 0.01 * std)
+        assert_allclose(alone.std, std, rtol=0.2)
 
 
 def test_too_few_trials_are_refused(experiment: Experiment, curve: Trajectory) -> None:
@@ -144,8 +145,8 @@ def test_priors_do_not_enter_the_study(short: Experiment, motion: Trajectory) ->
     sure = short.replace(parameters={"m": {"prior": 1e-6}})
     plain, prior = (monte_carlo(e, motion, trials=3, seed=1) for e in (short, sure))
     (found, expected) = (study.sets["final"] for study in (prior, plain))
-    np.testing.assert_allclose(found.estimates, expected.estimates, rtol=1e-9)
-    np.testing.assert_allclose(np.linalg.inv(prior.information["final"]), found.crlb)
+    assert_allclose(found.estimates, expected.estimates, rtol=1e-9)
+    assert_allclose(np.linalg.inv(prior.information["final"]), found.crlb)
 
 
 def test_a_request_to_stop_keeps_the_finished_sets(short: Experiment, motion: Trajectory) -> None:

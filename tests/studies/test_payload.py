@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.arrays import Array
@@ -106,8 +107,8 @@ def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Pa
     index = [parameters.names.index(name) for name in ROBOT]
     information = parameters.prior_information[np.ix_(index, index)]
     expected = np.linalg.inv(honest_covariance(system.parameters, estimate))
-    np.testing.assert_allclose(information, expected, rtol=1e-8)
-    np.testing.assert_array_equal(parameters.guess[index], theta)
+    assert_allclose(information, expected, rtol=1e-8)
+    assert_array_equal(parameters.guess[index], theta)
 
     # A parameter that the estimate does not determine is held.
     unknown = replace(estimate, std=np.array([np.inf, *std[1:]]))
@@ -155,8 +156,8 @@ def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Pat
     assert again.parameters.names == names
     for vector in (theta, theta + 0.1 * system.parameters.magnitude):
         expected, found = system.model_at(vector), again.model_at(vector)
-        np.testing.assert_allclose(found.body_mass, expected.body_mass, rtol=1e-12)
-        np.testing.assert_allclose(found.body_inertia, expected.body_inertia, rtol=1e-9)
+        assert_allclose(found.body_mass, expected.body_mass, rtol=1e-12)
+        assert_allclose(found.body_inertia, expected.body_inertia, rtol=1e-9)
 
 
 def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
@@ -179,7 +180,7 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     prior = found.prior_information + CadPrior.of(found).information(found.guess)
     inverse = np.linalg.inv(covariance)
     size = np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
-    np.testing.assert_allclose(prior[np.ix_(index, index)] / size, inverse / size, atol=1e-5)
+    assert_allclose(prior[np.ix_(index, index)] / size, inverse / size, atol=1e-5)
     assert not CadPrior.of(found).bodies
 
 
@@ -205,7 +206,7 @@ def test_recordings_without_the_payload_take_the_place_of_an_estimate(tmp_path: 
     estimate = mjfim.identify_payload(robot, [recording], body="hand", without=[reference])
     earlier = mjfim.identify(robot, [reference])
     other = mjfim.identify_payload(robot, [recording], body="hand", robot=earlier)
-    np.testing.assert_allclose(estimate.theta, other.theta, rtol=1e-9)
+    assert_allclose(estimate.theta, other.theta, rtol=1e-9)
     assert inside(estimate).all()
 
     # With a robot that is held at its guess, which is wrong, the load is not what it is.

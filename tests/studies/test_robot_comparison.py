@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.stats import t as student
 
 import mjfim
@@ -78,7 +79,7 @@ def test_a_worn_joint_is_named() -> None:
     sigmas = 0.06 / np.hypot(0.01, 0.01)
     assert found.p[1] == pytest.approx(4 * 2 * student.sf(sigmas, 1e6), rel=1e-2)
     half = NORMAL_95 * 0.01 * 2**0.5
-    np.testing.assert_allclose(found.interval[1], [0.06 - half, 0.06 + half], rtol=1e-3)
+    assert_allclose(found.interval[1], [0.06 - half, 0.06 + half], rtol=1e-3)
 
     # The other way round, the sign changes.
     back = compare_estimates(worn, estimate())
@@ -121,7 +122,7 @@ def test_wide_intervals_count_and_bounds_do_not() -> None:
     theta = np.array([2.0, 0.0, 1.0])
     interval = np.array([[1.8, 2.2], [0.0, 0.3], [0.9, 1.1]])
     wide = estimate(theta=theta, interval=interval, at_bound=("damping",))
-    np.testing.assert_allclose(honest_std(wide) * NORMAL_95, [0.2, 0.3, 0.1])
+    assert_allclose(honest_std(wide) * NORMAL_95, [0.2, 0.3, 0.1])
 
 
 PRIOR = {"prior": np.diag([1.0, 0.0, 0.0])}
@@ -199,7 +200,7 @@ def test_initial_states_are_not_compared() -> None:
 
 
 def test_holm() -> None:
-    np.testing.assert_allclose(holm(np.array([0.04, 0.001, 0.03, 0.5])), [0.09, 0.004, 0.09, 0.5])
+    assert_allclose(holm(np.array([0.04, 0.001, 0.03, 0.5])), [0.09, 0.004, 0.09, 0.5])
     assert holm(np.zeros(0)).shape == (0,)
 
 

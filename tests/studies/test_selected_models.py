@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.arrays import Array
@@ -60,8 +61,8 @@ def test_intervals_are_widened_to_the_scatter_between_parts(changes: dict[str, o
     estimates[:, 0] += [-0.1, -0.05, 0.0, 0.05, 0.1]
     found = selected(estimates, **changes)
     half = scipy.stats.t.ppf(0.975, 4) * np.sqrt(4 / 5 * 0.025)
-    np.testing.assert_allclose(found.interval[0], [2.0 - half, 2.0 + half])
-    np.testing.assert_array_equal(found.interval[1:], around(THETA)[1:])
+    assert_allclose(found.interval[0], [2.0 - half, 2.0 + half])
+    assert_array_equal(found.interval[1:], around(THETA)[1:])
     assert NOT_WIDENED not in found.warnings
 
     # What the others assume is said.
@@ -69,13 +70,13 @@ def test_intervals_are_widened_to_the_scatter_between_parts(changes: dict[str, o
     assert assumes == ("held" in changes)
 
     # Nothing was chosen with the data where the model stays as it is.
-    np.testing.assert_array_equal(selected(estimates).interval, around(THETA))
+    assert_array_equal(selected(estimates).interval, around(THETA))
 
 
 def test_a_warning_says_that_no_interval_contains_the_choice_of_terms() -> None:
     found = selected(THETA[None], terms=(SLIDE_FRICTION,))
     assert found.warnings[-1] == NOT_WIDENED
-    np.testing.assert_array_equal(found.interval, around(THETA))
+    assert_array_equal(found.interval, around(THETA))
     assert selected(THETA[None]).warnings == ()
 
 

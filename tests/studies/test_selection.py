@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mjfim
 from mjfim.errors import SimulationDivergedError
@@ -67,7 +68,7 @@ def test_the_missing_term_is_added_and_nothing_else(tmp_path: Path) -> None:
 
     # The same experiment with the terms is what was identified.
     again = mjfim.identify(stated().replace(parameters=selection.parameters), fitted)
-    np.testing.assert_allclose(again.theta, found.theta, rtol=2e-2)
+    assert_allclose(again.theta, found.theta, rtol=2e-2)
 
 
 @pytest.mark.slow
@@ -80,8 +81,8 @@ def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
 
     # Without a term, the estimate is that of an ordinary identification.
     plain = mjfim.identify(stated(), logs)
-    np.testing.assert_array_equal(found.theta, plain.theta)
-    np.testing.assert_array_equal(found.interval, plain.interval)
+    assert_array_equal(found.theta, plain.theta)
+    assert_array_equal(found.interval, plain.interval)
 
     # The length of the segments, which the user left free, is still free.
     assert mjfim.selected_experiment(stated(), found.selection) == stated()
@@ -135,7 +136,7 @@ def test_a_selection_that_cannot_predict_left_out_data_says_so(
     assert not found.interrupted
 
     plain = mjfim.identify(stated(), logs)
-    np.testing.assert_allclose(found.theta, plain.theta, rtol=1e-4)
+    assert_allclose(found.theta, plain.theta, rtol=1e-4)
 
     # The error that is not known is shown, drawn and saved as such.
     found.save(tmp_path / "results")

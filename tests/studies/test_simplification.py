@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
@@ -52,7 +53,7 @@ def test_parameters_of_one_field_are_pooled_by_a_factor_on_their_guesses() -> No
     pooled = System.resolve(simplified_experiment(experiment, [pool], ()))
     assert pooled.parameters.names == ("joint_damping",)
     model = pooled.model_at(np.array([3.0]))
-    np.testing.assert_allclose(model.dof_damping[:2], [0.6, 0.15])
+    assert_allclose(model.dof_damping[:2], [0.6, 0.15])
 
     # Equal guesses give one value, and one name alone nothing.
     (same,) = possible_pools(System.resolve(arm(0.1, 0.1)).parameters, set(JOINTS))
@@ -112,7 +113,7 @@ def test_a_selection_holds_what_the_recordings_hardly_determine(tmp_path: Path) 
     # The selected experiment says the same, and the record is saved.
     again = selected_experiment(experiment, selection)
     assert again.fit.hold == ("slide",)
-    np.testing.assert_allclose(mjfim.identify(again, logs).theta, found.theta, rtol=1e-3)
+    assert_allclose(mjfim.identify(again, logs).theta, found.theta, rtol=1e-3)
     found.save(tmp_path)
     assert mjfim.Estimate.load(tmp_path).selection == selection
 

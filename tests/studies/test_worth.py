@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -48,7 +49,7 @@ def sensors(experiment: mjfim.Experiment, **options: Any) -> dict[str, Any]:
 
 def assert_tells(std: Array, experiment: mjfim.Experiment) -> None:
     """σ of the wanted parameters are those of a check of an experiment."""
-    np.testing.assert_allclose(std[:3], checked(experiment)[:3], rtol=1e-6)
+    assert_allclose(std[:3], checked(experiment)[:3], rtol=1e-6)
 
 
 def test_each_sensor_alone_left_out_and_halved_is_a_changed_file() -> None:
@@ -109,7 +110,7 @@ def test_a_joint_acceleration_is_the_difference_of_two_velocities() -> None:
         slopes.append((ends[0] - ends[1])[:, 1] / 2e-4)
     rows = np.diff(slopes, axis=1) / (task.dt * 0.1)
     expected = np.sqrt(np.diag(np.linalg.inv(rows @ rows.T)))
-    np.testing.assert_allclose(found.alone, expected, rtol=1e-4)
+    assert_allclose(found.alone, expected, rtol=1e-4)
 
 
 def test_the_smallest_set_is_that_of_all_sets() -> None:

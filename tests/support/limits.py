@@ -125,18 +125,6 @@ def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -
     return {key: np.array(column) for key, *column in zip("qvaf", *rows, strict=True)}
 
 
-def distances_of_arm(model: Any, positions: Array) -> float:
-    """Smallest distance of the links of `ARM` to post and floor at some positions [m]."""
-    data, near = mujoco.MjData(model), []
-    fore, post, floor, upper = (model.geom(n).id for n in ("fore", "post", "floor", "upper"))
-    for qpos in positions:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        for a, b in ((fore, post), (fore, floor), (upper, post), (upper, floor)):
-            near.append(mujoco.mj_geomDistance(model, data, a, b, 1.0, None))
-    return min(near)
-
-
 def directions_of(task: DesignTask, count: int, seed: int = 0) -> Array:
     """Random changes of the control, half of them smooth and half of them rough: (count, N, nu)."""
     rng = np.random.default_rng(seed)
