@@ -376,8 +376,9 @@ def known_from(
 
     The inflation is the honest standard deviation of an estimate over its formal one, which white
     noise would leave: residuals of the same model are expected to widen the next estimate as much.
-    Of several estimates it is the root mean square. A parameter of which none is known has the
-    geometric mean of the others.
+    Of several estimates it is the root mean square. As it comes from few groups of data, the part
+    of the differences between parameters that chance explains is left out. A parameter of which
+    none is known has the geometric mean of the others.
 
     Args:
         paths: Files design.json and estimate.json.
@@ -420,8 +421,13 @@ def known_from(
     return total, expected_inflation(ratios), sigma
 
 
+# Variance of the logarithm of a standard deviation with three degrees of freedom: honest ones come
+# from the scatter between four groups of data.
+VARIANCE_OF_LOG = 0.234
+
+
 def expected_inflation(ratios: Sequence[Array]) -> Array:
-    """(p,) root mean squares of the inflations of estimates, as `known_from` returns them.
+    """(p,) inflations that are expected after those of estimates, as `known_from` returns them.
 
     Args:
         ratios: (p,) inflation of each estimate; NaN where it is not known.
@@ -431,10 +437,14 @@ def expected_inflation(ratios: Sequence[Array]) -> Array:
     if not np.isfinite(known).any():
         return np.zeros(0)
     squares = np.maximum(known, 1.0) ** 2
-    counts = np.isfinite(squares).sum(axis=0)
-    found = np.sqrt(np.nansum(squares, axis=0) / np.maximum(counts, 1))
-    usual = np.exp(np.mean(np.log(found[counts > 0])))
-    return np.asarray(np.where(counts > 0, found, usual))
+    is_known = np.isfinite(squares).any(axis=0)
+    logs = 0.5 * np.log(np.nanmean(squares[:, is_known], axis=0))
+    # What chance explains of their differences is shrunk (James & Stein).
+    usual, spread = float(logs.mean()), float(logs.var())
+    found = np.full(len(is_known), usual)
+    if spread > VARIANCE_OF_LOG:
+        found[is_known] += (1.0 - VARIANCE_OF_LOG / spread) * (logs - usual)
+    return np.asarray(np.exp(found))
 
 
 def _information_in(

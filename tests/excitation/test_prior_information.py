@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.special import polygamma
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.task_parts import known_from
+from mjfim.excitation.task_parts import expected_inflation, known_from
 from mjfim.output import archive
 from mjfim.output.words import sigma_remark
 from mjfim.studies.check import check_task
@@ -92,24 +93,33 @@ def estimate_file(path: Path, names: list[str], honest: list[float | None], **mo
 
 
 def test_estimates_tell_how_much_wider_honest_deviations_are(tmp_path: Path) -> None:
-    """Root mean squares of several estimates, at least 1; unknown ones are as the others."""
-    first = estimate_file(tmp_path / "1.json", ["b", "a", "c"], [0.2, 0.3, None], sigma={"y": 2.0})
-    second = estimate_file(tmp_path / "2.json", ["a", "d"], [0.4, 0.05])
+    """Mean squares of several estimates, at least 1; what chance explains of differences is left
+    out, and unknown ones are as the others.
+    """
+    first = estimate_file(tmp_path / "1.json", ["b", "a", "c"], [0.2, 3.0, None], sigma={"y": 2.0})
+    second = estimate_file(tmp_path / "2.json", ["a", "d"], [4.0, 0.05])
     _, inflation, sigma = known_from([first, second], ("a", "b", "c", "d"))
-    known = [np.sqrt((9.0 + 16.0) / 2.0), 2.0, 1.0]
-    assert_allclose(inflation[[0, 1, 3]], known, rtol=1e-12)
-    assert inflation[2] == pytest.approx(np.prod(known) ** (1.0 / 3.0))
+    logs = np.log([np.sqrt((30.0**2 + 40.0**2) / 2.0), 2.0, 1.0])
+    # The variance of the logarithm of a standard deviation of four normal values, by its theory.
+    chance = float(polygamma(1, 1.5)) / 4.0
+    kept = 1.0 - chance / np.var(logs)
+    wanted = np.exp(logs.mean() + kept * (logs - logs.mean()))
+    assert_allclose(inflation[[0, 1, 3]], wanted, rtol=2e-3)
+    assert inflation[2] == pytest.approx(np.exp(logs.mean()))
+    alike = estimate_file(tmp_path / "3.json", ["a", "b"], [0.2, 0.3])
+    assert_allclose(known_from([alike], ("a", "b"))[1], np.sqrt(6.0), rtol=1e-12)
     assert sigma == {"y": 2.0}
     assert not len(known_from([design_file(tmp_path / "d.json", ["a"], np.eye(1))], ("a",))[1])
 
 
 def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -> None:
     """Data count by the honest deviation and the noise of the estimate; stated priors do not."""
-    names, ratio = ["m", "l", "c"], np.array([2.0, 5.0, 1.0])
+    names, honest = ["m", "l", "c"], np.array([0.2, 5.0, 0.1])
+    ratio = expected_inflation([10.0 * honest])
     parameters = {**CART_PARAMETERS, "l": {**CART_PARAMETERS["l"], "prior": 0.02}}
     white = cart_task(tmp_path, parameters=parameters)
     sigma = dict(zip(white.system.outputs.names, 3.0 * white.system.noise.sigma, strict=True))
-    path = estimate_file(tmp_path / "e.json", names, (0.1 * ratio).tolist(), sigma=sigma)
+    path = estimate_file(tmp_path / "e.json", names, honest.tolist(), sigma=sigma)
     task = cart_task(tmp_path, parameters=parameters, earlier=[str(path)])
     data = (check_task(white).information - white.prior) / 9.0
     prior = np.diag([0.0, 0.02**-2, 0.0])
@@ -117,16 +127,15 @@ def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -
     found = check_task(task)
     assert_allclose([row.std for row in found.rows], np.sqrt(np.diag(wanted)), rtol=1e-6)
     assert found.steps is not None and found.steps.confirmed.all()
-    assert "1 (c) to 5 (l) times" in sigma_remark(found.inflation, names)
+    assert f"(c) to {ratio[1]:.0f} (l) times" in sigma_remark(found.inflation, names)
 
 
 def test_what_a_model_lacks_does_not_average_out(tmp_path: Path) -> None:
     """A repetition of an earlier experiment halves the variance of white noise, and no other."""
     data = check_task(cart_task(tmp_path)).information
-    ratio = np.array([2.0, 5.0, 1.0])
-    path = estimate_file(
-        tmp_path / "e.json", ["m", "l", "c"], (0.1 * ratio).tolist(), data=data.tolist()
-    )
+    honest = np.array([0.2, 5.0, 0.1])
+    ratio = expected_inflation([10.0 * honest])
+    path = estimate_file(tmp_path / "e.json", ["m", "l", "c"], honest.tolist(), data=data.tolist())
     found = check_task(cart_task(tmp_path, earlier=[str(path)]))
     white = np.diag(np.linalg.inv(data))
     wanted = np.sqrt(white / 2.0 + (ratio**2 - 1.0) * white)
