@@ -78,6 +78,7 @@ class Robot:
         load: Largest dry friction over the torque of the motor.
         gap: Largest gap of the driven joints [m or rad], by joint.
         encoder: Side of the gap on which the sensors are.
+        rotors: Joints whose armature may be a nuisance beside the parameters.
         delay: Largest delay of the commands [s].
     """
 
@@ -88,6 +89,7 @@ class Robot:
     load: float
     gap: dict[str, float]
     encoder: str
+    rotors: tuple[str, ...]
     delay: float
 
 
@@ -100,6 +102,7 @@ ROBOTS = {
         load=0.03,
         gap={"slide": 0.004},
         encoder="link",
+        rotors=("slide",),
         delay=0.03,
     ),
     "servo arm": Robot(
@@ -128,6 +131,7 @@ ROBOTS = {
         load=0.05,
         gap={"yaw": 0.01, "shoulder": 0.01, "elbow": 0.01},
         encoder="motor",
+        rotors=("yaw", "shoulder", "elbow"),
         delay=0.005,
     ),
     # Two of the parameters of the file cannot be identified beside the others.
@@ -147,6 +151,8 @@ ROBOTS = {
         load=0.03,
         gap={"shoulder": 0.01, "elbow": 0.01},
         encoder="motor",
+        # The armature of the shoulder has the effect of the inertia of its link.
+        rotors=("elbow",),
         delay=0.005,
     ),
 }
@@ -307,8 +313,7 @@ def experiments_of(robot: Robot) -> dict[str, Experiment]:
     """The experiment of a robot as its model is, and with nuisance parameters, by name."""
     file = ROOT / "models" / f"{robot.experiment}.toml"
     plain = Experiment.from_file(file).replace(**robot.changes)
-    # Joints with a gap are those that a motor drives.
-    armature = dict.fromkeys(robot.gap, True)
+    armature = dict.fromkeys(robot.rotors, True)
     nuisance = {"friction": True, "delay": True, "armature": armature}
     return {PLAIN: plain, CURED: plain.replace(nuisance=nuisance)}
 
