@@ -259,7 +259,9 @@ def relative_widths(estimate: mjfim.Estimate, joint: str) -> list[float]:
         ]
     )
     covariance = estimate.honest_covariance[np.ix_(places, places)]
-    return [196.0 * float(np.sqrt(row @ covariance @ row)) for row in weights]
+    # The variance of what is not determined is infinite; other weights are zero.
+    counted = [(row[row != 0.0], covariance[np.ix_(row != 0.0, row != 0.0)]) for row in weights]
+    return [196.0 * float(np.sqrt(row @ part @ row)) for row, part in counted]
 
 
 def ranges_of(estimate: mjfim.Estimate, joint: str) -> dict[str, Array]:
