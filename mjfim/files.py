@@ -176,6 +176,14 @@ def _umask() -> int:
 # ---- JSON for people
 
 
+def relative_name(path: Path, folder: Path) -> str:
+    """Path of a file or folder relative to a folder; on another drive, the absolute path."""
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()
+
+
 def as_json(values: Mapping[str, Any]) -> str:
     """Render values as readable JSON; numbers that are not finite become null."""
     return json.dumps(_plain(values), indent=2, allow_nan=False) + "\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ import typer
 
 import mjfim
 from mjfim.cli.common import Run, verb
+from mjfim.files import relative_name
 
 # Files of an estimate.
 ESTIMATE_FILES = ("estimate.json", "estimate.npz")
@@ -47,7 +47,10 @@ def compare_robots(
     result = mjfim.compare_estimates(*estimates, names=_names(first, second))
     result = replace(result, remarks=(*result.remarks, *_differences_of_files(first, second)))
 
-    origin = {"first": _relative(first, run.output), "second": _relative(second, run.output)}
+    origin = {
+        "first": relative_name(first, run.output),
+        "second": relative_name(second, run.output),
+    }
     raise typer.Exit(run.finish(result, None, further=origin))
 
 
@@ -65,14 +68,6 @@ def _names(first: Path, second: Path) -> tuple[str, str]:
 def _folder_of(path: Path) -> Path:
     """The folder of an estimate, of which one of the files may be named."""
     return path if path.is_dir() else path.parent
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """Name of a folder relative to that of the results; on another drive, the absolute path."""
-    try:
-        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-    except ValueError:
-        return path.resolve().as_posix()
 
 
 def _differences_of_files(first: Path, second: Path) -> Iterator[str]:

@@ -12,7 +12,6 @@ ball and free joints are rotation vectors in the measured body's frame.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,7 +20,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.files import read_arrays, replacing, write_json
+from mjfim.files import read_arrays, relative_name, replacing, write_json
 from mjfim.model.coordinates import (
     QUATERNION,
     dof_names,
@@ -238,16 +237,9 @@ def origin_of(system: System, folder: Path) -> dict[str, str | None]:
     """
     files = {"experiment": Path(system.experiment.source), "model": system.model_path}
     return {
-        name: _relative(file, folder) if file.is_file() else None for name, file in files.items()
+        name: relative_name(file, folder) if file.is_file() else None
+        for name, file in files.items()
     }
-
-
-def _relative(file: Path, folder: Path) -> str:
-    """Return the path of a file relative to a folder; on another drive, the absolute path."""
-    try:
-        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
-    except ValueError:
-        return file.resolve().as_posix()
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:

@@ -139,11 +139,7 @@ MAX_ENVELOPES, MAX_ROWS, FULL_ROW = 2, 12, 0.86
 
 def trajectories(design: Design, labels: Labels) -> Picture:
     """Show states and controls of both motions (the paper's figure 2)."""
-    both: dict[str, Trajectory] = {
-        INITIAL: design.initial.trajectory,
-        DESIGNED: design.final.trajectory,
-    }
-    groups = motion_panels(labels, both, design.usage)
+    groups = motion_panels(labels, both_motions(design), design.usage)
     columns = min(PANEL_COLUMNS, max(map(len, groups.values())))
     panels: list[Panel] = []
     row = 0
@@ -165,6 +161,11 @@ def trajectories(design: Design, labels: Labels) -> Picture:
         heights=[1.15] * row,
         widths=[1.0] * columns,
     )
+
+
+def both_motions(design: Design) -> dict[str, Trajectory]:
+    """Return the initial and the designed motion by their roles."""
+    return {INITIAL: design.initial.trajectory, DESIGNED: design.final.trajectory}
 
 
 def motion_panels(

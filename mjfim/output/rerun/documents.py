@@ -40,6 +40,7 @@ from mjfim.output.pages import page_of
 from mjfim.output.panels import ROBOT_ROLES, Panel, line
 from mjfim.output.plots.design import (
     accuracy_over_time,
+    both_motions,
     convergence,
     largest_share,
     limit_panels,
@@ -116,10 +117,7 @@ def log_design(
         beside: Motions of the two robots beside the initial and beside the designed motion, and
             what they show in words.
     """
-    both: dict[str, Trajectory] = {
-        INITIAL: design.initial.trajectory,
-        DESIGNED: design.final.trajectory,
-    }
+    both = both_motions(design)
     learning = accuracy_over_time(design, design.labels)
     motion = motion_panels(labels, both, design.usage)
     asked: Tabs = {"limits": limit_panels(design, labels, rows=False)} if design.usage else {}
