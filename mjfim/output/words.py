@@ -178,7 +178,7 @@ def sigma_remark(inflation: Array, names: Sequence[str]) -> str:
         names: Names of the p parameters.
     """
     if not len(inflation):
-        return f"{BEST_CASE} Logs show more: state their `earlier` estimate in the experiment file."
+        return BEST_CASE
     low, high = int(np.argmin(inflation)), int(np.argmax(inflation))
     return (
         "σ allows for residuals like those of the earlier estimates: it is about "

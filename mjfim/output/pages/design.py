@@ -785,6 +785,9 @@ def _check_parts(check: Check) -> Iterator[Part]:
     yield from _groups("Not excited by this control, but by another one", check.not_excited, check)
     remark = sigma_remark(check.inflation, [row.name for row in check.rows])
     yield Text(remark, Emphasis.WEAK)
+    if not len(check.inflation):
+        hint = "Logs show more: state their estimate as `earlier` in the experiment file."
+        yield Text(hint, detail=True)
     yield Text(_about_self_test(check), detail=True)
 
 
