@@ -13,10 +13,13 @@ from __future__ import annotations
 import gzip
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
@@ -24,6 +27,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
+from mjfim.records.estimate import Prediction
 from scripts.benchmarks.child import new_table, options_of
 
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
@@ -40,6 +44,12 @@ FITTED = {
     "single_joint_elbow": (900, 1600),
 }
 HELD_OUT = "chirp_sweep step_response hold_under_gravity random_waypoints slow_precision"
+
+# Joints and rows of two predictions that are drawn.
+SHOWN = {
+    "chirp_sweep": (("wrist_roll", "gripper"), 5800, 5980),
+    "slow_precision": (("shoulder_lift", "elbow_flex"), 200, 1200),
+}
 
 # Published sets: rows of kp, -kp, -kd, armature, dry friction and viscous friction.
 PUBLISHED = {
@@ -193,6 +203,26 @@ def ratios_table(found: mjfim.Estimate) -> Table:
     return table
 
 
+def draw_predictions(motions: Sequence[Array], predictions: Sequence[Prediction]) -> Figure:
+    """Draw the parts of `SHOWN`: measured angles, their references, and their predictions."""
+    figure, rows = plt.subplots(2, 2, figsize=(13.0, 6.5), layout="constrained")
+    parts = zip(rows.T, SHOWN.items(), motions, predictions, strict=True)
+    for axes, (name, (joints, first, last)), motion, prediction in parts:
+        rows_shown = slice(first, last)
+        t = PERIOD * np.arange(first, last)
+        for axis, joint in zip(axes, joints, strict=True):
+            j = JOINTS.index(joint)
+            axis.plot(t, motion[rows_shown, j], color="0.5", lw=0.8, label="reference")
+            predicted = prediction.identified_outputs[rows_shown, j]
+            axis.plot(t, predicted, color="C0", lw=1.6, label="predicted")
+            axis.plot(t, motion[rows_shown, 6 + j], "k:", lw=1.4, label="measured")
+            axis.set_ylabel(f"{joint} [rad]")
+        axes[0].set_title(f"{name}, not fitted")
+        axes[-1].set_xlabel("time [s]")
+    rows[0, 0].legend(loc="upper right", ncols=3)
+    return figure
+
+
 def main() -> int:
     """Fit, predict, and print the errors of all motions."""
     parser = options_of(__doc__)
@@ -248,4 +278,7 @@ def main() -> int:
         table.add_row(name, *(f"{each:.1f}" for each in (rms(errors), *rms(errors, 0), *theirs)))
     console.print(table)
     console.print(ratios_table(found))
+    shown = [predictions[list(motions).index(name)] for name in SHOWN]
+    figure = draw_predictions([motions[name] for name in SHOWN], shown)
+    figure.savefig(output / "predictions.png", dpi=110)
     return 0
