@@ -178,7 +178,8 @@ def numbers_of(row: str) -> Array:
 def ratios_table(found: mjfim.Estimate) -> Table:
     """Ratios that the motions determine, in the estimate and in the published sets.
 
-    Torques have no scale without a load, so that sets with other gains may move alike.
+    Torques have no scale without a load, so that sets with other gains may move alike. Intervals
+    are those of the numerators.
     """
     quantities = {"damping": ("ms", 1e3), "friction": ("mrad", 1e3), "armature": ("ms²", 1e6)}
     heads = [f"{name} / kp [{unit}]" for name, (unit, _) in quantities.items()]
@@ -189,15 +190,14 @@ def ratios_table(found: mjfim.Estimate) -> Table:
         cells = []
         for name, (_, scale) in quantities.items():
             own = f"{name}_{joint}"
-            pair = [places[own if own in places else name], places["kp"]]
-            value, kp = found.theta[pair]
-            slope = np.array([1.0 / kp, -value / kp**2])
-            std = np.sqrt(slope @ found.honest_covariance[np.ix_(pair, pair)] @ slope)
+            place = places[own if own in places else name]
+            value, (low, high) = found.theta[place], found.interval[place]
             theirs = []
             for gain, _, kd, armature, friction, damping in published:
                 top = {"damping": damping - kd, "friction": friction, "armature": armature}[name]
                 theirs.append(f"{scale * top[number] / gain[number]:.3g}")
-            ours = f"{scale * value / kp:.3g} ± {scale * 1.96 * std:.2g}"
+            value, low, high = scale * np.array([value, low, high]) / found.theta[places["kp"]]
+            ours = f"{value:.3g} ({low:.2g} to {high:.2g})"
             cells.append(f"{ours} | {', '.join(theirs)}")
         table.add_row(joint, *cells)
     return table
